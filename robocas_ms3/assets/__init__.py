@@ -1,0 +1,1 @@
+"""Asset packs: folders of simulation-ready, grasp-annotated objects and furniture."""

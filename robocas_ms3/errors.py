@@ -1,0 +1,65 @@
+"""Every failure a user can meet has a type here, and a message of one line: what, where, expected, found, fix."""
+
+from __future__ import annotations
+
+
+class RobocasError(Exception):
+    """Base of all errors this package raises on purpose; the command line prints them in one line.
+
+    Args:
+        what: what went wrong.
+        where: the file, key, flag or object concerned.
+        expected: what would have been right.
+        found: what was there instead.
+        fix: what to do about it.
+    """
+
+    def __init__(
+        self, what: str, *, where: object = "", expected: object = "", found: object = "", fix: str = ""
+    ) -> None:
+        self.what, self.where, self.expected, self.found, self.fix = what, where, expected, found, fix
+        head = f"{where}: {what}" if str(where) else what
+        parts = [f"{name} {value}" for name, value in (("expected", expected), ("found", found)) if str(value)]
+        message = head + (f" ({', '.join(parts)})" if parts else "") + (f". {fix}" if fix else "")
+        super().__init__(message)
+
+
+class ConfigError(RobocasError):
+    """A task configuration is wrong."""
+
+
+class AssetError(RobocasError):
+    """An asset pack, or a mesh on its way into one, is missing, damaged or unusable."""
+
+
+class LayoutError(RobocasError):
+    """No arrangement of the objects satisfies the configuration."""
+
+
+class OutputExistsError(RobocasError):
+    """The output is already there and neither ``--resume`` nor ``--overwrite`` was given."""
+
+
+class DatasetError(RobocasError):
+    """A trajectory file or dataset can't be read or written."""
+
+
+class MissingExtraError(RobocasError):
+    """An optional dependency is needed; the message names the extra that brings it."""
+
+
+class PlanningFailed(RobocasError):
+    """A scripted policy could not go on.
+
+    Args:
+        stage: the step of the policy: ``grasp_sampling``, ``reach``, ``approach``, ``grasp``, ``lift``, ...
+        reason: why, in a few words that can be counted.
+    """
+
+    def __init__(self, stage: str, reason: str) -> None:
+        self.stage, self.reason = stage, reason
+        super().__init__(f"{stage}: {reason}")
+
+    def __reduce__(self):
+        """Let the error cross a process boundary."""
+        return type(self), (self.stage, self.reason)

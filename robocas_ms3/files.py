@@ -1,0 +1,91 @@
+"""Files appear whole or not at all: write beside the target, then rename."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.errors import OutputExistsError, RobocasError
+
+
+@contextmanager
+def replacing(path: Path | str) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``; on success it replaces ``path``, on failure it is removed.
+
+    The temporary name keeps the suffix, since many writers choose their format by it.
+    """
+    path = Path(path)
+    make_folder(path.parent)
+    tmp = path.parent / f".{path.stem}.{os.getpid()}.tmp{path.suffix}"
+    try:
+        yield tmp
+        os.replace(tmp, path)
+    finally:
+        if tmp.is_dir():
+            shutil.rmtree(tmp, ignore_errors=True)
+        else:
+            tmp.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_folder(path: Path | str) -> Iterator[Path]:
+    """Yield a fresh folder beside ``path``; on success it becomes ``path`` (an older one goes), else it is removed."""
+    path = Path(path)
+    make_folder(path.parent)
+    tmp = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
+    tmp.chmod(0o755)
+    try:
+        yield tmp
+        if path.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
+            os.replace(path, old / "old")
+            os.replace(tmp, path)
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            os.replace(tmp, path)
+    finally:
+        shutil.rmtree(tmp, ignore_errors=True)
+
+
+def make_folder(path: Path | str) -> Path:
+    """Make a folder and its parents, and check that it can be written to.
+
+    Raises:
+        RobocasError: it can't be made or written to.
+    """
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RobocasError("can't make this folder", where=path, found=error.strerror, fix="Choose another.") from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise RobocasError("this folder is not writable", where=path, fix="Choose another, or change its permissions.")
+    return path
+
+
+def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool = False) -> None:
+    """Refuse an output that exists, unless the user said what to do with it.
+
+    Raises:
+        OutputExistsError: ``path`` exists and is not empty, and neither flag is set.
+    """
+    path = Path(path)
+    taken = path.exists() and not (path.is_dir() and not any(path.iterdir()))
+    if taken and not (overwrite or resume):
+        raise OutputExistsError(
+            "the output exists already", where=path, fix="Pass --resume to go on, --overwrite to replace it."
+        )
+    if taken and overwrite:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def write_json(path: Path | str, data: Any) -> None:
+    """Write JSON whole or not at all."""
+    with replacing(path) as tmp:
+        tmp.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
