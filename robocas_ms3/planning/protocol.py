@@ -1,0 +1,97 @@
+"""The small interface between scripted policies and a motion planner.
+
+Everything is in the arm's base frame (``panda_link0``), so the mobile base never matters to a backend. Poses are 4x4
+float64 matrices in metres; ``tcp_in_base`` is ManiSkill's TCP (z approach, y closing). ``qpos`` are the 7 arm joints, rad.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Joint positions at exact control steps.
+
+    Attributes:
+        qpos: (T, 7) rad; row i is reached ``(i + 1) * dt`` after the start; the last row is the goal exactly.
+        dt: seconds between rows.
+    """
+
+    qpos: Array
+    dt: float
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the start to the last row."""
+        return len(self.qpos) * self.dt
+
+
+@dataclass(frozen=True)
+class AttachedBody:
+    """An object held by the gripper, for collision checking.
+
+    Attributes:
+        vertices: (V, 3) points whose convex hull stands for the object, in the object's frame, m.
+        object_in_tcp: 4x4.
+    """
+
+    vertices: Array
+    object_in_tcp: Array
+
+
+class Planner(Protocol):
+    """What a backend offers. Every planning method raises ``PlanningFailed(stage, reason)``; none returns a sentinel."""
+
+    def seed(self, seed: int) -> None:
+        """Make everything that follows repeat exactly for the same calls."""
+
+    def set_scene(self, points_in_base: Array) -> None:
+        """Replace the obstacles by a point cloud.
+
+        Args:
+            points_in_base: (P, 3) samples of all obstacle surfaces, m. Points inside the robot's own base are cut out.
+        """
+
+    def attach(self, body: AttachedBody | None) -> None:
+        """Attach a held object to the TCP, or nothing."""
+
+    def collisions(self, qpos: Array, finger_width: float = 0.08) -> list[str]:
+        """Name what touches at a configuration: links, 'cloud', 'attached'. Empty: free."""
+
+    def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
+        """Solve inverse kinematics.
+
+        Args:
+            tcp_in_base: 4x4.
+            near: (7,) preferred configuration.
+            avoid_collisions: keep only configurations free of collisions.
+
+        Returns:
+            Distinct solutions (7,), nearest to ``near`` first; empty when there is none.
+        """
+
+    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str) -> Trajectory:
+        """Plan a collision-free motion to the best of several configurations."""
+
+    def plan_to_pose(self, start: Array, tcp_in_base: Array, *, stage: str) -> Trajectory:
+        """Plan a collision-free motion that ends with the TCP at a pose."""
+
+    def plan_straight(
+        self, start: Array, tcp_in_base: Array, *, stage: str, check_collisions: bool = True, speed: float = 1.0
+    ) -> Trajectory:
+        """Move the TCP on a straight line (and shortest rotation) from where ``start`` has it to a pose.
+
+        Args:
+            start: (7,).
+            tcp_in_base: 4x4 goal.
+            stage: name for errors.
+            check_collisions: whether points of the cloud may not be touched (self-collisions always count).
+            speed: fraction of the velocity and acceleration limits.
+        """
