@@ -103,7 +103,7 @@ class TaskConfig(StrictModel):
     robot: PoseConfig = Field(description="pose of the mobile base's frame on the floor")
     surface: SurfaceConfig
     objects: ObjectsConfig = ObjectsConfig()
-    layout: Annotated[ScatteredLayout, Field(discriminator=None)]
+    layout: ScatteredLayout
     target: TargetConfig = TargetConfig()
 
     @model_validator(mode="after")
