@@ -1,0 +1,1 @@
+"""Scenes: layouts as pure maths, and building them in a simulator."""

@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robocas_ms3.errors import LayoutError
+from robocas_ms3.scenes.placement import Placeable, Region, choose_objects, choose_target, planar_pose, sample_scattered
+
+
+def box(width: float, depth: float, height: float = 0.1) -> Placeable:
+    """A box that stands or lies on its side."""
+    standing, lying = np.eye(4), np.eye(4)
+    standing[2, 3], lying[2, 3] = height / 2, depth / 2
+    lying[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
+
+    def outline(a, b):
+        return np.array([[-a, -b], [a, -b], [a, b], [-a, b]]) / 2
+
+    return Placeable(
+        "box", np.stack([standing, lying]), np.array([0.5, 0.5]), [outline(width, depth), outline(width, height)]
+    )
+
+
+def test_planar_pose_turns_then_shifts():
+    assert planar_pose(1, 2, 3, np.pi / 2) @ [1, 0, 0, 1] == pytest.approx([1, 3, 3, 1])
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), count=st.integers(1, 8))
+def test_scattered_objects_keep_their_distance_and_stay_inside(seed, count):
+    region = Region((0.0, -0.4), (0.4, 0.4), 0.61)
+    placeables = [box(0.05 + 0.01 * i, 0.06) for i in range(count)]
+    poses = sample_scattered(np.random.default_rng(seed), placeables, region, min_gap=0.02, max_tries=5000)
+    outlines = []
+    for pose, placeable in zip(poses, placeables, strict=True):
+        half = np.array([placeable.footprints[0][1, 0], placeable.footprints[0][2, 1], 0.05])
+        corners = np.array([[sx, sy, sz] for sx in (-1, 1) for sy in (-1, 1) for sz in (-1, 1)]) * half
+        world = corners @ pose[:3, :3].T + pose[:3, 3]
+        assert world[:, 2].min() == pytest.approx(0.61)
+        assert (world[:, :2] >= np.array(region.min_xy) - 1e-9).all()
+        assert (world[:, :2] <= np.array(region.max_xy) + 1e-9).all()
+        outlines.append(shapely.MultiPoint(world[:, :2]).convex_hull)
+    for i, a in enumerate(outlines):
+        for b in outlines[:i]:
+            assert a.distance(b) >= 0.02 - 1e-9
+
+
+def test_scattered_repeats_for_the_same_seed_only():
+    region = Region((0.0, 0.0), (0.5, 0.5), 0.0)
+    first, again, other = (
+        sample_scattered(np.random.default_rng(seed), [box(0.1, 0.05)] * 3, region, min_gap=0.01, max_tries=500)
+        for seed in (1, 1, 2)
+    )
+    assert np.array_equal(first, again)
+    assert not np.allclose(first, other)
+
+
+def test_objects_that_do_not_fit_are_an_error_with_the_fix():
+    with pytest.raises(LayoutError, match=r"10 objects don't fit 2.0 cm apart on 0.20 x 0.20 m.*Lower objects.count"):
+        sample_scattered(
+            np.random.default_rng(0), [box(0.1, 0.1)] * 10, Region((0, 0), (0.2, 0.2), 0), min_gap=0.02, max_tries=300
+        )
+
+
+def test_objects_repeat_only_when_there_are_too_few():
+    rng = np.random.default_rng(0)
+    assert sorted(choose_objects(rng, ["a", "b", "c"], 3)) == ["a", "b", "c"]
+    assert sorted(choose_objects(rng, ["a", "b"], 5)).count("a") in (2, 3)
+
+
+def test_target_is_the_nearest_of_its_name():
+    positions = np.array([[0.0, 1.0], [0.0, 0.5], [0.3, 0.5]])
+    names = ["apple", "apple", "mug"]
+    drawn = {
+        choose_target(np.random.default_rng(s), names, positions, np.array([True, True, True]), np.zeros(2))
+        for s in range(30)
+    }
+    assert drawn == {1, 2}
+    # the nearer apple can't be grasped: "the apple" would name it all the same
+    assert choose_target(np.random.default_rng(0), names, positions, np.array([True, False, False]), np.zeros(2)) is None
