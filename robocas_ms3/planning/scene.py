@@ -1,0 +1,89 @@
+"""What a planner has to know of an environment: obstacle clouds, poses as matrices."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.planning.protocol import Array
+from robocas_ms3.scenes import build
+from robocas_ms3.tasks.base import RoboCASEnv
+
+# Upstream's: samples of the meshes at 5 mm, none farther than 1.5 m from the robot
+SPACING = 0.005
+RADIUS = 1.5
+
+
+def matrix(raw_pose: torch.Tensor) -> Array:
+    """4x4 of a pose (7,): position m, quaternion wxyz."""
+    values = raw_pose.detach().cpu().numpy().astype(float)
+    result = np.eye(4)
+    result[:3, :3] = Rotation.from_quat(values[[4, 5, 6, 3]]).as_matrix()
+    result[:3, 3] = values[:3]
+    return result
+
+
+def transform(pose: Array, points: Array) -> Array:
+    """Points (P, 3) moved by a 4x4."""
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def inverse(pose: Array) -> Array:
+    """Inverse of a rigid 4x4."""
+    result = np.eye(4)
+    result[:3, :3] = pose[:3, :3].T
+    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return result
+
+
+class PlanningScene:
+    """Reads one environment (``num_envs`` = 1) as a planner sees it. All clouds are in the arm's base frame, m."""
+
+    def __init__(self, env: RoboCASEnv) -> None:
+        self.env = env
+        config = env.task_config
+        pieces = [
+            transform(build.fixture_pose(item.pose), env.furniture_pack.furniture[item.asset].surface_points(SPACING))
+            for item in config.furniture.values()
+        ]
+        self._fixed_in_world = np.concatenate(pieces)
+
+    @property
+    def arm_base_in_world(self) -> Array:
+        """4x4 of ``panda_link0`` in the world."""
+        return matrix(self.env.agent.arm_base_link.pose.raw_pose[0])
+
+    @property
+    def tcp_in_base(self) -> Array:
+        """4x4 of the TCP in the arm's base frame."""
+        return inverse(self.arm_base_in_world) @ matrix(self.env.agent.tcp.pose.raw_pose[0])
+
+    @property
+    def arm_qpos(self) -> Array:
+        """(7,) rad, where the arm is."""
+        return self.env.agent.robot.get_qpos()[0, 3:10].cpu().numpy().astype(float)
+
+    def object_in_base(self, slot: int) -> Array:
+        """4x4 of an object in the arm's base frame."""
+        return inverse(self.arm_base_in_world) @ matrix(self.env.objects[slot].pose.raw_pose[0])
+
+    @property
+    def basket_in_base(self) -> Array:
+        """4x4 of the basket's frame in the arm's base frame."""
+        return inverse(self.arm_base_in_world) @ matrix(self.env.fixtures.basket.pose.raw_pose[0])
+
+    def obstacles_in_base(self, *, without: int | None = None) -> Array:
+        """Samples (P, 3) of the collision surfaces of furniture, basket and objects.
+
+        Args:
+            without: slot of an object to leave out.
+        """
+        to_base = inverse(self.arm_base_in_world)
+        basket = self.env.furniture_pack.furniture[self.env.task_config.basket.asset]
+        pieces = [transform(to_base, self._fixed_in_world), transform(self.basket_in_base, basket.surface_points(SPACING))]
+        for slot, asset in enumerate(self.env.object_assets[0]):
+            if slot != without:
+                pieces.append(transform(self.object_in_base(slot), asset.surface_points(SPACING)))
+        points = np.concatenate(pieces)
+        return points[np.linalg.norm(points, axis=1) <= RADIUS]

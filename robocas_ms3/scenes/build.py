@@ -1,0 +1,155 @@
+"""Put a configuration's room, furniture, basket and objects into a ManiSkill scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import sapien
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.utils.structs import Actor
+
+from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
+from robocas_ms3.assets.spawn import spawn
+from robocas_ms3.config.task import BasketConfig, FurnitureConfig, PoseConfig, SurfaceConfig, TaskConfig
+from robocas_ms3.errors import ConfigError
+from robocas_ms3.scenes.placement import Placeable, Region, planar_pose
+
+
+@dataclass(frozen=True)
+class Fixtures:
+    """What stays the same in all scenes of a configuration."""
+
+    room: Actor
+    furniture: dict[str, Actor]
+    basket: Actor
+
+
+def fixture_pose(config: PoseConfig) -> np.ndarray:
+    """4x4 of a pose in the configuration."""
+    return planar_pose(*config.position, np.deg2rad(config.yaw_deg))
+
+
+def basket_pose(config: BasketConfig, basket: LoadedFurniture) -> np.ndarray:
+    """4x4 of the basket's frame: the configuration says where its bottom stands."""
+    pose = fixture_pose(config.pose)
+    pose[2, 3] += basket.asset.origin_height
+    return pose
+
+
+def build_fixtures(scene: ManiSkillScene, config: TaskConfig, furniture_pack: Pack) -> Fixtures:
+    """Build room, furniture and basket into every sub-scene.
+
+    Raises:
+        ConfigError: an asset is unknown or can't play its part.
+    """
+    room = find_furniture(furniture_pack, config.room.asset, key="room.asset")
+    actors = {}
+    for name, item in config.furniture.items():
+        asset = find_furniture(furniture_pack, item.asset, key=f"furniture.{name}.asset")
+        actors[name] = spawn(scene, asset, name=name, pose=sapien.Pose(fixture_pose(item.pose)))
+    basket = find_container(furniture_pack, config.basket)
+    return Fixtures(
+        room=spawn(scene, room, name="room", pose=sapien.Pose()),
+        furniture=actors,
+        basket=spawn(scene, basket, name="basket", pose=sapien.Pose(basket_pose(config.basket, basket))),
+    )
+
+
+def build_object_slot(scene: ManiSkillScene, slot: int, assets: list[LoadedObject]) -> Actor:
+    """Build one slot of objects: env i gets ``assets[i]``; the actors are merged into one batched view.
+
+    Until the layout puts them in place they hang apart from each other, high above the room.
+    """
+    name = f"object_{slot}"
+    waiting = sapien.Pose([slot * 0.5, 0, 20.0])
+    actors = [
+        spawn(scene, asset, name=f"{name}-env_{i}" if len(assets) > 1 else name, pose=waiting, scene_idxs=[i])
+        for i, asset in enumerate(assets)
+    ]
+    if len(actors) == 1:
+        return actors[0]
+    for actor in actors:
+        scene.remove_from_state_dict_registry(actor)
+    merged = Actor.merge(actors, name=name)
+    scene.add_to_state_dict_registry(merged)
+    return merged
+
+
+def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
+    """Look up a piece of furniture.
+
+    Raises:
+        ConfigError: the pack has no such furniture.
+    """
+    if asset_id not in pack.furniture:
+        raise ConfigError(
+            f"{key}: no such furniture in pack {pack.name!r}", expected=f"one of {sorted(pack.furniture)}", found=asset_id
+        )
+    return pack.furniture[asset_id]
+
+
+def find_container(pack: Pack, config: FurnitureConfig) -> LoadedFurniture:
+    """Look up the basket.
+
+    Raises:
+        ConfigError: no such furniture, or it isn't a movable container.
+    """
+    basket = find_furniture(pack, config.asset, key="basket.asset")
+    if basket.asset.inner is None or basket.asset.mass is None:
+        raise ConfigError("basket.asset: this furniture is no movable container", found=config.asset)
+    return basket
+
+
+def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
+    """Ids of the configuration's objects.
+
+    Raises:
+        ConfigError: an id is not in the pack, or the pack has no objects.
+    """
+    known = sorted(pack.objects)
+    ids = known if config.objects.ids == "all" else list(config.objects.ids)
+    unknown = [i for i in ids if i not in pack.objects]
+    if unknown:
+        raise ConfigError(
+            f"objects.ids: no such object in pack {pack.name!r}", expected=f"one of {known}", found=", ".join(unknown)
+        )
+    if not ids:
+        raise ConfigError(f"objects.ids: pack {pack.name!r} has no objects to choose from")
+    return ids
+
+
+def find_region(config: SurfaceConfig, furniture: LoadedFurniture) -> Region:
+    """Rectangle that objects are placed on, in the furniture's frame.
+
+    Raises:
+        ConfigError: the furniture has no such surface, or the rectangle sticks out of it.
+    """
+    surfaces = furniture.asset.surfaces
+    if config.name not in surfaces:
+        raise ConfigError("surface.name: no such surface", expected=f"one of {sorted(surfaces)}", found=config.name)
+    whole = surfaces[config.name]
+    if config.min_xy is None or config.max_xy is None:
+        return Region(whole.min_xy, whole.max_xy, whole.z)
+    inside = all(
+        low <= a and b <= high
+        for low, a, b, high in zip(whole.min_xy, config.min_xy, config.max_xy, whole.max_xy, strict=True)
+    )
+    if not inside:
+        raise ConfigError(
+            f"surface: the rectangle lies outside surface {config.name!r} of {furniture.asset.id!r}",
+            expected=f"within {whole.min_xy}..{whole.max_xy}",
+            found=f"{config.min_xy}..{config.max_xy}",
+        )
+    return Region(config.min_xy, config.max_xy, whole.z)
+
+
+def placeable(asset: LoadedObject) -> Placeable:
+    """What a layout has to know of an object."""
+    notes = asset.annotations
+    return Placeable(
+        asset.asset.id,
+        notes.resting_poses,
+        notes.resting_probabilities,
+        [asset.footprint(i) for i in range(len(notes.resting_poses))],
+    )
