@@ -1,0 +1,1 @@
+"""Instructions, sub-goal texts, and their sentence embeddings."""
