@@ -1,0 +1,135 @@
+"""Run planned motions in an environment, keep what was done, and undo it by simulating again from the reset."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from robocas_ms3.planning.protocol import Array, Trajectory
+from robocas_ms3.tasks.base import RoboCASEnv
+
+OPEN, CLOSED = 1.0, -1.0
+
+
+@dataclass
+class Segment:
+    """A part of the demonstration with one sub-goal.
+
+    Attributes:
+        goal_type: one of the dataset's types, e.g. ``move and grasp``.
+        goal_description: the sub-goal in words.
+        first: index of its first action.
+    """
+
+    goal_type: str
+    goal_description: str
+    first: int
+
+
+@dataclass
+class Seconds:
+    """Where an episode's time went."""
+
+    reset: float = 0.0
+    planning: float = 0.0
+    simulation: float = 0.0
+
+    @contextmanager
+    def spent_on(self, part: str) -> Iterator[None]:
+        """Add the time spent inside to a part."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            setattr(self, part, getattr(self, part) + time.perf_counter() - start)
+
+
+@dataclass
+class Executor:
+    """Steps one environment (``pd_joint_pos``, one env) and remembers every action since the reset.
+
+    Attributes:
+        env: the environment, possibly wrapped by a recorder.
+        seed: the episode's seed.
+        actions: every action since the reset, (8,) each.
+        segments: the sub-goals so far.
+        info: of the last step or reset.
+        gripper: the gripper's command as it stands.
+        seconds: where the time went.
+    """
+
+    env: gym.Env
+    seed: int
+    actions: list[np.ndarray] = field(default_factory=list)
+    segments: list[Segment] = field(default_factory=list)
+    info: dict[str, Any] = field(default_factory=dict)
+    gripper: float = OPEN
+    seconds: Seconds = field(default_factory=Seconds)
+
+    @property
+    def base_env(self) -> RoboCASEnv:
+        """The environment under its wrappers."""
+        env = self.env.unwrapped
+        assert isinstance(env, RoboCASEnv)
+        return env
+
+    @property
+    def dt(self) -> float:
+        """Seconds a control step takes."""
+        return self.base_env.control_timestep
+
+    def reset(self) -> None:
+        """Start the episode from its seed, forgetting all actions."""
+        with self.seconds.spent_on("reset"):
+            _, self.info = self.env.reset(seed=self.seed)
+        self.actions, self.segments, self.gripper = [], [], OPEN
+
+    def rewind(self, length: int) -> None:
+        """Undo all but the first ``length`` actions: reset, then simulate those again exactly."""
+        kept, segments = self.actions[:length], [s for s in self.segments if s.first < length]
+        self.reset()
+        for action in kept:
+            self._step(action)
+        self.segments = segments
+
+    def follow(self, trajectory: Trajectory) -> None:
+        """Send a trajectory's rows to the arm, the gripper's command held."""
+        for qpos in trajectory.qpos:
+            self._step(np.append(qpos, self.gripper).astype(np.float32))
+
+    def move_gripper(self, command: float, hold: Array, *, seconds: float) -> None:
+        """Command the gripper, with the arm held where it is meant to be.
+
+        Args:
+            command: ``OPEN`` or ``CLOSED``.
+            hold: (7,) arm target meanwhile.
+            seconds: how long.
+        """
+        self.gripper = command
+        for _ in range(max(1, round(seconds / self.dt))):
+            self._step(np.append(hold, command).astype(np.float32))
+
+    def label(self, goal_type: str, goal_description: str) -> None:
+        """Begin a sub-goal with the next action; a label that repeats the last one changes nothing."""
+        if self.segments and self.segments[-1].first == len(self.actions):
+            self.segments.pop()
+        if not self.segments or (self.segments[-1].goal_type, self.segments[-1].goal_description) != (
+            goal_type,
+            goal_description,
+        ):
+            self.segments.append(Segment(goal_type, goal_description, len(self.actions)))
+
+    def flag(self, name: str) -> bool:
+        """A bool of the last ``info``."""
+        return bool(self.info[name][0])
+
+    def _step(self, action: np.ndarray) -> None:
+        with self.seconds.spent_on("simulation"):
+            *_, self.info = self.env.step(action)
+        self.actions.append(action)

@@ -1,0 +1,1 @@
+"""Scripted policies: one solver a task."""

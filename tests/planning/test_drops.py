@@ -1,0 +1,40 @@
+import numpy as np
+import pytest
+
+from robocas_ms3.planning.drops import sample_drops
+
+CONTAINER = np.array([[0, -1, 0, 0.6], [1, 0, 0, 0.2], [0, 0, 1, 0.1], [0, 0, 0, 1.0]])  # turned by 90 degrees
+LOW, HIGH = np.array([-0.2, -0.1, -0.1]), np.array([0.2, 0.1, 0.1])
+BOX = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.02, 0.02) for z in (-0.1, 0.1)]) + [0, 0, 0.05]
+
+
+def drops(**changes):
+    arguments = dict(
+        count=200, container_in_base=CONTAINER, inner_low=LOW, inner_high=HIGH, vertices_in_tcp=BOX,
+        center_in_tcp=np.array([0, 0, 0.05]),
+    )
+    return sample_drops(np.random.default_rng(0), **{**arguments, **changes})
+
+
+def test_objects_hang_above_the_container_clear_of_its_rim():
+    poses = drops()
+    rim = 0.1 + 0.1
+    for pose in poses:
+        world = BOX @ pose[:3, :3].T + pose[:3, 3]
+        assert rim + 0.02 - 1e-9 <= world[:, 2].min() <= rim + 0.10 + 1e-9
+        center = pose[:3, :3] @ [0, 0, 0.05] + pose[:3, 3]
+        # the container's x is the base's y
+        assert abs(center[0] - 0.6) <= 0.25 * 0.1 + 1e-9
+        assert abs(center[1] - 0.2) <= 0.25 * 0.2 + 1e-9
+
+
+def test_approach_points_down_and_tilts_away_from_the_arm():
+    poses = drops()
+    approach = poses[:, :3, 2]
+    tilt = np.degrees(np.arccos(-approach[:, 2]))
+    assert tilt.max() <= 70 + 1e-6
+    assert tilt.min() < 5
+    tilted = approach[tilt > 20]
+    outward = np.array([0.6, 0.2]) / np.hypot(0.6, 0.2)
+    assert (tilted[:, :2] @ outward > 0).all()
+    assert np.linalg.det(poses[:, :3, :3]) == pytest.approx(np.ones(200))
