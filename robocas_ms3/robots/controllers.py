@@ -1,0 +1,164 @@
+"""Controllers of the mobile Panda: a base that is held, end-effector deltas in the end effector's own frame.
+
+Actions of ``pd_ee_delta_pose``: (x, y, z, rx, ry, rz) in [-1, 1], all in the current TCP frame. Translation is
+metres / 0.1. Rotation is Euler angles in radians / 0.5, in the convention of ManiSkill's controllers (intrinsic XYZ:
+R = Rx Ry Rz), its norm clipped to 1. A positive angle turns positively about the TCP's axis (ManiSkill's own controller
+turns the other way).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from mani_skill.agents.controllers import (
+    PDEEPoseController,
+    PDEEPoseControllerConfig,
+    PDJointPosController,
+    PDJointPosControllerConfig,
+)
+from mani_skill.utils import gym_utils
+from mani_skill.utils.geometry.rotation_conversions import (
+    euler_angles_to_matrix,
+    matrix_to_quaternion,
+    quaternion_apply,
+    quaternion_multiply,
+)
+from mani_skill.utils.structs import Pose
+from scipy.spatial.transform import Rotation
+
+POSITION_SCALE = 0.1  # m at |action| = 1
+ROTATION_SCALE = 0.5  # rad at |action| = 1
+BODY_FRAME = "body_translation:body_aligned_body_rotation"
+GPU_IK_ITERATIONS = 5
+
+
+def to_ee_delta_action(
+    translation: np.ndarray, rotation: np.ndarray | Rotation, *, euler: str | None = None
+) -> np.ndarray:
+    """Turn a relative motion of the TCP, in its own frame, into the arm's part of a ``pd_ee_delta_pose`` action.
+
+    Args:
+        translation: (..., 3) m.
+        rotation: (..., 3) rotation vectors, rad; or Euler angles with ``euler``; or a scipy ``Rotation``.
+        euler: scipy's name of the convention when ``rotation`` holds Euler angles: ``"XYZ"`` intrinsic (ManiSkill's),
+            ``"xyz"`` extrinsic (RoboCAS datasets read with scipy).
+
+    Returns:
+        (..., 6) float32, not clipped: beyond +-1 the motion does not fit into one step.
+    """
+    translation = np.asarray(translation, dtype=np.float64)
+    if not isinstance(rotation, Rotation):
+        angles = np.asarray(rotation, dtype=np.float64).reshape(-1, 3)
+        rotation = Rotation.from_rotvec(angles) if euler is None else Rotation.from_euler(euler, angles)
+    angles = rotation.as_euler("XYZ").reshape(translation.shape)
+    return np.concatenate([translation / POSITION_SCALE, angles / ROTATION_SCALE], axis=-1).astype(np.float32)
+
+
+def ee_delta_target(
+    position: torch.Tensor, quaternion: torch.Tensor, delta: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Apply a motion given in the end effector's frame to its pose in any parent frame.
+
+    Args:
+        position: (N, 3) m, of the end effector in the parent frame.
+        quaternion: (N, 4) wxyz.
+        delta: (N, 6) translation in m and intrinsic XYZ Euler angles in rad, in the end effector's frame.
+
+    Returns:
+        Position (N, 3) and quaternion (N, 4) of the target in the parent frame.
+    """
+    rotation = matrix_to_quaternion(euler_angles_to_matrix(delta[:, 3:6], "XYZ"))
+    return position + quaternion_apply(quaternion, delta[:, :3]), quaternion_multiply(quaternion, rotation)
+
+
+class HeldJointsController(PDJointPosController):
+    """Holds joints where they are at reset; takes no action (0 dimensions)."""
+
+    def _initialize_action_space(self) -> None:
+        self.single_action_space = spaces.Box(np.empty(0, np.float32), np.empty(0, np.float32))
+
+    def reset(self) -> None:
+        """Take the present configuration as the one to hold."""
+        super().reset()
+        self.set_drive_targets(self._target_qpos)
+
+    def set_action(self, action: Any) -> None:
+        """Do nothing: the drive targets stand."""
+
+
+@dataclass
+class HeldJointsControllerConfig(PDJointPosControllerConfig):
+    """Configuration of a ``HeldJointsController``; bounds are not used."""
+
+    lower: None = None
+    upper: None = None
+    stiffness: Any = None
+    damping: Any = None
+    normalize_action: bool = False
+    controller_cls = HeldJointsController
+
+
+class RoboCASEEPoseController(PDEEPoseController):
+    """End-effector pose control: deltas in the end effector's frame, or absolute poses in the arm's base frame.
+
+    Differs from ManiSkill's: rotations have their natural sign, and body-frame deltas work on a GPU too, since the
+    target pose in the base frame is computed before inverse kinematics.
+    """
+
+    def _check_gpu_sim_works(self) -> None:
+        """Every frame works: ``set_action`` hands poses in the root frame to inverse kinematics."""
+
+    def _clip_and_scale_action(self, action: torch.Tensor) -> torch.Tensor:
+        position = gym_utils.clip_and_scale_action(action[:, :3], self.action_space_low[:3], self.action_space_high[:3])
+        rotation = action[:, 3:]
+        rotation = rotation / torch.linalg.norm(rotation, dim=1, keepdim=True).clamp(min=1.0)
+        return torch.hstack([position, rotation * self.action_space_high[3:]])
+
+    def compute_target_pose(self, prev_ee_pose_at_base: Pose, action: torch.Tensor) -> Pose:
+        """Compute the target in the arm's base frame.
+
+        Args:
+            prev_ee_pose_at_base: (N,) the pose deltas refer to.
+            action: (N, 6) scaled: m and rad.
+        """
+        if self.config.use_delta:
+            return Pose.create_from_pq(*ee_delta_target(prev_ee_pose_at_base.p, prev_ee_pose_at_base.q, action))
+        rotation = matrix_to_quaternion(euler_angles_to_matrix(action[:, 3:6], "XYZ"))
+        return Pose.create_from_pq(action[:, :3], rotation)
+
+    def set_action(self, action: Any) -> None:
+        """Drive the arm towards the pose; where no inverse kinematics is found it stays where it is."""
+        action = self._preprocess_action(action)
+        self._step = 0
+        self._start_qpos = self.qpos
+        now = self.ee_pose_at_base
+        self._target_pose = self.compute_target_pose(self._target_pose if self.config.use_target else now, action)
+        target = self._solve(self._target_pose, now)
+        self._target_qpos = self._start_qpos if target is None else target
+        self.set_drive_targets(self._target_qpos)
+
+    def _solve(self, target: Pose, now: Pose) -> torch.Tensor | None:
+        qpos = self.articulation.get_qpos()
+        if not self.scene.gpu_sim_enabled:
+            return cast("torch.Tensor | None", self.kinematics.compute_ik(pose=target, q0=qpos))
+        # On a GPU ManiSkill's solver is one linear step, too coarse for 0.5 rad: repeat it.
+        qpos = qpos.clone()
+        current: Pose | None = now
+        for _ in range(GPU_IK_ITERATIONS):
+            arm = self.kinematics.compute_ik(
+                pose=target, q0=qpos, current_pose=current, solver_config=self.config.delta_solver_config
+            )
+            qpos[:, self.active_joint_indices] = cast("torch.Tensor", arm)
+            current = None
+        return qpos[:, self.active_joint_indices]
+
+
+@dataclass
+class RoboCASEEPoseControllerConfig(PDEEPoseControllerConfig):
+    """Configuration of a ``RoboCASEEPoseController``. Rotation bounds must be symmetric."""
+
+    controller_cls = RoboCASEEPoseController

@@ -1,0 +1,269 @@
+"""Robot description files, generated from the installed mani_skill's Panda into the cache. Needs no SAPIEN."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import importlib.util
+import json
+import os
+import shutil
+import tempfile
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.files import make_folder
+from robocas_ms3.paths import cache_dir
+from robocas_ms3.robots import constants as c
+from robocas_ms3.robots.meshes import decimate_glb, write_boxes_glb
+
+LINK_TRIANGLES = 1000
+
+# The AGV: a body on the floor (1 cm of air below, so that it never rubs), a deck that carries the pedestal.
+_BODY = ((0.5, 0.4, 0.24), (0.0, 0.0, 0.13 - c.BASE_LINK_HEIGHT), (0.16, 0.17, 0.19))
+_DECK = ((0.36, 0.3, 0.04), (0.0, 0.0, 0.27 - c.BASE_LINK_HEIGHT), (0.85, 0.86, 0.88))
+_PEDESTAL = (c.PEDESTAL_SIZE, (0.0, 0.0, c.PEDESTAL_ABOVE_BASE_LINK), (0.85, 0.86, 0.88))
+_BASE_MASS = 60.0  # kg
+
+# Tip pads in the finger's frame; y is the closing direction. Upstream's 55 mm pad starts 28 mm up the finger, over the
+# stock rubber tip, whose inner face is at y = 0 too, and ends 8 mm beyond the TCP.
+_TIP_WIDTH, _TIP_THICKNESS, _TIP_START, _TIP_STOCK_END = 0.018, 0.004, 0.028, 0.053
+_TIP_COLOUR = (0.05, 0.05, 0.05)
+
+
+@dataclass(frozen=True)
+class RobotFiles:
+    """Where the generated files lie.
+
+    Attributes:
+        urdf: mobile base, arm, hand; visual meshes beside it, collision meshes in mani_skill by absolute path. Its SRDF
+            has the same stem, where SAPIEN's loader looks for it.
+        arm_urdf: the arm alone, rooted at ``panda_link0``, without visuals: for planners and inverse kinematics.
+        arm_srdf: pairs of links of ``arm_urdf`` whose collisions are not to be checked.
+        folder: holds all of them.
+    """
+
+    urdf: Path
+    arm_urdf: Path
+    arm_srdf: Path
+    folder: Path
+
+
+def robot_files(finger_extension: float = c.FINGER_EXTENSION) -> RobotFiles:
+    """Return the robot's files, generating them where they are missing.
+
+    The folder's name is a hash of all they are made from, this generator's code included. Two processes may do this at
+    once: a folder appears whole, and the first one wins.
+
+    Args:
+        finger_extension: how much longer than stock the fingers are, m; 0 gives ManiSkill's own fingers.
+
+    Raises:
+        RobocasError: mani_skill's Panda is not where it should be, or the cache can't be written to.
+    """
+    if finger_extension < 0:
+        raise RobocasError("negative finger extension", expected=">= 0 m", found=finger_extension)
+    source = _panda_folder()
+    folder = cache_dir() / "robots" / _fingerprint(source, finger_extension)
+    files = RobotFiles(
+        urdf=folder / f"{c.ROBOT_UID}.urdf",
+        arm_urdf=folder / "panda_arm.urdf",
+        arm_srdf=folder / "panda_arm.srdf",
+        folder=folder,
+    )
+    if not _is_complete(folder):
+        make_folder(folder.parent)
+        tmp = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
+        try:
+            tmp.chmod(0o755)
+            _generate(tmp, source, finger_extension)
+            _publish(tmp, folder)
+        finally:
+            shutil.rmtree(tmp, ignore_errors=True)
+    return files
+
+
+def _publish(tmp: Path, folder: Path) -> None:
+    """Rename ``tmp`` to ``folder``; keep a complete folder another process has put there meanwhile."""
+    try:
+        os.rename(tmp, folder)
+    except OSError:
+        if _is_complete(folder):
+            return
+        damaged = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".old", dir=folder.parent))
+        os.rename(folder, damaged / "old")
+        os.rename(tmp, folder)
+        shutil.rmtree(damaged, ignore_errors=True)
+
+
+def _is_complete(folder: Path) -> bool:
+    try:
+        names = json.loads((folder / "files.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return all((folder / name).is_file() for name in names)
+
+
+def _panda_folder() -> Path:
+    """mani_skill's Panda assets, found without importing mani_skill."""
+    spec = importlib.util.find_spec("mani_skill")
+    if spec is None or not spec.submodule_search_locations:
+        raise RobocasError("mani_skill is not installed", fix="Install it: pip install 'mani_skill>=3.0.1,<3.1'.")
+    folder = Path(spec.submodule_search_locations[0]) / "assets" / "robots" / "panda"
+    if not (folder / "panda_v2.urdf").is_file():
+        raise RobocasError("mani_skill's Panda is missing", where=folder / "panda_v2.urdf", fix="Reinstall mani_skill.")
+    return folder
+
+
+@lru_cache(maxsize=8)
+def _fingerprint(source: Path, finger_extension: float) -> str:
+    digest = hashlib.sha256()
+    version = importlib.metadata.version("mani_skill")
+    digest.update(f"{version} {source} {finger_extension:.6f}".encode())
+    meshes = source / "franka_description" / "meshes"
+    generator = [Path(__file__).with_name(name) for name in ("constants.py", "meshes.py", "urdf.py")]
+    for path in [*generator, *sorted(source.glob("panda_v2.*rdf")), *sorted(meshes.glob("*/*"))]:
+        digest.update(path.name.encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _generate(folder: Path, source: Path, finger_extension: float) -> None:
+    visual = folder / "visual"
+    visual.mkdir()
+    panda = _parse(source / "panda_v2.urdf")
+    tips = _adapt_fingers(panda, finger_extension)
+    for mesh in panda.iterfind(".//collision/geometry/mesh"):
+        mesh.set("filename", str((source / mesh.attrib["filename"]).resolve()))
+    for name in {mesh.attrib["filename"] for mesh in panda.iterfind(".//visual/geometry/mesh")}:
+        decimate_glb(source / name, visual / Path(name).name, LINK_TRIANGLES)
+    for mesh in panda.iterfind(".//visual/geometry/mesh"):
+        mesh.set("filename", f"visual/{Path(mesh.attrib['filename']).name}")
+    write_boxes_glb(visual / "base.glb", [_BODY, _DECK, _PEDESTAL])
+
+    arm = deepcopy(panda)
+    for link in arm.iterfind("link"):
+        for element in link.findall("visual"):
+            link.remove(element)
+    _write(arm, folder / "panda_arm.urdf")
+
+    for link, (size, centre) in tips.items():
+        name = f"visual/tip_{link}.glb"
+        write_boxes_glb(folder / name, [(size, centre, _TIP_COLOUR)])
+        _find(panda, "link", link).insert(1, _visual(name))
+    _write(_with_base(panda), folder / f"{c.ROBOT_UID}.urdf")
+
+    srdf = _parse(source / "panda_v2.srdf")
+    _write(srdf, folder / "panda_arm.srdf")
+    for child, reason in ((c.ARM_BASE_LINK, "Adjacent"), ("panda_link1", "Never")):
+        SubElement(srdf, "disable_collisions", link1=c.BASE_LINK, link2=child, reason=reason)
+    _write(srdf, folder / f"{c.ROBOT_UID}.srdf")
+
+    names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+    (folder / "files.json").write_text(json.dumps(names, indent=1), encoding="utf-8")
+
+
+def _adapt_fingers(panda: Element, extension: float) -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Move the TCP and add the tips' collision boxes; return size and centre of each finger's tip box."""
+    _origin(panda, "panda_hand_tcp_joint").set("xyz", f"0 0 {c.STOCK_TCP_IN_HAND + extension:g}")
+    tips = {}
+    if extension == 0:
+        return tips
+    end = _TIP_STOCK_END + extension
+    for link, side in zip(c.FINGER_LINKS, (1, -1), strict=True):
+        _origin(panda, f"{link}_pad_joint").set("xyz", f"0 0 {0.0455 + extension:g}")
+        size = (_TIP_WIDTH, _TIP_THICKNESS, end - _TIP_START)
+        centre = (0.0, side * _TIP_THICKNESS / 2, (end + _TIP_START) / 2)
+        tips[link] = (size, centre)
+        _find(panda, "link", link).append(_box_collision(size, centre))
+    return tips
+
+
+def _with_base(panda: Element) -> Element:
+    """Put the arm on the mobile base: root, three virtual joints, base link, fixed arm base."""
+    robot = Element("robot", name=c.ROBOT_UID)
+    # Small but not tiny: reduced-coordinate solvers dislike mass ratios beyond a few hundred along a chain.
+    for link in ("root", "base_x_link", "base_y_link"):
+        SubElement(robot, "link", name=link).append(_inertial(1.0, (0.01, 0.01, 0.01), (0, 0, 0)))
+    base = SubElement(robot, "link", name=c.BASE_LINK)
+    base.append(_visual("visual/base.glb"))
+    for size, centre, _ in (_BODY, _DECK, _PEDESTAL):
+        base.append(_box_collision(size, centre))
+    x, y, z = _BODY[0]
+    inertia = tuple(_BASE_MASS / 12 * (a * a + b * b) for a, b in ((y, z), (x, z), (x, y)))
+    base.append(_inertial(_BASE_MASS, inertia, _BODY[1]))
+
+    chain = ("root", "base_x_link", "base_y_link", c.BASE_LINK)
+    for i, (name, axis, limits) in enumerate(
+        zip(c.BASE_JOINTS, ("1 0 0", "0 1 0", "0 0 1"), c.BASE_LIMITS, strict=True)
+    ):
+        height = c.BASE_LINK_HEIGHT if chain[i + 1] == c.BASE_LINK else 0.0
+        joint = _joint(robot, name, "revolute" if i == 2 else "prismatic", chain[i], chain[i + 1], height)
+        SubElement(joint, "axis", xyz=axis)
+        lower, upper = (f"{limit:.10g}" for limit in limits)
+        SubElement(joint, "limit", effort="1000", lower=lower, upper=upper, velocity="1")
+    _joint(robot, "arm_base_joint", "fixed", c.BASE_LINK, c.ARM_BASE_LINK, c.ARM_BASE_ABOVE_BASE_LINK)
+    robot.extend(list(panda))
+    return robot
+
+
+def _joint(robot: Element, name: str, kind: str, parent: str, child: str, height: float) -> Element:
+    joint = SubElement(robot, "joint", name=name, type=kind)
+    SubElement(joint, "origin", rpy="0 0 0", xyz=f"0 0 {height:g}")
+    SubElement(joint, "parent", link=parent)
+    SubElement(joint, "child", link=child)
+    return joint
+
+
+def _visual(filename: str) -> Element:
+    visual = Element("visual")
+    SubElement(SubElement(visual, "geometry"), "mesh", filename=filename)
+    return visual
+
+
+def _box_collision(size: tuple[float, ...], centre: tuple[float, ...]) -> Element:
+    collision = Element("collision")
+    SubElement(collision, "origin", rpy="0 0 0", xyz=_text(centre))
+    SubElement(SubElement(collision, "geometry"), "box", size=_text(size))
+    return collision
+
+
+def _inertial(mass: float, diagonal: tuple[float, ...], centre: tuple[float, ...]) -> Element:
+    inertial = Element("inertial")
+    SubElement(inertial, "origin", rpy="0 0 0", xyz=_text(centre))
+    SubElement(inertial, "mass", value=f"{mass:g}")
+    xx, yy, zz = (f"{value:.6g}" for value in diagonal)
+    SubElement(inertial, "inertia", ixx=xx, ixy="0", ixz="0", iyy=yy, iyz="0", izz=zz)
+    return inertial
+
+
+def _text(numbers: tuple[float, ...]) -> str:
+    return " ".join(f"{number:.6g}" for number in numbers)
+
+
+def _parse(path: Path) -> Element:
+    return ElementTree.parse(path).getroot()
+
+
+def _find(root: Element, tag: str, name: str) -> Element:
+    element = root.find(f"{tag}[@name='{name}']")
+    if element is None:
+        raise RobocasError(f"mani_skill's Panda has no such {tag}", where=name, fix="Install mani_skill 3.0.1.")
+    return element
+
+
+def _origin(root: Element, joint: str) -> Element:
+    element = _find(root, "joint", joint).find("origin")
+    if element is None:
+        raise RobocasError("mani_skill's Panda has no origin", where=joint, fix="Install mani_skill 3.0.1.")
+    return element
+
+
+def _write(root: Element, path: Path) -> None:
+    ElementTree.indent(root)
+    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
