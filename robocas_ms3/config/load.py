@@ -99,8 +99,11 @@ def _config_error(error: ValidationError, where: str) -> ConfigError:
     if kind == "extra_forbidden":
         known = _known_keys(first["loc"][:-1])
         return ConfigError(
-            f"unknown key {key!r}", where=where, expected=f"one of {known}" if known else "no such key",
-            found=repr(first["loc"][-1]), fix=more,
+            f"unknown key {key!r}",
+            where=where,
+            expected=f"one of {known}" if known else "no such key",
+            found=repr(first["loc"][-1]),
+            fix=more,
         )
     if kind == "value_error":
         return ConfigError(f"{key}: {first['msg'].removeprefix('Value error, ')}", where=where, fix=more)
@@ -134,5 +137,7 @@ def _find(config: str | Path) -> Path:
     if path.suffix in {".yaml", ".yml"} and path.is_file():
         return path
     raise ConfigError(
-        "no such task configuration", where=name, expected=f"a YAML file or one of {sorted(shipped)}",
+        "no such task configuration",
+        where=name,
+        expected=f"a YAML file or one of {sorted(shipped)}",
     )

@@ -42,7 +42,9 @@ def sample_drops(
         (count, 4, 4) TCP in the arm's base frame.
     """
     middle, half = (inner_low + inner_high) / 2, (inner_high - inner_low) / 2
-    local = np.column_stack([middle[:2] + rng.uniform(-spread, spread, (count, 2)) * half[:2], np.full(count, inner_high[2])])
+    local = np.column_stack(
+        [middle[:2] + rng.uniform(-spread, spread, (count, 2)) * half[:2], np.full(count, inner_high[2])]
+    )
     above = local @ container_in_base[:3, :3].T + container_in_base[:3, 3]
     tilt = np.deg2rad(max_tilt_deg) * rng.uniform(0, 1, count) ** 2
     outward = np.arctan2(above[:, 1], above[:, 0]) + rng.uniform(-0.6, 0.6, count)

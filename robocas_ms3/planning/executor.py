@@ -98,10 +98,21 @@ class Executor:
             self._step(action)
         self.segments = segments
 
-    def follow(self, trajectory: Trajectory) -> None:
-        """Send a trajectory's rows to the arm, the gripper's command held."""
+    def follow(self, trajectory: Trajectory, *, until: str | None = None) -> bool:
+        """Send a trajectory's rows to the arm, the gripper's command held.
+
+        Args:
+            trajectory: at this executor's ``dt``.
+            until: stop as soon as this flag of ``info`` is set.
+
+        Returns:
+            Whether the flag is set at the end; True without one.
+        """
         for qpos in trajectory.qpos:
+            if until and self.flag(until):
+                return True
             self._step(np.append(qpos, self.gripper).astype(np.float32))
+        return until is None or self.flag(until)
 
     def move_gripper(self, command: float, hold: Array, *, seconds: float) -> None:
         """Command the gripper, with the arm held where it is meant to be.

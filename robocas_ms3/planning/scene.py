@@ -81,7 +81,10 @@ class PlanningScene:
         """
         to_base = inverse(self.arm_base_in_world)
         basket = self.env.furniture_pack.furniture[self.env.task_config.basket.asset]
-        pieces = [transform(to_base, self._fixed_in_world), transform(self.basket_in_base, basket.surface_points(SPACING))]
+        pieces = [
+            transform(to_base, self._fixed_in_world),
+            transform(self.basket_in_base, basket.surface_points(SPACING)),
+        ]
         for slot, asset in enumerate(self.env.object_assets[0]):
             if slot != without:
                 pieces.append(transform(self.object_in_base(slot), asset.surface_points(SPACING)))

@@ -84,7 +84,9 @@ def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
     """
     if asset_id not in pack.furniture:
         raise ConfigError(
-            f"{key}: no such furniture in pack {pack.name!r}", expected=f"one of {sorted(pack.furniture)}", found=asset_id
+            f"{key}: no such furniture in pack {pack.name!r}",
+            expected=f"one of {sorted(pack.furniture)}",
+            found=asset_id,
         )
     return pack.furniture[asset_id]
 

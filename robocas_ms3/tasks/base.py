@@ -17,9 +17,11 @@ from mani_skill.utils.structs.types import SimConfig
 from robocas_ms3.assets.pack import LoadedObject, load_pack
 from robocas_ms3.config import TaskConfig, load_task_config
 from robocas_ms3.errors import ConfigError, LayoutError
+from robocas_ms3.robots.constants import HAND_LINK
 from robocas_ms3.robots.mobile_panda import RoboCASMobilePanda
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.placement import choose_objects, choose_target, sample_scattered
+from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.contacts import contact_forces
 from robocas_ms3.tasks.spec import TaskSpec
 
@@ -64,7 +66,8 @@ class RoboCASEnv(BaseEnv):
         self.task_config = load_task_config(self.SPEC.default_config if config is None else config)
         if self.task_config.task != self.SPEC.name:
             raise ConfigError(
-                f"{self.SPEC.env_id} can't run this configuration", expected=f"task: {self.SPEC.name}",
+                f"{self.SPEC.env_id} can't run this configuration",
+                expected=f"task: {self.SPEC.name}",
                 found=f"task: {self.task_config.task}",
             )
         self.object_pack = load_pack(pack)
@@ -122,8 +125,11 @@ class RoboCASEnv(BaseEnv):
         lights = self.task_config.lights
         self.scene.set_ambient_light([lights.ambient] * 3)
         self.scene.add_directional_light(
-            list(lights.direction), [lights.directional] * 3, shadow=lights.shadow or self.enable_shadow,
-            shadow_scale=5, shadow_map_size=2048,
+            list(lights.direction),
+            [lights.directional] * 3,
+            shadow=lights.shadow or self.enable_shadow,
+            shadow_scale=5,
+            shadow_map_size=2048,
         )
         self.scene.add_directional_light([0, 0, -1], [lights.directional] * 3)
 
@@ -169,7 +175,9 @@ class RoboCASEnv(BaseEnv):
                     break
             else:
                 raise LayoutError(
-                    "no object qualifies as the target", where="target", found=f"{_LAYOUT_TRIES} layouts tried",
+                    "no object qualifies as the target",
+                    where="target",
+                    found=f"{_LAYOUT_TRIES} layouts tried",
                     fix="Raise target.max_distance, lower target.min_grasps, or use other objects.",
                 )
             layouts.append(poses)
@@ -197,8 +205,23 @@ class RoboCASEnv(BaseEnv):
 
     def gripper_forces(self) -> torch.Tensor:
         """(N, 3, K, 3) N: force of each object on left finger, right finger and hand, world frame."""
-        bodies = [self.agent.finger1_link, self.agent.finger2_link, self.agent.hand_link]
+        bodies = [self.agent.finger1_link, self.agent.finger2_link, self.agent.robot.links_map[HAND_LINK]]
         return contact_forces(self.scene, bodies, self.objects)
+
+    def grasped(self, forces: torch.Tensor | None = None) -> torch.Tensor:
+        """(N, K) bool: which objects both fingers hold right now.
+
+        Args:
+            forces: of ``gripper_forces``, if they are known already.
+        """
+        forces = self.gripper_forces() if forces is None else forces
+        y = torch.tensor([[0.0, 1.0, 0.0]], device=self.device).expand(self.num_envs, 3)
+        # the left finger opens along its own +y
+        return terms.finger_grasps(forces[:, 0], forces[:, 1], terms.rotate(self.agent.finger1_link.pose.q, y))
+
+    def target_measures(self) -> dict[str, torch.Tensor]:
+        """Conditions of success that have to hold at the same moment, (N,) bool each; for reports."""
+        raise NotImplementedError
 
     def get_language_instruction(self) -> list[str]:
         """The instruction of each env."""

@@ -36,42 +36,42 @@ class RoboCASPickEnv(RoboCASEnv):
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Stages and success of each env, (N,) bool each."""
         forces = self.gripper_forces()
-        left_opens = terms.rotate(
-            self.agent.finger1_link.pose.q, torch.tensor([[0.0, 1, 0]], device=self.device).expand(self.num_envs, 3)
-        )
-        grasped = terms.finger_grasps(forces[:, 0], forces[:, 1], left_opens)
+        grasped = self.grasped(forces)
         touched = terms.touched(forces)
-        poses = self.object_poses
-        lifted = terms.lifted(poses[..., 2], self._rest_height, grasped)
-
-        basket = self.fixtures.basket.pose
-        target_pose = terms.of_target(poses, self.target_slot)
-        center = target_pose[:, :3] + terms.rotate(
-            target_pose[:, 3:], terms.of_target(self._centers_of_mass, self.target_slot)
-        )
-        in_basket = terms.inside_box(center, basket.p, basket.q, self._basket_low, self._basket_high)
+        lifted = terms.lifted(self.object_poses[..., 2], self._rest_height, grasped)
+        measures = self.target_measures(touched)
         now = {
             "reached_any": touched.any(dim=1),
             "picked_any": lifted.any(dim=1),
             "reached_target": terms.of_target(touched, self.target_slot),
             "target_grasped": terms.of_target(grasped, self.target_slot),
             "target_lifted": terms.of_target(lifted, self.target_slot),
-            "target_in_basket": in_basket,
+            "target_in_basket": measures["in_basket"],
         }
         for stage, flags in now.items():
             self._stages[stage] |= flags
+        success = self._stages["target_lifted"] & torch.stack(list(measures.values())).all(dim=0)
+        return {**{stage: flags.clone() for stage, flags in self._stages.items()}, "success": success}
 
+    def target_measures(self, touched: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        """What has to hold at the same moment for success, besides the target having been lifted: (N,) bool each.
+
+        Args:
+            touched: (N, K) bool, which objects the gripper touches, if that is known already.
+        """
+        if touched is None:
+            touched = terms.touched(self.gripper_forces())
+        basket, start, slot = self.fixtures.basket.pose, self.basket_at_start, self.target_slot
+        pose = terms.of_target(self.object_poses, slot)
+        center = pose[:, :3] + terms.rotate(pose[:, 3:], terms.of_target(self._centers_of_mass, slot))
         linear = torch.stack([actor.linear_velocity for actor in self.objects], dim=1)
         angular = torch.stack([actor.angular_velocity for actor in self.objects], dim=1)
-        start = self.basket_at_start
-        success = (
-            self._stages["target_lifted"]
-            & in_basket
-            & ~terms.of_target(touched, self.target_slot)
-            & terms.at_rest(terms.of_target(linear, self.target_slot), terms.of_target(angular, self.target_slot))
-            & terms.stands(basket.p, basket.q, start.p, start.q)
-        )
-        return {**{stage: flags.clone() for stage, flags in self._stages.items()}, "success": success}
+        return {
+            "in_basket": terms.inside_box(center, basket.p, basket.q, self._basket_low, self._basket_high),
+            "untouched": ~terms.of_target(touched, slot),
+            "at_rest": terms.at_rest(terms.of_target(linear, slot), terms.of_target(angular, slot)),
+            "basket_stands": terms.stands(basket.p, basket.q, start.p, start.q),
+        }
 
     def get_language_instruction(self) -> list[str]:
         """The instruction of each env."""

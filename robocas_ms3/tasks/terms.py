@@ -37,7 +37,12 @@ def inside_box(points: Tensor, box_position: Tensor, box_quaternion: Tensor, low
 
 
 def finger_grasps(
-    left_force: Tensor, right_force: Tensor, closing_axis: Tensor, *, min_force: float = 0.5, max_angle_deg: float = 85.0
+    left_force: Tensor,
+    right_force: Tensor,
+    closing_axis: Tensor,
+    *,
+    min_force: float = 0.5,
+    max_angle_deg: float = 85.0,
 ) -> Tensor:
     """Which objects both fingers press on, each along its own opening direction.
 
@@ -107,8 +112,13 @@ def tilt(quaternion: Tensor, quaternion_before: Tensor) -> Tensor:
 
 
 def stands(
-    position: Tensor, quaternion: Tensor, position_before: Tensor, quaternion_before: Tensor,
-    *, max_shift: float = 0.1, max_tilt_deg: float = 20.0,
+    position: Tensor,
+    quaternion: Tensor,
+    position_before: Tensor,
+    quaternion_before: Tensor,
+    *,
+    max_shift: float = 0.1,
+    max_tilt_deg: float = 20.0,
 ) -> Tensor:
     """(N,) whether a body still stands where it stood: moved and tilted no more than upstream allows a basket."""
     shift = torch.linalg.norm(position - position_before, dim=-1)

@@ -78,4 +78,6 @@ def test_target_is_the_nearest_of_its_name():
     }
     assert drawn == {1, 2}
     # the nearer apple can't be grasped: "the apple" would name it all the same
-    assert choose_target(np.random.default_rng(0), names, positions, np.array([True, False, False]), np.zeros(2)) is None
+    assert (
+        choose_target(np.random.default_rng(0), names, positions, np.array([True, False, False]), np.zeros(2)) is None
+    )

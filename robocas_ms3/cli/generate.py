@@ -1,0 +1,100 @@
+"""``robocas generate``: record demonstrations with a scripted policy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass
+class Generate:
+    """Record demonstrations of a task with its scripted policy, as a ManiSkill trajectory file.
+
+    Rendering is not needed: states and actions are recorded, pictures are made by `robocas convert`.
+    """
+
+    task: Annotated[Literal["pick"], tyro.conf.Positional]
+    """Which task."""
+    episodes: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 10
+    """How many successful episodes to record."""
+    config: str | None = None
+    """Name of a shipped task configuration, or a YAML file. Default: the task's own (see `robocas list`)."""
+    pack: str = "builtin"
+    """Object pack: its name, or its folder."""
+    out: Path | None = None
+    """Output folder. Default: demos/<config>-<pack>."""
+    seed: int = 0
+    """First seed; the following episodes take the seeds after it."""
+    jobs: int = 1
+    """Worker processes. The outcome does not depend on it."""
+    control_freq: int = 20
+    """Control rate in Hz (the paper's is 5)."""
+    max_attempts: int = 20
+    """Attempts of the policy before a seed is given up."""
+    keep_recoveries: bool = False
+    """Leave failed attempts in the episode, as one continuous motion, instead of undoing them."""
+    resume: bool = False
+    """Go on with an interrupted run, or add episodes to a finished one."""
+    overwrite: bool = False
+    """Replace the output folder if it exists."""
+
+
+def main(cfg: Generate) -> int:
+    """Run the command."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from robocas_ms3.config import load_task_config, shipped_configs
+    from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, recordable_config
+    from robocas_ms3.demos.generate import generate
+    from robocas_ms3.tasks.spec import TASKS
+
+    name = cfg.config or TASKS[cfg.task].default_config
+    config = recordable_config(load_task_config(name), name if name in shipped_configs() else None)
+    out = cfg.out or Path("demos") / f"{Path(name).stem}-{Path(cfg.pack).name}"
+    settings = EpisodeSettings(cfg.task, config, cfg.pack, cfg.control_freq, cfg.max_attempts, cfg.keep_recoveries)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        bar = progress.add_task(f"{cfg.task}: recording", total=cfg.episodes)
+
+        def on_result(result: EpisodeResult) -> None:
+            if result.success:
+                progress.advance(bar)
+            else:
+                last = result.failures[-1]
+                progress.console.print(f"seed {result.seed}: given up ({last.stage}: {last.reason})", highlight=False)
+
+        summary = generate(
+            settings,
+            out,
+            episodes=cfg.episodes,
+            first_seed=cfg.seed,
+            jobs=cfg.jobs,
+            resume=cfg.resume,
+            overwrite=cfg.overwrite,
+            on_result=on_result,
+        )
+    seconds = ", ".join(f"{part} {value:.2f}" for part, value in summary.mean_seconds.items())
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"{summary.episodes} episodes from {summary.seeds} seeds ({summary.success_rate:.0%})")
+    console.print(f"mean seconds a seed: {seconds}; mean length {summary.mean_steps:.0f} steps")
+    if summary.failures:
+        console.print("failed attempts: " + ", ".join(f"{reason} x{n}" for reason, n in summary.failures.items()))
+    console.print(f"wrote {summary.trajectory}")
+    return 0

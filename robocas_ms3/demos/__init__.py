@@ -1,0 +1,1 @@
+"""Demonstrations: recording, generation over seeds and workers, the ledger of failures, replay."""

@@ -1,0 +1,193 @@
+"""One seed to one recorded episode: attempts, undone or kept, until the task succeeds."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+
+import robocas_ms3.tasks  # noqa: F401  (registers the environments)
+from robocas_ms3.config import TaskConfig
+from robocas_ms3.demos.ledger import Failure
+from robocas_ms3.demos.record import EpisodeRecorder
+from robocas_ms3.errors import LayoutError, PlanningFailed
+from robocas_ms3.planning.executor import Executor, Seconds
+from robocas_ms3.planning.mplib_backend import MplibPlanner
+from robocas_ms3.planning.protocol import Planner
+from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.robots.urdf import robot_files
+from robocas_ms3.tasks.base import RoboCASEnv
+from robocas_ms3.tasks.spec import TASKS
+
+
+@dataclass(frozen=True)
+class EpisodeSettings:
+    """How episodes are generated; the same for all seeds of a run.
+
+    Attributes:
+        task: short name of the task.
+        config: name of a shipped configuration, or the whole of one.
+        pack: name or folder of the object pack.
+        control_freq: Hz.
+        max_attempts: attempts a seed has.
+        keep_recoveries: leave failed attempts in the record instead of undoing them.
+    """
+
+    task: str
+    config: str | dict[str, Any]
+    pack: str
+    control_freq: int = 20
+    max_attempts: int = 20
+    keep_recoveries: bool = False
+
+
+@dataclass
+class EpisodeResult:
+    """What became of a seed.
+
+    Attributes:
+        seed: of the episode.
+        success: whether an episode was recorded.
+        steps: its length in control steps.
+        attempts: attempts used.
+        seconds: where the time went.
+        failures: every attempt that failed.
+    """
+
+    seed: int
+    success: bool
+    steps: int = 0
+    attempts: int = 0
+    seconds: Seconds = field(default_factory=Seconds)
+    failures: list[Failure] = field(default_factory=list)
+
+
+class Solver(Protocol):
+    """A task's scripted policy."""
+
+    def attempt(self, executor: Executor, rng: np.random.Generator) -> None:
+        """Try once; raises ``PlanningFailed``."""
+
+    def recover(self, executor: Executor) -> None:
+        """Get out of a failed attempt that stays in the record."""
+
+
+class EpisodeGenerator:
+    """Makes episodes of one task in one process: holds the environment, the planner and the policy.
+
+    Args:
+        settings: the same for all episodes.
+    """
+
+    def __init__(self, settings: EpisodeSettings) -> None:
+        self.settings = settings
+        self.env = gym.make(
+            TASKS[settings.task].env_id,
+            config=settings.config,
+            pack=settings.pack,
+            obs_mode="none",
+            reward_mode="none",
+            control_mode="pd_joint_pos",
+            render_backend="none",
+            sim_config={"control_freq": settings.control_freq},
+        )
+        base_env = self.env.unwrapped
+        assert isinstance(base_env, RoboCASEnv)
+        files = robot_files()
+        self.planner: Planner = MplibPlanner(str(files.arm_urdf), str(files.arm_srdf), dt=base_env.control_timestep)
+        module, name = TASKS[settings.task].solver.split(":")
+        solver_class = getattr(import_module(module), name)
+        self.solver: Solver = solver_class(base_env, self.planner, Reachability(str(files.arm_urdf)))
+
+    def generate(self, seed: int, folder: Path, name: str) -> EpisodeResult:
+        """Make the episode of a seed, as ``folder/name.h5`` and ``.json``; no files where every attempt failed.
+
+        The same seed and versions give the same episode, whatever was generated before.
+        """
+        recorder = EpisodeRecorder(self.env, folder, name)
+        executor = Executor(recorder, seed)
+        result = EpisodeResult(seed, success=False, seconds=executor.seconds)
+        finished = False
+        try:
+            recoveries = self._attempts(executor, result)
+            if result.success:
+                recorder.finish({**self._describe(executor), "attempts": result.attempts, "recoveries": recoveries})
+                finished = True
+        finally:
+            if not finished:
+                recorder.discard()
+        return result
+
+    def _attempts(self, executor: Executor, result: EpisodeResult) -> list[dict[str, Any]]:
+        recoveries = []
+        try:
+            executor.reset()
+        except LayoutError as error:
+            self._log(result, 0, PlanningFailed("layout", error.what), 0.0)
+            return recoveries
+        for attempt in range(self.settings.max_attempts):
+            result.attempts = attempt + 1
+            begun, first = time.perf_counter(), len(executor.actions)
+            # seeded by seed and attempt alone: what was planned before must not matter
+            entropy = np.random.SeedSequence([executor.seed, attempt])
+            self.planner.seed(int(entropy.generate_state(1)[0] % (2**31 - 1)) + 1)
+            try:
+                self.solver.attempt(executor, np.random.default_rng(entropy))
+                result.success, result.steps = True, len(executor.actions)
+                return recoveries
+            except PlanningFailed as error:
+                self._log(result, attempt, error, time.perf_counter() - begun)
+                last = error
+            if len(executor.actions) == first:
+                continue  # it failed in planning: nothing to undo
+            if not self.settings.keep_recoveries or last.stage == "horizon":
+                executor.rewind(0)
+                recoveries = []
+                continue
+            try:
+                self.solver.recover(executor)
+                recoveries.append(
+                    {"range": [first, len(executor.actions) - 1], "stage": last.stage, "reason": last.reason}
+                )
+            except PlanningFailed:
+                executor.rewind(0)
+                recoveries = []
+        return recoveries
+
+    @staticmethod
+    def _log(result: EpisodeResult, attempt: int, error: PlanningFailed, seconds: float) -> None:
+        result.failures.append(Failure(result.seed, attempt, error.stage, error.reason, round(seconds, 3)))
+
+    def _describe(self, executor: Executor) -> dict[str, Any]:
+        env = executor.base_env
+        target = env.target_asset().asset
+        bounds = [s.first for s in executor.segments] + [len(executor.actions)]
+        return {
+            "instruction": env.get_language_instruction()[0],
+            "support": env.task_config.support,
+            "target": {"slot": int(env.target_slot[0]), "asset_id": target.id, "name": target.name},
+            "objects": [asset.asset.id for asset in env.object_assets[0]],
+            "subgoals": [
+                {
+                    "goal_type": segment.goal_type,
+                    "goal_description": segment.goal_description,
+                    "goal_range": [segment.first, after - 1],
+                }
+                for segment, after in zip(executor.segments, bounds[1:], strict=True)
+            ],
+            "seconds": {part: round(value, 3) for part, value in asdict(executor.seconds).items()},
+        }
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+
+def recordable_config(config: TaskConfig, name: str | None) -> str | dict[str, Any]:
+    """What a record says of its configuration: the name of a shipped one, else the whole of it (no local path)."""
+    return name if name is not None else config.model_dump(mode="json")
