@@ -1,0 +1,213 @@
+"""The first backend of the planner protocol: mplib's kinematics and collision checks, our own search and timing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from robocas_ms3.errors import PlanningFailed, RobocasError
+from robocas_ms3.planning.collision import ArmWorld
+from robocas_ms3.planning.kinematics import ArmKinematics
+from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
+from robocas_ms3.planning.rrt import PathSearch
+from robocas_ms3.planning.timing import JointPath, rounded, stopping, through, timed
+
+CHECKS_PER_SECOND = 10_000  # turns a planning time into a budget of collision checks, which load can't change
+SPACING = 0.03  # rad between checks while searching
+FINE_SPACING = 0.01  # rad between checks of the final path
+CORNER_RADII = (0.3, 0.1, 0.03)  # rad; smaller ones are tried when a rounded corner touches something
+SHORTCUTS = 40
+STILL = 1e-6  # rad; a shorter motion is none
+
+
+class MplibPlanner:
+    """Plan for the arm in its base frame; implements ``planning.protocol.Planner``.
+
+    Args:
+        urdf: the arm alone, rooted at ``panda_link0``, with the TCP as ``panda_hand_tcp``.
+        srdf: its pairs of links that may touch.
+        dt: seconds between rows of a trajectory.
+        velocity_limit: of every joint, rad/s.
+        acceleration_limit: of every joint, rad/s^2.
+        rrt_range: longest extension of a tree, rad.
+        planning_time: budget of one search, in seconds of a quiet core; counted in collision checks, not by the clock.
+        voxel: edge of the cloud's voxels = spacing of its points, m.
+
+    Raises:
+        RobocasError: numpy 2, missing files, a description without the Panda's links.
+    """
+
+    def __init__(
+        self,
+        urdf: Path | str,
+        srdf: Path | str,
+        *,
+        dt: float,
+        velocity_limit: float = 0.5,
+        acceleration_limit: float = 0.5,
+        rrt_range: float = 0.1,
+        planning_time: float = 2.0,
+        voxel: float = 0.005,
+    ) -> None:
+        if not dt > 0:
+            raise RobocasError("the time step must be positive", where="dt", found=dt)
+        self._world = ArmWorld(urdf, srdf, voxel=voxel)
+        self._kinematics = ArmKinematics(self._world)
+        self._velocity, self._acceleration, self._dt = velocity_limit, acceleration_limit, dt
+        self._budget = int(planning_time * CHECKS_PER_SECOND)
+        self._search = PathSearch(
+            self._world.free, self._kinematics.lower, self._kinematics.upper, step=rrt_range, spacing=SPACING
+        )
+        self._rng = np.random.default_rng(0)
+
+    @property
+    def finger_width(self) -> float:
+        """Opening of the gripper during motions, m: the sum of both fingers."""
+        return self._world.finger_width
+
+    @finger_width.setter
+    def finger_width(self, width: float) -> None:
+        self._world.finger_width = float(np.clip(width, 0.0, 0.08))
+
+    @property
+    def collision_checks(self) -> int:
+        """Collision checks made so far, for measurements."""
+        return self._world.checks
+
+    def seed(self, seed: int) -> None:
+        """Make everything that follows repeat exactly for the same calls."""
+        self._rng = np.random.default_rng(seed)
+
+    def set_scene(self, points_in_base: Array) -> None:
+        """Replace the obstacles by a point cloud (P, 3) m; points at the robot's own base and out of reach are cut."""
+        self._world.set_points(points_in_base)
+
+    def attach(self, body: AttachedBody | None) -> None:
+        """Attach a held object to the TCP, or nothing."""
+        self._world.attach(body)
+
+    def tcp(self, qpos: Array) -> Array:
+        """Give the TCP's pose in the base frame (4x4) at joints (7,)."""
+        return self._world.tcp(qpos)
+
+    def collisions(self, qpos: Array, finger_width: float = 0.08) -> list[str]:
+        """Name what touches at a configuration (7,): links, 'pedestal', 'cloud', 'attached'. Empty: free."""
+        return self._world.contacts(np.asarray(qpos, dtype=np.float64), finger_width)
+
+    def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
+        """Solve inverse kinematics; see the protocol."""
+        found = self._kinematics.solutions(tcp_in_base, np.asarray(near, dtype=np.float64), self._rng)
+        return [qpos for qpos in found if self._world.free(qpos)] if avoid_collisions else found
+
+    def plan_to_pose(self, start: Array, tcp_in_base: Array, *, stage: str) -> Trajectory:
+        """Plan a collision-free motion (see ``plan_to_qpos``) that ends with the TCP at a pose (4x4).
+
+        Raises:
+            PlanningFailed: ``no_ik``, ``goal_in_collision``, or as ``plan_to_qpos``.
+        """
+        goals = self.ik(tcp_in_base, start, avoid_collisions=False)
+        if not goals:
+            raise PlanningFailed(stage, "no_ik")
+        return self.plan_to_qpos(start, goals, stage=stage)
+
+    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str) -> Trajectory:
+        """Plan a collision-free motion to the nearest of several configurations that can be reached.
+
+        Args:
+            start: (7,), free of collisions.
+            goals: (7,) each.
+            stage: name for errors.
+
+        Raises:
+            PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``goal_in_collision``, ``rrt_timeout``,
+                ``path_blocked``, ``timing_failed``.
+        """
+        start = self._checked_start(start, stage)
+        goals = sorted(
+            (np.asarray(goal, dtype=np.float64) for goal in goals), key=lambda g: float(np.linalg.norm(g - start))
+        )
+        lower, upper = self._world.limits.T
+        free = [goal for goal in goals if np.all((goal >= lower) & (goal <= upper)) and self._world.free(goal)]
+        if not free:
+            raise PlanningFailed(stage, "goal_in_collision")
+        if np.linalg.norm(free[0] - start) < STILL:
+            return Trajectory(free[0][None].copy(), self._dt)
+        for goal in free:
+            trajectory = self._finish([start, goal]) if self._straight_free(start, goal) else None
+            if trajectory is not None:
+                return trajectory
+        reason = "rrt_timeout"
+        # The nearest goal alone gets a quick try; all of them together get the full budget.
+        for roots, budget in ((free[:1], self._budget // 10), (free, self._budget)):
+            path = self._search.connect(start, roots, self._rng, max_checks=budget)
+            if path is None:
+                continue
+            path = self._search.shorten(path, self._rng, tries=SHORTCUTS, max_checks=self._budget // 4)
+            trajectory = self._finish(path)
+            if trajectory is not None:
+                return trajectory
+            reason = "path_blocked"
+        raise PlanningFailed(stage, reason)
+
+    def plan_straight(
+        self, start: Array, tcp_in_base: Array, *, stage: str, check_collisions: bool = True, speed: float = 1.0
+    ) -> Trajectory:
+        """Move the TCP on a straight line; see the protocol.
+
+        Raises:
+            PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``line_unreachable``, ``line_joint_jump``,
+                ``straight_line_blocked``, ``timing_failed``.
+        """
+        start = self._checked_start(start, stage, cloud=check_collisions)
+        waypoints = self._kinematics.line(start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
+        if np.linalg.norm(waypoints[-1] - start) < STILL:
+            return Trajectory(waypoints[-1:].copy(), self._dt)
+        path = through(waypoints)
+        if not self._path_free(path, cloud=check_collisions):
+            raise PlanningFailed(stage, "straight_line_blocked")
+        trajectory = timed(path, velocity=speed * self._velocity, acceleration=speed * self._acceleration, dt=self._dt)
+        if trajectory is None:
+            raise PlanningFailed(stage, "timing_failed")
+        return trajectory
+
+    def _checked_start(self, start: Array, stage: str, *, cloud: bool = True) -> Array:
+        start = np.asarray(start, dtype=np.float64)
+        lower, upper = self._world.limits.T
+        if np.any(start < lower - 1e-3) or np.any(start > upper + 1e-3):
+            raise PlanningFailed(stage, "start_outside_limits")
+        if not self._world.free(start, cloud=cloud):
+            raise PlanningFailed(stage, "start_in_collision")
+        return start
+
+    def _straight_free(self, start: Array, goal: Array) -> bool:
+        count = int(np.ceil(np.linalg.norm(goal - start) / FINE_SPACING))
+        coarse = [start + (goal - start) * (i / 8) for i in range(1, 8)]  # most failures show in a few checks
+        return all(map(self._world.free, coarse)) and all(
+            self._world.free(start + (goal - start) * (i / count)) for i in range(1, count)
+        )
+
+    def _path_free(self, path: JointPath, *, cloud: bool = True) -> bool:
+        return all(self._world.free(qpos, cloud=cloud) for qpos in path.dense(FINE_SPACING))
+
+    def _finish(self, waypoints: list[Array]) -> Trajectory | None:
+        """Round corners, check the very path that will be driven, and time it; none when it touches something."""
+        points = [waypoints[0]]
+        points += [b for a, b in zip(waypoints[:-1], waypoints[1:], strict=True) if np.linalg.norm(b - a) > 1e-4]
+        points[-1] = waypoints[-1]
+        limits = {"velocity": self._velocity, "acceleration": self._acceleration, "dt": self._dt}
+        corners = np.array(points)
+        if len(points) == 2:
+            return stopping(corners, **limits)
+        for radius in CORNER_RADII:
+            path = rounded(corners, radius)
+            if self._path_free(path):
+                trajectory = timed(path, **limits)
+                if trajectory is not None:
+                    return trajectory
+        polyline = [a + (b - a) * s for a, b in zip(corners[:-1], corners[1:], strict=True) for s in _fractions(a, b)]
+        return stopping(corners, **limits) if all(map(self._world.free, polyline)) else None
+
+
+def _fractions(a: Array, b: Array) -> Array:
+    return np.linspace(0, 1, int(np.ceil(np.linalg.norm(b - a) / FINE_SPACING)) + 1)

@@ -1,0 +1,183 @@
+"""RRT-Connect and shortcutting with a fixed budget of collision checks: the same seed gives the same path, always.
+
+OMPL inside mplib stops by the clock (2 s), so whether a hard problem is solved there depends on the machine's load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from robocas_ms3.planning.protocol import Array
+
+Valid = Callable[[Array], bool]
+
+
+class BudgetSpent(Exception):
+    """The planner has made all the collision checks it was given."""
+
+
+class _Tree:
+    """Nodes of one tree, with room that grows."""
+
+    def __init__(self, roots: list[Array]) -> None:
+        self.qpos = np.empty((256, len(roots[0])))
+        self.parent: list[int] = []
+        for root in roots:
+            self.add(root, -1)
+
+    def add(self, qpos: Array, parent: int) -> int:
+        count = len(self.parent)
+        if count == len(self.qpos):
+            self.qpos = np.concatenate([self.qpos, np.empty_like(self.qpos)])
+        self.qpos[count] = qpos
+        self.parent.append(parent)
+        return count
+
+    def nearest(self, qpos: Array) -> int:
+        difference = self.qpos[: len(self.parent)] - qpos
+        return int(np.argmin(np.einsum("ij,ij->i", difference, difference)))
+
+    def branch(self, node: int) -> list[Array]:
+        """Configurations from the root to a node."""
+        chain = []
+        while node >= 0:
+            chain.append(self.qpos[node].copy())
+            node = self.parent[node]
+        return chain[::-1]
+
+
+class PathSearch:
+    """Search in joint space.
+
+    Args:
+        valid: says whether a configuration is free.
+        lower: (n,) joint limits, rad.
+        upper: (n,).
+        step: longest extension of a tree, rad (norm over the joints).
+        spacing: distance of checks along an edge, rad (norm).
+    """
+
+    def __init__(self, valid: Valid, lower: Array, upper: Array, *, step: float, spacing: float) -> None:
+        self._valid, self._lower, self._upper = valid, lower, upper
+        self._step, self._spacing = step, spacing
+        self._left = 0
+
+    def _check(self, qpos: Array) -> bool:
+        if self._left <= 0:
+            raise BudgetSpent
+        self._left -= 1
+        return self._valid(qpos)
+
+    def edge_free(self, a: Array, b: Array) -> bool:
+        """Check the straight edge from ``a`` (taken as free) to ``b``; the middle first, where failures are likely."""
+        count = max(1, int(np.ceil(np.linalg.norm(b - a) / self._spacing)))
+        return all(self._check(a + (b - a) * (i / count)) for i in _spread(count))
+
+    def connect(
+        self, start: Array, goals: list[Array], rng: np.random.Generator, *, max_checks: int
+    ) -> list[Array] | None:
+        """Find a path from ``start`` to one of ``goals`` (all free).
+
+        Returns:
+            Waypoints, the first is ``start``, the last one of ``goals``; none when the budget is spent.
+        """
+        self._left = max_checks
+        trees = (_Tree([start]), _Tree(goals))
+        grow, other = 0, 1
+        try:
+            while True:
+                sample = self._sample(start, goals, rng)
+                node, _ = self._extend(trees[grow], sample, greedy=False)
+                if node is not None:
+                    target = trees[grow].qpos[node].copy()
+                    last, reached = self._extend(trees[other], target, greedy=True)
+                    if reached and last is not None:
+                        ends = {grow: node, other: last}
+                        forward, backward = trees[0].branch(ends[0]), trees[1].branch(ends[1])
+                        return forward + backward[::-1][1:]
+                grow, other = other, grow
+        except BudgetSpent:
+            return None
+
+    def _sample(self, start: Array, goals: list[Array], rng: np.random.Generator) -> Array:
+        """Half the samples lie around start and a goal, since most detours are small."""
+        if rng.random() < 0.5:
+            return rng.uniform(self._lower, self._upper)
+        goal = goals[int(rng.integers(len(goals)))]
+        low, high = np.minimum(start, goal) - 0.7, np.maximum(start, goal) + 0.7
+        return rng.uniform(np.maximum(low, self._lower), np.minimum(high, self._upper))
+
+    def _extend(self, tree: _Tree, target: Array, *, greedy: bool) -> tuple[int | None, bool]:
+        """Grow a tree towards ``target``, by a step or all the way; give the last new node and whether it is there."""
+        node, added = tree.nearest(target), None
+        while True:
+            here = tree.qpos[node]
+            distance = float(np.linalg.norm(target - here))
+            if distance <= 1e-9:
+                return node, True
+            arrives = distance <= self._step
+            there = target if arrives else here + (target - here) * (self._step / distance)
+            if not self.edge_free(here, there):
+                return added, False
+            node = added = tree.add(there, node)
+            if arrives or not greedy:
+                return added, arrives
+
+    def shorten(self, path: list[Array], rng: np.random.Generator, *, tries: int, max_checks: int) -> list[Array]:
+        """Cut corners: first drop waypoints greedily, then join random points of the path by straight edges."""
+        self._left = max_checks
+        try:
+            path = self._drop_waypoints(path)
+            for _ in range(tries):
+                if len(path) <= 2:
+                    break
+                path = self._shortcut(path, rng)
+        except BudgetSpent:
+            pass
+        return path
+
+    def _drop_waypoints(self, path: list[Array]) -> list[Array]:
+        """From each waypoint go straight to the furthest one that can be seen, by halving."""
+        kept, index = [path[0]], 0
+        while index < len(path) - 1:
+            reach = len(path) - 1
+            while reach > index + 1:
+                try:
+                    if self.edge_free(path[index], path[reach]):
+                        break
+                except BudgetSpent:
+                    return kept + path[index + 1 :]
+                reach = index + (reach - index) // 2
+            kept.append(path[reach])
+            index = reach
+        return kept
+
+    def _shortcut(self, path: list[Array], rng: np.random.Generator) -> list[Array]:
+        points = np.array(path)
+        lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        ends = np.concatenate([[0.0], np.cumsum(lengths)])
+        low, high = np.sort(rng.uniform(0, ends[-1], 2))
+        first, second = (min(int(np.searchsorted(ends, at, side="right")) - 1, len(lengths) - 1) for at in (low, high))
+        if first == second:
+            return path
+        a = points[first] + (points[first + 1] - points[first]) * ((low - ends[first]) / max(lengths[first], 1e-12))
+        b = points[second] + (points[second + 1] - points[second]) * (
+            (high - ends[second]) / max(lengths[second], 1e-12)
+        )
+        if np.linalg.norm(b - a) > 0.98 * (high - low) or not self.edge_free(a, b):
+            return path
+        return [*path[: first + 1], a, b, *path[second + 1 :]]
+
+
+def _spread(count: int) -> list[int]:
+    """Order 1..count so that early indices are far apart (bisection); the end comes first."""
+    order, seen, stride = [count], {count}, count
+    while stride > 1:
+        stride = (stride + 1) // 2
+        for index in range(stride, count, stride):
+            if index not in seen:
+                seen.add(index)
+                order.append(index)
+    return order

@@ -1,0 +1,155 @@
+"""From waypoints to joint positions at exact control steps, within velocity and acceleration limits.
+
+A joint path is a polyline whose corners are rounded by parabolas, so that its shape is known exactly and never
+overshoots as a spline through sparse waypoints does; a line of the TCP is a spline through dense configurations.
+TOPP-RA finds the fastest timing of either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import toppra
+import toppra.algorithm
+import toppra.constraint
+from scipy.interpolate import CubicSpline, PPoly
+from toppra.interpolator import AbstractGeometricPath
+
+from robocas_ms3.planning.protocol import Array, Trajectory
+
+GRID = 0.04  # rad between grid points of TOPP-RA
+SAFETY = 0.98  # limits hold between grid points too
+
+
+class JointPath(AbstractGeometricPath):
+    """A path through joint space by (nearly) its own length.
+
+    Args:
+        curve: piecewise polynomial over [0, length], values (n,).
+    """
+
+    def __init__(self, curve: PPoly) -> None:
+        super().__init__()
+        self._curve = curve
+
+    def __call__(self, path_positions: Array | float, order: int = 0) -> Array:
+        """Evaluate positions (m,) or one, or a derivative by the path's length."""
+        return self._curve(path_positions, order)
+
+    @property
+    def dof(self) -> int:
+        """Number of joints."""
+        return int(self._curve.c.shape[2])
+
+    @property
+    def path_interval(self) -> Array:
+        """First and last position."""
+        return self._curve.x[[0, -1]]
+
+    @property
+    def waypoints(self) -> Array:
+        """Where the pieces join."""
+        return self._curve.x
+
+    @property
+    def length(self) -> float:
+        """Length of the parameter, rad."""
+        return float(self._curve.x[-1])
+
+    def dense(self, spacing: float) -> Array:
+        """Give configurations (m, n) at most ``spacing`` rad apart, both ends included."""
+        return self(np.linspace(0, self.length, max(2, int(np.ceil(self.length / spacing)) + 1)))
+
+    def grid(self) -> Array:
+        """Give grid points for TOPP-RA: even ones, and both sides of every joint of the pieces."""
+        even = np.linspace(0, self.length, max(20, int(np.ceil(self.length / GRID))) + 1)
+        inner = self._curve.x[1:-1] if len(self._curve.x) < 40 else self._curve.x[:0]
+        beside = np.concatenate([inner - 1e-4 * self.length, inner + 1e-4 * self.length])
+        points = np.sort(np.concatenate([even, beside[(beside > 0) & (beside < self.length)]]))
+        return points[np.concatenate([[True], np.diff(points) > 1e-6 * self.length])]
+
+
+def rounded(waypoints: Array, radius: float) -> JointPath:
+    """Round the corners of a polyline (m, n) by parabolas that begin at most ``radius`` rad before each corner."""
+    points = np.asarray(waypoints, dtype=np.float64)
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    directions = steps / lengths[:, None]
+    cut = np.zeros(len(points))
+    cut[1:-1] = np.minimum(radius, 0.5 * np.minimum(lengths[:-1], lengths[1:]))
+    breaks, pieces = [0.0], []
+    for i, direction in enumerate(directions):
+        straight = lengths[i] - cut[i] - cut[i + 1]
+        if straight > 1e-9:
+            pieces.append((np.zeros_like(direction), direction, points[i] + cut[i] * direction))
+            breaks.append(breaks[-1] + straight)
+        r = cut[i + 1]
+        if r > 0:
+            bend = (directions[i + 1] - direction) / (4 * r)
+            pieces.append((bend, direction, points[i + 1] - r * direction))
+            breaks.append(breaks[-1] + 2 * r)
+    return JointPath(PPoly(np.array(pieces).transpose(1, 0, 2), np.array(breaks)))
+
+
+def through(waypoints: Array) -> JointPath:
+    """Lay a cubic spline through dense configurations (m, n) of a smooth motion."""
+    points = np.asarray(waypoints, dtype=np.float64)
+    ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    return JointPath(CubicSpline(ends, points, bc_type="not-a-knot" if len(points) > 3 else "natural"))
+
+
+def timed(path: JointPath, *, velocity: float, acceleration: float, dt: float) -> Trajectory | None:
+    """Time a path as fast as the limits allow, from rest to rest; none when TOPP-RA fails.
+
+    The motion is stretched to a whole number of steps, so that row i lies exactly at ``(i + 1) * dt``.
+
+    Args:
+        path: where to go.
+        velocity: limit of every joint, rad/s.
+        acceleration: limit of every joint, rad/s^2.
+        dt: seconds between rows.
+    """
+    ones = np.ones(path.dof) * SAFETY
+    bounds = [
+        toppra.constraint.JointVelocityConstraint(np.stack([-ones, ones], 1) * velocity),
+        toppra.constraint.JointAccelerationConstraint(np.stack([-ones, ones], 1) * acceleration),
+    ]
+    solver = toppra.algorithm.TOPPRA(bounds, path, gridpoints=path.grid(), parametrizer="ParametrizeConstAccel")
+    motion = solver.compute_trajectory(0.0, 0.0)
+    if motion is None:
+        return None
+    duration = float(motion.path_interval[1])
+    return sampled(motion, duration, path(path.length), dt) if np.isfinite(duration) else None
+
+
+def stopping(waypoints: Array, *, velocity: float, acceleration: float, dt: float) -> Trajectory:
+    """Time a polyline (m, n) as straight segments that each begin and end at rest: slow, and exactly on the path."""
+    points = np.asarray(waypoints, dtype=np.float64)
+    steps = np.diff(points, axis=0)
+    largest = np.abs(steps).max(axis=1)  # the joint that moves most sets the time
+    cruise = np.minimum(SAFETY * velocity, np.sqrt(largest * SAFETY * acceleration))
+    ramp = cruise / (SAFETY * acceleration)
+    spans = largest / cruise + ramp
+    ends = np.concatenate([[0.0], np.cumsum(spans)])
+
+    def at(times: Array) -> Array:
+        index = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, len(steps) - 1)
+        t, a, r, T = times - ends[index], SAFETY * acceleration, ramp[index], spans[index]
+        t = np.clip(t, 0, T)
+        done = np.where(
+            t < r,
+            a * t * t / 2,
+            np.where(t > T - r, largest[index] - a * (T - t) ** 2 / 2, cruise[index] * (t - r / 2)),
+        )
+        return points[index] + (done / largest[index])[:, None] * steps[index]
+
+    return sampled(at, float(ends[-1]), points[-1], dt)
+
+
+def sampled(motion: Callable[[Array], Array], duration: float, goal: Array, dt: float) -> Trajectory:
+    """Sample a motion at exact steps; the last row is ``goal``, a vanishing motion has that row alone."""
+    count = max(1, int(np.ceil(duration / dt - 1e-9)))
+    qpos = np.array(motion(np.arange(1, count + 1) * (duration / count)), dtype=np.float64)
+    qpos[-1] = goal
+    return Trajectory(qpos, dt)
