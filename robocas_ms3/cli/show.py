@@ -1,0 +1,71 @@
+"""``robocas show``: look at a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass
+class Show:
+    """Render the scene of a configuration to PNG files, from all cameras, after reset."""
+
+    config: Annotated[str, tyro.conf.Positional] = "pick_table_scattered"
+    """Name of a shipped task configuration, or a YAML file."""
+    pack: str = "builtin"
+    """Object pack: its name, or its folder."""
+    seed: int = 0
+    """Seed of the episode."""
+    out: Path = Path("scene")
+    """Folder for the pictures."""
+    shader: str = "default"
+    """ManiSkill shader: minimal (fast), default, rt-fast or rt (ray tracing, needs a GPU)."""
+
+
+def main(cfg: Show) -> int:
+    """Run the command."""
+    import gymnasium as gym
+    from rich.console import Console
+
+    import robocas_ms3.tasks  # noqa: F401  (registers the environments)
+    from robocas_ms3.config import load_task_config
+    from robocas_ms3.errors import RobocasError
+    from robocas_ms3.files import make_folder, replacing
+    from robocas_ms3.tasks.base import RoboCASEnv
+    from robocas_ms3.tasks.spec import TASKS
+
+    config = load_task_config(cfg.config)
+    make_folder(cfg.out)
+    shader = {"shader_pack": cfg.shader}
+    env = gym.make(
+        TASKS[config.task].env_id,
+        config=config,
+        pack=cfg.pack,
+        obs_mode="rgb",
+        render_mode="rgb_array",
+        sensor_configs=shader,
+        human_render_camera_configs=shader,
+    )
+    base_env = env.unwrapped
+    assert isinstance(base_env, RoboCASEnv)
+    if not base_env.scene.can_render():
+        raise RobocasError(
+            "no render device", fix="Run scripts/setup.sh, or install a Vulkan driver; see robocas doctor."
+        )
+    from PIL import Image
+
+    obs, _ = env.reset(seed=cfg.seed)
+    pictures = {name: data["rgb"][0] for name, data in obs["sensor_data"].items()}
+    pictures["overview"] = base_env.render_rgb_array()[0]
+    console = Console(highlight=False, soft_wrap=True)
+    for name, pixels in pictures.items():
+        path = cfg.out / f"{Path(cfg.config).stem}_seed{cfg.seed}_{name}.png"
+        with replacing(path) as tmp:
+            Image.fromarray(pixels.cpu().numpy()).save(tmp)
+        console.print(f"wrote {path}")
+    console.print(f"instruction: {base_env.get_language_instruction()[0]}")
+    env.close()
+    return 0
