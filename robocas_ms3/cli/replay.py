@@ -1,0 +1,66 @@
+"""``robocas replay``: run recorded episodes again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass
+class Replay:
+    """Replay a trajectory file, by its actions or its states, or converted to another control mode.
+
+    Exit code 1 when an episode does not succeed.
+    """
+
+    trajectory: Annotated[Path, tyro.conf.Positional]
+    """The HDF5 file; its JSON lies beside it."""
+    control_mode: Annotated[str | None, tyro.conf.arg(aliases=["-c"])] = None
+    """Convert the actions: pd_joint_delta_pos, pd_ee_delta_pose or pd_ee_pose. Default: as recorded."""
+    obs_mode: Annotated[str, tyro.conf.arg(aliases=["-o"])] = "none"
+    """Observations to record with --save, e.g. rgb+depth or state."""
+    use_env_states: bool = False
+    """Set the recorded state after every step."""
+    count: int | None = None
+    """Only the first so many episodes."""
+    save: Path | None = None
+    """Write the replayed episodes to this HDF5 file."""
+    allow_failure: bool = False
+    """With --save: write failed episodes too."""
+    overwrite: bool = False
+    """Replace the file given by --save if it exists."""
+
+
+def main(cfg: Replay) -> int:
+    """Run the command."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from robocas_ms3.demos.record import read_json
+    from robocas_ms3.demos.replay import replay
+
+    total = len(read_json(cfg.trajectory)["episodes"][: cfg.count])
+    results = replay(
+        cfg.trajectory,
+        control_mode=cfg.control_mode,
+        obs_mode=cfg.obs_mode,
+        use_env_states=cfg.use_env_states,
+        count=cfg.count,
+        save=cfg.save,
+        allow_failure=cfg.allow_failure,
+        overwrite=cfg.overwrite,
+    )
+    console = Console(highlight=False, soft_wrap=True)
+    done = list(track(results, "replaying", total=total, console=Console(stderr=True)))
+    for result in done:
+        if not result.success:
+            console.print(f"episode {result.episode_id} (seed {result.seed}): not successful")
+    good = sum(result.success for result in done)
+    console.print(f"{good} of {len(done)} episodes succeed")
+    errors = [result.state_error for result in done if result.state_error is not None]
+    if errors:
+        console.print(f"greatest difference from a recorded final state: {max(errors):.3g}")
+    return 0 if good == len(done) else 1

@@ -1,0 +1,139 @@
+"""Replay recorded trajectories: by actions, by actions of another control mode, or by states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from mani_skill.trajectory.utils import dict_to_list_of_dicts
+
+from robocas_ms3.demos.convert_actions import ActionConverter
+from robocas_ms3.demos.record import EpisodeRecorder, merge, open_trajectory, read_json
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.files import claim_output, replacing_folder
+from robocas_ms3.tasks.base import RoboCASEnv
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What a replay of one episode did.
+
+    Attributes:
+        episode_id: in the source file.
+        seed: of the episode.
+        success: at the last step.
+        state_error: greatest distance of any object or the TCP's joints from the recorded final state, m or rad; None
+            when the actions were converted.
+    """
+
+    episode_id: int
+    seed: int
+    success: bool
+    state_error: float | None
+
+
+def replay(
+    trajectory: Path,
+    *,
+    control_mode: str | None = None,
+    obs_mode: str = "none",
+    use_env_states: bool = False,
+    count: int | None = None,
+    save: Path | None = None,
+    allow_failure: bool = False,
+    overwrite: bool = False,
+    env_kwargs: dict[str, Any] | None = None,
+) -> Iterator[Replay]:
+    """Replay episodes one by one.
+
+    Args:
+        trajectory: HDF5 file, its JSON beside it.
+        control_mode: convert the actions to this mode; default: as recorded.
+        obs_mode: observations to record in ``save``.
+        use_env_states: set the recorded state after every step.
+        count: only the first so many episodes.
+        save: write the replayed episodes to this HDF5 file.
+        allow_failure: write the failed ones too.
+        overwrite: replace ``save`` if it exists.
+        env_kwargs: further arguments of the environment.
+
+    Raises:
+        DatasetError: the file can't be read, or the control mode can't be converted to.
+    """
+    data = read_json(trajectory)
+    info = data["env_info"]
+    recorded_mode = info["env_kwargs"]["control_mode"]
+    mode = control_mode or recorded_mode
+    if mode != recorded_mode and (use_env_states or recorded_mode != "pd_joint_pos"):
+        raise DatasetError(
+            "only pd_joint_pos recordings can be converted, and not while setting states",
+            where=trajectory,
+            found=f"{recorded_mode} -> {mode}",
+        )
+    if save is not None:
+        claim_output(save, overwrite=overwrite)
+    kwargs = {**info["env_kwargs"], "control_mode": mode, "obs_mode": obs_mode, **(env_kwargs or {})}
+    if obs_mode == "none":
+        kwargs.setdefault("render_backend", "none")
+    env = gym.make(info["env_id"], **kwargs)
+    episodes = data["episodes"][:count]
+    try:
+        if save is None:
+            for episode in episodes:
+                yield _replay_one(env, trajectory, episode, use_env_states)
+            return
+        with replacing_folder(save.with_suffix(".parts")) as parts:
+            shards = []
+            for episode in episodes:
+                recorder = EpisodeRecorder(env, parts, f"episode_{episode['episode_id']:09d}")
+                result = _replay_one(recorder, trajectory, episode, use_env_states)
+                if result.success or allow_failure:
+                    recorder.finish(episode.get("robocas", {}))
+                    shards.append(parts / f"episode_{episode['episode_id']:09d}.h5")
+                else:
+                    recorder.discard()
+                yield result
+            if shards:
+                merge(shards, save)
+            for path in parts.iterdir():
+                path.unlink()
+        save.with_suffix(".parts").rmdir()
+    finally:
+        env.close()
+
+
+def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env_states: bool) -> Replay:
+    base_env = env.unwrapped
+    assert isinstance(base_env, RoboCASEnv)
+    name = f"traj_{episode['episode_id']}"
+    with open_trajectory(trajectory) as file:
+        if name not in file:
+            raise DatasetError("the file lacks an episode its JSON lists", where=trajectory, found=name)
+        group: Any = file[name]
+        actions, states = np.array(group["actions"]), dict_to_list_of_dicts(group["env_states"])
+    _, info = env.reset(**episode["reset_kwargs"])
+    convert = ActionConverter(base_env) if base_env.control_mode != episode["control_mode"] else None
+    if use_env_states:
+        base_env.set_state_dict(states[0])
+    for action, state in zip(actions, states[1:], strict=True):
+        *_, info = env.step(action if convert is None else convert(action))
+        if use_env_states:
+            base_env.set_state_dict(state)
+    error = None if convert else state_distance(base_env.get_state_dict(), states[-1])
+    return Replay(episode["episode_id"], int(episode["episode_seed"]), bool(info["success"][0]), error)
+
+
+def state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:
+    """Greatest absolute difference of any number of two states."""
+    worst = 0.0
+    for kind in ("actors", "articulations"):
+        for name, value in recorded[kind].items():
+            now = state[kind][name]
+            now = now.cpu().numpy() if isinstance(now, torch.Tensor) else np.asarray(now)
+            worst = max(worst, float(np.abs(now.reshape(-1) - np.asarray(value).reshape(-1)).max()))
+    return worst
