@@ -1,0 +1,1 @@
+"""RoboCAS datasets: one declared schema, the converter, the validator, videos."""

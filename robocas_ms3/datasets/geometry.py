@@ -1,0 +1,117 @@
+"""Does depth agree with the cameras' intrinsics and poses? Pure maths, robust against occlusion and thin edges.
+
+Two laws hold in any scene. Nothing lies below the floor, and what is near the floor lies on it. And a surface point one
+camera sees is, seen from another camera, at the depth stored there or hidden by something nearer: no camera looks
+through a surface that another one saw. Wrong poses, intrinsics, axes or units break one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets.episode import invert
+
+Array = NDArray[np.float64]
+
+POINT_STEP = 4  # pixels between the points looked at
+MIN_POINTS = 100  # fewer say nothing
+FLOOR_TOLERANCE = 0.03  # m
+FLOOR_BAND = 0.15  # m; what lies within it is taken for the floor
+SEEN_THROUGH = 0.05  # share of points
+AGREEING = 0.15  # share of points
+NEAR = 0.15  # m; nearer than this a pixel covers less than the depth's millimetre
+
+
+@dataclass(frozen=True)
+class View:
+    """What one camera saw at one step.
+
+    Attributes:
+        camera: its name.
+        depth: (H, W) uint16, mm, 0 = nothing.
+        intrinsic: (4,) fx, fy, cx, cy.
+        camera_in_world: (4, 4), OpenCV frame.
+    """
+
+    camera: str
+    depth: NDArray[np.uint16]
+    intrinsic: Array
+    camera_in_world: Array
+
+    def points(self, step: int = POINT_STEP) -> Array:
+        """(N, 3) seen points in the world, one of ``step`` x ``step`` pixels, m."""
+        rows, columns = np.mgrid[step // 2 : self.depth.shape[0] : step, step // 2 : self.depth.shape[1] : step]
+        z = self.depth[rows, columns].astype(np.float64) / 1000
+        fx, fy, cx, cy = self.intrinsic
+        # SAPIEN's rays go through pixel centres, which lie at + 0.5.
+        local = np.stack([(columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z], axis=-1)[z > 0]
+        return local @ self.camera_in_world[:3, :3].T + self.camera_in_world[:3, 3]
+
+
+def check(views: list[View]) -> Iterator[tuple[str, str, str]]:
+    """Check what the cameras saw at one step; gives (camera, expected, found) for each broken law."""
+    clouds = {view.camera: view.points() for view in views}
+    for view in views:
+        yield from _floor(view.camera, clouds[view.camera])
+    for view in views:
+        for other in views:
+            if other is not view:
+                yield from _through(clouds[other.camera], other.camera, view)
+
+
+def _floor(camera: str, points: Array) -> Iterator[tuple[str, str, str]]:
+    if len(points) < MIN_POINTS:
+        return
+    heights = points[:, 2]
+    below = np.mean(heights < -FLOOR_TOLERANCE)
+    if below > 0.01:
+        yield camera, "nothing below the floor", f"{below:.0%} of the depth, down to {heights.min():.2f} m"
+    near = np.abs(heights[np.abs(heights) < FLOOR_BAND])
+    if len(near) > MIN_POINTS and np.median(near) > FLOOR_TOLERANCE:
+        yield camera, "floor at height 0", f"a floor {np.median(near) * 100:.0f} cm off"
+
+
+def compare(points: Array, view: View) -> tuple[int, float, float]:
+    """Compare points another camera saw with a view.
+
+    Args:
+        points: (N, 3) in the world, m.
+        view: where they may be seen.
+
+    Returns:
+        How many fall into the picture; which share of them the view looks through; which share lies at its depth.
+    """
+    local = (points - view.camera_in_world[:3, 3]) @ invert(view.camera_in_world)[:3, :3].T
+    local = local[local[:, 2] > NEAR]
+    fx, fy, cx, cy = view.intrinsic
+    z = local[:, 2]
+    columns = np.floor(local[:, 0] / z * fx + cx).astype(int)
+    rows = np.floor(local[:, 1] / z * fy + cy).astype(int)
+    height, width = view.depth.shape
+    inside = (columns >= 1) & (columns < width - 1) & (rows >= 1) & (rows < height - 1)
+    rows, columns, z = rows[inside], columns[inside], z[inside]
+    if len(z) == 0:
+        return 0, 0.0, 0.0
+    around = np.stack([view.depth[rows + i, columns + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]) / 1000
+    known = np.all(around > 0, axis=0)
+    if not known.any():
+        return 0, 0.0, 0.0
+    z, nearest, farthest = z[known], around[:, known].min(axis=0), around[:, known].max(axis=0)
+    tolerance = 0.01 + 0.01 * z
+    through = nearest > z + tolerance
+    agree = ~through & (farthest > z - tolerance)
+    return len(z), float(np.mean(through)), float(np.mean(agree))
+
+
+def _through(points: Array, source: str, view: View) -> Iterator[tuple[str, str, str]]:
+    count, through, agree = compare(points, view)
+    if count < MIN_POINTS:
+        return
+    if through > SEEN_THROUGH:
+        yield view.camera, f"no looking through what {source} sees", f"{through:.0%} of {count} points seen through"
+    if agree < AGREEING:
+        yield view.camera, f"depth that agrees with {source}'s", f"{agree:.0%} of {count} points agree"

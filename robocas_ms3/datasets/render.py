@@ -1,0 +1,166 @@
+"""Shows recorded states through ManiSkill's cameras: the scene is rebuilt from its seed, physics never steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.episode import invert
+from robocas_ms3.datasets.trajectory import Recording
+from robocas_ms3.datasets.writer import CameraModel, Frame
+from robocas_ms3.errors import DatasetError
+
+_SAME_PLACE = 1e-3  # m
+
+
+class EnvFrames:
+    """A ``FrameSource`` made of the environment that recorded a trajectory.
+
+    Attributes:
+        env: the environment.
+        gripper_column: of its actions.
+        finger_range: target of one finger at -1 and +1, m.
+    """
+
+    def __init__(self, env_info: dict[str, Any], control_mode: str, size: tuple[int, int] | None = None) -> None:
+        """Make the environment, with cameras.
+
+        Args:
+            env_info: of the trajectory's JSON.
+            control_mode: of its actions.
+            size: width and height of the pictures; None leaves the cameras' own, 640 x 480.
+
+        Raises:
+            DatasetError: there is no render device.
+        """
+        kwargs = dict(env_info["env_kwargs"])
+        sensors = dict(kwargs.pop("sensor_configs", None) or {})
+        if size is not None:
+            sensors["width"], sensors["height"] = size
+        for key in ("render_backend", "render_mode", "sim_backend", "num_envs", "obs_mode", "control_mode"):
+            kwargs.pop(key, None)
+        require_renderer()
+        self.env = gym.make(
+            env_info["env_id"],
+            obs_mode="rgb+depth",
+            control_mode=control_mode,
+            num_envs=1,
+            sim_backend="physx_cpu",
+            sensor_configs=sensors,
+            **kwargs,
+        )
+        self._base: Any = self.env.unwrapped
+        self._loaded = False
+        self.gripper_column, self.finger_range = 0, (0.0, 0.0)
+
+    def close(self) -> None:
+        """Free the renderer."""
+        self.env.close()
+
+    def load(self, recording: Recording) -> None:
+        """Rebuild a recording's scene.
+
+        Raises:
+            DatasetError: the scene is not the recorded one: another pack, configuration or version.
+        """
+        self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
+        controller = self._base.agent.controller
+        self.gripper_column = controller.action_mapping["gripper"][0]
+        gripper = controller.controllers["gripper"].config
+        self.finger_range = (float(gripper.lower), float(gripper.upper))
+        self._check_scene(recording)
+
+    def _check_scene(self, recording: Recording) -> None:
+        where = f"episode {recording.episode_id}, seed {recording.seed}"
+        fix = "Use the pack, configuration and versions it was recorded with."
+        built = self._base.get_state_dict()
+        for kind in ("actors", "articulations"):
+            mine, theirs = set(built.get(kind, {})), set(recording.states.get(kind, {}))
+            if mine != theirs:
+                raise DatasetError(
+                    "the seed builds another scene", where=where, expected=sorted(theirs), found=sorted(mine), fix=fix
+                )
+        for name, states in recording.states.get("actors", {}).items():
+            distance = float(np.linalg.norm(built["actors"][name][0, :3].cpu().numpy() - states[0, :3]))
+            if distance > _SAME_PLACE:
+                raise DatasetError(
+                    "the seed builds another scene",
+                    where=f"{where}, {name}",
+                    expected="the recorded place",
+                    found=f"{distance * 1000:.1f} mm away",
+                    fix=fix,
+                )
+        instruction = self._base.get_language_instruction()[0]
+        if instruction != recording.instruction:
+            raise DatasetError(
+                "the seed builds another scene",
+                where=where,
+                expected=recording.instruction,
+                found=instruction,
+                fix=fix,
+            )
+
+    def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[Frame]:
+        """Show some of the states, in order; ``load`` comes first."""
+        for index in samples:
+            yield self.frame(recording.state(int(index)))
+
+    def frame(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> Frame:
+        """Show one state, without a step of physics."""
+        tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
+        self._base.set_state_dict(tensors)
+        pictures = self._base._get_obs_sensor_data()
+        agent = self._base.agent
+        return Frame(
+            rgb={c.name: pictures[c.name]["rgb"][0].cpu().numpy() for c in schema.CAMERAS},
+            depth={c.name: to_millimetres(pictures[c.name]["depth"][0, ..., 0]) for c in schema.CAMERAS},
+            tcp_in_world=_matrix(agent.tcp.pose),
+            arm_base_in_world=_matrix(agent.arm_base_link.pose),
+        )
+
+    def cameras(self) -> dict[str, CameraModel]:
+        """Intrinsics, and poses in the parents, at the state shown last."""
+        agent = self._base.agent
+        parents = {"ee": agent.tcp.pose, "arm_base": agent.arm_base_link.pose}
+        models = {}
+        for spec in schema.CAMERAS:
+            camera = self._base.scene.sensors[spec.name].camera
+            world_in_camera = np.vstack([camera.get_extrinsic_matrix()[0].cpu().numpy(), [0, 0, 0, 1]])
+            parent_in_world = _matrix(parents[spec.parent]) if spec.parent in parents else np.eye(4)
+            k = camera.get_intrinsic_matrix()[0].cpu().numpy().astype(np.float64)
+            models[spec.name] = CameraModel(
+                intrinsic=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
+                camera_in_parent=invert(parent_in_world) @ invert(world_in_camera.astype(np.float64)),
+            )
+        return models
+
+
+def require_renderer() -> None:
+    """Check that SAPIEN finds a device to render with.
+
+    Raises:
+        DatasetError: it finds none.
+    """
+    import sapien
+
+    try:
+        sapien.render.RenderMaterial()  # the cheapest thing that needs the device
+    except RuntimeError as error:
+        raise DatasetError(
+            "no render device", fix="Run scripts/setup.sh or install a Vulkan driver; robocas doctor says more."
+        ) from error
+
+
+def to_millimetres(depth: torch.Tensor) -> NDArray[np.uint16]:
+    """ManiSkill's depth, (H, W) int16 mm, as it is stored: what is behind the camera or nowhere becomes 0."""
+    return depth.clamp(min=0).cpu().numpy().astype(np.uint16)
+
+
+def _matrix(pose: Any) -> NDArray[np.float64]:
+    return pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64)

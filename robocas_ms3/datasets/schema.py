@@ -1,0 +1,182 @@
+"""The RoboCAS folder, declared once: writer, reader, validator, documentation and tests all read it here.
+
+::
+
+    data_info.json                    overview and split, see DATA_INFO
+    conversion.json                   how the dataset was made; ours, the released loader ignores it
+    episode_0000000/
+      episode_info.npz                arrays over T steps, see EPISODE_INFO; holds no pickles
+      gripper_camera/, base_camera/, static_camera/
+        cam_pos_wrt_<parent>.npy      4x4 OpenCV camera frame (x right, y down, z forward) in its parent; the paper's
+        cam_pose_wrt_<parent>.npy     name and upstream's, the same content
+        intrinsic.npy                 (4,) fx, fy, cx, cy in pixels
+        rgb/0000.png ...              8-bit RGB, one a step
+        depth/0000.png ...            16-bit grey, millimetres along the optical axis, 0 = nothing
+
+Metres and radians; quaternions are xyzw.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from robocas_ms3.language.embed import DIMENSIONS
+from robocas_ms3.language.templates import GOAL_TYPES
+
+DataType = Literal["float32", "int64", "bool", "str"]
+
+EPISODE_FILE = "episode_info.npz"
+DATA_INFO_FILE = "data_info.json"
+CONVERSION_FILE = "conversion.json"
+PREVIEW_FOLDER = "preview"
+INTRINSIC_FILE = "intrinsic.npy"
+IMAGE_KINDS = ("rgb", "depth")
+MAX_STEPS = 10_000  # four digits in image names
+MAX_DEPTH_MM = 65_535
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """One array of ``episode_info.npz``.
+
+    Attributes:
+        name: its key.
+        dtype: its type; ``str`` is numpy's fixed-width unicode.
+        shape: lengths; ``"T"`` is the number of steps.
+        unit: of its numbers.
+        meaning: for people.
+        quaternion: rows are unit quaternions xyzw.
+        embedding: rows are sentence embeddings; absent from datasets converted without.
+    """
+
+    name: str
+    dtype: DataType
+    shape: tuple[int | Literal["T"], ...]
+    unit: str
+    meaning: str
+    quaternion: bool = False
+    embedding: bool = False
+
+    def shape_for(self, steps: int) -> tuple[int, ...]:
+        """Shape in an episode of ``steps`` steps."""
+        return tuple(steps if length == "T" else length for length in self.shape)
+
+    def has_dtype(self, array: np.ndarray) -> bool:
+        """Whether an array is of the declared type."""
+        return array.dtype.kind == "U" if self.dtype == "str" else array.dtype == np.dtype(self.dtype)
+
+    def cast(self, values: Any) -> np.ndarray:
+        """Values as an array of the declared type."""
+        return np.asarray(values, dtype=np.str_ if self.dtype == "str" else self.dtype)
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """One camera.
+
+    Attributes:
+        name: its folder.
+        parent: name of its parent frame in file names.
+        parent_frame: that frame, for people.
+    """
+
+    name: str
+    parent: Literal["ee", "arm_base", "world"]
+    parent_frame: str
+
+    @property
+    def pose_files(self) -> tuple[str, str]:
+        """Both names of the file with the camera's pose."""
+        return f"cam_pos_wrt_{self.parent}.npy", f"cam_pose_wrt_{self.parent}.npy"
+
+
+CAMERAS: tuple[CameraSpec, ...] = (
+    CameraSpec("base_camera", "arm_base", "arm base (panda_link0)"),
+    CameraSpec("gripper_camera", "ee", "EEF: ManiSkill's TCP, z approach, y closing"),
+    CameraSpec("static_camera", "world", "world"),
+)
+
+_EE = "EEF (TCP) in the arm base frame (panda_link0)"
+_BASE = "arm base in the world"
+
+EPISODE_INFO: tuple[ArraySpec, ...] = (
+    ArraySpec("rel_pos", "float32", ("T", 3), "m", "EEF from step t to t+1, in the EEF frame at t; last row 0"),
+    ArraySpec("rel_orn", "float32", ("T", 4), "xyzw", "the same turn; last row the identity", quaternion=True),
+    ArraySpec("ee_pos", "float32", ("T", 3), "m", _EE),
+    ArraySpec("ee_orn", "float32", ("T", 4), "xyzw", _EE, quaternion=True),
+    ArraySpec("robot_joints", "float32", ("T", 7), "rad", "arm joints"),
+    ArraySpec("arm_joint_vel", "float32", ("T", 7), "rad/s", "velocities of the arm joints"),
+    ArraySpec("base_pos", "float32", ("T", 3), "m", _BASE),
+    ArraySpec("base_orn", "float32", ("T", 4), "xyzw", _BASE, quaternion=True),
+    ArraySpec("base_rel_pos", "float32", ("T", 3), "m", "as rel_pos, of the arm base"),
+    ArraySpec("base_rel_orn", "float32", ("T", 4), "xyzw", "as rel_orn, of the arm base", quaternion=True),
+    ArraySpec("gripper_width", "float32", ("T",), "m", "distance between the finger pads: sum of both finger joints"),
+    ArraySpec(
+        "gripper_status", "bool", ("T",), "", "command in force at this step: True = open (commanded width > 0.04 m)"
+    ),
+    ArraySpec("agv_pose", "float32", ("T", 3), "m, m, rad", "mobile base in the world: x, y, yaw"),
+    ArraySpec(
+        "rel_agv_pose", "float32", ("T", 3), "m, m, rad", "agv_pose[t+1] - agv_pose[t] (world frame); last row 0"
+    ),
+    ArraySpec("episode_length", "int64", (), "steps", "T"),
+    ArraySpec("language_goal", "str", (), "", "the instruction"),
+    ArraySpec(
+        "language_embedding", "float32", (DIMENSIONS,), "", "the instruction, by all-MiniLM-L6-v2", embedding=True
+    ),
+    ArraySpec("step_lang_goals", "str", ("T",), "", "text of the sub-goal pursued at this step"),
+    ArraySpec("step_goal_type", "str", ("T",), "", "its type, one of: " + ", ".join(GOAL_TYPES)),
+    ArraySpec(
+        "step_goal_embs", "float32", ("T", DIMENSIONS), "", "step_lang_goals, by all-MiniLM-L6-v2", embedding=True
+    ),
+)
+
+RELATIVE_PAIRS = (("ee_pos", "ee_orn", "rel_pos", "rel_orn"), ("base_pos", "base_orn", "base_rel_pos", "base_rel_orn"))
+"""Keys of absolute position and orientation, and of the same as relative motion."""
+
+DATA_INFO: dict[str, str] = {
+    "train_eps": "list of episode numbers",
+    "val_eps": "list of episode numbers: 10 % of the seeds, at least one where there are two",
+    "ep_length": "{number: T}",
+    "language_goal": "{number: instruction}",
+    "step_goals": "{number: [{goal_type, goal_range: [first, last] step, inclusive, goal_description}]}",
+    "action_space": "{relative_position: [1st percentile (3), 99th percentile (3)] of rel_pos in m,"
+    " relative_rotation: the same of rel_orn as Euler xyz angles in rad}; last rows left out",
+}
+"""Keys of ``data_info.json``. JSON turns the episode numbers of ``{number: ...}`` into strings."""
+
+
+def episode_folder(number: int) -> str:
+    """Name of an episode's folder."""
+    return f"episode_{number:07d}"
+
+
+def episode_number(folder: str) -> int | None:
+    """Number of an episode's folder, None for other folders."""
+    digits = folder.removeprefix("episode_")
+    return int(digits) if folder.startswith("episode_") and len(digits) == 7 and digits.isdecimal() else None
+
+
+def image_path(episode: Path, camera: str, kind: str, step: int) -> Path:
+    """Path of a picture; ``kind`` is ``rgb`` or ``depth``."""
+    return episode / camera / kind / f"{step:04d}.png"
+
+
+def markdown() -> str:
+    """Tables of the schema for the documentation."""
+    rows = ["| key | dtype | shape | unit | meaning |", "|---|---|---|---|---|"]
+    for spec in EPISODE_INFO:
+        shape = (
+            "scalar" if not spec.shape else "(" + ", ".join(map(str, spec.shape)) + ("," * (len(spec.shape) == 1)) + ")"
+        )
+        rows.append(f"| `{spec.name}` | {spec.dtype} | {shape} | {spec.unit} | {spec.meaning} |")
+    rows += ["", "| camera | parent | pose files |", "|---|---|---|"]
+    rows += [
+        f"| `{c.name}` | {c.parent_frame} | " + ", ".join(f"`{name}`" for name in c.pose_files) + " |" for c in CAMERAS
+    ]
+    rows += ["", f"| key of `{DATA_INFO_FILE}` | value |", "|---|---|"]
+    rows += [f"| `{key}` | {meaning} |" for key, meaning in DATA_INFO.items()]
+    return "\n".join(rows)

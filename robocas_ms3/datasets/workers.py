@@ -1,0 +1,122 @@
+"""Writes many episodes, in this process or in several."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Generator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets.trajectory import TrajectoryFile
+from robocas_ms3.datasets.writer import FrameSource, WrittenEpisode, write_episode
+from robocas_ms3.errors import DatasetError
+
+OpenSource = Callable[[dict[str, Any], str, "tuple[int, int] | None"], FrameSource]
+"""Makes a frame source from ``env_info``, control mode and picture size."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a process needs to know.
+
+    Attributes:
+        trajectory: the HDF5 file.
+        out: the dataset.
+        stride: control steps a dataset step.
+        size: width and height of the pictures, None: the cameras' own.
+        vectors: embedding (384,) of every text; None: no embeddings.
+        open_source: makes what shows the states.
+        tasks: (number in the dataset, index in the trajectory) of each episode to write.
+    """
+
+    trajectory: Path
+    out: Path
+    stride: int
+    size: tuple[int, int] | None
+    vectors: dict[str, NDArray[np.float32]] | None
+    open_source: OpenSource
+    tasks: list[tuple[int, int]]
+
+
+def write_all(job: Job, processes: int) -> Generator[WrittenEpisode, None, None]:
+    """Write the job's episodes; gives each when it is done, in any order.
+
+    Raises:
+        DatasetError: an episode can't be written, or a process died.
+    """
+    if processes <= 1 or len(job.tasks) < 2:
+        writer = _Writer(job)
+        try:
+            yield from map(writer.write, job.tasks)
+        finally:
+            writer.close()
+        return
+    pool = ProcessPoolExecutor(
+        min(processes, len(job.tasks)),
+        mp_context=multiprocessing.get_context("spawn"),  # a renderer does not survive a fork
+        initializer=_start_worker,
+        initargs=(job,),
+    )
+    try:
+        for future in as_completed([pool.submit(_write, task) for task in job.tasks]):
+            yield future.result()
+    except BrokenProcessPool as error:
+        raise DatasetError(
+            "a worker process died", where=job.out, fix="Is memory short? Pass --resume and fewer --jobs."
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+class _Writer:
+    """One process's share: keeps the trajectory and the environment open from one episode to the next."""
+
+    def __init__(self, job: Job) -> None:
+        self.job = job
+        self.file = TrajectoryFile(job.trajectory)
+        self.source: FrameSource | None = None
+        self.control_mode = ""
+
+    def write(self, task: tuple[int, int]) -> WrittenEpisode:
+        job, (number, index) = self.job, task
+        recording = self.file.recording(index)
+        if self.source is None or recording.control_mode != self.control_mode:
+            self._close_source()
+            self.source = job.open_source(self.file.env_info, recording.control_mode, job.size)
+            self.control_mode = recording.control_mode
+        return write_episode(job.out, number, recording, self.source, stride=job.stride, embed=self._embed())
+
+    def _embed(self) -> Callable[[list[str]], NDArray[np.float32]] | None:
+        vectors = self.job.vectors
+        return None if vectors is None else lambda texts: np.stack([vectors[text] for text in texts])
+
+    def _close_source(self) -> None:
+        if self.source is not None:
+            self.source.close()
+            self.source = None
+
+    def close(self) -> None:
+        self._close_source()
+        self.file.close()
+
+
+_writer: _Writer | None = None
+
+
+def _start_worker(job: Job) -> None:
+    global _writer  # noqa: PLW0603  (state of a worker process)
+    # One thread a process: several that render in software on all cores get in each other's way.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    _writer = _Writer(job)
+
+
+def _write(task: tuple[int, int]) -> WrittenEpisode:
+    assert _writer is not None
+    return _writer.write(task)
