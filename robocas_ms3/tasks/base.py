@@ -13,6 +13,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Actor, Pose
 from mani_skill.utils.structs.types import SimConfig
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.pack import LoadedObject, load_pack
 from robocas_ms3.config import TaskConfig, load_task_config
@@ -147,14 +148,15 @@ class RoboCASEnv(BaseEnv):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         with torch.device(self.device):
             count = len(env_idx)
-            self.agent.reset(torch.from_numpy(self.agent.keyframes["rest"].qpos).float().repeat(count, 1))
+            rest = torch.as_tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32)
+            self.agent.reset(rest.repeat(count, 1))
             self.agent.robot.set_pose(Pose.create(sapien.Pose(build.fixture_pose(self.task_config.robot))))
             self.fixtures.basket.set_pose(Pose.create(sapien.Pose(self._basket_pose())))
             poses, targets = self._sample_layouts(env_idx)
             for slot, actor in enumerate(self.objects):
-                actor.set_pose(Pose.create(torch.from_numpy(poses[:, slot]).float()))
-            self.target_slot[env_idx] = torch.from_numpy(targets)
-            self._rest_height[env_idx] = torch.from_numpy(poses[:, :, 2, 3]).float()
+                actor.set_pose(Pose.create(torch.as_tensor(_raw_poses(poses[:, slot]), device=self.device)))
+            self.target_slot[env_idx] = torch.as_tensor(targets, device=self.device)
+            self._rest_height[env_idx] = torch.as_tensor(poses[:, :, 2, 3], dtype=torch.float32, device=self.device)
 
     def _sample_layouts(self, env_idx: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
         """Layout and target of each env: (n, K, 4, 4) objects in the world, (n,) slots."""
@@ -236,3 +238,9 @@ class RoboCASEnv(BaseEnv):
             "target": torch.nn.functional.one_hot(self.target_slot, len(self.objects)).float(),
             "basket_pose": self.fixtures.basket.pose.raw_pose,
         }
+
+
+def _raw_poses(matrices: np.ndarray) -> np.ndarray:
+    """(n, 4, 4) -> (n, 7) float32: position, quaternion wxyz."""
+    xyzw = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
+    return np.concatenate([matrices[:, :3, 3], xyzw[:, [3, 0, 1, 2]]], axis=1).astype(np.float32)
