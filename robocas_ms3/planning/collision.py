@@ -7,7 +7,12 @@ ignore it; the cloud counts in every check; an attached body is checked against 
 
 from __future__ import annotations
 
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +75,20 @@ def matrix_to_pose(matrix: Array) -> Array:
     return np.concatenate([matrix[:3, 3], quaternion])
 
 
+@contextmanager
+def relative_meshes(urdf: Path | str) -> Iterator[Path]:
+    """Yield a copy of a URDF whose mesh paths are relative, since mplib puts the file's folder before absolute ones."""
+    source = Path(urdf).resolve()
+    tree = ElementTree.parse(source)
+    with tempfile.TemporaryDirectory() as folder:
+        for mesh in tree.iterfind(".//mesh"):
+            # An absolute path stays itself when joined to the folder.
+            mesh.set("filename", os.path.relpath(source.parent / mesh.attrib["filename"], Path(folder).resolve()))
+        copy = Path(folder).resolve() / source.name
+        tree.write(copy)
+        yield copy
+
+
 class ArmWorld:
     """The arm, the obstacles and the held object.
 
@@ -91,9 +110,10 @@ class ArmWorld:
         from mplib.pymp.collision_detection import fcl
 
         self._fcl, self._voxel = fcl, voxel
-        self._robot = ArticulatedModel(
-            str(urdf), str(srdf), np.array([0, 0, -9.81]), [], [], convex=True, verbose=False
-        )
+        with relative_meshes(urdf) as relative:
+            self._robot = ArticulatedModel(
+                str(relative), str(srdf), np.array([0, 0, -9.81]), [], [], convex=True, verbose=False
+            )
         self.kinematics = self._robot.get_pinocchio_model()
         links, joints = self.kinematics.get_link_names(), self.kinematics.get_joint_names()
         missing = [name for name in (BASE_LINK, TCP_LINK) if name not in links]

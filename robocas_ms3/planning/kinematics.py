@@ -9,7 +9,7 @@ from robocas_ms3.planning.collision import ArmWorld, matrix_to_pose
 from robocas_ms3.planning.protocol import Array
 
 LIMIT_MARGIN = 0.02  # rad kept from every joint limit
-STARTS = 12  # configurations that inverse kinematics starts from, the preferred one first
+STARTS = 16  # configurations that inverse kinematics starts from, the preferred one first
 DISTINCT = 0.1  # rad (norm over the joints) between two solutions that count as different
 POSITION_TOLERANCE = 1e-4  # m
 ROTATION_TOLERANCE = 1e-3  # rad

@@ -1,0 +1,186 @@
+"""Which annotated grasps to try, and in what order: geometry only, no simulator.
+
+A grasp is a pose of the TCP: z approach, y closing direction. Turned by 180 deg about its approach it is the same grasp with
+another turn of the wrist, so both are candidates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.planning.protocol import Array
+
+MAX_WIDTH = 0.08  # m, the gripper's opening
+MAX_CLOSING_TILT_DEG = 60.0  # of the closing axis from the horizontal
+MAX_SIDEWAYS_DEG = 45.0  # of the approach's horizontal direction from that of base -> object
+FREE_LEAN_DEG = 15.0  # an approach this close to straight down has no horizontal direction to speak of
+PREGRASP_DISTANCE = 0.1  # m
+
+# The open gripper in the TCP frame, one half of it (the other is mirrored at y = 0): low and high corner, m. Upstream uses
+# fingers 0.04..0.045 x +-0.01 x -0.09..0 and a palm +-0.1 x +-0.02 x -0.18..-0.09. These are the same parts of the Panda
+# with 3 cm longer fingers: pads reach 8 mm beyond the TCP, knuckles and hand stand wider and lower than upstream's boxes.
+GRIPPER_BOXES = np.array(
+    [
+        ((-0.010, 0.040, -0.040), (0.010, 0.046, 0.0085)),  # tip
+        ((-0.012, 0.040, -0.075), (0.012, 0.067, -0.020)),  # knuckle
+        ((-0.033, 0.000, -0.180), (0.033, 0.104, -0.067)),  # palm
+    ]
+)
+GRIPPER_RADIUS = 0.22  # m from the TCP, holds all boxes
+
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class GraspFilter:
+    """Grasps that are left; the second half are the first half with the wrist turned by 180 deg.
+
+    Attributes:
+        tcp_in_world: (2K, 4, 4).
+        widths: (2K,) m.
+        qualities: (2K,).
+        index: (2K,) which of the given grasps each one is.
+        rejected: how many fell to each test, in the order of the tests.
+    """
+
+    tcp_in_world: Array
+    widths: Array
+    qualities: Array
+    index: NDArray[np.int_]
+    rejected: dict[str, int]
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def directions_ok(tcp_in_world: Array, base_to_object: Array) -> dict[str, NDArray[np.bool_]]:
+    """Test the directions of grasps against gravity and the robot.
+
+    The robot reaches an object from its own side: the approach's horizontal part may deviate at most 45 deg from the
+    horizontal direction base -> object. Approaches within 15 deg of straight down pass, since they come from no side.
+
+    Args:
+        tcp_in_world: (G, 4, 4).
+        base_to_object: (3,) or (2,) in the world; only the horizontal part counts.
+
+    Returns:
+        Three tests, each (G,): ``from_above``, ``from_the_robots_side``, ``closing_is_level``.
+    """
+    approach, closing = tcp_in_world[:, :3, 2], tcp_in_world[:, :3, 1]
+    lean = np.linalg.norm(approach[:, :2], axis=1)  # sine of the angle from the vertical
+    forward = base_to_object[:2] / max(np.linalg.norm(base_to_object[:2]), 1e-9)
+    along = approach[:, :2] @ forward
+    return {
+        "from_above": approach[:, 2] < 0,
+        "from_the_robots_side": (lean <= np.sin(np.deg2rad(FREE_LEAN_DEG)))
+        | (along >= lean * np.cos(np.deg2rad(MAX_SIDEWAYS_DEG)) - 1e-9),
+        "closing_is_level": np.abs(closing[:, 2]) <= np.sin(np.deg2rad(MAX_CLOSING_TILT_DEG)) + 1e-9,
+    }
+
+
+def gripper_is_clear(
+    tcp_in_world: Array, points_in_world: Array, sweep: float = PREGRASP_DISTANCE
+) -> NDArray[np.bool_]:
+    """Say for each grasp (G, 4, 4) whether no point (P, 3) lies in the open gripper, from pre-grasp to grasp.
+
+    Args:
+        tcp_in_world: (G, 4, 4).
+        points_in_world: (P, 3) m.
+        sweep: distance from which the gripper comes in along its approach, m.
+    """
+    clear = np.ones(len(tcp_in_world), dtype=bool)
+    if len(points_in_world) == 0 or len(tcp_in_world) == 0:
+        return clear
+    low, high = GRIPPER_BOXES[:, 0].copy(), GRIPPER_BOXES[:, 1]
+    low[:, 2] -= sweep
+    centers = tcp_in_world[:, :3, 3]
+    reach = GRIPPER_RADIUS + sweep
+    near = np.all((points_in_world >= centers.min(0) - reach) & (points_in_world <= centers.max(0) + reach), axis=1)
+    points = points_in_world[near]
+    for i, pose in enumerate(tcp_in_world):
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        # Most points are above or below everything; the rest is tested against the three boxes, both halves at once.
+        local = local[(local[:, 2] <= high[:, 2].max()) & (np.abs(local[:, 0]) <= high[:, 0].max())]
+        local[:, 1] = np.abs(local[:, 1])
+        clear[i] = not any(np.any(np.all((local >= a) & (local <= b), axis=1)) for a, b in zip(low, high, strict=True))
+    return clear
+
+
+def filter_grasps(
+    tcp_in_world: Array,
+    widths: Array,
+    *,
+    arm_base_in_world: Array,
+    object_center_in_world: Array,
+    scene_points_in_world: Array,
+    qualities: Array | None = None,
+    sweep: float = PREGRASP_DISTANCE,
+) -> GraspFilter:
+    """Keep the grasps that a robot standing there could try; the wrist-turned twin of each is added.
+
+    Args:
+        tcp_in_world: (G, 4, 4).
+        widths: (G,) opening the object needs there, m.
+        arm_base_in_world: 4x4.
+        object_center_in_world: (3,).
+        scene_points_in_world: (P, 3) surfaces that the open gripper may not touch, the object itself left out.
+        qualities: (G,), more is better; none: all alike.
+        sweep: straight way in, m.
+    """
+    poses = np.asarray(tcp_in_world, dtype=np.float64).reshape(-1, 4, 4)
+    widths = np.asarray(widths, dtype=np.float64)
+    qualities = np.ones(len(poses)) if qualities is None else np.asarray(qualities, dtype=np.float64)
+    tests = {"narrow_enough": widths <= MAX_WIDTH}
+    tests |= directions_ok(poses, np.asarray(object_center_in_world)[:3] - np.asarray(arm_base_in_world)[:3, 3])
+    left, rejected = np.ones(len(poses), dtype=bool), {}
+    for name, passed in tests.items():
+        rejected[name] = int(np.sum(left & ~passed))
+        left &= passed
+    index = np.flatnonzero(left)
+    clear = gripper_is_clear(poses[index], np.asarray(scene_points_in_world, dtype=np.float64), sweep)
+    rejected["gripper_is_clear"] = int(np.sum(~clear))
+    index = index[clear]
+    both = np.concatenate([index, index])
+    kept = np.concatenate([poses[index], poses[index] @ _HALF_TURN])
+    return GraspFilter(kept, widths[both], qualities[both], both, rejected)
+
+
+def rank_grasps(
+    tcp: Array,
+    qualities: Array,
+    *,
+    object_center: Array,
+    qpos: Array,
+    near: Array,
+    rng: np.random.Generator,
+    temperature: float = 0.15,
+) -> NDArray[np.int_]:
+    """Order grasps, good ones first, with some chance so that a retry tries others.
+
+    The score adds quality (relative to the best), nearness of the TCP to the object's centre (falls by e every 3 cm),
+    steepness (1 straight down, 0 level) and nearness in joint space (falls by e every rad of the joint that turns most).
+
+    Args:
+        tcp: (N, 4, 4) in any upright frame.
+        qualities: (N,), more is better.
+        object_center: (3,) in the same frame.
+        qpos: (N, 7) a configuration for each.
+        near: (7,) where the arm is.
+        rng: source of chance.
+        temperature: 0 gives the plain order; at 0.15 a grasp overtakes one that is 0.15 better about one time in four.
+
+    Returns:
+        (N,) indices.
+    """
+    tcp, qualities = np.asarray(tcp, dtype=np.float64), np.asarray(qualities, dtype=np.float64)
+    if len(tcp) == 0:
+        return np.zeros(0, dtype=int)
+    quality = qualities / max(float(np.abs(qualities).max()), 1e-9)
+    distance = np.linalg.norm(tcp[:, :3, 3] - object_center, axis=1)
+    turn = np.abs(np.asarray(qpos) - near).max(axis=1)
+    score = quality + np.exp(-distance / 0.03) + 0.7 * -tcp[:, 2, 2] + 0.7 * np.exp(-turn)
+    # Gumbel noise turns scores into draws without replacement, weighted by exp(score / temperature).
+    return np.argsort(-(score + temperature * rng.gumbel(size=len(score))), kind="stable")
