@@ -30,10 +30,13 @@ from mani_skill.utils.geometry.rotation_conversions import (
 from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
-POSITION_SCALE = 0.1  # m at |action| = 1
-ROTATION_SCALE = 0.5  # rad at |action| = 1
+POSITION_SCALE, ROTATION_SCALE = 0.1, 0.5  # m and rad at |action| = 1, end effector
+JOINT_SCALE = 0.1  # rad, arm joints
+BASE_SCALE = (0.05, 0.05, 0.1)  # m, m, rad, base joints
 BODY_FRAME = "body_translation:body_aligned_body_rotation"
 GPU_IK_ITERATIONS = 5
+# Distances of a joint from its drive target (rad, m) that no motion explains: the state was set from outside.
+ARM_SET_FROM_OUTSIDE, HELD_SET_FROM_OUTSIDE = 0.3, 0.02
 
 
 def to_ee_delta_action(
@@ -75,6 +78,58 @@ def ee_delta_target(
     return position + quaternion_apply(quaternion, delta[:, :3]), quaternion_multiply(quaternion, rotation)
 
 
+class SmoothJointPosController(PDJointPosController):
+    """Joint positions, absolute or relative to the last target, whose drive target moves evenly within a control step.
+
+    A target that jumps at 5 Hz makes the arm start and stop with every step, at twice the planned velocity. ManiSkill's
+    ``interpolate`` starts from where the arm is instead of from the last target, and jerks more than jumps do.
+    """
+
+    config: SmoothJointPosControllerConfig
+
+    def _initialize_joints(self) -> None:
+        super()._initialize_joints()
+        self._limits = self.articulation.get_qlimits()[0, self.active_joint_indices]
+
+    def set_action(self, action: Any) -> None:
+        """Take the positions (N, joints), rad or m, to command at the end of the control step."""
+        action = self._preprocess_action(action)
+        assert self._target_qpos is not None, "the controller has not been reset"
+        moved = (self._target_qpos - self.qpos).abs() > ARM_SET_FROM_OUTSIDE
+        start = torch.where(moved, self.qpos, self._target_qpos)
+        travel = action if self.config.use_delta else action - start
+        if self.config.max_speed is not None:
+            furthest = self.config.max_speed / self._control_freq
+            travel = travel.clamp(-furthest, furthest)
+        self._step = 0
+        self._start_qpos = start
+        self._target_qpos = torch.clamp(start + travel, self._limits[:, 0], self._limits[:, 1])
+
+    def before_simulation_step(self) -> None:
+        """Move the drive target on."""
+        if self._start_qpos is None or self._target_qpos is None or self._step >= self._sim_steps:
+            return
+        self._step += 1
+        self.set_drive_targets(torch.lerp(self._start_qpos, self._target_qpos, self._step / self._sim_steps))
+        if self.scene.gpu_sim_enabled:
+            cast("Any", self.scene.px).gpu_apply_articulation_target_position()
+
+    def reset(self) -> None:
+        """Start from the present configuration."""
+        super().reset()
+        self._step = self._sim_steps
+
+
+@dataclass
+class SmoothJointPosControllerConfig(PDJointPosControllerConfig):
+    """Configuration of a ``SmoothJointPosController``."""
+
+    normalize_action: bool = False
+    max_speed: float | None = None
+    """rad/s or m/s that the target moves at most; a command further away takes several steps."""
+    controller_cls = SmoothJointPosController
+
+
 class HeldJointsController(PDJointPosController):
     """Holds joints where they are at reset; takes no action (0 dimensions)."""
 
@@ -87,7 +142,11 @@ class HeldJointsController(PDJointPosController):
         self.set_drive_targets(self._target_qpos)
 
     def set_action(self, action: Any) -> None:
-        """Do nothing: the drive targets stand."""
+        """Keep the drive targets, unless the state was set from outside: then hold the joints where they are now."""
+        assert self._target_qpos is not None, "the controller has not been reset"
+        moved = (self._target_qpos - self.qpos).abs() > HELD_SET_FROM_OUTSIDE
+        self._target_qpos = torch.where(moved, self.qpos, self._target_qpos)
+        self.set_drive_targets(self._target_qpos)
 
 
 @dataclass

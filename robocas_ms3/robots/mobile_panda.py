@@ -20,11 +20,14 @@ from mani_skill.utils.structs import Actor, Link, Pose
 
 from robocas_ms3.robots import constants as c
 from robocas_ms3.robots.controllers import (
+    BASE_SCALE,
     BODY_FRAME,
+    JOINT_SCALE,
     POSITION_SCALE,
     ROTATION_SCALE,
     HeldJointsControllerConfig,
     RoboCASEEPoseControllerConfig,
+    SmoothJointPosControllerConfig,
 )
 from robocas_ms3.robots.urdf import robot_files
 
@@ -79,9 +82,12 @@ class RoboCASMobilePanda(BaseAgent):
     gripper_joint_names = list(c.FINGER_JOINTS)
     base_joint_names = list(c.BASE_JOINTS)
 
-    arm_stiffness, arm_damping, arm_force_limit = 1e3, 1e2, 100.0
+    # Arm: twice as stiff as ManiSkill's Panda, damped so that no direction overshoots. Damping / stiffness is the lag.
+    # Stiffer gains would track no better (targets are smooth) and press harder on what is touched.
+    arm_stiffness, arm_damping, arm_force_limit = 2e3, 1.5e2, 100.0
     gripper_stiffness, gripper_damping, gripper_force_limit = 1e3, 1e2, 100.0
-    base_stiffness, base_damping, base_force_limit = 1e6, 2e4, 1e5
+    base_stiffness, base_damping, base_force_limit = 4e5, 2e4, 4e3
+    base_max_speed = 0.5  # m/s and rad/s
 
     @property
     def _controller_configs(self) -> dict[str, dict[str, Any]]:
@@ -99,8 +105,10 @@ class RoboCASMobilePanda(BaseAgent):
             **arm,
         )
         arms = dict(
-            pd_joint_pos=PDJointPosControllerConfig(self.arm_joint_names, None, None, normalize_action=False, **arm),
-            pd_joint_delta_pos=PDJointPosControllerConfig(self.arm_joint_names, -0.1, 0.1, use_delta=True, **arm),
+            pd_joint_pos=SmoothJointPosControllerConfig(self.arm_joint_names, None, None, **arm),
+            pd_joint_delta_pos=PDJointPosControllerConfig(
+                self.arm_joint_names, -JOINT_SCALE, JOINT_SCALE, use_delta=True, **arm
+            ),
             pd_ee_delta_pose=RoboCASEEPoseControllerConfig(
                 pos_lower=-POSITION_SCALE,
                 pos_upper=POSITION_SCALE,
@@ -124,8 +132,16 @@ class RoboCASMobilePanda(BaseAgent):
             mimic=mimic,
         )
         held = HeldJointsControllerConfig(self.base_joint_names, **base)
-        moved = PDJointPosControllerConfig(self.base_joint_names, None, None, normalize_action=False, **base)
-        moved_by = PDJointPosControllerConfig(self.base_joint_names, -0.1, 0.1, use_delta=True, **base)
+        base["max_speed"] = self.base_max_speed
+        moved = SmoothJointPosControllerConfig(self.base_joint_names, None, None, **base)
+        moved_by = SmoothJointPosControllerConfig(
+            self.base_joint_names,
+            [-scale for scale in BASE_SCALE],
+            BASE_SCALE,
+            use_delta=True,
+            normalize_action=True,
+            **base,
+        )
         modes = {}
         for name, controller in arms.items():
             modes[name] = dict(arm=controller, gripper=gripper, base=held)
