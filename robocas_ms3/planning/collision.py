@@ -2,16 +2,20 @@
 
 mplib's own ``Planner`` is not used. Its traps that are closed here: numpy 2 ends in a segmentation fault (refused
 first); the voxel size of the cloud is the point spacing; the base pose stays at the origin, since attached bodies
-ignore it; the cloud counts in every check; an attached body is checked against links too, not only the cloud.
+ignore it; the cloud is an object like any other, so no flag can be forgotten; an attached body is checked against the
+cloud, the links and what carries the arm; absolute mesh paths are made relative.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
+from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -24,10 +28,16 @@ ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
 TCP_LINK = "panda_hand_tcp"
 BASE_LINK = "panda_link0"
+CLOUD = "cloud"
 REACH = 1.5  # m; obstacle points further from the arm's base never matter
 BASE_MARGIN = 0.01  # m around panda_link0 within which points of the cloud are cut out
-PEDESTAL_GAP = 0.01  # m between panda_link0's bottom and the solid box that stands for what carries it
-PEDESTAL_DEPTH = 1.0  # m
+# What carries the arm, as solid boxes in the frame of panda_link0: size, centre (m). The pedestal ends 1 cm below
+# panda_link0, which would touch it; the rest holds the mobile base's deck and body, down to the floor and below.
+CARRIER = {
+    "pedestal": ((0.25, 0.20, 0.19), (0.0, 0.0, -0.105)),
+    "mobile_base": ((0.50, 0.40, 0.40), (0.0, 0.0, -0.40)),
+}
+CLOUDS_KEPT = 4  # trees of the last clouds; policies switch between a few of them
 
 
 def require_numpy_1() -> None:
@@ -121,7 +131,6 @@ class ArmWorld:
         if missing:
             raise RobocasError("the description lacks links or joints", where=urdf, expected=", ".join(missing))
         self._robot.set_move_group(TCP_LINK)
-        self._world = PlanningWorld([self._robot], ["robot"], [], [])
         self.tcp_index = links.index(TCP_LINK)
         self.arm_indices = np.array([joints.index(name) for name in ARM_JOINTS])
         self._fingers = np.array([joints.index(name) for name in FINGER_JOINTS if name in joints], dtype=int)
@@ -134,13 +143,20 @@ class ArmWorld:
         names, objects = model.get_collision_link_names(), model.get_collision_objects()
         self._robot.set_qpos(np.zeros(self.state_size), True)
         self._cut_min, self._cut_max = self._bounds([o for n, o in zip(names, objects, strict=True) if n == BASE_LINK])
+        upright = np.array([1.0, 0, 0, 0])
+        carrier = {
+            name: fcl.CollisionObject(fcl.Box(np.array(size)), np.array(center), upright)
+            for name, (size, center) in CARRIER.items()
+        }
+        self._bare = PlanningWorld([self._robot], ["robot"], list(carrier.values()), list(carrier))
+        self._world = PlanningWorld([self._robot], ["robot"], list(carrier.values()), list(carrier))
         # The hand, the fingers and link 7 are rigid with the held object, whose hull may touch them.
-        self._links = [o for n, o in zip(names, objects, strict=True) if n in {f"panda_link{i}" for i in range(7)}]
-        self._link_names = [n for n in names if n in {f"panda_link{i}" for i in range(7)}]
-        self._add_pedestal()
+        movable = {f"panda_link{i}" for i in range(7)}
+        self._body_may_hit = [(n, o) for n, o in zip(names, objects, strict=True) if n in movable] + [*carrier.items()]
         self._request = fcl.CollisionRequest()
-        self._has_points = False
-        self._body = None
+        self._trees: OrderedDict[bytes, Any] = OrderedDict()
+        self._cloud: Any = None
+        self._body: Any = None
         self._object_in_tcp = np.eye(4)
 
     def _bounds(self, objects: list) -> tuple[Array, Array]:
@@ -156,14 +172,6 @@ class ArmWorld:
             corners.append(vertices @ np.array(item.get_rotation()).T + np.array(item.get_translation()))
         points = np.concatenate(corners)
         return points.min(0), points.max(0)
-
-    def _add_pedestal(self) -> None:
-        """Put a solid box under the base: what stands there is cut out of clouds, yet nothing may go there."""
-        top = self._cut_min[2] - PEDESTAL_GAP
-        size = np.array([*(self._cut_max - self._cut_min)[:2], PEDESTAL_DEPTH])
-        center = np.array([*((self._cut_max + self._cut_min) / 2)[:2], top - PEDESTAL_DEPTH / 2])
-        self._pedestal = self._fcl.CollisionObject(self._fcl.Box(size), center, np.array([1.0, 0, 0, 0]))
-        self._world.set_normal_object("pedestal", self._pedestal)
 
     def _full(self, qpos: Array, finger_width: float) -> Array:
         state = np.zeros(self.state_size)
@@ -189,11 +197,18 @@ class ArmWorld:
         points = np.asarray(points_in_base, dtype=np.float64).reshape(-1, 3)
         if not np.isfinite(points).all():
             raise RobocasError("obstacle points must be finite", where="set_scene")
-        points = points[self.keeps(points)]
-        self._has_points = len(points) > 0
-        if self._has_points:
-            self._world.update_point_cloud(points, self._voxel)
-        self._world.set_use_point_cloud(self._has_points)
+        points = np.ascontiguousarray(points[self.keeps(points)])
+        if self._cloud is not None:
+            self._world.remove_normal_object(CLOUD)
+            self._cloud = None
+        if len(points) == 0:
+            return
+        key = hashlib.blake2b(points.data).digest()
+        self._cloud = self._trees.pop(key, None) or self._fcl.CollisionObject(self._fcl.OcTree(points, self._voxel))
+        self._trees[key] = self._cloud
+        if len(self._trees) > CLOUDS_KEPT:
+            self._trees.popitem(last=False)
+        self._world.set_normal_object(CLOUD, self._cloud)
 
     def keeps(self, points: Array) -> NDArray[np.bool_]:
         """Say which points (P, 3) count as obstacles: in reach, and not where the robot's own base stands."""
@@ -207,9 +222,6 @@ class ArmWorld:
     def attach(self, body: AttachedBody | None) -> None:
         """Attach the convex hull of a held object to the TCP, or nothing."""
         if body is None:
-            if self._body is not None:
-                self._world.set_use_attach(False)
-                self._world.remove_attach()
             self._body = None
             return
         from scipy.spatial import ConvexHull
@@ -221,40 +233,32 @@ class ArmWorld:
         used, faces = np.unique(faces, return_inverse=True)
         geometry = self._fcl.Convex(vertices[used], faces.reshape(-1, 3).astype(np.int32))
         self._object_in_tcp = np.asarray(body.object_in_tcp, dtype=np.float64)
-        self._world.update_attached_tool(geometry, self.tcp_index, matrix_to_pose(self._object_in_tcp))
-        self._world.set_use_attach(True)
         self._body = self._fcl.CollisionObject(geometry)
 
     def free(self, qpos: Array, *, cloud: bool = True) -> bool:
         """Say whether a configuration (7,) touches nothing; without ``cloud`` only robot and held object count."""
         self.checks += 1
         self._robot.set_qpos(self._full(qpos, self.finger_width), True)
-        if not cloud and self._has_points:
-            self._world.set_use_point_cloud(False)
-            touches = self._world.collide()
-            self._world.set_use_point_cloud(True)
-        else:
-            touches = self._world.collide()
-        return not touches and not (self._body is not None and self._body_touches())
+        if (self._world if cloud else self._bare).collide():
+            return False
+        return self._body is None or not self._body_touches(cloud=cloud)
 
     def contacts(self, qpos: Array, finger_width: float) -> list[str]:
-        """Name what touches at a configuration (7,): links, 'pedestal', 'cloud', 'attached'."""
+        """Name what touches at a configuration (7,): links, 'pedestal', 'mobile_base', 'cloud', 'attached'."""
         self._robot.set_qpos(self._full(qpos, finger_width), True)
         names: set[str] = set()
         for hit in self._world.collide_full():
             names.update((hit.link_name1, hit.link_name2))
         if self._body is not None:
-            names.update(self._body_touches())
-        renamed = {"point_cloud": "cloud", "attached_tool": "attached"}
-        return sorted({renamed.get(name, name) for name in names})
+            names.update(self._body_touches(cloud=True))
+        return sorted(names)
 
-    def _body_touches(self) -> list[str]:
-        """Name links and pedestal that the held object touches, with 'attached' itself; the joints are set already."""
+    def _body_touches(self, *, cloud: bool) -> list[str]:
+        """Name what the held object touches, with 'attached' itself; the joints are set already."""
         tcp = pose_to_matrix(np.asarray(self.kinematics.get_link_pose(self.tcp_index)))
-        assert self._body is not None
         self._body.set_transformation(matrix_to_pose(tcp @ self._object_in_tcp))
-        pairs = zip([*self._link_names, "pedestal"], [*self._links, self._pedestal], strict=True)
-        hits = [name for name, item in pairs if self._fcl.collide(self._body, item, self._request).is_collision()]
+        others = self._body_may_hit + ([(CLOUD, self._cloud)] if cloud and self._cloud is not None else [])
+        hits = [name for name, item in others if self._fcl.collide(self._body, item, self._request).is_collision()]
         return [*hits, "attached"] if hits else []
 
 

@@ -1,7 +1,7 @@
 """Which annotated grasps to try, and in what order: geometry only, no simulator.
 
-A grasp is a pose of the TCP: z approach, y closing direction. Turned by 180 deg about its approach it is the same grasp with
-another turn of the wrist, so both are candidates.
+A grasp is a pose of the TCP: z approach, y closing direction. Turned by 180 deg about its approach it is the same grasp
+with another turn of the wrist, so both are candidates.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ MAX_SIDEWAYS_DEG = 45.0  # of the approach's horizontal direction from that of b
 FREE_LEAN_DEG = 15.0  # an approach this close to straight down has no horizontal direction to speak of
 PREGRASP_DISTANCE = 0.1  # m
 
-# The open gripper in the TCP frame, one half of it (the other is mirrored at y = 0): low and high corner, m. Upstream uses
-# fingers 0.04..0.045 x +-0.01 x -0.09..0 and a palm +-0.1 x +-0.02 x -0.18..-0.09. These are the same parts of the Panda
-# with 3 cm longer fingers: pads reach 8 mm beyond the TCP, knuckles and hand stand wider and lower than upstream's boxes.
+# The open gripper in the TCP frame, one half of it (the other is mirrored at y = 0): low and high corner, m. Upstream
+# uses fingers 0.04..0.045 x +-0.01 x -0.09..0 and a palm +-0.1 x +-0.02 x -0.18..-0.09. These are the same parts of the
+# Panda with 3 cm longer fingers: pads reach 8 mm beyond the TCP; knuckles and hand are wider and lower than upstream's.
 GRIPPER_BOXES = np.array(
     [
         ((-0.010, 0.040, -0.040), (0.010, 0.046, 0.0085)),  # tip
@@ -161,7 +161,7 @@ def rank_grasps(
     """Order grasps, good ones first, with some chance so that a retry tries others.
 
     The score adds quality (relative to the best), nearness of the TCP to the object's centre (falls by e every 3 cm),
-    steepness (1 straight down, 0 level) and nearness in joint space (falls by e every rad of the joint that turns most).
+    steepness (1 straight down, 0 level), nearness in joint space (falls by e every rad of the joint that turns most).
 
     Args:
         tcp: (N, 4, 4) in any upright frame.

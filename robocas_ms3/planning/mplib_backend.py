@@ -17,6 +17,7 @@ CHECKS_PER_SECOND = 10_000  # turns a planning time into a budget of collision c
 SPACING = 0.03  # rad between checks while searching
 FINE_SPACING = 0.01  # rad between checks of the final path
 CORNER_RADII = (0.3, 0.1, 0.03)  # rad; smaller ones are tried when a rounded corner touches something
+DETOUR = 1.5  # a straight motion to another goal is taken when not longer than this times the nearest (+ 0.5 rad)
 SHORTCUTS = 40
 STILL = 1e-6  # rad; a shorter motion is none
 
@@ -54,7 +55,8 @@ class MplibPlanner:
             raise RobocasError("the time step must be positive", where="dt", found=dt)
         self._world = ArmWorld(urdf, srdf, voxel=voxel)
         self._kinematics = ArmKinematics(self._world)
-        self._velocity, self._acceleration, self._dt = velocity_limit, acceleration_limit, dt
+        self._dt = dt
+        self._limits = {"velocity": velocity_limit, "acceleration": acceleration_limit, "dt": dt}
         self._budget = int(planning_time * CHECKS_PER_SECOND)
         self._search = PathSearch(
             self._world.free, self._kinematics.lower, self._kinematics.upper, step=rrt_range, spacing=SPACING
@@ -92,7 +94,7 @@ class MplibPlanner:
         return self._world.tcp(qpos)
 
     def collisions(self, qpos: Array, finger_width: float = 0.08) -> list[str]:
-        """Name what touches at a configuration (7,): links, 'pedestal', 'cloud', 'attached'. Empty: free."""
+        """Name what touches at a configuration (7,): links, 'pedestal', 'mobile_base', 'cloud', 'attached'."""
         return self._world.contacts(np.asarray(qpos, dtype=np.float64), finger_width)
 
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
@@ -133,13 +135,21 @@ class MplibPlanner:
             raise PlanningFailed(stage, "goal_in_collision")
         if np.linalg.norm(free[0] - start) < STILL:
             return Trajectory(free[0][None].copy(), self._dt)
+        enough = DETOUR * float(np.linalg.norm(free[0] - start)) + 0.5
         for goal in free:
-            trajectory = self._finish([start, goal]) if self._straight_free(start, goal) else None
-            if trajectory is not None:
-                return trajectory
+            if np.linalg.norm(goal - start) <= enough and self._straight_free(start, goal):
+                return stopping(np.array([start, goal]), **self._limits)
         reason = "rrt_timeout"
-        # The nearest goal alone gets a quick try; all of them together get the full budget.
-        for roots, budget in ((free[:1], self._budget // 10), (free, self._budget)):
+        # The nearest goal alone gets a quick try, then all of them the full budget; a path that slips through something
+        # between two checks is searched again with the spacing of the final check.
+        for roots, budget, spacing in (
+            (free[:1], self._budget // 10, SPACING),
+            (free, self._budget, SPACING),
+            (free, self._budget, FINE_SPACING),
+        ):
+            if spacing == FINE_SPACING and reason == "rrt_timeout":
+                break
+            self._search.spacing = spacing
             path = self._search.connect(start, roots, self._rng, max_checks=budget)
             if path is None:
                 continue
@@ -166,7 +176,8 @@ class MplibPlanner:
         path = through(waypoints)
         if not self._path_free(path, cloud=check_collisions):
             raise PlanningFailed(stage, "straight_line_blocked")
-        trajectory = timed(path, velocity=speed * self._velocity, acceleration=speed * self._acceleration, dt=self._dt)
+        limits = {name: value * speed for name, value in self._limits.items()} | {"dt": self._dt}
+        trajectory = timed(path, **limits)
         if trajectory is None:
             raise PlanningFailed(stage, "timing_failed")
         return trajectory
@@ -195,18 +206,17 @@ class MplibPlanner:
         points = [waypoints[0]]
         points += [b for a, b in zip(waypoints[:-1], waypoints[1:], strict=True) if np.linalg.norm(b - a) > 1e-4]
         points[-1] = waypoints[-1]
-        limits = {"velocity": self._velocity, "acceleration": self._acceleration, "dt": self._dt}
         corners = np.array(points)
-        if len(points) == 2:
-            return stopping(corners, **limits)
+        if len(points) == 2 and self._straight_free(*points):
+            return stopping(corners, **self._limits)
         for radius in CORNER_RADII:
             path = rounded(corners, radius)
             if self._path_free(path):
-                trajectory = timed(path, **limits)
+                trajectory = timed(path, **self._limits)
                 if trajectory is not None:
                     return trajectory
         polyline = [a + (b - a) * s for a, b in zip(corners[:-1], corners[1:], strict=True) for s in _fractions(a, b)]
-        return stopping(corners, **limits) if all(map(self._world.free, polyline)) else None
+        return stopping(corners, **self._limits) if all(map(self._world.free, polyline)) else None
 
 
 def _fractions(a: Array, b: Array) -> Array:

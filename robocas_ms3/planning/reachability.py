@@ -40,8 +40,8 @@ SCATTERED_RESTARTS = 12  # the last group, all over the joint space, always the 
 class Reachability:
     """Batched damped least squares; starts are fixed, so that answers repeat.
 
-    pytorch-kinematics reads the chain. The Jacobian is evaluated in numpy: for hundreds of configurations that is several
-    times faster on a shared CPU, and the last bits do not hang on the number of threads.
+    pytorch-kinematics reads the chain. The Jacobian is evaluated in numpy: for hundreds of configurations that is
+    several times faster on a shared CPU, and the last bits do not hang on the number of threads.
 
     Args:
         arm_urdf: the arm alone, rooted at ``panda_link0``, with the TCP as ``panda_hand_tcp``.

@@ -61,7 +61,7 @@ class PathSearch:
 
     def __init__(self, valid: Valid, lower: Array, upper: Array, *, step: float, spacing: float) -> None:
         self._valid, self._lower, self._upper = valid, lower, upper
-        self._step, self._spacing = step, spacing
+        self._step, self.spacing = step, spacing
         self._left = 0
 
     def _check(self, qpos: Array) -> bool:
@@ -72,7 +72,7 @@ class PathSearch:
 
     def edge_free(self, a: Array, b: Array) -> bool:
         """Check the straight edge from ``a`` (taken as free) to ``b``; the middle first, where failures are likely."""
-        count = max(1, int(np.ceil(np.linalg.norm(b - a) / self._spacing)))
+        count = max(1, int(np.ceil(np.linalg.norm(b - a) / self.spacing)))
         return all(self._check(a + (b - a) * (i / count)) for i in _spread(count))
 
     def connect(
