@@ -1,13 +1,14 @@
 """Does depth agree with the cameras' intrinsics and poses? Pure maths, robust against occlusion and thin edges.
 
-Two laws hold in any scene. Nothing lies below the floor, and what is near the floor lies on it. And a surface point one
+Three laws hold in any scene. Nothing lies below the floor, and what is near the floor lies on it. A surface point one
 camera sees is, seen from another camera, at the depth stored there or hidden by something nearer: no camera looks
-through a surface that another one saw. Wrong poses, intrinsics, axes or units break one of them.
+through a surface that another one saw. And all cameras look at the workspace, so each shares something with another.
+Wrong poses, intrinsics, axes or units break one of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,15 +53,33 @@ class View:
         return local @ self.camera_in_world[:3, :3].T + self.camera_in_world[:3, 3]
 
 
-def check(views: list[View]) -> Iterator[tuple[str, str, str]]:
-    """Check what the cameras saw at one step; gives (camera, expected, found) for each broken law."""
-    clouds = {view.camera: view.points() for view in views}
-    for view in views:
-        yield from _floor(view.camera, clouds[view.camera])
-    for view in views:
-        for other in views:
-            if other is not view:
-                yield from _through(clouds[other.camera], other.camera, view)
+def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]]:
+    """Check what the cameras saw at some steps of an episode.
+
+    Args:
+        steps: the views of each of these steps.
+
+    Yields:
+        (index into ``steps``, camera, expected, found) of each broken law, each law once a camera.
+    """
+    told: set[tuple[str, str]] = set()
+    overlapping: set[str] = set()
+    for index, views in enumerate(steps):
+        clouds = {view.camera: view.points() for view in views}
+        broken = [law for view in views for law in _floor(view.camera, clouds[view.camera])]
+        for view in views:
+            for other in views:
+                if other is not view:
+                    count, *shares = compare(clouds[other.camera], view)
+                    if count >= MIN_POINTS:
+                        overlapping |= {view.camera, other.camera}
+                        broken += _disagreement(view.camera, other.camera, count, *shares)
+        for camera, expected, found in broken:
+            if (camera, expected) not in told:
+                told.add((camera, expected))
+                yield index, camera, expected, found
+    for camera in {view.camera for views in steps for view in views} - overlapping:
+        yield 0, camera, "a view that shares something with another camera's", "nothing shared"
 
 
 def _floor(camera: str, points: Array) -> Iterator[tuple[str, str, str]]:
@@ -107,11 +126,8 @@ def compare(points: Array, view: View) -> tuple[int, float, float]:
     return len(z), float(np.mean(through)), float(np.mean(agree))
 
 
-def _through(points: Array, source: str, view: View) -> Iterator[tuple[str, str, str]]:
-    count, through, agree = compare(points, view)
-    if count < MIN_POINTS:
-        return
+def _disagreement(camera: str, other: str, count: int, through: float, agree: float) -> Iterator[tuple[str, str, str]]:
     if through > SEEN_THROUGH:
-        yield view.camera, f"no looking through what {source} sees", f"{through:.0%} of {count} points seen through"
+        yield camera, f"no looking through what {other} sees", f"{through:.0%} of {count} points seen through"
     if agree < AGREEING:
-        yield view.camera, f"depth that agrees with {source}'s", f"{agree:.0%} of {count} points agree"
+        yield camera, f"depth that agrees with {other}'s", f"{agree:.0%} of {count} points agree"

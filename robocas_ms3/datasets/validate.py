@@ -222,7 +222,7 @@ def _cameras(folder: Path, cameras: dict[str, tuple[NDArray, NDArray]]) -> Itera
             else:
                 found[name] = array.astype(np.float64)
         poses = [found[name] for name in camera.pose_files if name in found]
-        if len(poses) == 2 and not np.allclose(*poses, atol=1e-6):
+        if len(poses) == 2 and not np.allclose(poses[0], poses[1], atol=1e-6):
             file = f"{folder.name}/{camera.name}/{camera.pose_files[1]}"
             yield Violation(file, "", f"the same as {camera.pose_files[0]}", "another pose")
         elif len(found) == 3:
@@ -268,19 +268,17 @@ def _geometry(
 ) -> Iterator[Violation]:
     base = to_matrices(arrays["base_pos"].astype(np.float64), arrays["base_orn"].astype(np.float64))
     ee = base @ to_matrices(arrays["ee_pos"].astype(np.float64), arrays["ee_orn"].astype(np.float64))
-    seen: set[tuple[str, str]] = set()
-    for step in sorted({round(step) for step in np.linspace(0, steps - 1, _GEOMETRY_STEPS)}):
+    chosen = sorted({round(step) for step in np.linspace(0, steps - 1, _GEOMETRY_STEPS)})
+    seen: list[list[geometry.View]] = []
+    for step in chosen:
         parents = {"ee": ee[step], "arm_base": base[step], "world": np.eye(4)}
-        views = []
+        seen.append([])
         for camera in schema.CAMERAS:
             intrinsic, pose = cameras[camera.name]
             path = schema.image_path(folder, camera.name, "depth", step)
-            depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            shown = f"{folder.name}/{camera.name}/depth/{step:04d}.png"
+            depth = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), dtype=np.uint16)
             if not depth.any():
-                yield Violation(shown, "", "depth", "only zeros")
-            views.append(geometry.View(camera.name, depth, intrinsic, parents[camera.parent] @ pose))
-        for camera_name, expected, found in geometry.check(views):
-            if (camera_name, expected) not in seen:  # once an episode is enough
-                seen.add((camera_name, expected))
-                yield Violation(f"{folder.name}/{camera_name}/depth/{step:04d}.png", "", expected, found)
+                yield Violation(f"{folder.name}/{camera.name}/depth/{step:04d}.png", "", "depth", "only zeros")
+            seen[-1].append(geometry.View(camera.name, depth, intrinsic, parents[camera.parent] @ pose))
+    for index, camera_name, expected, found in geometry.check(seen):
+        yield Violation(f"{folder.name}/{camera_name}/depth/{chosen[index]:04d}.png", "", expected, found)

@@ -1,0 +1,77 @@
+"""``robocas convert``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass
+class Convert:
+    """Write a dataset from a trajectory file made by ``robocas generate``."""
+
+    trajectory: Annotated[Path, tyro.conf.Positional]
+    """F.h5, with F.json beside it."""
+    out: Path
+    """Folder of the dataset."""
+    to: Literal["robocas"] = "robocas"
+    """Format of the dataset."""
+    rate: float = 5.0
+    """Steps a second; must divide the control frequency."""
+    embeddings: bool = True
+    """Embed instruction and sub-goals (needs the extra 'language')."""
+    video: bool = True
+    """Write a video of each episode and a contact sheet into OUT/preview."""
+    size: tuple[int, int] | None = None
+    """Width and height of the pictures; default: the cameras' own, 640 480."""
+    include_failed: bool = False
+    """Also convert episodes without success."""
+    overwrite: bool = False
+    """Replace the dataset that is there."""
+    resume: bool = False
+    """Go on with a conversion that was interrupted."""
+    jobs: int = 1
+    """Processes that render."""
+
+
+def main(cfg: Convert) -> int:
+    """Convert, with a progress bar; gives the exit code."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from robocas_ms3.datasets.convert import convert
+    from robocas_ms3.datasets.video import write_previews
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("episodes", total=None)
+        done = convert(
+            cfg.trajectory,
+            cfg.out,
+            rate_hz=cfg.rate,
+            embeddings=cfg.embeddings,
+            size=cfg.size,
+            include_failed=cfg.include_failed,
+            overwrite=cfg.overwrite,
+            resume=cfg.resume,
+            jobs=cfg.jobs,
+            on_start=lambda count: progress.update(bar, total=count),
+            on_episode=lambda _: progress.advance(bar),
+        )
+        if cfg.video:
+            videos = progress.add_task("videos", total=len(done.episodes) + done.kept)
+            write_previews(cfg.out, on_video=lambda _: progress.advance(videos))
+    steps = sum(episode.steps for episode in done.episodes)
+    megabytes = sum(episode.size for episode in done.episodes) / 1e6
+    each = done.seconds / max(1, len(done.episodes))
+    kept = f", {done.kept} kept" if done.kept else ""
+    Console().print(
+        f"{cfg.out}: {len(done.episodes)} episodes{kept}, {steps} steps, {megabytes:.0f} MB, {each:.1f} s an episode",
+        soft_wrap=True,
+        highlight=False,
+    )
+    return 0

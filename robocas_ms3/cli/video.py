@@ -1,0 +1,46 @@
+"""``robocas video``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass
+class Video:
+    """Write videos and a contact sheet of a RoboCAS dataset."""
+
+    dataset: Annotated[Path, tyro.conf.Positional]
+    """Folder of the dataset."""
+    out: Path | None = None
+    """Folder to write to; default: DATASET/preview."""
+    episodes: tuple[int, ...] = ()
+    """Numbers of episodes; default: all."""
+    kind: Literal["rgb", "depth"] = "rgb"
+    """What to show; depth is shown in colours."""
+    speed: float = 1.0
+    """1 is real time."""
+
+
+def main(cfg: Video) -> int:
+    """Write them; gives the exit code."""
+    from rich.console import Console
+
+    from robocas_ms3.datasets.reader import Dataset
+    from robocas_ms3.datasets.schema import PREVIEW_FOLDER, episode_folder
+    from robocas_ms3.datasets.video import contact_sheet, write_video
+
+    dataset = Dataset(cfg.dataset)
+    out = cfg.out or cfg.dataset / PREVIEW_FOLDER
+    numbers = list(cfg.episodes) or dataset.numbers
+    suffix = "" if cfg.kind == "rgb" else f"_{cfg.kind}"
+    console = Console(soft_wrap=True, highlight=False)
+    for number in numbers:
+        path = out / f"{episode_folder(number)}{suffix}.mp4"
+        console.print(str(write_video(dataset, number, path, speed=cfg.speed, kind=cfg.kind)))
+    sheet = out / f"contact_sheet{suffix}.png"
+    console.print(str(contact_sheet(cfg.dataset, sheet, episodes=cfg.episodes or None, kind=cfg.kind)))
+    return 0

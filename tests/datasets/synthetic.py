@@ -1,0 +1,185 @@
+"""A small made-up recording, and a ray caster that shows it: trajectories and frames without a simulator."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.datasets.episode import invert, to_matrices, wxyz_to_xyzw
+from robocas_ms3.datasets.writer import CameraModel, Frame
+
+STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one
+SIZE = (64, 48)
+TABLE = ((0.3, 0.6, 0.0), (1.5, 1.4, 0.61))
+ROOM = ((-3.0, -3.0, 0.0), (3.0, 3.0, 4.0))
+HALF = 0.05  # of the cubes on the table
+COLOURS = np.array([[90, 90, 90], [200, 160, 100], [220, 40, 40], [40, 200, 60], [40, 60, 220]], np.uint8)
+
+
+def pose(xyz, rotation=None):
+    matrix = np.eye(4)
+    matrix[:3, 3] = xyz
+    if rotation is not None:
+        matrix[:3, :3] = rotation.as_matrix()
+    return matrix
+
+
+def looking(eye, at):
+    """OpenCV camera (x right, y down, z forward) at a place, looking at another, not rolled."""
+    z = np.subtract(at, eye) / np.linalg.norm(np.subtract(at, eye))
+    x = np.cross(z, [0, 0, 1])
+    x /= np.linalg.norm(x)
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([x, np.cross(z, x), z, eye])
+    return matrix
+
+
+def robot_frames(robot_state):
+    """Made-up kinematics: arm base and TCP in the world from (13 + 24,) of a state."""
+    root = to_matrices(robot_state[:3].astype(float), wxyz_to_xyzw(robot_state[3:7].astype(float)))
+    q = robot_state[13:25].astype(float)
+    base = root @ pose([q[0], q[1], 0.49], Rotation.from_euler("z", q[2]))
+    tcp = pose(
+        [0.55 + 0.1 * q[4], 0.3 * q[3], 0.35 + 0.1 * q[6]], Rotation.from_euler("ZX", [q[9], np.pi + 0.1 * q[8]])
+    )
+    return base, base @ tcp
+
+
+CAMERA_IN_PARENT = {
+    "base_camera": looking([0.1, 0.3, 1.2], [0.8, 0.0, 0.0]),
+    "gripper_camera": pose([0.06, 0.0, -0.1]),
+    "static_camera": looking([1.0, 1.8, 1.6], [0.85, 0.8, 0.5]),
+}
+
+
+class RayCaster:
+    """A ``FrameSource``: floor, room, table and a cube for each actor."""
+
+    gripper_column = 7
+    finger_range = (-0.01, 0.04)
+
+    def __init__(self, env_info, control_mode, size):
+        self.size = size or SIZE
+        self.closed = False
+
+    def load(self, recording):
+        pass
+
+    def close(self):
+        self.closed = True
+
+    def cameras(self):
+        return {name: CameraModel(self.intrinsic(), camera) for name, camera in CAMERA_IN_PARENT.items()}
+
+    def intrinsic(self):
+        width, height = self.size
+        return np.array([height / 2, height / 2, width / 2, height / 2])  # 90 deg upright
+
+    def frames(self, recording, samples):
+        for index in samples:
+            state = recording.state(int(index))
+            base, tcp = robot_frames(state["articulations"]["robocas_mobile_panda"][0])
+            parents = {"base_camera": base, "gripper_camera": tcp, "static_camera": np.eye(4)}
+            boxes = [TABLE] + [(p[0, :3] - HALF, p[0, :3] + HALF) for p in state["actors"].values()]
+            pictures = {n: self.shoot(parents[n] @ camera, boxes) for n, camera in CAMERA_IN_PARENT.items()}
+            yield Frame({n: p[0] for n, p in pictures.items()}, {n: p[1] for n, p in pictures.items()}, tcp, base)
+
+    def shoot(self, camera_in_world, boxes):
+        width, height = self.size
+        fx, fy, cx, cy = self.intrinsic()
+        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones_like(rows)], -1) @ camera_in_world[:3, :3].T
+        eye = camera_in_world[:3, 3]
+        hit, depth = np.zeros((height, width), int), slab(eye, rays, ROOM)[1]
+        for index, box in enumerate(boxes):
+            near, far = slab(eye, rays, box)
+            in_front = (near < far) & (near > 0.001) & (near < depth)
+            depth = np.where(in_front, near, depth)
+            hit[in_front] = index + 1
+        return COLOURS[hit % len(COLOURS)], np.round(depth * 1000).astype(np.uint16)
+
+
+def slab(eye, rays, box):
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = ((np.asarray(corner) - eye) / rays for corner in box)
+    return np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
+
+
+def make_states(seed, steps=STEPS):
+    """States 0..S of a robot that reaches out, and of three cubes of which the first is lifted."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0, 1, steps + 1)[:, None]
+    qpos = np.zeros((steps + 1, 12))
+    qpos[:, 3:10] = rng.uniform(-0.5, 0.5, 7) + t * rng.uniform(-0.6, 0.6, 7)
+    qpos[:, 10:] = np.where(t < 0.4, 0.04, 0.02)
+    robot = np.zeros((steps + 1, 37), np.float32)
+    robot[:, :3] = 0.7, 0.15, 0.0
+    robot[:, 3:7] = np.sqrt(0.5), 0, 0, np.sqrt(0.5)  # wxyz: 90 deg about z
+    robot[:, 13:25] = qpos
+    robot[:-1, 25:] = np.diff(qpos, axis=0) * 20
+    actors = {}
+    for index in range(3):
+        actors[f"object_{index}"] = cube = np.zeros((steps + 1, 13), np.float32)
+        cube[:, :3] = 0.6 + 0.25 * index, 0.8 + 0.3 * rng.random(), 0.66
+        cube[:, 3] = 1
+    actors["object_0"][:, 2] += 0.2 * np.clip(t[:, 0] - 0.5, 0, 1)
+    return {"actors": actors, "articulations": {"robocas_mobile_panda": robot}}
+
+
+def write_trajectory(path: Path, seeds=(3, 4, 5), failed=(), steps=STEPS):
+    """Write ``F.h5`` and ``F.json`` in the generator's form; gives the path."""
+    episodes = []
+    with h5py.File(path, "w") as file:
+        for number, seed in enumerate(seeds):
+            group = file.create_group(f"traj_{number}")
+            states = make_states(seed, steps)
+            for kind, arrays in states.items():
+                for name, array in arrays.items():
+                    group.create_dataset(f"env_states/{kind}/{name}", data=array)
+            actions = np.zeros((steps, 8), np.float32)
+            actions[:, :7] = states["articulations"]["robocas_mobile_panda"][1:, 16:23]
+            actions[:, 7] = np.where(np.arange(steps) < 9, 1, -1)
+            group.create_dataset("actions", data=actions)
+            for flag in ("success", "terminated", "truncated"):
+                group.create_dataset(flag, data=np.zeros(steps, bool))
+            episodes.append(
+                {
+                    "episode_id": number,
+                    "episode_seed": seed,
+                    "control_mode": "pd_joint_pos",
+                    "elapsed_steps": steps,
+                    "reset_kwargs": {"seed": seed},
+                    "success": number not in failed,
+                    "robocas": {
+                        "instruction": f"grasp the cube {seed} on the table and move it to the basket",
+                        "target": {"slot": 0, "asset_id": "cube", "name": f"cube {seed}"},
+                        "support": "table",
+                        "subgoals": [
+                            {
+                                "goal_type": "move and grasp",
+                                "goal_description": f"grasp the cube {seed} on the table",
+                                "goal_range": [0, 11],
+                            },
+                            {
+                                "goal_type": "transfer object",
+                                "goal_description": f"Drop the cube {seed} into the basket",
+                                "goal_range": [12, steps - 1],
+                            },
+                        ],
+                    },
+                }
+            )
+    metadata = {
+        "env_info": {"env_id": "robocas_ms3:RoboCASPick-v1", "env_kwargs": {"control_mode": "pd_joint_pos"}},
+        "episodes": episodes,
+        "robocas": {"control_freq": 20, "versions": {"robocas_ms3": "0.1.0"}},
+    }
+    path.with_suffix(".json").write_text(json.dumps(metadata))
+    return path
+
+
+__all__ = ["RayCaster", "invert", "make_states", "write_trajectory"]
