@@ -3,20 +3,16 @@
 mplib's own ``Planner`` is not used. Its traps that are closed here: numpy 2 ends in a segmentation fault (refused
 first); the voxel size of the cloud is the point spacing; the base pose stays at the origin, since attached bodies
 ignore it; the cloud is an object like any other, so no flag can be forgotten; an attached body is checked against the
-cloud, the links and what carries the arm; absolute mesh paths are made relative.
+cloud, the links and what carries the arm.
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
+import itertools
 from collections import OrderedDict
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,15 +24,10 @@ ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
 TCP_LINK = "panda_hand_tcp"
 BASE_LINK = "panda_link0"
+STATIC_LINKS = (BASE_LINK, "base_link")  # the second one, what carries the arm, may be missing
 CLOUD = "cloud"
 REACH = 1.5  # m; obstacle points further from the arm's base never matter
-BASE_MARGIN = 0.01  # m around panda_link0 within which points of the cloud are cut out
-# What carries the arm, as solid boxes in the frame of panda_link0: size, centre (m). The pedestal ends 1 cm below
-# panda_link0, which would touch it; the rest holds the mobile base's deck and body, down to the floor and below.
-CARRIER = {
-    "pedestal": ((0.25, 0.20, 0.19), (0.0, 0.0, -0.105)),
-    "mobile_base": ((0.50, 0.40, 0.40), (0.0, 0.0, -0.40)),
-}
+BASE_MARGIN = 0.015  # m around the parts that never move within which points of the cloud are cut out
 CLOUDS_KEPT = 4  # trees of the last clouds; policies switch between a few of them
 
 
@@ -85,20 +76,6 @@ def matrix_to_pose(matrix: Array) -> Array:
     return np.concatenate([matrix[:3, 3], quaternion])
 
 
-@contextmanager
-def relative_meshes(urdf: Path | str) -> Iterator[Path]:
-    """Yield a copy of a URDF whose mesh paths are relative, since mplib puts the file's folder before absolute ones."""
-    source = Path(urdf).resolve()
-    tree = ElementTree.parse(source)
-    with tempfile.TemporaryDirectory() as folder:
-        for mesh in tree.iterfind(".//mesh"):
-            # An absolute path stays itself when joined to the folder.
-            mesh.set("filename", os.path.relpath(source.parent / mesh.attrib["filename"], Path(folder).resolve()))
-        copy = Path(folder).resolve() / source.name
-        tree.write(copy)
-        yield copy
-
-
 class ArmWorld:
     """The arm, the obstacles and the held object.
 
@@ -120,10 +97,17 @@ class ArmWorld:
         from mplib.pymp.collision_detection import fcl
 
         self._fcl, self._voxel = fcl, voxel
-        with relative_meshes(urdf) as relative:
+        try:
             self._robot = ArticulatedModel(
-                str(relative), str(srdf), np.array([0, 0, -9.81]), [], [], convex=True, verbose=False
+                str(urdf), str(srdf), np.array([0, 0, -9.81]), [], [], convex=True, verbose=False
             )
+        except ValueError as error:
+            raise RobocasError(
+                "mplib can't load this description",
+                where=urdf,
+                expected="meshes by relative path, each with its hull beside it (NAME.convex.stl)",
+                found=str(error).splitlines()[0],
+            ) from error
         self.kinematics = self._robot.get_pinocchio_model()
         links, joints = self.kinematics.get_link_names(), self.kinematics.get_joint_names()
         missing = [name for name in (BASE_LINK, TCP_LINK) if name not in links]
@@ -142,36 +126,18 @@ class ArmWorld:
         model = self._robot.get_fcl_model()
         names, objects = model.get_collision_link_names(), model.get_collision_objects()
         self._robot.set_qpos(np.zeros(self.state_size), True)
-        self._cut_min, self._cut_max = self._bounds([o for n, o in zip(names, objects, strict=True) if n == BASE_LINK])
-        upright = np.array([1.0, 0, 0, 0])
-        carrier = {
-            name: fcl.CollisionObject(fcl.Box(np.array(size)), np.array(center), upright)
-            for name, (size, center) in CARRIER.items()
-        }
-        self._bare = PlanningWorld([self._robot], ["robot"], list(carrier.values()), list(carrier))
-        self._world = PlanningWorld([self._robot], ["robot"], list(carrier.values()), list(carrier))
+        parts = list(zip(names, objects, strict=True))
+        self._cut = [_bounds(part) for name, part in parts if name in STATIC_LINKS]
+        self._bare = PlanningWorld([self._robot], ["robot"], [], [])
+        self._world = PlanningWorld([self._robot], ["robot"], [], [])
         # The hand, the fingers and link 7 are rigid with the held object, whose hull may touch them.
-        movable = {f"panda_link{i}" for i in range(7)}
-        self._body_may_hit = [(n, o) for n, o in zip(names, objects, strict=True) if n in movable] + [*carrier.items()]
+        hittable = {*STATIC_LINKS, *(f"panda_link{i}" for i in range(7))}
+        self._body_may_hit = [(name, part) for name, part in parts if name in hittable]
         self._request = fcl.CollisionRequest()
         self._trees: OrderedDict[bytes, Any] = OrderedDict()
         self._cloud: Any = None
         self._body: Any = None
         self._object_in_tcp = np.eye(4)
-
-    def _bounds(self, objects: list) -> tuple[Array, Array]:
-        """Give the box around collision objects in the base frame, as corners (3,) and (3,)."""
-        corners = []
-        for item in objects:
-            geometry = item.get_collision_geometry()
-            if hasattr(geometry, "get_vertices"):
-                vertices = np.array(geometry.get_vertices())
-            else:
-                half = np.array(geometry.side) / 2
-                vertices = half * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-            corners.append(vertices @ np.array(item.get_rotation()).T + np.array(item.get_translation()))
-        points = np.concatenate(corners)
-        return points.min(0), points.max(0)
 
     def _full(self, qpos: Array, finger_width: float) -> Array:
         state = np.zeros(self.state_size)
@@ -193,7 +159,7 @@ class ArmWorld:
         return pose_to_matrix(np.asarray(self.kinematics.get_link_pose(self.tcp_index)))
 
     def set_points(self, points_in_base: Array) -> None:
-        """Replace the cloud by points (P, 3); those at and under the robot's own base, or out of reach, are dropped."""
+        """Replace the cloud by points (P, 3); those in the robot's own base or out of reach are dropped."""
         points = np.asarray(points_in_base, dtype=np.float64).reshape(-1, 3)
         if not np.isfinite(points).all():
             raise RobocasError("obstacle points must be finite", where="set_scene")
@@ -212,12 +178,10 @@ class ArmWorld:
 
     def keeps(self, points: Array) -> NDArray[np.bool_]:
         """Say which points (P, 3) count as obstacles: in reach, and not where the robot's own base stands."""
-        below = points[:, 2] <= self._cut_max[2] + BASE_MARGIN
-        inside = np.all(
-            (points[:, :2] >= self._cut_min[:2] - BASE_MARGIN) & (points[:, :2] <= self._cut_max[:2] + BASE_MARGIN),
-            axis=1,
-        )
-        return ~(below & inside) & (np.linalg.norm(points, axis=1) <= REACH)
+        keep = np.linalg.norm(points, axis=1) <= REACH
+        for low, high in self._cut:
+            keep &= ~np.all((points >= low - BASE_MARGIN) & (points <= high + BASE_MARGIN), axis=1)
+        return keep
 
     def attach(self, body: AttachedBody | None) -> None:
         """Attach the convex hull of a held object to the TCP, or nothing."""
@@ -244,7 +208,7 @@ class ArmWorld:
         return self._body is None or not self._body_touches(cloud=cloud)
 
     def contacts(self, qpos: Array, finger_width: float) -> list[str]:
-        """Name what touches at a configuration (7,): links, 'pedestal', 'mobile_base', 'cloud', 'attached'."""
+        """Name what touches at a configuration (7,): links, 'cloud', 'attached'."""
         self._robot.set_qpos(self._full(qpos, finger_width), True)
         names: set[str] = set()
         for hit in self._world.collide_full():
@@ -265,3 +229,14 @@ class ArmWorld:
 def _normals(vertices: Array, faces: NDArray[np.int_]) -> Array:
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     return np.cross(b - a, c - a)
+
+
+def _bounds(part: Any) -> tuple[Array, Array]:
+    """Give the box around a collision object in the base frame: low and high corner (3,), m."""
+    geometry = part.get_collision_geometry()
+    if hasattr(geometry, "get_vertices"):
+        vertices = np.array(geometry.get_vertices())
+    else:
+        vertices = np.array(geometry.side) / 2 * np.array(list(itertools.product((-1, 1), repeat=3)))
+    points = vertices @ np.array(part.get_rotation()).T + np.array(part.get_translation())
+    return points.min(axis=0), points.max(axis=0)

@@ -94,7 +94,7 @@ class MplibPlanner:
         return self._world.tcp(qpos)
 
     def collisions(self, qpos: Array, finger_width: float = 0.08) -> list[str]:
-        """Name what touches at a configuration (7,): links, 'pedestal', 'mobile_base', 'cloud', 'attached'."""
+        """Name what touches at a configuration (7,): links, 'cloud', 'attached'."""
         return self._world.contacts(np.asarray(qpos, dtype=np.float64), finger_width)
 
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
