@@ -35,7 +35,7 @@ class LightConfig(StrictModel):
     ambient: Annotated[float, Field(ge=0, le=2)] = 0.4
     directional: Annotated[float, Field(ge=0, le=10)] = 1.0
     direction: Vec3 = (0.3, 0.6, -1.0)
-    shadow: bool = Field(False, description="doubles the cost of a frame on a CPU")
+    shadow: bool = Field(default=False, description="doubles the cost of a frame on a CPU")
 
 
 class FurnitureConfig(StrictModel):
@@ -54,7 +54,7 @@ class SurfaceConfig(StrictModel):
 
     furniture: str = Field(description="key in `furniture`")
     name: str = Field(description="surface of that furniture")
-    min_xy: Vec2 | None = Field(None, description="none: the whole surface")
+    min_xy: Vec2 | None = Field(default=None, description="none: the whole surface")
     max_xy: Vec2 | None = None
 
     @model_validator(mode="after")
@@ -70,23 +70,23 @@ class ScatteredLayout(StrictModel):
     """Objects apart from each other, each in a stable pose, at a random yaw."""
 
     kind: Literal["scattered"]
-    min_gap: Annotated[float, Field(ge=0, le=0.2)] = Field(0.02, description="free space between two objects, m")
+    min_gap: Annotated[float, Field(ge=0, le=0.2)] = Field(default=0.02, description="space between two objects, m")
     max_tries: Annotated[int, Field(ge=1)] = 2000
 
 
 class ObjectsConfig(StrictModel):
     """Which objects are on the surface."""
 
-    ids: list[str] | Literal["all"] = Field("all", description="asset ids of the object pack")
+    ids: list[str] | Literal["all"] = Field(default="all", description="asset ids of the object pack")
     count: Annotated[int, Field(ge=1, le=64)] = 10
 
 
 class TargetConfig(StrictModel):
     """Which of the objects may be the target."""
 
-    min_grasps: Annotated[int, Field(ge=1)] = Field(20, description="fewer annotated grasps: never the target")
+    min_grasps: Annotated[int, Field(ge=1)] = Field(default=20, description="fewer annotated grasps: never the target")
     max_distance: Annotated[float, Field(gt=0)] = Field(
-        0.8, description="horizontal distance from the arm's base to the object's centre, m"
+        default=0.8, description="horizontal distance from the arm's base to the object's centre, m"
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import h5py
@@ -29,7 +29,7 @@ class EpisodeRecorder(RecordEpisode):
 
     def __init__(self, env: gym.Env, folder: Path, name: str) -> None:
         super().__init__(
-            env,
+            cast(Any, env),
             output_dir=str(folder),
             trajectory_name=name,
             save_video=False,

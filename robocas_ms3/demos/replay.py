@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -124,7 +124,7 @@ def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env
         *_, info = env.step(action if convert is None else convert(action))
         if use_env_states:
             base_env.set_state_dict(state)
-    error = None if convert else state_distance(base_env.get_state_dict(), states[-1])
+    error = None if convert else state_distance(cast(Any, base_env.get_state_dict()), states[-1])
     return Replay(episode["episode_id"], int(episode["episode_seed"]), bool(info["success"][0]), error)
 
 

@@ -62,6 +62,10 @@ class Planner(Protocol):
     def attach(self, body: AttachedBody | None) -> None:
         """Attach a held object to the TCP, or nothing."""
 
+    def tcp(self, qpos: Array) -> Array:
+        """Forward kinematics: (7,) -> 4x4 TCP in the arm's base frame."""
+        ...
+
     def collisions(self, qpos: Array, finger_width: float = 0.08) -> list[str]:
         """Name what touches at a configuration: links, 'cloud', 'attached'. Empty: free."""
 

@@ -89,7 +89,7 @@ def sample_scattered(
                 if placed and shapely.distance(polygon, placed).min() < min_gap:
                     continue
                 placed.append(polygon)
-                poses[index] = planar_pose(*position, region.z, yaw) @ placeable.resting_poses[choice]
+                poses[index] = planar_pose(position[0], position[1], region.z, yaw) @ placeable.resting_poses[choice]
                 break
             else:
                 break  # no room for this one: start over

@@ -150,7 +150,7 @@ class RoboCASEnv(BaseEnv):
             count = len(env_idx)
             rest = torch.as_tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32)
             self.agent.reset(rest.repeat(count, 1))
-            self.agent.robot.set_pose(Pose.create(sapien.Pose(build.fixture_pose(self.task_config.robot))))
+            self.agent.robot.set_pose(sapien.Pose(build.fixture_pose(self.task_config.robot)))
             self.fixtures.basket.set_pose(Pose.create(sapien.Pose(self._basket_pose())))
             poses, targets = self._sample_layouts(env_idx)
             for slot, actor in enumerate(self.objects):

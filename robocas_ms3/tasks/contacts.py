@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Link
+from sapien.physx import PhysxCpuSystem
 
 
 def contact_forces(scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor]) -> torch.Tensor:
@@ -23,7 +25,7 @@ def contact_forces(scene: ManiSkillScene, bodies: Sequence[Actor | Link], object
     forces = torch.zeros(1, len(bodies), len(objects), 3)
     body_index = {b._bodies[0].entity.per_scene_id: i for i, b in enumerate(bodies)}
     object_index = {o._bodies[0].entity.per_scene_id: i for i, o in enumerate(objects)}
-    for contact in scene.px.get_contacts():
+    for contact in cast(PhysxCpuSystem, scene.px).get_contacts():
         first, second = (part.entity.per_scene_id for part in contact.bodies)
         if first in body_index and second in object_index:
             key, sign = (body_index[first], object_index[second]), 1.0

@@ -10,7 +10,11 @@ BOX = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.02, 0.02) for z in
 
 def drops(**changes):
     arguments = dict(
-        count=200, container_in_base=CONTAINER, inner_low=LOW, inner_high=HIGH, vertices_in_tcp=BOX,
+        count=200,
+        container_in_base=CONTAINER,
+        inner_low=LOW,
+        inner_high=HIGH,
+        vertices_in_tcp=BOX,
         center_in_tcp=np.array([0, 0, 0.05]),
     )
     return sample_drops(np.random.default_rng(0), **{**arguments, **changes})

@@ -211,18 +211,23 @@ class PickSolver:
         failure = PlanningFailed("transfer", "no_plan")
         for index in np.argsort(np.abs(qpos - start).max(axis=1))[: self.settings.drops_planned]:
             try:
-                return self.planner.plan_to_pose(start, drops[index], stage="transfer")
+                carry = self.planner.plan_to_pose(start, drops[index], stage="transfer")
+                self._plan_retreat(carry.qpos[-1], drops[index])  # no way up from there: no place to let go
+                return carry
             except PlanningFailed as error:
                 failure = error
         raise failure
+
+    def _plan_retreat(self, start: Array, tcp_in_base: Array) -> Trajectory:
+        goal = raised(tcp_in_base, self.settings.retreat_height)
+        return self.planner.plan_straight(start, goal, stage="retreat", check_collisions=False)
 
     def _release(self, executor: Executor, scene: PlanningScene, slot: int, end: Array) -> None:
         executor.move_gripper(OPEN, end, seconds=self.settings.open_seconds)
         with executor.seconds.spent_on("planning"):
             self.planner.attach(None)
             self.planner.set_scene(scene.obstacles_in_base(without=slot))
-            goal = raised(scene.tcp_in_base, self.settings.retreat_height)
-            retreat = self.planner.plan_straight(end, goal, stage="retreat", check_collisions=False)
+            retreat = self._plan_retreat(end, self.planner.tcp(end))
             home = self.planner.plan_to_qpos(retreat.qpos[-1], [np.array(ARM_REST)], stage="home")
         executor.follow(retreat)
         # The object settles while the arm goes home; the demonstration ends as soon as it lies still.
