@@ -1,0 +1,42 @@
+"""An empty environment with the robot."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+ROBOT = "robocas_mobile_panda"
+YAW_90 = [np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
+
+
+@pytest.fixture
+def make_env():
+    """A function that makes ManiSkill's empty environment with the robot, turned by 90 deg, at a keyframe."""
+    import mani_skill.envs  # noqa: F401
+    import sapien
+
+    import robocas_ms3.robots.mobile_panda  # noqa: F401
+
+    made = []
+
+    def make(control_mode="pd_joint_pos", keyframe="evaluation", control_freq=20, robot=ROBOT, obs_mode="none"):
+        env = gym.make(
+            "Empty-v1",
+            robot_uids=robot,
+            control_mode=control_mode,
+            obs_mode=obs_mode,
+            render_backend="none",
+            sim_config=dict(sim_freq=100, control_freq=control_freq),
+        )
+        made.append(env)
+        env.reset(seed=0)
+        agent = env.unwrapped.agent
+        agent.robot.set_pose(sapien.Pose([0.7, 0.15, 0], YAW_90))
+        agent.reset(agent.keyframes[keyframe].qpos)
+        agent.controller.reset()
+        return env, agent
+
+    yield make
+    for env in made:
+        env.close()

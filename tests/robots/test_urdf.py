@@ -1,0 +1,191 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from robot_checks import link_poses, numbers
+
+import robocas_ms3.robots
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.robots import constants as c
+from robocas_ms3.robots.urdf import robot_files
+
+REST = dict(zip(c.ARM_JOINTS, c.ARM_REST, strict=True))
+EVALUATION = dict(zip(c.ARM_JOINTS, c.ARM_EVALUATION_START, strict=True))
+
+
+def python(code: str, **env: str) -> subprocess.Popen:
+    env = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1", **env}
+    return subprocess.Popen(
+        [sys.executable, "-c", code], env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def output(process: subprocess.Popen) -> str:
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    return out.strip()
+
+
+def test_active_joints_have_the_reference_order_and_limits():
+    joints = [j for j in ET.parse(robot_files().urdf).getroot().iterfind("joint") if j.get("type") != "fixed"]
+    limits = {j.get("name"): (float(j.find("limit").get("lower")), float(j.find("limit").get("upper"))) for j in joints}
+    assert set(limits) == set(c.JOINTS)
+    assert [j.get("name") for j in joints][:3] == list(c.BASE_JOINTS)
+    expected = c.BASE_LIMITS + c.ARM_LIMITS + c.FINGER_LIMITS
+    for name, limit in zip(c.JOINTS, expected, strict=True):
+        assert limits[name] == pytest.approx(limit, abs=1e-9), name
+    assert c.BASE_LIMITS[2] == pytest.approx((-3.14159265, 1.57079633))
+    assert {j.get("name"): j.get("type") for j in joints}["base_yaw_joint"] == "revolute"
+
+
+def test_heights_above_the_floor():
+    poses = link_poses(robot_files().urdf, REST)
+    assert poses["base_link"][2, 3] == pytest.approx(0.26)
+    assert poses["panda_link0"][:3, 3] == pytest.approx([0, 0, 0.49])
+    # The evaluation start holds the TCP 0.29 m above the 0.61 m table, which is why the base link stands 0.26 m high.
+    assert link_poses(robot_files().urdf, EVALUATION)["panda_hand_tcp"][2, 3] - 0.61 == pytest.approx(0.287, abs=2e-3)
+
+
+def test_base_joints_move_x_then_y_then_turn():
+    poses = link_poses(robot_files().urdf, dict(base_x_joint=0.3, base_y_joint=-0.2, base_yaw_joint=np.pi / 2))
+    assert poses["base_link"][:3, 3] == pytest.approx([0.3, -0.2, 0.26])
+    assert poses["base_link"][:3, 0] == pytest.approx([0, 1, 0], abs=1e-9)
+
+
+@pytest.mark.parametrize(("extension", "distance"), [(0.03, 0.1334), (0.0, 0.1034)])
+def test_tcp_is_in_front_of_the_hand_and_not_turned(extension, distance):
+    poses = link_poses(robot_files(extension).urdf, REST)
+    tcp_in_hand = np.linalg.inv(poses["panda_hand"]) @ poses["panda_hand_tcp"]
+    expected = np.eye(4)
+    expected[2, 3] = distance
+    assert tcp_in_hand == pytest.approx(expected, abs=1e-9)
+
+
+def collision_boxes(urdf: Path, link: str) -> list[tuple[np.ndarray, np.ndarray]]:
+    element = ET.parse(urdf).getroot().find(f"link[@name='{link}']")
+    return [
+        (numbers(x.find("geometry/box").get("size")), numbers(x.find("origin").get("xyz")))
+        for x in element.iterfind("collision")
+        if x.find("geometry/box") is not None
+    ]
+
+
+def test_finger_tips_meet_in_the_middle_and_reach_8_mm_beyond_the_tcp():
+    urdf = robot_files().urdf
+    poses = link_poses(urdf, {})
+    tips = {link: collision_boxes(urdf, link)[-1] for link in c.FINGER_LINKS}
+    for (size, centre), side in zip(tips.values(), (1, -1), strict=True):
+        assert size == pytest.approx([0.018, 0.004, 0.055])
+        assert side * centre[1] - size[1] / 2 == pytest.approx(0)  # inner face at the finger's y = 0
+    finger_in_tcp = np.linalg.inv(poses["panda_hand_tcp"]) @ poses["panda_leftfinger"]
+    assert finger_in_tcp[:2, 3] == pytest.approx([0, 0], abs=1e-9)  # closed: both at the TCP's y = 0
+    size, centre = tips["panda_leftfinger"]
+    assert finger_in_tcp[2, 3] + centre[2] + size[2] / 2 == pytest.approx(0.008)
+    assert len(collision_boxes(robot_files(0.0).urdf, "panda_leftfinger")) == 4  # stock: no tip
+
+
+def test_base_body_stays_off_the_floor_and_the_pedestal_carries_the_arm():
+    boxes = collision_boxes(robot_files().urdf, "base_link")
+    assert min(centre[2] - size[2] / 2 for size, centre in boxes) + 0.26 == pytest.approx(0.01)
+    pedestal = [(size, centre) for size, centre in boxes if size == pytest.approx([0.25, 0.2, 0.2])]
+    assert len(pedestal) == 1
+    assert pedestal[0][1] == pytest.approx([0, 0, 0.13])
+
+
+def test_arm_urdf_is_the_same_arm_rooted_at_its_base():
+    files = robot_files()
+    whole = link_poses(files.urdf, EVALUATION)
+    arm = link_poses(files.arm_urdf, EVALUATION)
+    for link in ("panda_hand_tcp", "panda_leftfinger", "base_link"):
+        assert arm[link] == pytest.approx(np.linalg.inv(whole["panda_link0"]) @ whole[link], abs=1e-9)
+    children = {joint.find("child").get("link") for joint in ET.parse(files.arm_urdf).getroot().iterfind("joint")}
+    assert "panda_link0" not in children
+
+
+SELF_COLLISIONS = """
+import sys
+import numpy as np
+from mplib.pymp import ArticulatedModel, PlanningWorld
+from robocas_ms3.robots import constants as c
+from robocas_ms3.robots.urdf import robot_files
+files = robot_files()
+arm = ArticulatedModel(str(files.arm_urdf), str(files.arm_srdf), [0, 0, -9.81], [], [], convex=True, verbose=False)
+world = PlanningWorld([arm], ["robot"], [], [])
+arm.set_move_group("panda_hand_tcp")
+reaching, into_base, folded = (0, 0.6, 0, -1.5, 0, 2.1, 0.78), (0, 1.7, 0, -1.6, 0, 1.5, 0), (0, -1, 0, -3.05, 0, 0, 0)
+for qpos in (c.ARM_REST, c.ARM_EVALUATION_START, reaching, into_base, folded):
+    pairs = set()
+    for finger in (0.0, 0.04):
+        arm.set_qpos(np.array([*qpos, finger, finger]), True)
+        pairs |= {"+".join(sorted((x.link_name1, x.link_name2))) for x in world.self_collide()}
+    print(" ".join(sorted(pairs)) or "free")
+"""
+
+
+def test_srdf_reports_true_self_collisions_only():
+    # In a child process: mplib crashes outright where it dislikes its surroundings.
+    rest, evaluation, reaching, into_base, folded = output(python(SELF_COLLISIONS)).splitlines()
+    assert rest == evaluation == reaching == "free"
+    assert "base_link+panda_hand" in into_base
+    assert "base_link" not in folded
+    assert "panda_link" in folded  # the hand on the shoulder
+
+
+def test_files_are_made_once_and_again_when_damaged(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path))
+    files = robot_files()
+    assert files.folder.parent == tmp_path / "robots"
+    stamp = files.urdf.stat().st_mtime_ns
+    assert robot_files() == files
+    assert files.urdf.stat().st_mtime_ns == stamp
+    mesh = files.folder / "visual" / "hand.glb"
+    mesh.unlink()
+    assert robot_files() == files
+    assert mesh.is_file()
+    assert [path.name for path in files.folder.parent.iterdir()] == [files.folder.name]  # nothing left behind
+    assert robot_files(0.0).folder != files.folder
+    for path in ET.parse(files.urdf).getroot().iter("mesh"):
+        assert (files.folder / path.get("filename")).is_file()
+
+
+def test_two_processes_at_once(tmp_path):
+    code = "from robocas_ms3.robots.urdf import robot_files; print(robot_files().urdf)"
+    both = [python(code, ROBOCAS_CACHE=str(tmp_path)) for _ in range(2)]
+    first, second = (output(process) for process in both)
+    assert first == second
+    assert Path(first).is_file()
+    assert len(list((tmp_path / "robots").iterdir())) == 1
+
+
+def test_unusable_cache_is_a_one_line_error(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "file"))
+    with pytest.raises(RobocasError, match="can't make this folder") as error:
+        robot_files()
+    assert "\n" not in str(error.value)
+
+
+def test_negative_extension_is_an_error():
+    with pytest.raises(RobocasError, match=r"expected >= 0 m, found -0.01"):
+        robot_files(-0.01)
+
+
+def test_imports_write_nothing_and_the_urdf_needs_no_sapien(tmp_path):
+    code = (
+        "import sys, robocas_ms3.robots.urdf; print('sapien' in sys.modules, 'mani_skill' in sys.modules);"
+        "import robocas_ms3.robots.mobile_panda"
+    )
+    cache = tmp_path / "cache"
+    assert output(python(code, ROBOCAS_CACHE=str(cache))).splitlines()[0] == "False False"
+    assert not cache.exists()
+
+
+def test_the_package_holds_no_meshes():
+    folder = Path(robocas_ms3.robots.__file__).parent
+    assert {path.suffix for path in folder.rglob("*") if path.is_file()} <= {".py", ".pyc"}
