@@ -85,7 +85,6 @@ class Dataset:
             DatasetError: there is none of this number.
         """
         if number not in self.numbers:
-            raise DatasetError(
-                "no such episode", where=self.root, expected=f"one of {self.numbers[0]} to {self.numbers[-1]}", found=number
-            )
+            known = f"{self.numbers[0]} to {self.numbers[-1]}"
+            raise DatasetError("no such episode", where=self.root, expected=known, found=number)
         return Episode(self.root / schema.episode_folder(number))

@@ -114,14 +114,14 @@ class TrajectoryFile:
                 found=_reason(error),
                 fix="Generate it again.",
             ) from error
-        expected = {f"traj_{episode['episode_id']}" for episode in self.episodes}
-        if expected != set(self._file):
+        listed, stored = {f"traj_{episode['episode_id']}" for episode in self.episodes}, set(self._file)
+        if listed != stored:
             self.close()
             raise DatasetError(
                 "HDF5 and JSON do not list the same episodes",
                 where=self.path,
-                expected=f"{len(expected)} of the JSON",
-                found=f"{len(set(self._file))}, {len(expected ^ set(self._file))} of them differ",
+                expected=f"{len(listed)} of the JSON",
+                found=f"{len(stored)}, {len(listed ^ stored)} of them differ",
             )
 
     def __enter__(self) -> TrajectoryFile:

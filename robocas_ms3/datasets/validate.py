@@ -68,14 +68,16 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
     numbers = {n: folder for folder in sorted(root.iterdir()) if (n := schema.episode_number(folder.name)) is not None}
     violations: list[Violation] = []
     loaded: dict[int, dict[str, NDArray]] = {}
+    embedded: set[bool] = set()
     for done, (number, folder) in enumerate(numbers.items()):
         arrays: dict[str, NDArray] = {}
         violations += _episode(root, folder, arrays)
         loaded[number] = {k: v for k, v in arrays.items() if not k.endswith(("_embs", "_embedding"))}
-        loaded[number]["embedded"] = np.array("language_embedding" in arrays)
+        if arrays:
+            embedded.add("language_embedding" in arrays)
         if on_episode:
             on_episode(done + 1, len(numbers))
-    if len({bool(arrays["embedded"]) for arrays in loaded.values()}) > 1:
+    if len(embedded) > 1:
         violations.append(Violation("", "language_embedding", "in all episodes or none", "in some"))
     violations += check_info(root, loaded)
     steps = sum(len(arrays["ee_pos"]) for arrays in loaded.values() if np.ndim(arrays.get("ee_pos", 0)))

@@ -1,0 +1,39 @@
+import shutil
+
+import pytest
+from synthetic import RayCaster, write_trajectory
+
+from robocas_ms3.datasets.convert import convert
+
+
+@pytest.fixture(scope="session")
+def trajectory(tmp_path_factory):
+    return write_trajectory(tmp_path_factory.mktemp("trajectory") / "F.h5", seeds=(3, 4, 5), failed=(1,))
+
+
+def made_up_vectors(file, chosen):
+    """Unit vectors in place of sentence embeddings, which take seconds to load."""
+    import numpy as np
+
+    texts = {
+        text
+        for index in chosen
+        for text in [file.recording(index).instruction, *(g.goal_description for g in file.recording(index).subgoals)]
+    }
+    return {text: np.eye(384, dtype=np.float32)[number] for number, text in enumerate(sorted(texts))}
+
+
+@pytest.fixture(scope="session")
+def made(trajectory, tmp_path_factory):
+    """A dataset of two episodes that nobody may change."""
+    out = tmp_path_factory.mktemp("made") / "dataset"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("robocas_ms3.datasets.convert._embed_all", made_up_vectors)
+        convert(trajectory, out, open_source=RayCaster)
+    return out
+
+
+@pytest.fixture
+def dataset(made, tmp_path):
+    """A copy to spoil."""
+    return shutil.copytree(made, tmp_path / "dataset")

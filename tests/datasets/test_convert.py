@@ -1,0 +1,222 @@
+import json
+import os
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from synthetic import STEPS, RayCaster, robot_frames, write_trajectory
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.episode import to_matrices
+from robocas_ms3.datasets.trajectory import TrajectoryFile
+from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
+
+
+def run(trajectory, out, **kwargs):
+    return convert(trajectory, out, embeddings=False, open_source=RayCaster, **kwargs)
+
+
+def files_of(root):
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def test_the_folder_is_the_schemas(made):
+    names = {path.name for path in made.iterdir()}
+    assert names == {"data_info.json", "conversion.json", "episode_0000000", "episode_0000001"}
+    episode = made / "episode_0000001"
+    assert {path.name for path in episode.iterdir()} == {
+        "episode_info.npz", "base_camera", "gripper_camera", "static_camera",
+    }  # fmt: skip
+    for camera, parent in (("base", "arm_base"), ("gripper", "ee"), ("static", "world")):
+        folder = episode / f"{camera}_camera"
+        assert {path.name for path in folder.iterdir()} == {
+            f"cam_pos_wrt_{parent}.npy", f"cam_pose_wrt_{parent}.npy", "intrinsic.npy", "rgb", "depth",
+        }  # fmt: skip
+        # 22 control steps with a stride of 4: states 0, 4, ..., 20 and 22.
+        for kind in ("rgb", "depth"):
+            assert sorted(path.name for path in (folder / kind).iterdir()) == [f"{i:04d}.png" for i in range(7)]
+        np.testing.assert_array_equal(np.load(folder / "intrinsic.npy"), [24, 24, 32, 24])
+
+
+def test_failed_episodes_stay_out_and_are_numbered_without_a_gap(made, trajectory, tmp_path):
+    info = json.loads((made / "data_info.json").read_text())
+    assert set(info) == set(schema.DATA_INFO)
+    assert sorted(info["train_eps"] + info["val_eps"]) == [0, 1]
+    assert len(info["val_eps"]) == 1
+    assert info["ep_length"] == {"0": 7, "1": 7}
+    assert info["language_goal"]["1"] == "grasp the cube 5 on the table and move it to the basket"
+    # Actions 0..11 and 12..21: states 0, 4, 8 and 12, 16, 20, 22.
+    assert [goal["goal_range"] for goal in info["step_goals"]["0"]] == [[0, 2], [3, 6]]
+    record = json.loads((made / "conversion.json").read_text())
+    assert [(e["trajectory_episode"], e["seed"]) for e in record["episodes"].values()] == [(0, 3), (2, 5)]
+    assert record["rate_hz"] == 5
+    assert len(run(trajectory, tmp_path / "all", include_failed=True).episodes) == 3
+
+
+def test_arrays_are_those_of_the_sampled_states(made, trajectory):
+    samples = [0, 4, 8, 12, 16, 20, 22]
+    with TrajectoryFile(trajectory) as file:
+        robot = file.recording(2).states["articulations"]["robocas_mobile_panda"][samples]
+    with np.load(made / "episode_0000001" / "episode_info.npz", allow_pickle=False) as arrays:
+        np.testing.assert_array_equal(arrays["robot_joints"], robot[:, 16:23])
+        base = to_matrices(arrays["base_pos"], arrays["base_orn"])
+        ee = base @ to_matrices(arrays["ee_pos"], arrays["ee_orn"])
+        # Actions 0..8 open; state 8 was reached by action 7, state 12 by action 11.
+        assert arrays["gripper_status"].tolist() == [True, True, True, False, False, False, False]
+    for row, state in enumerate(robot):
+        expected_base, expected_tcp = robot_frames(state)
+        np.testing.assert_allclose(base[row], expected_base, atol=1e-5)
+        np.testing.assert_allclose(ee[row], expected_tcp, atol=1e-5)
+
+
+def test_pictures_are_what_was_seen(made, trajectory):
+    source = RayCaster({}, "pd_joint_pos", None)
+    with TrajectoryFile(trajectory) as file:
+        frame = list(source.frames(file.recording(2), np.array([0, 4, 8, 12, 16, 20, 22])))[3]
+    for camera in frame.rgb:
+        folder = made / "episode_0000001" / camera
+        rgb = cv2.cvtColor(cv2.imread(str(folder / "rgb" / "0003.png"), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGR2RGB)
+        np.testing.assert_array_equal(rgb, frame.rgb[camera])
+        depth = cv2.imread(str(folder / "depth" / "0003.png"), cv2.IMREAD_UNCHANGED)
+        assert depth.dtype == np.uint16
+        np.testing.assert_array_equal(depth, frame.depth[camera])
+
+
+def test_the_released_loader_reads_it(made):
+    """What the released loader does with paths and keys, on our files."""
+    info = json.loads((made / "data_info.json").read_text())
+    for index in info["train_eps"] + info["val_eps"]:
+        episode = os.path.join(made, "episode_%07d" % index)  # noqa: UP031
+        data = np.load(os.path.join(episode, "episode_info.npz"))
+        length = info["ep_length"][str(index)]
+        actions = data["gripper_status"].astype(float).reshape(-1, 1)[1:length]
+        assert len(np.concatenate([actions, actions[-1:]])) == length == len(data["rel_pos"])
+        assert data["language_embedding"][np.newaxis].repeat(6, axis=0).shape == (6, 384)
+        for goal in info["step_goals"][str(index)]:
+            start, end = goal["goal_range"]
+            assert data["step_goal_embs"][start : end + 1].shape == (end + 1 - start, 384)
+        for camera in ("static", "base", "gripper"):
+            assert os.path.isfile("%s/%s_camera/rgb/%04d.png" % (episode, camera, length - 1))  # noqa: UP031
+
+
+def test_without_embeddings_and_at_another_rate(trajectory, tmp_path):
+    run(trajectory, tmp_path / "out", rate_hz=10)
+    with np.load(tmp_path / "out" / "episode_0000000" / "episode_info.npz") as arrays:
+        assert "language_embedding" not in arrays
+        assert len(arrays["rel_pos"]) == STEPS // 2 + 1
+
+
+def test_processes_write_the_same(made, trajectory, tmp_path):
+    out = tmp_path / "out"
+    run(trajectory, out, jobs=2)
+    run(trajectory, tmp_path / "one", jobs=1)
+    assert files_of(out) == files_of(tmp_path / "one")
+
+
+def test_resume_keeps_what_is_there(trajectory, tmp_path):
+    out = tmp_path / "out"
+    run(trajectory, out)
+    before = files_of(out)
+    (out / "data_info.json").unlink()
+    (out / "episode_0000001" / "episode_info.npz").rename(out / "gone")
+    (out / "gone").unlink()
+    for path in sorted((out / "episode_0000001").rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    (out / "episode_0000001").rmdir()
+    kept = (out / "episode_0000000" / "episode_info.npz").stat().st_mtime_ns
+    done = run(trajectory, out, resume=True)
+    assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
+    assert files_of(out) == before
+    assert (out / "episode_0000000" / "episode_info.npz").stat().st_mtime_ns == kept
+    with pytest.raises(DatasetError, match="can't resume with other settings .found different rate_hz"):
+        run(trajectory, out, resume=True, rate_hz=10)
+    assert files_of(out) == before
+
+
+def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
+    out = tmp_path / "out"
+    run(trajectory, out)
+    before = files_of(out)
+    with pytest.raises(OutputExistsError, match="--resume to go on, --overwrite to replace"):
+        run(trajectory, out, rate_hz=10)
+    with pytest.raises(DatasetError):
+        run(tmp_path / "missing.h5", out, overwrite=True)
+    assert files_of(out) == before
+    run(trajectory, out, overwrite=True, rate_hz=10)
+    assert len(list((out / "episode_0000000" / "base_camera" / "rgb").iterdir())) == STEPS // 2 + 1
+
+
+def test_overwrite_deletes_datasets_only(trajectory, tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(DatasetError, match="refusing to overwrite what is not a dataset"):
+        run(trajectory, tmp_path, overwrite=True)
+    assert (tmp_path / "thesis.tex").exists()
+
+
+def fails(match, trajectory, out, **kwargs):
+    with pytest.raises(RobocasError, match=match) as caught:
+        run(trajectory, out, **kwargs)
+    assert "\n" not in str(caught.value)
+    assert not Path(out).exists()
+
+
+def test_errors_leave_nothing_behind(trajectory, tmp_path):
+    out = tmp_path / "out"
+    fails("no such trajectory file", tmp_path / "missing.h5", out)
+    fails("the rate must divide the control frequency", trajectory, out, rate_hz=3)
+    failed = write_trajectory(tmp_path / "failed.h5", seeds=(1, 2), failed=(0, 1))
+    fails("no successful episodes to convert .found 2 episodes.*--include-failed", failed, out)
+    fails("no episodes to convert", write_trajectory(tmp_path / "empty.h5", seeds=()), out)
+    cut = write_trajectory(tmp_path / "cut.h5")
+    cut.write_bytes(cut.read_bytes()[:-5000])
+    fails("cut off", cut, out)
+    broken = write_trajectory(tmp_path / "broken.h5", seeds=(1,))
+    with h5py.File(broken, "a") as file:
+        del file["traj_0/env_states"]
+    fails("this episode is damaged", broken, out)
+
+
+def test_an_episode_that_breaks_leaves_the_ones_before(trajectory, tmp_path):
+    class Breaking(RayCaster):
+        def frames(self, recording, samples):
+            for index, frame in enumerate(super().frames(recording, samples)):
+                if recording.seed == 5 and index == 3:
+                    raise DatasetError("it broke")
+                yield frame
+
+    out = tmp_path / "out"
+    with pytest.raises(DatasetError, match="it broke"):
+        convert(trajectory, out, embeddings=False, open_source=Breaking)
+    assert {path.name for path in out.iterdir()} == {"conversion.json", "episode_0000000"}
+    run(trajectory, out, resume=True)
+    assert {path.name for path in out.iterdir()} == {
+        "conversion.json", "data_info.json", "episode_0000000", "episode_0000001",
+    }  # fmt: skip
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_that_is_not_writable(trajectory, tmp_path):
+    tmp_path.chmod(0o555)
+    with pytest.raises(RobocasError, match="can't make this folder"):
+        run(trajectory, tmp_path / "out")
+
+
+def test_a_file_where_a_folder_should_be(trajectory, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RobocasError, match="can't make this folder"):
+        run(trajectory, tmp_path / "file" / "out")
+
+
+def test_no_render_device_is_said_before_anything_is_written(trajectory, tmp_path, monkeypatch):
+    import sapien
+
+    def no_device(*_):
+        raise RuntimeError("failed to find a rendering device")
+
+    monkeypatch.setattr(sapien.render, "RenderMaterial", no_device)
+    with pytest.raises(DatasetError, match="no render device. Run scripts/setup.sh or install a Vulkan driver"):
+        convert(trajectory, tmp_path / "out", embeddings=False)
+    assert not (tmp_path / "out").exists()

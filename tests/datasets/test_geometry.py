@@ -1,0 +1,57 @@
+import numpy as np
+
+from robocas_ms3.datasets.geometry import View, check, compare
+
+
+def overhead(height, *, depth=None, size=80, shift=0.0):
+    """A camera at (shift, 0, height) that looks straight down on the floor, x as the world's."""
+    pose = np.diag([1.0, -1, -1, 1])
+    pose[:3, 3] = shift, 0, height
+    depth = height if depth is None else depth
+    picture = np.full((size, size), round(depth * 1000), np.uint16)
+    return View("overhead", picture, np.full(4, size / 2), pose)
+
+
+def test_points_by_hand():
+    # 90 deg: pixel (20, 20)'s corner is the centre; a pixel is 2 m / 40 = 5 cm wide at 1 m.
+    points = overhead(1.0, size=40).points(step=1)
+    assert points.shape == (1600, 3)
+    np.testing.assert_allclose(points[0], [-0.975, 0.975, 0], atol=1e-9)
+    np.testing.assert_allclose(points[:, 2], 0, atol=1e-9)
+
+
+def test_nothing_seen_gives_no_points():
+    view = overhead(1.0, size=40)
+    view.depth[10:20] = 0
+    assert len(view.points(step=1)) == 1200
+
+
+def test_compare_by_hand():
+    floor = overhead(2.0).points(step=1)
+    assert compare(floor, overhead(1.0))[1:] == (0.0, 1.0)
+    # 10 cm too deep: it looks through the floor. 10 cm too near: something may hide the floor.
+    assert compare(floor, overhead(1.0, depth=1.1))[1:] == (1.0, 0.0)
+    assert compare(floor, overhead(1.0, depth=0.9))[1:] == (0.0, 0.0)
+    assert compare(floor + [50, 0, 0], overhead(1.0)) == (0, 0.0, 0.0)
+
+
+def test_floor():
+    assert [law[2] for law in check([[overhead(1.0, depth=1.1)]])] == [
+        "nothing below the floor",
+        "floor at height 0",
+        "a view that shares something with another camera's",
+    ]
+    assert [law[2] for law in check([[overhead(1.0, depth=0.9)]])][0] == "floor at height 0"
+
+
+def test_two_right_views_and_one_wrong():
+    low, high, moved = overhead(1.0), overhead(2.0, shift=0.2), overhead(1.5, depth=1.56)
+    named = [
+        View(name, v.depth, v.intrinsic, v.camera_in_world) for name, v in zip("abc", (low, high, moved), strict=True)
+    ]
+    assert list(check([named[:2]])) == []
+    # The third one's floor is 6 cm below the others'.
+    broken = list(check([named[:2], named]))
+    assert {index for index, *_ in broken} == {1}
+    assert ("c", "floor at height 0") in {(camera, expected) for _, camera, expected, _ in broken}
+    assert ("c", "no looking through what a sees") in {(camera, expected) for _, camera, expected, _ in broken}

@@ -1,0 +1,30 @@
+from pathlib import Path
+
+from robocas_ms3.datasets import schema
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "dataset.md"
+
+
+def test_the_documentation_is_the_schemas():
+    """Every table of the schema stands in docs/dataset.md as it is declared."""
+    text = DOCS.read_text(encoding="utf-8")
+    for table in schema.markdown().split("\n\n"):
+        assert table in text, f"put this into docs/dataset.md:\n{table}"
+
+
+def test_names():
+    assert schema.episode_folder(12) == "episode_0000012"
+    assert schema.episode_number("episode_0000012") == 12
+    for other in ("episode_12", "preview", "episode_00000ab", ".episode_0000012.tmp"):
+        assert schema.episode_number(other) is None
+    path = schema.image_path(Path("episode_0000012"), "base_camera", "rgb", 7)
+    assert path.as_posix() == "episode_0000012/base_camera/rgb/0007.png"
+
+
+def test_keys_are_the_papers_and_upstreams():
+    paper = {
+        "rel_pos", "rel_orn", "ee_pos", "ee_orn", "robot_joints", "arm_joint_vel", "base_pos", "base_orn",
+        "base_rel_pos", "base_rel_orn", "gripper_width", "gripper_status", "episode_length", "language_goal",
+        "language_embedding", "step_lang_goals", "step_goal_embs", "step_goal_type",
+    }  # fmt: skip
+    assert {spec.name for spec in schema.EPISODE_INFO} == paper | {"agv_pose", "rel_agv_pose"}

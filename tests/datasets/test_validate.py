@@ -1,0 +1,303 @@
+"""A clean dataset has no violations; each way of spoiling it is reported by file, key and reason."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from robocas_ms3.datasets.schema import EPISODE_INFO
+from robocas_ms3.datasets.validate import validate
+from robocas_ms3.errors import DatasetError
+
+NPZ = "episode_0000001/episode_info.npz"
+
+
+def arrays_of(root):
+    with np.load(root / NPZ) as content:
+        return {key: content[key] for key in content.files}
+
+
+def change(root, **new):
+    arrays = {**arrays_of(root), **new}
+    np.savez(root / NPZ, **{key: array for key, array in arrays.items() if array is not None})
+
+
+def change_info(root, edit):
+    path = root / "data_info.json"
+    info = json.loads(path.read_text())
+    edit(info)
+    path.write_text(json.dumps(info))
+
+
+def change_array(path, edit):
+    np.save(path, edit(np.load(path)))
+
+
+def change_depth(root, edit, camera="base_camera"):
+    for path in (root / "episode_0000001" / camera / "depth").iterdir():
+        cv2.imwrite(str(path), edit(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+
+
+def found(root):
+    report = validate(root)
+    assert report.as_json()["valid"] is (not report.violations)
+    return [str(violation) for violation in report.violations]
+
+
+def assert_only(root, *texts):
+    """Each violation is one of the texts, and each text was found."""
+    violations = found(root)
+    for text in texts:
+        assert any(text in violation for violation in violations), f"{text!r} not in {violations}"
+    for violation in violations:
+        assert any(text in violation for text in texts), violation
+
+
+def test_a_converted_dataset_is_valid(made):
+    report = validate(made)
+    assert report.violations == []
+    assert (report.episodes, report.steps) == (2, 14)
+
+
+def test_no_folder(tmp_path):
+    with pytest.raises(DatasetError, match="no such dataset folder"):
+        validate(tmp_path / "gone")
+
+
+def test_an_empty_folder(tmp_path):
+    assert found(tmp_path) == ["data_info.json: expected this file, found no file"]
+
+
+@pytest.mark.parametrize("spec", EPISODE_INFO, ids=lambda spec: spec.name)
+def test_every_key_is_missed(dataset, spec):
+    change(dataset, **{spec.name: None})
+    assert f"{NPZ}, {spec.name}: expected this key, found no such key" in found(dataset)
+
+
+def test_unknown_keys(dataset):
+    change(dataset, speed=np.zeros(7))
+    assert_only(dataset, f"{NPZ}, speed: expected keys of the schema only")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "text"),
+    [
+        ("ee_pos", np.zeros((7, 3)), "expected float32, found float64"),
+        ("gripper_status", np.ones(7, np.int64), "expected bool, found int64"),
+        ("robot_joints", np.zeros((7, 6), np.float32), "expected shape (7, 7), found shape (7, 6)"),
+        ("gripper_width", np.full(7, np.nan, np.float32), "expected finite numbers, found 7 others"),
+        ("step_lang_goals", np.array([b"x"] * 7), "expected str, found |S1"),
+        ("language_embedding", np.ones(512, np.float32), "expected shape (384,), found shape (512,)"),
+    ],
+)
+def test_types_and_shapes(dataset, key, value, text):
+    change(dataset, **{key: value})
+    assert any(violation.startswith(f"{NPZ}, {key}: {text}") for violation in found(dataset))
+
+
+def test_pickles_are_not_loaded(dataset):
+    change(dataset, language_goal=np.array({"a": 1}, dtype=object))
+    assert any(v.startswith(f"{NPZ}, language_goal: expected an array without pickles") for v in found(dataset))
+
+
+def test_a_damaged_archive(dataset):
+    data = (dataset / NPZ).read_bytes()
+    (dataset / NPZ).write_bytes(data[: len(data) // 2])
+    assert any(v.startswith(f"{NPZ}: expected a numpy archive") for v in found(dataset))
+
+
+def test_quaternions_that_are_no_rotations(dataset):
+    orn = arrays_of(dataset)["ee_orn"]
+    orn[3] *= 1.1
+    change(dataset, ee_orn=orn)
+    assert_only(dataset, f"{NPZ}, ee_orn: expected unit quaternions, found off by 0.1 in row 3")
+
+
+def test_wxyz_is_recognised(dataset):
+    arrays = arrays_of(dataset)
+    change(dataset, **{key: np.roll(arrays[key], 1, axis=1) for key in ("ee_orn", "rel_orn")})
+    assert f"{NPZ}, ee_orn, rel_orn: expected quaternions xyzw, found quaternions wxyz" in found(dataset)
+
+
+def test_relative_motion_stored_a_step_late(dataset):
+    arrays = arrays_of(dataset)
+    change(dataset, **{key: np.roll(arrays[key], 1, axis=0) for key in ("rel_pos", "rel_orn")})
+    violations = found(dataset)
+    assert any(v.startswith(f"{NPZ}, rel_pos: expected the motion between rows of ee_pos, ee_orn") for v in violations)
+    assert any(v.startswith(f"{NPZ}, rel_orn: expected the motion between rows of ee_pos, ee_orn") for v in violations)
+
+
+def test_one_wrong_row_of_the_base(dataset):
+    motion = arrays_of(dataset)["base_rel_pos"]
+    motion[2, 0] += 0.01
+    change(dataset, base_rel_pos=motion)
+    assert_only(dataset, f"{NPZ}, base_rel_pos: expected the motion between rows of base_pos, base_orn, found 1 of 7")
+
+
+def test_values(dataset):
+    arrays = arrays_of(dataset)
+    change(
+        dataset,
+        gripper_width=arrays["gripper_width"] * 10,
+        rel_agv_pose=arrays["rel_agv_pose"] + 0.1,
+        language_embedding=arrays["language_embedding"] * 2,
+    )
+    assert_only(
+        dataset,
+        f"{NPZ}, gripper_width: expected 0 to 0.08 m, found 0.4",
+        f"{NPZ}, rel_agv_pose: expected differences of agv_pose, found off by 0.1",
+        f"{NPZ}, language_embedding: expected unit length, found off by 1",
+    )
+
+
+def test_unknown_sub_goal_types(dataset):
+    kinds = arrays_of(dataset)["step_goal_type"]
+    kinds[:3] = "dance"
+    change(dataset, step_goal_type=kinds)
+    assert any(v.startswith(f"{NPZ}, step_goal_type: expected one of") and v.endswith("dance") for v in found(dataset))
+
+
+def test_embeddings_in_one_episode_only(dataset):
+    change(dataset, language_embedding=None, step_goal_embs=None)
+    assert_only(dataset, "language_embedding: expected in all episodes or none, found in some")
+
+
+def test_pictures(dataset):
+    rgb = dataset / "episode_0000000" / "static_camera" / "rgb"
+    depth = dataset / "episode_0000000" / "static_camera" / "depth"
+    (rgb / "0002.png").unlink()
+    shutil.copy(rgb / "0001.png", rgb / "0007.png")
+    data = (rgb / "0003.png").read_bytes()
+    (rgb / "0003.png").write_bytes(data[:-20])
+    (rgb / "0004.png").write_bytes(data[:200] + bytes([data[200] ^ 1]) + data[201:])
+    picture = cv2.imread(str(rgb / "0005.png"))
+    cv2.imwrite(str(rgb / "0005.png"), picture[:40])
+    cv2.imwrite(str(depth / "0006.png"), np.full((48, 64), 200, np.uint8))
+    place = "episode_0000000/static_camera"
+    assert sorted(found(dataset)) == [
+        f"{place}/depth/0006.png: expected 64 x 48, 1 x 16 bit, found 64 x 48, 1 x 8 bit",
+        f"{place}/rgb/0002.png: expected a picture of every step, found no file",
+        f"{place}/rgb/0003.png: expected a PNG, found PNG cut off",
+        f"{place}/rgb/0004.png: expected a PNG, found damaged PNG",
+        f"{place}/rgb/0005.png: expected 64 x 48, 3 x 8 bit, found 64 x 40, 3 x 8 bit",
+        f"{place}/rgb/0007.png: expected 7 pictures from 0000.png, found a file beyond them",
+    ]
+
+
+def test_camera_files(dataset):
+    folder = dataset / "episode_0000000"
+    (folder / "base_camera" / "intrinsic.npy").unlink()
+    change_array(folder / "gripper_camera" / "cam_pose_wrt_ee.npy", lambda pose: pose + np.eye(4)[:, ::-1] * 0.1)
+    change_array(folder / "static_camera" / "cam_pose_wrt_world.npy", np.linalg.inv)
+    static = "episode_0000000/static_camera/cam_pose_wrt_world.npy"
+    assert sorted(found(dataset)) == [
+        "episode_0000000/base_camera/intrinsic.npy: expected this file, found no file",
+        "episode_0000000/gripper_camera/cam_pose_wrt_ee.npy: expected a rigid transform, found another matrix",
+        f"{static}: expected the same as cam_pos_wrt_world.npy, found another pose",
+    ]
+
+
+def both_poses(root, camera, parent, edit):
+    for name in (f"cam_pos_wrt_{parent}.npy", f"cam_pose_wrt_{parent}.npy"):
+        change_array(root / "episode_0000001" / camera / name, edit)
+
+
+def turned(pose):
+    """By 5 deg about the camera's own x."""
+    c, s = np.cos(np.deg2rad(5)), np.sin(np.deg2rad(5))
+    return pose @ np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("camera", "parent"), [("base_camera", "arm_base"), ("gripper_camera", "ee"), ("static_camera", "world")]
+)
+@pytest.mark.parametrize(
+    "edit",
+    [
+        turned,
+        np.linalg.inv,
+        lambda pose: pose @ np.diag([1.0, -1, -1, 1]),  # OpenGL's camera frame
+        lambda pose: pose @ np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]]).T,  # SAPIEN's
+    ],
+    ids=["turned by 5 deg", "inverted", "OpenGL frame", "SAPIEN frame"],
+)
+def test_wrong_camera_poses_show_in_the_depth(dataset, camera, parent, edit):
+    both_poses(dataset, camera, parent, edit)
+    assert_depth(found(dataset), camera)
+
+
+@pytest.mark.parametrize(
+    ("camera", "edit"),
+    [
+        ("base_camera", lambda depth: depth // 10),
+        ("base_camera", lambda depth: (depth * 1.05).astype(np.uint16)),
+        ("gripper_camera", lambda depth: (depth * 0.9).astype(np.uint16)),
+        ("base_camera", lambda depth: np.ascontiguousarray(depth[:, ::-1])),
+        ("static_camera", lambda depth: depth * 0),
+    ],
+    ids=["centimetres", "5 % too far", "10 % too near", "mirrored", "nothing"],
+)
+def test_wrong_depth(dataset, camera, edit):
+    change_depth(dataset, edit, camera)
+    assert_depth(found(dataset), camera)
+
+
+def test_wrong_intrinsics(dataset):
+    path = dataset / "episode_0000001" / "base_camera" / "intrinsic.npy"
+    change_array(path, lambda intrinsic: intrinsic * [1.1, 1.1, 1, 1])
+    assert_depth(found(dataset), "base_camera")
+
+
+def assert_depth(violations, camera):
+    """Depth is reported, in this episode only; the camera itself is among those that disagree."""
+    assert violations
+    assert all(v.startswith("episode_0000001/") and "/depth/" in v for v in violations)
+    assert any(camera in v for v in violations)
+
+
+@pytest.mark.parametrize(
+    ("edit", "text"),
+    [
+        (lambda info: info.pop("val_eps"), "data_info.json, val_eps: expected this key"),
+        (lambda info: info["train_eps"].extend(info["val_eps"]), "expected no episode in both"),
+        (lambda info: info["train_eps"].append(7), "expected the episodes on disk, found [7]"),
+        (lambda info: info.update(train_eps="all"), "expected a list of episode numbers, found all"),
+        (lambda info: info["ep_length"].update({"1": 8}), "ep_length.1: expected 7, found 8"),
+        (lambda info: info["ep_length"].pop("0"), "ep_length: expected the episodes on disk, found 1 others"),
+        (lambda info: info["language_goal"].update({"0": "dance"}), "language_goal.0: expected 'grasp the cube 3"),
+        (lambda info: info["step_goals"]["0"][0].update(goal_range=[0, 1]), "step_goals.0: expected a range from 2"),
+        (lambda info: info["step_goals"]["0"].pop(), "step_goals.0: expected ranges up to step 6, found up to 2"),
+        (lambda info: info["step_goals"]["0"][0].update(goal_type="dance"), "step_goals.0: expected one of find the"),
+        (lambda info: info["step_goals"]["0"][0].pop("goal_range"), "step_goals.0: expected goal_type, goal_range"),
+        (lambda info: info["action_space"].pop("relative_rotation"), "action_space.relative_rotation: expected [1st"),
+        (lambda info: info["action_space"]["relative_position"][0].__setitem__(0, 9.0), "expected percentiles of the"),
+    ],
+)
+def test_data_info(dataset, edit, text):
+    change_info(dataset, edit)
+    violations = found(dataset)
+    assert any(text in violation for violation in violations), violations
+    assert all(violation.startswith("data_info.json") for violation in violations)
+
+
+def test_every_violation_is_listed(dataset):
+    (dataset / "data_info.json").write_text("{")
+    Path(dataset / "episode_0000000" / "episode_info.npz").unlink()
+    change(dataset, speed=np.zeros(1), gripper_width=None)
+    assert len(found(dataset)) == 4
+
+
+def test_command(dataset, capsys):
+    from robocas_ms3.cli.validate import Validate, main
+
+    assert main(Validate(dataset)) == 0
+    assert "2 episodes, 14 steps, valid" in capsys.readouterr().out
+    change(dataset, speed=np.zeros(7))
+    assert main(Validate(dataset, json=True)) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["violations"] == [
+        {"file": NPZ, "key": "speed", "expected": "keys of the schema only", "found": "an unknown key"}
+    ]

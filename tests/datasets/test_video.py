@@ -1,0 +1,82 @@
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+from PIL import Image
+
+from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.video import PANEL, colour_depth, contact_sheet, video_frame, write_previews, write_video
+from robocas_ms3.errors import DatasetError
+
+
+def test_videos_show_every_step_in_real_time(made, tmp_path):
+    path = write_video(Dataset(made), 1, tmp_path / "e.mp4")
+    with imageio.get_reader(path) as video:
+        facts = video.get_meta_data()
+        frames = [frame for frame in video]
+    assert facts["fps"] == 5
+    assert facts["codec"] == "h264"
+    assert facts["pix_fmt"].startswith("yuv420p")
+    assert len(frames) == 7
+    assert frames[0].shape == (320 + 64, 3 * 426, 3)
+    drawn = video_frame(Dataset(made).episode(1), 6, number=1)
+    assert np.abs(frames[6].astype(int) - drawn).mean() < 4, "H.264 loses little"
+
+
+def test_a_frame_shows_cameras_and_texts(made):
+    episode = Dataset(made).episode(0)
+    frame = video_frame(episode, 2)
+    assert frame.shape == (384, 1278, 3)
+    width, height = PANEL
+    for index, camera in enumerate(("base_camera", "gripper_camera", "static_camera")):
+        panel = frame[:height, index * width : (index + 1) * width]
+        original = episode.rgb(camera, 2)
+        middle = panel[height // 2, width // 2], original[24, 32]
+        np.testing.assert_array_equal(*middle)
+    band = frame[height:]
+    light = (band.min(axis=2) > 200).sum()
+    assert 500 < light < 5000, "the instruction stands there"
+    other = video_frame(episode, 4)[height:]
+    assert (band != other).any(axis=2).sum() > 300, "another sub-goal, another text"
+
+
+def test_long_texts_stay_inside(made, tmp_path):
+    episode = Dataset(made).episode(0)
+    episode.arrays["language_goal"] = np.array("grasp the very long named thing " * 6)
+    frame = video_frame(episode, 0)
+    assert (frame[320:, -8:].max(axis=2) < 60).all()
+
+
+def test_contact_sheet(made, tmp_path):
+    sheet = np.asarray(Image.open(contact_sheet(made, tmp_path / "sheet.png", columns=4, thumbnail=(64, 48))))
+    assert sheet.shape == (2 * (30 + 3 * 51 + 10), 110 + 4 * 67, 3)
+    # Row of episode 1, static camera, last column: its last step.
+    top, left = 193 + 30 + 2 * 51, 110 + 3 * 67
+    shown = sheet[top : top + 48, left : left + 64]
+    seen = Dataset(made).episode(1).rgb("static_camera", 6)
+    np.testing.assert_array_equal(shown[:20], seen[:20])  # below stands the sub-goal
+
+
+def test_depth_colours():
+    colours = colour_depth(np.array([[0, 200, 3000, 60000]], np.uint16))
+    assert colours[0, 0].tolist() == [0, 0, 0]
+    assert colours[0, 1, 0] > colours[0, 1, 2], "near is red"
+    assert colours[0, 2].tolist() == colours[0, 3].tolist()
+
+
+def test_previews_leave_a_dataset_valid(dataset):
+    from robocas_ms3.datasets.validate import validate
+
+    videos, sheet = write_previews(dataset, episodes=[0])
+    assert [path.relative_to(dataset).as_posix() for path in (*videos, sheet)] == [
+        "preview/episode_0000000.mp4",
+        "preview/contact_sheet.png",
+    ]
+    assert validate(dataset).violations == []
+
+
+def test_errors(made, tmp_path):
+    with pytest.raises(DatasetError, match="no dataset here"):
+        Dataset(tmp_path)
+    with pytest.raises(DatasetError, match="no such episode .expected 0 to 1, found 9"):
+        write_video(Dataset(made), 9, tmp_path / "e.mp4")
+    assert list(tmp_path.iterdir()) == []
