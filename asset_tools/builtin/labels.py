@@ -1,0 +1,240 @@
+"""What is printed on packages: one ``Label`` per product, drawn onto cartons, round packages and tubes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from PIL import Image
+
+from asset_tools.builtin.mesh import Shape
+from asset_tools.builtin.motifs import MOTIFS
+from asset_tools.builtin.textures import Box, Canvas, Colour, Painter
+
+METAL = (186, 190, 194)
+
+
+@dataclass(frozen=True)
+class Label:
+    """The print on a package.
+
+    Args:
+        title, subtitle, amount: words; the title may hold line breaks.
+        base, accent: the package's colours. ink: of the letters. outline: around the title's letters, or none.
+        amount_ink: of the amount, where the ground there differs.
+        style: how the accent colour is laid out.
+        motif: a picture of ``MOTIFS``.
+        cap: colour of lids, caps and nozzles.
+        turn: degrees by which the front is turned (tubes: 90).
+        rows: of the table on the back.
+    """
+
+    title: str
+    subtitle: str
+    amount: str
+    base: Colour
+    accent: Colour
+    ink: Colour
+    motif: str
+    style: Literal["bands", "half", "wave", "stripes", "diagonal", "panel", "dots"] = "bands"
+    outline: Colour | None = None
+    amount_ink: Colour | None = None
+    cap: Colour = (240, 240, 238)
+    turn: int = 0
+    rows: tuple[tuple[str, str], ...] = (
+        ("Energy", "420 kJ"),
+        ("Fat", "0.8 g"),
+        ("Sugars", "9.5 g"),
+        ("Protein", "2.1 g"),
+        ("Salt", "0.6 g"),
+    )
+
+
+CARE_ROWS = (
+    ("Use", "daily"),
+    ("Skin", "all types"),
+    ("Water", "70 %"),
+    ("Keep", "below 30 C"),
+    ("Opened", "12 months"),
+)
+
+
+def paint_carton(shape: Shape, rng: np.random.Generator, label: Label) -> Image.Image:
+    """All six faces of a box; the larger ones show the front."""
+    painter = Painter(shape, rng, label.base)
+    largest = max(region.size[0] * region.size[1] for region in shape.regions.values())
+    for name, region in shape.regions.items():
+        wide, high = region.size
+        with painter.region(name) as canvas:
+            _background(canvas, label)
+            if wide * high > 0.6 * largest:
+                _front(canvas, (0.06, 0.15, 0.94, 0.85) if label.style == "bands" else (0.05, 0.04, 0.95, 0.96), label)
+            elif name == "right" and high > wide:
+                canvas.facts((0.1, 0.3, 0.9, 0.75), "Contents", list(label.rows))
+                canvas.text(label.amount, (0.1, 0.8, 0.9, 0.9), label.ink, bold=0.03)
+            elif name == "left" and high > wide:
+                canvas.text(
+                    label.title.replace("\n", " "),
+                    (0.2, 0.22, 0.8, 0.72),
+                    label.ink,
+                    bold=0.04,
+                    turn=90,
+                    outline=label.outline,
+                )
+                canvas.barcode((0.15, 0.8, 0.85, 0.93))
+            elif name == "left":
+                canvas.barcode((0.15, 0.2, 0.85, 0.8))
+            else:
+                canvas.text(
+                    label.title.replace("\n", " "), (0.1, 0.2, 0.9, 0.8), label.ink, bold=0.04, outline=label.outline
+                )
+    return painter.image()
+
+
+def paint_wrapped(shape: Shape, rng: np.random.Generator, label: Label, *, metal: bool = False) -> Image.Image:
+    """Cans, jars and bottles: print around the ``side``, plain caps and lids.
+
+    Args:
+        shape: with a ``side`` region and any of shoulder, rim, cap, spout, lid, bottom.
+        rng: source of variation.
+        label: the print.
+        metal: rims, lids and bottoms are tin.
+    """
+    painter = Painter(shape, rng, label.base)
+    with painter.region("side") as canvas:
+        _background(canvas, label)
+        wide, high = shape.regions["side"].size
+        half = min(0.2, 0.9 * high / wide / 2 + 0.06)
+        if label.style == "panel":
+            canvas.rectangle((0.5 - half - 0.035, 0.1, 0.5 + half + 0.035, 0.93), label.accent, corner=0.12)
+        top, bottom = (0.14, 0.86) if label.style == "bands" else (0.12, 0.91)
+        _front(canvas, (0.5 - half, top, 0.5 + half, bottom), label)
+        canvas.facts((0.79, 0.22, 0.97, 0.8), "Contents", list(label.rows))
+        if label.style == "panel":
+            canvas.rectangle((0.02, 0.22, 0.22, 0.84), label.accent, corner=0.12)
+        canvas.barcode((0.05, 0.62, 0.19, 0.8))
+        canvas.text(label.title, (0.035, 0.26, 0.205, 0.54), label.ink, bold=0.04, outline=label.outline)
+    for name in ("rim", "bottom", "lid", "cap", "spout"):
+        painter.fill(name, METAL if metal else label.cap)
+    painter.fill("bottom", METAL if metal else label.accent if label.style in ("bands", "half", "wave") else label.base)
+    _ridges(painter, "cap", label.cap)
+    if metal:
+        for name in ("lid", "bottom"):
+            _rings(painter, name, METAL)
+    elif "lid" in shape.regions:
+        with painter.region("lid", label.cap) as canvas:
+            ink = (70, 70, 74) if sum(label.cap) > 380 else (244, 244, 240)
+            canvas.text(label.title.replace("-\n", "").replace("\n", " "), (0.2, 0.3, 0.8, 0.7), ink, bold=0.03)
+    return painter.image()
+
+
+def paint_tube(shape: Shape, rng: np.random.Generator, label: Label) -> Image.Image:
+    """Tubes: the print runs along the body, front and back alike."""
+    painter = Painter(shape, rng, label.base)
+    with painter.region("side") as canvas:
+        _background(canvas, label)
+        canvas.rectangle((0, 0, 1, 0.055), label.accent)
+        _front(canvas, (0.33, 0.15, 0.67, 0.85), label)
+        canvas.facts((0.8, 0.28, 0.95, 0.66), "Directions", list(label.rows))
+        canvas.barcode((0.05, 0.5, 0.2, 0.66))
+        canvas.text(label.title, (0.05, 0.15, 0.2, 0.46), label.ink, bold=0.04, turn=90, outline=label.outline)
+    _ridges(painter, "cap", label.cap)
+    painter.fill("lid", label.cap)
+    return painter.image()
+
+
+def paint_soap(shape: Shape, rng: np.random.Generator, label: Label) -> Image.Image:
+    """A bar of soap with its name pressed in."""
+    painter = Painter(shape, rng, label.base)
+    for name in ("top", "bottom"):
+        with painter.region(name) as canvas:
+            canvas.rectangle((0.17, 0.24, 0.83, 0.76), label.accent, corner=0.45)
+            canvas.rectangle((0.18, 0.255, 0.82, 0.745), label.base, corner=0.45)
+            canvas.text(label.title, (0.24, 0.34, 0.76, 0.66), label.ink, bold=0.03, outline=label.accent)
+    return painter.image()
+
+
+def paint_mug(shape: Shape, rng: np.random.Generator, label: Label) -> Image.Image:
+    """A glazed mug with a band of print."""
+    painter = Painter(shape, rng, label.base)
+    with painter.region("side") as canvas:
+        canvas.rectangle((0, 0.3, 1, 0.78), label.accent)
+        for x in np.arange(24) / 24:
+            canvas.polygon([(x, 0.3), (x + 1 / 24, 0.3), (x + 0.5 / 24, 0.36)], label.base)
+            canvas.polygon([(x, 0.78), (x + 1 / 24, 0.78), (x + 0.5 / 24, 0.72)], label.base)
+        for left in (0.36, 0.86 - 1.0, 0.86):  # in front, and across the seam at the back
+            canvas.text(label.title, (left, 0.41, left + 0.28, 0.67), label.ink, bold=0.04)
+    for name in ("inside", "floor"):
+        painter.fill(name, label.cap)
+    return painter.image()
+
+
+def _background(canvas: Canvas, label: Label) -> None:
+    """The accent colour over the whole canvas, closing around a cylinder."""
+    if label.style == "bands":
+        for top, bottom in ((0, 0.1), (0.12, 0.135), (0.865, 0.88), (0.9, 1)):
+            canvas.rectangle((0, top, 1, bottom), label.accent)
+    elif label.style == "half":
+        canvas.rectangle((0, 0.54, 1, 1), label.accent)
+        canvas.rectangle((0, 0.53, 1, 0.55), (222, 184, 92))
+    elif label.style == "wave":
+        lighter = tuple(round(0.5 * (a + b)) for a, b in zip(label.base, label.accent, strict=True))
+        canvas.wave(0.62, 0.06, 2, (lighter[0], lighter[1], lighter[2]))
+        canvas.wave(0.7, 0.06, 2, label.accent)
+    elif label.style == "stripes":
+        for x in np.arange(12) / 12:
+            canvas.rectangle((x, 0, x + 1 / 24, 1), label.accent)
+    elif label.style == "diagonal":
+        for x in np.arange(-2, 4) / 2:
+            canvas.polygon([(x, 0), (x + 0.22, 0), (x - 0.28, 1), (x - 0.5, 1)], label.accent)
+    elif label.style == "dots":
+        for i, j in np.ndindex(9, 12):
+            canvas.disc((j + 0.5 * (i % 2)) / 12, (i + 0.5) / 9, 0.018, label.accent)
+
+
+def _front(canvas: Canvas, box: Box, label: Label) -> None:
+    """Motif, title, subtitle and amount, stacked or (in a wide box) in a row; turned as a whole if the label is."""
+    left, top, right, bottom = canvas.pixels(box)
+    wide, high = right - left, bottom - top
+    area = canvas.image.crop((left, top, right, bottom)).rotate(-label.turn, expand=True)
+    inner = Canvas((area.width, area.height), 1, label.base, canvas.rng)
+    inner.image.paste(area)
+    wide, high = area.width, area.height
+    plate = label.style in ("stripes", "diagonal", "dots")
+    if wide > 1.9 * high:
+        if plate:
+            inner.rectangle((0.0, 0.12, 1, 0.88), label.base, corner=0.3)
+        radius = 0.3 * high
+        MOTIFS[label.motif](inner.draw, 0.04 * wide + radius, 0.5 * high, radius)
+        start = 0.07 + 2 * radius / wide
+        inner.text(label.title.replace("\n", " "), (start, 0.2, 0.96, 0.6), label.ink, bold=0.05, outline=label.outline)
+        inner.text(label.subtitle, (start, 0.65, 0.78, 0.82), label.ink)
+        inner.text(label.amount, (0.82, 0.65, 0.96, 0.82), label.ink, bold=0.03)
+    else:
+        if plate:
+            inner.rectangle((0.0, 0.0, 1, 1), label.base, corner=0.12)
+        radius = min(0.17 * high, 0.42 * wide)
+        inner.text(label.title, (0.04, 0.06, 0.96, 0.38), label.ink, bold=0.05, outline=label.outline)
+        inner.text(label.subtitle, (0.08, 0.4, 0.92, 0.48), label.ink, bold=0.02)
+        MOTIFS[label.motif](inner.draw, 0.5 * wide, 0.68 * high, radius)
+        inner.text(label.amount, (0.3, 0.89, 0.7, 0.97), label.amount_ink or label.ink, bold=0.03)
+    canvas.image.paste(inner.image.rotate(label.turn, expand=True), (left, top))
+
+
+def _ridges(painter: Painter, name: str, colour: Colour) -> None:
+    """Fine vertical grooves, as on screw caps."""
+    if name in painter.shape.regions:
+        angle, level = painter.grid(name)
+        shade = 1 - 0.13 * (np.cos(angle * 40) > 0.3)
+        painter.put(
+            name, (np.ones_like(level)[:, None, None] * shade[None, :, None] * np.asarray(colour)).astype(np.uint8)
+        )
+
+
+def _rings(painter: Painter, name: str, colour: Colour) -> None:
+    """Concentric grooves of a tin's lid."""
+    with painter.region(name, colour) as canvas:
+        for radius, shade in ((0.44, 1.1), (0.41, 0.86), (0.395, 1.0), (0.33, 1.1), (0.305, 0.88), (0.29, 1.02)):
+            tone = tuple(min(255, round(c * shade)) for c in colour)
+            canvas.disc(0.5, 0.5, radius, (tone[0], tone[1], tone[2]), stretch=canvas.width / canvas.height)

@@ -1,0 +1,171 @@
+"""Small pictures for labels, drawn into a square of given centre and radius (pixels)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from PIL import ImageDraw
+
+Pen = ImageDraw.ImageDraw
+GREEN, DARK_GREEN, WHITE = (74, 140, 58), (44, 98, 44), (252, 252, 248)
+
+
+def _disc(pen: Pen, x: float, y: float, r: float, fill: tuple[int, int, int], stretch: float = 1.0) -> None:
+    pen.ellipse((x - r * stretch, y - r, x + r * stretch, y + r), fill=fill)
+
+
+def _ray_points(
+    x: float, y: float, inner: float, outer: float, count: int, turn: float = 0.0
+) -> list[tuple[float, float]]:
+    """Corners of a star."""
+    angle = np.arange(2 * count) * np.pi / count + turn
+    radius = np.where(np.arange(2 * count) % 2 == 0, outer, inner)
+    return list(zip((x + radius * np.sin(angle)).tolist(), (y - radius * np.cos(angle)).tolist(), strict=True))
+
+
+def _leaf(pen: Pen, x: float, y: float, length: float, angle: float, fill: tuple[int, int, int] = GREEN) -> None:
+    t = np.linspace(0, 1, 15)
+    half = 0.24 * np.sin(np.pi * t) * (1.15 - 0.5 * t)
+    along, across = np.concatenate([t, t[::-1]]), np.concatenate([half, -half[::-1]])
+    px = x + length * (along * np.cos(angle) - across * np.sin(angle))
+    py = y - length * (along * np.sin(angle) + across * np.cos(angle))
+    pen.polygon(list(zip(px.tolist(), py.tolist(), strict=True)), fill=fill)
+    tip = (x + 0.9 * length * np.cos(angle), y - 0.9 * length * np.sin(angle))
+    pen.line([(x, y), tip], fill=DARK_GREEN, width=max(1, round(length * 0.04)))
+
+
+def tomato(pen: Pen, x: float, y: float, r: float) -> None:
+    """A tomato."""
+    _disc(pen, x, y + 0.08 * r, 0.9 * r, (205, 38, 30), 1.08)
+    _disc(pen, x - 0.35 * r, y - 0.2 * r, 0.2 * r, (232, 104, 84))
+    pen.polygon(_ray_points(x, y - 0.62 * r, 0.13 * r, 0.5 * r, 6), fill=DARK_GREEN)
+
+
+def sun(pen: Pen, x: float, y: float, r: float) -> None:
+    """A sun."""
+    pen.polygon(_ray_points(x, y, 0.62 * r, r, 14), fill=(250, 190, 40))
+    _disc(pen, x, y, 0.56 * r, (255, 226, 96))
+
+
+def leaf(pen: Pen, x: float, y: float, r: float) -> None:
+    """Three leaves."""
+    for angle in (0.5, 1.57, 2.64):
+        _leaf(pen, x, y + 0.7 * r, 1.6 * r if angle == 1.57 else 1.25 * r, angle, GREEN)
+
+
+def drop(pen: Pen, x: float, y: float, r: float) -> None:
+    """A drop of water."""
+    pen.polygon([(x, y - r), (x - 0.56 * r, y + 0.15 * r), (x + 0.56 * r, y + 0.15 * r)], fill=(64, 150, 218))
+    _disc(pen, x, y + 0.33 * r, 0.62 * r, (64, 150, 218))
+    _disc(pen, x - 0.22 * r, y + 0.42 * r, 0.17 * r, (190, 226, 248))
+
+
+def strawberry(pen: Pen, x: float, y: float, r: float) -> None:
+    """A strawberry."""
+    red = (208, 28, 48)
+    _disc(pen, x - 0.36 * r, y - 0.22 * r, 0.46 * r, red)
+    _disc(pen, x + 0.36 * r, y - 0.22 * r, 0.46 * r, red)
+    pen.polygon([(x - 0.8 * r, y - 0.12 * r), (x + 0.8 * r, y - 0.12 * r), (x, y + r)], fill=red)
+    for dx, dy in ((-0.4, -0.1), (0, -0.15), (0.4, -0.1), (-0.22, 0.2), (0.22, 0.2), (0, 0.5)):
+        _disc(pen, x + dx * r, y + dy * r, 0.06 * r, (250, 214, 110))
+    pen.polygon(_ray_points(x, y - 0.6 * r, 0.14 * r, 0.48 * r, 7), fill=GREEN)
+
+
+def chips(pen: Pen, x: float, y: float, r: float) -> None:
+    """A fan of potato chips."""
+    for dx, dy, shade in ((-0.5, 0.3, 0), (0.5, 0.3, 8), (0, -0.2, 16)):
+        _disc(pen, x + dx * r, y + dy * r, 0.5 * r, (214 + shade, 150 + shade, 40), 1.15)
+        _disc(pen, x + dx * r, y + dy * r, 0.42 * r, (244, 200 + shade, 92), 1.15)
+        _disc(pen, x + (dx - 0.15) * r, y + (dy - 0.1) * r, 0.08 * r, (222, 164, 60), 1.4)
+
+
+def flower(pen: Pen, x: float, y: float, r: float, petal: tuple[int, int, int] = (252, 222, 70)) -> None:
+    """A flower."""
+    for angle in np.arange(8) * np.pi / 4:
+        _disc(pen, x + 0.58 * r * np.cos(angle), y + 0.58 * r * np.sin(angle), 0.36 * r, petal)
+    _disc(pen, x, y, 0.36 * r, (150, 90, 30))
+
+
+def blossom(pen: Pen, x: float, y: float, r: float) -> None:
+    """A pink flower."""
+    flower(pen, x, y, r, (246, 170, 196))
+
+
+def citrus(pen: Pen, x: float, y: float, r: float) -> None:
+    """A slice of orange."""
+    _disc(pen, x, y, r, (240, 130, 20))
+    _disc(pen, x, y, 0.86 * r, (255, 236, 196))
+    for angle in np.arange(8) * 45:
+        pen.pieslice((x - 0.8 * r, y - 0.8 * r, x + 0.8 * r, y + 0.8 * r), angle + 4, angle + 41, fill=(250, 160, 40))
+
+
+def cubes(pen: Pen, x: float, y: float, r: float) -> None:
+    """Three sugar cubes."""
+    for dx, dy in ((-0.48, 0.42), (0.48, 0.42), (0, -0.4)):
+        cx, cy, s = x + dx * r, y + dy * r, 0.46 * r
+        top = [(cx, cy - s), (cx + s, cy - 0.5 * s), (cx, cy), (cx - s, cy - 0.5 * s)]
+        left = [(cx - s, cy - 0.5 * s), (cx, cy), (cx, cy + s), (cx - s, cy + 0.5 * s)]
+        right = [(cx + s, cy - 0.5 * s), (cx, cy), (cx, cy + s), (cx + s, cy + 0.5 * s)]
+        for side, shade in ((top, 255), (left, 226), (right, 200)):
+            pen.polygon(side, fill=(shade, shade, shade), outline=(150, 160, 175))
+
+
+def meat(pen: Pen, x: float, y: float, r: float) -> None:
+    """Slices of ham."""
+    for dx in (-0.42, 0.0, 0.42):
+        _disc(pen, x + dx * r, y, 0.66 * r, (160, 60, 52), 0.82)
+        _disc(pen, x + dx * r, y, 0.6 * r, (232, 138, 128), 0.82)
+        _disc(pen, x + dx * r, y - 0.12 * r, 0.1 * r, (250, 200, 190), 1.6)
+
+
+def star(pen: Pen, x: float, y: float, r: float) -> None:
+    """A five-pointed star."""
+    pen.polygon(_ray_points(x, y, 0.42 * r, r, 5), fill=WHITE)
+
+
+def sparkle(pen: Pen, x: float, y: float, r: float) -> None:
+    """Two thin stars, as on things that clean."""
+    pen.polygon(_ray_points(x - 0.15 * r, y + 0.1 * r, 0.2 * r, 0.95 * r, 4), fill=WHITE)
+    pen.polygon(_ray_points(x + 0.62 * r, y - 0.6 * r, 0.1 * r, 0.42 * r, 4), fill=WHITE)
+
+
+def bubbles(pen: Pen, x: float, y: float, r: float) -> None:
+    """Rising bubbles."""
+    for dx, dy, size in ((-0.35, 0.45, 0.46), (0.42, 0.2, 0.34), (-0.1, -0.35, 0.28), (0.38, -0.7, 0.2)):
+        cx, cy, s = x + dx * r, y + dy * r, size * r
+        pen.ellipse(
+            (cx - s, cy - s, cx + s, cy + s), fill=(206, 236, 250), outline=WHITE, width=max(1, round(0.08 * r))
+        )
+        _disc(pen, cx - 0.3 * s, cy - 0.35 * s, 0.22 * s, WHITE)
+
+
+def olive(pen: Pen, x: float, y: float, r: float) -> None:
+    """Two olives and leaves."""
+    _leaf(pen, x, y - 0.2 * r, 1.0 * r, 0.6)
+    _leaf(pen, x, y - 0.2 * r, 1.0 * r, 2.5)
+    for dx in (-0.36, 0.36):
+        _disc(pen, x + dx * r, y + 0.4 * r, 0.46 * r, (112, 130, 48), 0.76)
+        _disc(pen, x + (dx - 0.1) * r, y + 0.22 * r, 0.1 * r, (186, 200, 120))
+
+
+MOTIFS: dict[str, Callable[[Pen, float, float, float], None]] = {
+    function.__name__: function
+    for function in (
+        tomato,
+        sun,
+        leaf,
+        drop,
+        strawberry,
+        chips,
+        flower,
+        blossom,
+        citrus,
+        cubes,
+        meat,
+        star,
+        sparkle,
+        bubbles,
+        olive,
+    )
+}

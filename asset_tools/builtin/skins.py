@@ -1,0 +1,81 @@
+"""Fruit skins: colour varies smoothly in space, so it has neither seams nor poles."""
+
+from __future__ import annotations
+
+import numpy as np
+from PIL import Image
+
+from asset_tools.builtin.mesh import Shape
+from asset_tools.builtin.textures import Colour, Painter, blend, noise
+
+
+def paint_fruit(
+    shape: Shape,
+    rng: np.random.Generator,
+    *,
+    base: Colour,
+    blush: Colour,
+    blush_amount: float = 0.5,
+    streaks: float = 0.0,
+    poles: Colour | None = None,
+    speckle: Colour | None = None,
+    pores: float = 0.0,
+    stem: Colour = (92, 62, 34),
+) -> Image.Image:
+    """Skin and stem of a round fruit.
+
+    Args:
+        shape: with a ``skin`` region.
+        rng: source of variation.
+        base, blush: ground colour, and the colour of its sunny side.
+        blush_amount: how much of the surface is blushed, 0 to 1.
+        streaks: how strongly the blush runs in lines from stem to bottom.
+        poles: colour around the stem and the bottom.
+        speckle: colour of small dots.
+        pores: depth of fine dimples, as a fraction of the brightness.
+        stem: its colour.
+    """
+    painter = Painter(shape, rng, base)
+    angle, level = painter.grid("skin")
+    polar = np.pi * (1 - level)[:, None]
+    points = np.stack(
+        np.broadcast_arrays(np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar)), axis=-1
+    )
+    side = points @ np.array([0.5, -0.8, 0.3])
+    amount = blush_amount - 0.5 + 0.55 * side + 0.35 * noise(points, rng, frequency=0.5)
+    if streaks:
+        lines = points * np.array([1.0, 1.0, 0.12]) / np.maximum(np.sin(polar), 0.15)[..., None]
+        amount = amount + streaks * noise(lines, rng, frequency=3.0, octaves=4)
+    colours = blend(1 / (1 + np.exp(-5 * amount)), base, blush)
+    if poles:
+        cap = np.exp(-(((1 - np.abs(points[..., 2])) / 0.09) ** 2))
+        colours = blend(cap * (0.8 + 0.2 * noise(points, rng, frequency=2.0)), colours, poles)
+    if speckle:
+        spots = noise(points, rng, frequency=9.0, octaves=1, waves=40)
+        colours = blend(np.clip(6 * (spots - 0.72), 0, 0.75), colours, speckle)
+    if pores:
+        colours = colours * (1 + pores * noise(points, rng, frequency=14.0, octaves=2, waves=40))[..., None]
+    colours = colours * (1 + 0.05 * noise(points, rng, frequency=1.5))[..., None]
+    painter.put("skin", np.clip(colours, 0, 255).astype(np.uint8))
+    painter.fill("stem", stem)
+    return painter.image()
+
+
+def paint_banana(shape: Shape, rng: np.random.Generator) -> Image.Image:
+    """Yellow, greenish towards the ends, brown stem, tip, edges and freckles."""
+    painter = Painter(shape, rng, (236, 200, 60))
+    angle, level = painter.grid("skin")
+    from_stem = level[:, None]  # the bottom of the region is the start of the sweep: the stem
+    points = np.stack(np.broadcast_arrays(np.cos(angle), np.sin(angle), 9 * from_stem), axis=-1)
+    ends = np.clip((np.abs(from_stem - 0.5) - 0.24) / 0.2, 0, 1)
+    colours = blend(0.75 * ends * (0.8 + 0.3 * noise(points, rng, frequency=0.3)), (238, 202, 58), (176, 182, 66))
+    ridge = np.clip(np.cos(5 * angle) - 0.93, 0, 1) / 0.07
+    colours = blend(ridge * (0.28 + 0.2 * noise(points, rng, frequency=0.6)), colours, (150, 112, 40))
+    freckles = noise(points, rng, frequency=1.6, octaves=2, waves=40)
+    colours = blend(np.clip(5 * (freckles - 0.62), 0, 0.8), colours, (112, 74, 32))
+    stem = np.clip((0.035 - from_stem) / 0.02, 0, 1) * 0.9 + np.clip((0.13 - from_stem) / 0.1, 0, 1) * 0.25
+    colours = blend(stem, colours, (104, 84, 40))
+    colours = blend(np.clip((from_stem - 0.95) / 0.03, 0, 1), colours, (62, 48, 34))
+    colours = colours * (1 + 0.05 * noise(points, rng, frequency=0.5))[..., None]
+    painter.put("skin", np.clip(colours, 0, 255).astype(np.uint8))
+    return painter.image()
