@@ -1,12 +1,20 @@
 """Small trials of things that may crash the process that tries them; run as a file, in a process of its own.
 
-``python probes.py NAME`` prints one line that names what works, and exits with 0; otherwise the last line on stderr
-says why not. As a file it needs nothing of this package, so it also answers where the package can't be imported.
+``python probes.py NAME`` prints one line that says what works, and exits with 0. Otherwise the last line on stderr says
+why not, and the exit code is 1; 3 stands for "there is no such thing here", which is no failure.
 """
 
 from __future__ import annotations
 
+import os
 import sys
+from pathlib import Path
+
+ABSENT = 3
+
+
+class Absent(Exception):
+    """The machine lacks what was to be tried."""
 
 
 def render() -> str:
@@ -16,12 +24,105 @@ def render() -> str:
     return sapien_render.RenderSystem().device.name
 
 
-PROBES = {"render": render}
+def physx_cpu() -> str:
+    """Let a box fall for 0.1 s."""
+    import sapien
+
+    scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
+    scene.set_timestep(0.01)
+    box = _falling_box(scene)
+    for _ in range(10):
+        scene.step()
+    fallen = 1.0 - float(box.pose.p[2])
+    if not 0.04 < fallen < 0.06:  # 0.5 g t^2 = 4.9 cm, 5.4 cm as the integrator has it
+        raise RuntimeError(f"a box fell {fallen:.3f} m in 0.1 s, not 0.05 m")
+    return "works"
+
+
+def physx_cuda() -> str:
+    """Let a box fall for 0.1 s on the GPU."""
+    import torch
+
+    if not torch.cuda.is_available():
+        raise Absent("no CUDA device that this build of torch can use")
+    import sapien
+
+    sapien.physx.enable_gpu()
+    system = sapien.physx.PhysxGpuSystem("cuda")
+    scene = sapien.Scene([system])
+    system.timestep = 0.01
+    system.set_scene_offset(scene, [0, 0, 0])
+    _falling_box(scene)
+    system.gpu_init()
+    for _ in range(10):
+        system.step()
+    system.gpu_fetch_rigid_dynamic_data()
+    fallen = 1.0 - float(system.cuda_rigid_body_data.torch()[0, 2])
+    if not 0.04 < fallen < 0.06:
+        raise RuntimeError(f"a box fell {fallen:.3f} m in 0.1 s, not 0.05 m")
+    return torch.cuda.get_device_name()
+
+
+def planner() -> str:
+    """Generate the robot's files, construct the planner, plan a short motion."""
+    import numpy as np
+
+    from robocas_ms3.planning.mplib_backend import MplibPlanner
+    from robocas_ms3.robots.constants import ARM_REST
+    from robocas_ms3.robots.urdf import robot_files
+
+    files = robot_files()
+    planner = MplibPlanner(files.arm_urdf, files.arm_srdf, dt=0.05)
+    start = np.asarray(ARM_REST, dtype=np.float64)
+    path = planner.plan_to_qpos(start, [start + 0.2], stage="doctor")
+    return f"works, planned {len(path.qpos)} steps"
+
+
+def packs() -> str:
+    """Load and verify every asset pack."""
+    from robocas_ms3.assets.pack import available_packs, load_pack
+
+    loaded = [load_pack(name) for name in available_packs()]
+    if not any(pack.name == "builtin" for pack in loaded):
+        raise RuntimeError("the builtin pack is not installed")
+    return ", ".join(f"{pack.name} ({len(pack.objects)} objects)" for pack in loaded)
+
+
+def _falling_box(scene):
+    import sapien
+
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(half_size=[0.05, 0.05, 0.05])
+    builder.initial_pose = sapien.Pose([0, 0, 1])
+    return builder.build(name="box")
+
+
+PROBES = {probe.__name__: probe for probe in (render, physx_cpu, physx_cuda, planner, packs)}
+
+
+def _main() -> int:
+    # As a file, Python puts this folder first on the path; the package's own parent belongs there instead, last, so
+    # that it also answers in a checkout that is not installed.
+    sys.path.pop(0)
+    sys.path.append(str(Path(__file__).resolve().parents[2]))
+    os.environ["ROBOCAS_DEFER_REGISTRATION"] = "1"
+    # What libraries print goes to stderr; stdout is for the answer.
+    answer = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    try:
+        found = PROBES[sys.argv[1]]()
+    except Absent as error:
+        sys.stderr.write(f"{error}\n")
+        return ABSENT
+    except Exception as error:  # whatever the trial meets is its answer
+        sys.stderr.write(f"{type(error).__name__}: {' '.join(str(error).split())}\n")
+        return 1
+    answer.write(found + "\n")
+    answer.flush()
+    return 0
 
 
 if __name__ == "__main__":
-    try:
-        found = PROBES[sys.argv[1]]()
-    except Exception as error:  # whatever the trial meets is its answer
-        sys.exit(f"{type(error).__name__}: {error}")
-    print(found)
+    code = _main()
+    sys.stderr.flush()
+    os._exit(code)  # a library that crashes while it is torn down has worked nevertheless

@@ -1,0 +1,56 @@
+"""``robocas doctor``: what of this machine works."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from robocas_ms3.doctor.checks import Finding
+
+
+@dataclass
+class Doctor:
+    """Check versions, render device, physics, planner, assets and disk; exit code 1 if something needed fails."""
+
+    json: bool = False
+    """Print a machine-readable report."""
+
+
+def main(cfg: Doctor) -> int:
+    """Run the command."""
+    from rich.console import Console
+
+    from robocas_ms3.doctor.checks import examine
+
+    with Console(stderr=True).status("examining"):
+        findings = examine()
+    failed = sum(finding.status == "fail" for finding in findings)
+    if cfg.json:
+        import json
+
+        report = {"ok": not failed, "findings": [asdict(finding) for finding in findings]}
+        Console(soft_wrap=True, highlight=False, markup=False).print(json.dumps(report, indent=2))
+        return 1 if failed else 0
+    _print(findings, failed)
+    return 1 if failed else 0
+
+
+def _print(findings: list[Finding], failed: int) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    marks = {"ok": "[green]ok[/]", "limited": "[yellow]limited[/]", "fail": "[bold red]FAIL[/]"}
+    table = Table("", "what")
+    table.add_column("found", overflow="fold")
+    if any(finding.fix for finding in findings):
+        table.add_column("fix", overflow="fold")
+    for finding in findings:
+        row = (finding.name, finding.found, finding.fix)[: len(table.columns) - 1]
+        table.add_row(marks[finding.status], *map(escape, row))
+    console = Console()
+    console.print(table)
+    limited = sum(finding.status == "limited" for finding in findings)
+    verdict = f"{failed} of what is needed fails" if failed else "everything needed works"
+    console.print(verdict + (f"; {limited} optional rows limited" if limited else ""))

@@ -1,0 +1,91 @@
+"""``robocas list``: tasks, shipped configurations, asset packs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass
+class List:
+    """List the tasks, the shipped task configurations and the asset packs."""
+
+    json: bool = False
+    """Print a machine-readable list."""
+
+
+def main(cfg: List) -> int:
+    """Run the command."""
+    from rich.console import Console
+
+    found = collect()
+    if cfg.json:
+        import json
+
+        Console(soft_wrap=True, highlight=False, markup=False).print(json.dumps(found, indent=2, ensure_ascii=False))
+    else:
+        _print(found)
+    return 0
+
+
+def collect() -> dict[str, list[dict[str, Any]]]:
+    """Gather what there is, verifying every pack.
+
+    Returns:
+        ``tasks``, ``configs`` and ``packs``, a mapping of plain values each. A damaged pack has ``error`` and no objects.
+
+    Raises:
+        ConfigError: a shipped configuration is damaged.
+    """
+    from robocas_ms3.assets.pack import load_pack, pack_folders
+    from robocas_ms3.config import load_task_config, shipped_configs
+    from robocas_ms3.errors import AssetError
+    from robocas_ms3.tasks.spec import TASKS
+
+    tasks = [
+        {"name": task.name, "env_id": task.env_id, "default_config": task.default_config, "summary": task.summary}
+        for task in TASKS.values()
+    ]
+    configs = []
+    for name, path in shipped_configs().items():
+        config = load_task_config(path)
+        scene = f"{config.objects.count} objects, {config.layout.kind}, on the {config.support}"
+        configs.append({"name": name, "task": config.task, "scene": scene, "description": config.description})
+    packs = []
+    for name, folder in pack_folders().items():
+        row: dict[str, Any] = {"name": name, "folder": str(folder), "megabytes": round(_size(folder) / 1e6, 1)}
+        try:
+            pack = load_pack(folder)
+            packs.append(row | {"objects": sorted(pack.objects), "furniture": sorted(pack.furniture), "error": ""})
+        except AssetError as error:
+            packs.append(row | {"objects": [], "furniture": [], "error": str(error)})
+    return {"tasks": tasks, "configs": configs, "packs": packs}
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def _print(found: dict[str, list[dict[str, Any]]]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    tables = {
+        "tasks": ("name", "env_id", "default_config", "summary"),
+        "configs": ("name", "task", "scene", "description"),
+        "packs": ("name", "objects", "furniture", "megabytes", "folder"),
+    }
+    console = Console()
+    for kind, columns in tables.items():
+        table = Table(title=kind, title_justify="left", title_style="bold")
+        for column in columns:
+            table.add_column(column.replace("_", " "), overflow="fold")
+        for row in found[kind]:
+            values = (row[column] for column in columns)
+            table.add_row(*(escape(", ".join(value) if isinstance(value, list) else str(value)) for value in values))
+        console.print(table)
+    for pack in found["packs"]:
+        if pack["error"]:
+            console.print(f"[bold red]damaged:[/] {escape(pack['error'])}", soft_wrap=True)

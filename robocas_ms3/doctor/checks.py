@@ -1,0 +1,239 @@
+"""The checks of ``robocas doctor``.
+
+They import nothing that may be broken: versions are read from metadata, everything else is tried in a child process
+(``probes.py``), so that a crash is a finding.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Literal
+
+from packaging.requirements import Requirement
+from packaging.version import Version
+
+from robocas_ms3 import paths
+from robocas_ms3.doctor.probes import ABSENT
+
+DISTRIBUTION = "robocas-ms3"
+PYTHONS = ((3, 10), (3, 13))  # from, below
+PROBE_SECONDS = 120
+PROBES = Path(__file__).with_name("probes.py")
+GIGABYTE = 1e9
+LEAST_DISK, ENOUGH_DISK = 1.0, 10.0  # GB; a converted episode of pick takes about 0.1
+
+WHY = {
+    "numpy": "mplib 0.1.1 dies with a segmentation fault under numpy 2",
+    "mplib": "mani_skill 3.0.1 pins it",
+}
+# Extra -> what it is for.
+EXTRAS = {"language": "sentence embeddings in datasets", "assets": "making asset packs"}
+# Packages worth a row of their own; the others share one.
+NAMED = ("numpy", "torch", "mani-skill", "sapien", "mplib", "gymnasium")
+
+RENDERER_FIX = (
+    "Install a Vulkan driver: the GPU's own, or Mesa >= 24.3 (mesa-vulkan-drivers and libvulkan1; in a checkout, as "
+    "root: bash scripts/setup.sh). Without one everything runs state-only."
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found.
+
+    Attributes:
+        name: what was looked at.
+        status: ``ok``; ``fail``: something needed does not work; ``limited``: something optional does not.
+        found: what is there.
+        fix: what to do about it; empty when ok.
+    """
+
+    name: str
+    status: Literal["ok", "limited", "fail"]
+    found: str
+    fix: str = ""
+
+
+def examine() -> list[Finding]:
+    """Run every check, in the order of the report."""
+    checks: list[Callable[[], list[Finding]]] = [
+        check_python,
+        check_packages,
+        lambda: [check_extra(extra) for extra in EXTRAS],
+        lambda: [probe("render device", "render", required=False, fix=RENDERER_FIX)],
+        lambda: [probe("physics on CPU", "physx_cpu", fix=_reinstall("sapien"))],
+        lambda: [probe("physics on GPU", "physx_cuda", required=False, fix="Check the GPU's driver.")],
+        lambda: [probe("planner", "planner", fix="Mend the failing rows above first, then " + _reinstall("mplib"))],
+        lambda: [probe("asset packs", "packs", fix="Restore the named pack, or remove its folder.")],
+        check_folders,
+        lambda: [check_disk(Path.cwd())],
+    ]
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        return [finding for found in pool.map(_guarded, checks) for finding in found]
+
+
+def check_python() -> list[Finding]:
+    """Whether this Python is one the dependencies are built for."""
+    found = ".".join(map(str, sys.version_info[:3]))
+    if PYTHONS[0] <= sys.version_info[:2] < PYTHONS[1]:
+        return [Finding("python", "ok", found)]
+    return [Finding("python", "fail", found, "Use Python 3.10, 3.11 or 3.12: numpy < 2 has no builds for others.")]
+
+
+def check_packages() -> list[Finding]:
+    """Versions of everything this package needs, against what its metadata (and mani_skill's) ask for."""
+    wanted = {_key(item.name): item for item in requirements(DISTRIBUTION)}
+    if not wanted:
+        return [Finding(DISTRIBUTION, "fail", "not installed", "Run bash scripts/setup.sh, or pip install -e .")]
+    wanted.setdefault("mplib", Requirement("mplib==0.1.1"))
+    named = [check_package(wanted.pop(name)) for name in NAMED if name in wanted]
+    rest = [check_package(item) for item in wanted.values()]
+    bad = [finding for finding in rest if finding.status != "ok"]
+    return named + (bad or [Finding("other packages", "ok", f"{len(rest)} as required")])
+
+
+def check_package(wanted: Requirement) -> Finding:
+    """Whether a package is there in a version that fits.
+
+    Args:
+        wanted: name and versions.
+    """
+    name = _key(wanted.name)
+    why = f" ({WHY[name]})" if name in WHY else ""
+    fix = f"pip install '{wanted.name}{wanted.specifier}'{why}"
+    try:
+        found = metadata.version(wanted.name)
+    except metadata.PackageNotFoundError:
+        return Finding(name, "fail", "not installed", fix)
+    # torch 2.13.0+cpu is torch 2.13.0
+    if not wanted.specifier.contains(Version(found).public, prereleases=True):
+        return Finding(name, "fail", f"{found}, needs {wanted.specifier}", fix)
+    return Finding(name, "ok", found)
+
+
+def check_extra(extra: str) -> Finding:
+    """Whether the packages of an extra are there; they are optional.
+
+    Args:
+        extra: name of the extra.
+    """
+    findings = [check_package(item) for item in requirements(DISTRIBUTION, extra)]
+    name, bad = f"extra {extra}", [finding for finding in findings if finding.status != "ok"]
+    if not findings or bad:
+        found = ", ".join(f"{finding.name} {finding.found}" for finding in bad) or "not installed"
+        return Finding(name, "limited", found, f"For {EXTRAS[extra]}: pip install 'robocas-ms3[{extra}]'")
+    return Finding(name, "ok", ", ".join(f"{finding.name} {finding.found}" for finding in findings))
+
+
+def check_folders() -> list[Finding]:
+    """Whether caches can be written (needed: the robot's files are made there) and packs be imported (optional)."""
+    return [
+        check_writable("cache folder", paths.cache_dir(), "ROBOCAS_CACHE", required=True),
+        check_writable("data folder", paths.data_dir(), "ROBOCAS_DATA", required=False),
+    ]
+
+
+def check_writable(name: str, folder: Path, variable: str, *, required: bool) -> Finding:
+    """Whether a folder, or the nearest one above it that exists, can be written to.
+
+    Args:
+        name: for the report.
+        folder: need not exist.
+        variable: environment variable that puts it elsewhere.
+        required: whether anything needs it.
+    """
+    there = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
+    if there.is_dir() and os.access(there, os.W_OK | os.X_OK):
+        return Finding(name, "ok", str(folder))
+    status = "fail" if required else "limited"
+    return Finding(name, status, f"{folder}: can't be written", f"Set ${variable} to a folder that can be written to.")
+
+
+def check_disk(folder: Path) -> Finding:
+    """Free space where outputs go by default.
+
+    Args:
+        folder: the one to look at.
+    """
+    free = shutil.disk_usage(folder).free / GIGABYTE
+    found = f"{free:.1f} GB free in {folder}"
+    if free < LEAST_DISK:
+        return Finding("disk", "fail", found, "Free some space.")
+    if free < ENOUGH_DISK:
+        return Finding("disk", "limited", found, "Converted datasets take about 0.1 GB an episode.")
+    return Finding("disk", "ok", found)
+
+
+def probe(name: str, trial: str, *, fix: str, required: bool = True) -> Finding:
+    """Try something in a child process.
+
+    Args:
+        name: for the report.
+        trial: name of the probe.
+        fix: what to do when it fails.
+        required: whether everything else hangs on it.
+    """
+    bad: Literal["fail", "limited"] = "fail" if required else "limited"
+    try:
+        done = subprocess.run(
+            [sys.executable, str(PROBES), trial], capture_output=True, text=True, timeout=PROBE_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Finding(name, bad, f"no answer within {PROBE_SECONDS} s", fix)
+    if done.returncode == 0:
+        return Finding(name, "ok", done.stdout.strip())
+    said = done.stderr.strip().splitlines()
+    if done.returncode == ABSENT:
+        return Finding(name, "ok", f"not used: {said[-1] if said else 'absent'}")
+    if done.returncode < 0:
+        return Finding(name, bad, f"crashed ({_signal_name(-done.returncode)})", fix)
+    return Finding(name, bad, said[-1] if said else f"exit code {done.returncode}", fix)
+
+
+def requirements(distribution: str, extra: str = "") -> Iterator[Requirement]:
+    """What an installed distribution asks for on this Python; nothing when it is not installed.
+
+    Args:
+        distribution: its name.
+        extra: only what this extra adds.
+    """
+    try:
+        lines = metadata.requires(distribution) or []
+    except metadata.PackageNotFoundError:
+        return
+    for item in map(Requirement, lines):
+        always = item.marker is None or item.marker.evaluate({"extra": ""})
+        if always if not extra else not always and item.marker and item.marker.evaluate({"extra": extra}):
+            yield item
+
+
+def _guarded(check: Callable[[], list[Finding]]) -> list[Finding]:
+    try:
+        return check()
+    except Exception as error:  # a check that breaks is a finding, not the end of the report
+        name = getattr(check, "__name__", "check").removeprefix("check_")
+        return [Finding(name, "fail", f"{type(error).__name__}: {error}", "Report this.")]
+
+
+def _reinstall(package: str) -> str:
+    return f"pip install --force-reinstall --no-deps {package}"
+
+
+def _key(name: str) -> str:
+    return name.lower().replace("_", "-")
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
