@@ -163,7 +163,8 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
 
     for link, (size, centre) in tips.items():
         name = f"visual/tip_{link}.glb"
-        write_boxes_glb(folder / name, [(size, centre, _TIP_COLOUR)])
+        shown = (centre[0], centre[1] * 0.95, centre[2])  # 0.1 mm inwards, before the rubber in the same plane
+        write_boxes_glb(folder / name, [(size, shown, _TIP_COLOUR)])
         _find(panda, "link", link).insert(1, _visual(name))
     _write(_with_base(panda), folder / f"{c.ROBOT_UID}.urdf")
 

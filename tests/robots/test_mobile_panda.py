@@ -81,6 +81,7 @@ def test_cameras_are_the_references(make_env):
     assert gripper[:3, 2] == pytest.approx([1, 0, 0], abs=1e-6)  # up: away from the fingers, which are below
 
 
+@pytest.mark.slow
 def test_cameras_see_what_they_should():
     import mani_skill.envs  # noqa: F401
 
@@ -88,7 +89,7 @@ def test_cameras_see_what_they_should():
         env = gym.make(
             "Empty-v1",
             robot_uids=c.ROBOT_UID,
-            obs_mode="rgb+depth+segmentation",
+            obs_mode="segmentation",
             sensor_configs=dict(width=160, height=120),
             sim_config=dict(sim_freq=100, control_freq=20),
         )
@@ -114,10 +115,11 @@ def test_cameras_see_what_they_should():
         assert u == pytest.approx(80, abs=1)
         # The TCP is 0.0834 m ahead of the camera and 0.05 m below its axis; f = 60 pixels.
         assert v == pytest.approx(60 + 60 * 0.05 / 0.0834, abs=1)
+        wrist = [agent.robot.links_map[f"panda_{link}"].per_scene_id[0].item() for link in ("link6", "link7", "hand")]
         for uid in ("base_camera", "static_camera"):
             u, v = project(cameras[uid], agent.tcp.pose.p[0].numpy())
             assert 0 < u < 160 and 0 < v < 120, uid
-            assert np.isin(pictures[uid]["segmentation"].numpy(), [*ids.values()]).any(), uid
+            assert np.isin(pictures[uid]["segmentation"].numpy(), wrist).sum() > 50, uid
     finally:
         env.close()
 
