@@ -18,12 +18,12 @@ from robocas_ms3.datasets.episode import invert
 
 Array = NDArray[np.float64]
 
-POINT_STEP = 4  # pixels between the points looked at
+POINT_ROWS = 80  # of the points looked at
 MIN_POINTS = 100  # fewer say nothing
 FLOOR_TOLERANCE = 0.03  # m
 FLOOR_BAND = 0.15  # m; what lies within it is taken for the floor
 SEEN_THROUGH = 0.05  # share of points
-AGREEING = 0.15  # share of points
+AGREEING = 0.02  # share of points; the rest may be hidden by something nearer
 NEAR = 0.15  # m; nearer than this a pixel covers less than the depth's millimetre
 
 
@@ -43,8 +43,9 @@ class View:
     intrinsic: Array
     camera_in_world: Array
 
-    def points(self, step: int = POINT_STEP) -> Array:
-        """(N, 3) seen points in the world, one of ``step`` x ``step`` pixels, m."""
+    def points(self, step: int = 0) -> Array:
+        """(N, 3) seen points in the world, one of ``step`` x ``step`` pixels (0: as the size asks for), m."""
+        step = step or max(1, self.depth.shape[0] // POINT_ROWS)
         rows, columns = np.mgrid[step // 2 : self.depth.shape[0] : step, step // 2 : self.depth.shape[1] : step]
         z = self.depth[rows, columns].astype(np.float64) / 1000
         fx, fy, cx, cy = self.intrinsic

@@ -20,7 +20,7 @@ PANEL = (426, 320)
 """Width and height of one camera's picture in a video."""
 _BAND = 64  # height of the text below the pictures
 _INK, _FAINT, _PAPER = (245, 245, 245), (170, 180, 190), (24, 26, 30)
-_NEAR_MM, _FAR_MM = 200, 3000  # colours of depth
+_NEAR_MM, _FAR_MM = 30, 5000  # colours of depth
 
 
 def write_video(
@@ -139,8 +139,9 @@ def write_previews(
 
 
 def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Depth as colours, (H, W, 3) RGB: near is red, far is blue, nothing is black."""
-    share = np.clip((_FAR_MM - depth.astype(np.float32)) / (_FAR_MM - _NEAR_MM), 0, 1)
+    """Depth as colours, (H, W, 3) RGB, on a logarithmic scale: near is red, far is blue, nothing is black."""
+    near, far = np.log(_NEAR_MM), np.log(_FAR_MM)
+    share = np.clip((far - np.log(np.maximum(depth, 1))) / (far - near), 0, 1)
     colours = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
     colours[depth == 0] = 0
     return colours.astype(np.uint8)

@@ -57,7 +57,7 @@ def test_contact_sheet(made, tmp_path):
 
 
 def test_depth_colours():
-    colours = colour_depth(np.array([[0, 200, 3000, 60000]], np.uint16))
+    colours = colour_depth(np.array([[0, 30, 5000, 60000]], np.uint16))
     assert colours[0, 0].tolist() == [0, 0, 0]
     assert colours[0, 1, 0] > colours[0, 1, 2], "near is red"
     assert colours[0, 2].tolist() == colours[0, 3].tolist()
