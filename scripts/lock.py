@@ -9,13 +9,14 @@ import json
 import subprocess
 import sys
 import tempfile
-import tomllib
 from pathlib import Path
+
+import tomllib
 
 ROOT = Path(__file__).resolve().parent.parent
 TORCH = "torch==2.13.0"
 OF_ONE_TORCH_BUILD = ("nvidia-c", "nvidia-n", "cuda-", "triton")
-HEADER = f"""\
+HEADER = """\
 # Exact versions for `pip install -c`; written by scripts/lock.py, not by hand.
 # numpy stays below 2: mplib 0.1.1 dies with a segmentation fault under numpy 2.
 """

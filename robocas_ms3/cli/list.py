@@ -33,7 +33,7 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     """Gather what there is, verifying every pack.
 
     Returns:
-        ``tasks``, ``configs`` and ``packs``, a mapping of plain values each. A damaged pack has ``error`` and no objects.
+        ``tasks``, ``configs`` and ``packs``, mappings of plain values. A damaged pack has an ``error`` and no objects.
 
     Raises:
         ConfigError: a shipped configuration is damaged.

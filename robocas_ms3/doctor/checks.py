@@ -6,11 +6,11 @@ They import nothing that may be broken: versions are read from metadata, everyth
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -143,7 +143,7 @@ def check_folders() -> list[Finding]:
 
 
 def check_writable(name: str, folder: Path, variable: str, *, required: bool) -> Finding:
-    """Whether a folder, or the nearest one above it that exists, can be written to.
+    """Whether a folder, or the nearest one above it that exists, can be written to: tried, as root may be refused too.
 
     Args:
         name: for the report.
@@ -152,10 +152,13 @@ def check_writable(name: str, folder: Path, variable: str, *, required: bool) ->
         required: whether anything needs it.
     """
     there = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
-    if there.is_dir() and os.access(there, os.W_OK | os.X_OK):
-        return Finding(name, "ok", str(folder))
-    status = "fail" if required else "limited"
-    return Finding(name, status, f"{folder}: can't be written", f"Set ${variable} to a folder that can be written to.")
+    try:
+        with tempfile.TemporaryDirectory(dir=there):
+            return Finding(name, "ok", str(folder))
+    except OSError as error:
+        found = f"{folder}: can't be written ({error.strerror})"
+        fix = f"Set ${variable} to a folder that can be written to."
+        return Finding(name, "fail" if required else "limited", found, fix)
 
 
 def check_disk(folder: Path) -> Finding:

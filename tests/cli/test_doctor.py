@@ -1,0 +1,74 @@
+"""`robocas doctor` in a process of its own, on a machine that works and on one where everything is broken."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def doctor(*words: str, **environment: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, ROOT / "robocas_cli.py", "doctor", *words],
+        capture_output=True,
+        text=True,
+        env=os.environ | environment,
+        check=False,
+    )
+
+
+@pytest.mark.slow
+def test_this_machine_is_fine():
+    done = doctor("--json")
+    report = json.loads(done.stdout)
+    assert [finding for finding in report["findings"] if finding["status"] == "fail"] == []
+    assert report["ok"] is True
+    assert done.returncode == 0
+    names = [finding["name"] for finding in report["findings"]]
+    assert {"python", "numpy", "render device", "planner", "asset packs", "cache folder", "disk"} <= set(names)
+
+
+@pytest.fixture
+def broken_machine(tmp_path):
+    """A folder for PYTHONPATH: numpy 2 that crashes mplib, a mani_skill and a sapien that can't be imported."""
+    for name, version, source in (
+        ("numpy", "2.1.0", "__version__ = '2.1.0'\n"),
+        ("mplib", "0.1.1", "import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n"),
+        ("mani_skill", "3.0.1", "raise ImportError('broken on purpose')\n"),
+        ("sapien", "3.0.3", "raise ImportError('broken on purpose')\n"),
+    ):
+        package, info = tmp_path / name, tmp_path / f"{name}-{version}.dist-info"
+        package.mkdir()
+        info.mkdir()
+        (package / "__init__.py").write_text(source)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_a_broken_machine_is_described(broken_machine):
+    unwritable = str(broken_machine / "numpy" / "__init__.py" / "x")
+    done = doctor("--json", PYTHONPATH=str(broken_machine), ROBOCAS_DATA=unwritable, ROBOCAS_CACHE=unwritable)
+    findings = {finding["name"]: finding for finding in json.loads(done.stdout)["findings"]}
+    assert done.returncode == 1
+    assert findings["numpy"]["status"] == "fail"
+    assert "segmentation fault" in findings["numpy"]["fix"]
+    for name in ("physics on CPU", "planner", "asset packs", "cache folder"):
+        assert findings[name]["status"] == "fail", name
+    for name in ("render device", "data folder"):
+        assert findings[name]["status"] == "limited", name
+    assert findings["physics on CPU"]["found"] == "ImportError: broken on purpose"
+    assert all(finding["fix"] for finding in findings.values() if finding["status"] != "ok")
+
+
+@pytest.mark.slow
+def test_the_table_shows_the_fix(broken_machine):
+    done = doctor(PYTHONPATH=str(broken_machine), COLUMNS="200")
+    assert done.returncode == 1
+    assert "FAIL" in done.stdout
+    assert "pip install 'numpy<2,>=1.26'" in done.stdout
+    assert "Traceback" not in done.stdout + done.stderr

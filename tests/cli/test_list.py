@@ -1,0 +1,44 @@
+import json
+
+import pytest
+
+from robocas_ms3.cli.list import List, collect, main
+from robocas_ms3.config import load_task_config, shipped_configs
+from robocas_ms3.paths import data_dir
+
+
+def test_tasks_and_configs_are_listed():
+    found = collect()
+    assert {"name": "pick", "env_id": "RoboCASPick-v1"}.items() <= found["tasks"][0].items()
+    configs = {row["name"]: row for row in found["configs"]}
+    assert configs.keys() == shipped_configs().keys()
+    for name, row in configs.items():
+        assert row["description"], f"{name} doesn't say what it is"
+        assert row["scene"].startswith(f"{load_task_config(name).objects.count} objects")
+
+
+def test_builtin_pack_is_listed():
+    packs = {row["name"]: row for row in collect()["packs"]}
+    assert len(packs["builtin"]["objects"]) >= 10
+    assert {"table", "basket", "room"} <= set(packs["builtin"]["furniture"])
+    assert packs["builtin"]["error"] == ""
+    assert 0.1 < packs["builtin"]["megabytes"] < 100
+
+
+@pytest.fixture
+def damaged_pack():
+    folder = data_dir() / "packs" / "broken"
+    folder.mkdir(parents=True)
+    (folder / "manifest.json").write_text("{")
+    yield
+    (folder / "manifest.json").unlink()
+    folder.rmdir()
+
+
+def test_a_damaged_pack_does_not_hide_the_others(damaged_pack, capsys):
+    assert main(List(json=True)) == 0
+    packs = {row["name"]: row for row in json.loads(capsys.readouterr().out)["packs"]}
+    assert "manifest" in packs["broken"]["error"]
+    assert packs["broken"]["objects"] == []
+    assert main(List()) == 0
+    assert "damaged" in capsys.readouterr().out

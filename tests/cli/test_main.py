@@ -1,0 +1,147 @@
+import dataclasses
+import errno
+import importlib
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from robocas_ms3.cli import main as cli
+from robocas_ms3.errors import RobocasError
+
+ROOT = Path(__file__).resolve().parents[2]
+HEAVY = {"torch", "numpy", "scipy", "sapien", "mani_skill", "gymnasium", "pydantic", "h5py", "trimesh"}
+
+
+def robocas(*words: str, **environment: str) -> subprocess.CompletedProcess:
+    """Run the command as a user does, in a process of its own."""
+    return subprocess.run(
+        [sys.executable, ROOT / "robocas_cli.py", *words],
+        capture_output=True,
+        text=True,
+        env=os.environ | environment,
+        check=False,
+    )
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """Make `robocas list` raise something."""
+
+    def fail(error: BaseException) -> None:
+        def main(cfg) -> int:
+            raise error
+
+        monkeypatch.setattr("robocas_ms3.cli.list.main", main)
+
+    return fail
+
+
+def test_help_lists_every_command_and_imports_nothing_heavy():
+    code = (
+        "import sys; from robocas_ms3.cli.main import run\n"
+        "try: run(['--help'])\n"
+        f"finally: sys.stderr.write(' '.join(sorted({HEAVY!r} & set(sys.modules))))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"ROBOCAS_DEFER_REGISTRATION": "1"},
+        check=True,
+    )
+    assert all(f"• {name}" in done.stdout for name in cli.COMMANDS)
+    assert done.stderr == ""
+
+
+def test_help_is_fast():
+    def seconds() -> float:
+        start = time.perf_counter()
+        assert robocas("--help").returncode == 0
+        return time.perf_counter() - start
+
+    assert min(seconds() for _ in range(4)) < 1.5
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_explains_itself(name, capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        cli.run([name, "--help"])
+    out = capsys.readouterr().out
+    assert exit_info.value.code == 0
+    assert f"usage: robocas {name}" in out
+    config_type = getattr(importlib.import_module(f"robocas_ms3.cli.{name}"), name.capitalize())
+    assert dataclasses.is_dataclass(config_type) or name == "assets"
+    assert config_type.__doc__.strip().split()[0] in out
+
+
+def test_no_arguments_show_the_overview(capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        cli.run([])
+    assert exit_info.value.code == 0
+    assert "generate" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [["lst"], ["list", "--jsn"], ["convert"]])
+def test_wrong_arguments_are_exit_code_2(words, capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        cli.run(words)
+    assert exit_info.value.code == 2
+    assert capsys.readouterr().out == ""
+
+
+def test_version():
+    from robocas_ms3 import __version__
+
+    assert robocas("--version").stdout == f"robocas {__version__}\n"
+
+
+def test_an_error_is_one_line(failing, capsys):
+    failing(RobocasError("too\nlong", where="a.yaml", expected=1, found=2, fix="Mend it."))
+    assert cli.run(["list"]) == 1
+    assert capsys.readouterr().err == "error: a.yaml: too long (expected 1, found 2). Mend it.\n"
+
+
+def test_debug_gives_the_traceback(failing, monkeypatch):
+    failing(RobocasError("broken"))
+    with pytest.raises(RobocasError):
+        cli.run(["list", "--debug"])
+    monkeypatch.setenv("ROBOCAS_DEBUG", "1")
+    with pytest.raises(RobocasError):
+        cli.run(["list"])
+    monkeypatch.setenv("ROBOCAS_DEBUG", "0")
+    assert cli.run(["list"]) == 1
+
+
+def test_interrupt(failing, capsys):
+    failing(KeyboardInterrupt())
+    assert cli.run(["list"]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_a_full_disk_is_one_line_but_a_bug_is_not(failing, capsys):
+    failing(OSError(errno.ENOSPC, "No space left on device", "out/x.h5"))
+    assert cli.run(["list"]) == 1
+    assert capsys.readouterr().err == "error: out/x.h5: No space left on device\n"
+    failing(FileNotFoundError(errno.ENOENT, "No such file or directory", "x"))
+    with pytest.raises(FileNotFoundError):
+        cli.run(["list"])
+
+
+def test_a_mistake_of_the_user_in_a_real_process(tmp_path):
+    done = robocas("convert", str(tmp_path / "missing.h5"), "--out", str(tmp_path / "out"), "--no-embeddings")
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].startswith("error: ")
+    assert "missing.h5" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_reader_that_goes_away():
+    script = f"{sys.executable} {ROOT / 'robocas_cli.py'} list --json | head -c 1; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr

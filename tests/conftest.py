@@ -1,0 +1,56 @@
+"""What all tests share. The user's data folder is kept out; the cache of robot files is kept, as it is only a cache."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PROBES = ROOT / "robocas_ms3" / "doctor" / "probes.py"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[_DATA] = tempfile.mkdtemp(prefix="robocas-test-data-")
+    os.environ["ROBOCAS_DATA"] = config.stash[_DATA]
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    shutil.rmtree(config.stash[_DATA], ignore_errors=True)
+
+
+_DATA = pytest.StashKey[str]()
+
+
+@pytest.fixture(scope="session")
+def shared_dir() -> Path:
+    """The folder of material that can't travel with the project: $ROBOCAS_SHARED, or `shared` beside the checkout."""
+    folder = Path(os.environ.get("ROBOCAS_SHARED") or ROOT.parent / "shared")
+    if not folder.is_dir():
+        pytest.skip(f"no reference material: {folder} is not a folder (set ROBOCAS_SHARED)")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def needs_renderer() -> str:
+    """The render device. Without one: a skip, on CI a failure, as setup installs one there."""
+    device, problem = _render_device()
+    if device is None and os.environ.get("CI") == "true":
+        pytest.fail(f"no render device: {problem}", pytrace=False)
+    if device is None:
+        pytest.skip(f"no render device: {problem}")
+    return device
+
+
+@lru_cache
+def _render_device() -> tuple[str | None, str]:
+    done = subprocess.run([sys.executable, PROBES, "render"], capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        return done.stdout.strip(), ""
+    return None, (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]

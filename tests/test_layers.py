@@ -1,0 +1,153 @@
+"""The import layers of docs/architecture.md, read from the source: who may know whom."""
+
+from __future__ import annotations
+
+import ast
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "robocas_ms3"
+# Lowest first; a module imports from its own layer and those before it.
+LAYERS = (
+    ("errors", "paths", "files"),
+    ("config",),
+    ("assets",),
+    ("scenes",),
+    ("robots",),
+    ("language",),
+    ("tasks",),
+    ("planning",),
+    ("demos",),
+    ("datasets",),
+    ("doctor",),
+    ("cli",),
+)
+RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
+SIMULATOR_FREE = ("config", "scenes.placement", "tasks.terms", "datasets.schema", "planning.protocol", "language")
+SIMULATORS = {"sapien", "mani_skill"}
+
+
+def modules(folder: Path) -> dict[str, Path]:
+    """Dotted name -> file of every module under a package's folder."""
+    found = {}
+    for path in sorted(folder.rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = modules(PACKAGE)
+
+
+@lru_cache
+def imports(module: str, path: Path) -> tuple[tuple[str, bool], ...]:
+    """(imported module, whether inside a function) of every import, type-checking ones too."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    local = {
+        id(node)
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for node in ast.walk(function)
+    }
+    found: list[tuple[str, bool]] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [(alias.name, id(node) in local) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+            for _ in range(node.level - 1):
+                package = package.rpartition(".")[0]
+            base = ".".join(filter(None, [package if node.level else "", node.module or ""]))
+            for alias in node.names:
+                # `from robocas_ms3 import paths` names a module, `from robocas_ms3.paths import data_dir` does not
+                name = f"{base}.{alias.name}"
+                found.append((name if name in MODULES else base, id(node) in local))
+    return tuple(found)
+
+
+def layer(module: str) -> str:
+    """`robocas_ms3.tasks.pick` is in `tasks`; the package itself in none."""
+    return module.split(".")[1] if module.count(".") else ""
+
+
+def reachable(module: str) -> dict[str, str]:
+    """Everything a module imports, directly or through others of this package -> who imports it."""
+    found: dict[str, str] = {}
+    todo = [module]
+    while todo:
+        current = todo.pop()
+        for name, _ in imports(current, MODULES[current]):
+            if name not in found:
+                found[name] = current
+                if name in MODULES and name != "robocas_ms3":
+                    todo.append(name)
+    return found
+
+
+def is_simulator_free(module: str) -> bool:
+    return any(f"{module}.".startswith(f"robocas_ms3.{name}.") for name in SIMULATOR_FREE)
+
+
+def test_every_module_has_a_layer():
+    assert len(MODULES) > 30
+    assert {layer(module) for module in MODULES} - {""} <= RANK.keys()
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if layer(module)])
+def test_imports_go_downwards(module):
+    upward = [
+        name
+        for name, _ in imports(module, MODULES[module])
+        if name.startswith("robocas_ms3.") and RANK[layer(name)] > RANK[layer(module)]
+    ]
+    assert upward == []
+
+
+@pytest.mark.parametrize(
+    "module", [m for m in MODULES if any(f"{m}.".startswith(f"robocas_ms3.{f}.") for f in SIMULATOR_FREE)]
+)
+def test_pure_layers_know_no_simulator(module):
+    found = reachable(module)
+    assert {name: by for name, by in found.items() if name.split(".")[0] in SIMULATORS} == {}
+
+
+def test_every_pure_layer_exists():
+    for name in SIMULATOR_FREE:
+        assert f"robocas_ms3.{name}" in MODULES
+
+
+def test_mesh_tools_are_imported_by_the_assets_command_alone_when_it_runs():
+    users = {
+        (module, local)
+        for module, path in MODULES.items()
+        for name, local in imports(module, path)
+        if name.split(".")[0] == "asset_tools"
+    }
+    assert users <= {("robocas_ms3.cli.assets", True)}
+
+
+def test_mesh_tools_know_only_the_lowest_layers():
+    allowed = {"errors", "paths", "files", "assets"}
+    for module, path in modules(ROOT / "asset_tools").items():
+        for name, _ in imports(module, path):
+            if name.startswith("robocas_ms3"):
+                assert layer(name) in allowed, f"{module} imports {name}"
+                if layer(name) == "assets":
+                    assert not {n.split(".")[0] for n in reachable(name)} & SIMULATORS, f"{module} imports {name}"
+
+
+def test_the_reader_of_imports_sees_them(tmp_path):
+    path = tmp_path / "x.py"
+    path.write_text(
+        "import sapien.physx\nfrom robocas_ms3 import paths\nfrom .base import thing\n"
+        "def f():\n    from mani_skill.envs import sapien_env\n"
+    )
+    assert imports("robocas_ms3.tasks.x", path) == (
+        ("sapien.physx", False),
+        ("robocas_ms3.paths", False),
+        ("robocas_ms3.tasks.base", False),
+        ("mani_skill.envs", True),
+    )

@@ -1,0 +1,85 @@
+"""The built wheel, installed by itself: what travels with it, and that an environment can be made from it."""
+
+import json
+import os
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+pytestmark = pytest.mark.slow
+
+MAKE_ENV = """
+import json
+import gymnasium as gym
+import robocas_ms3
+env = gym.make("RoboCASPick-v1", render_backend="none", obs_mode="state", num_envs=1)
+env.reset(seed=0)
+obs, reward, terminated, truncated, info = env.step(env.action_space.sample() * 0)
+print(json.dumps({"file": robocas_ms3.__file__, "success": info["success"].tolist(), "dims": list(obs.shape)}))
+env.close()
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT]
+    subprocess.run(build, check=True, capture_output=True)
+    (found,) = folder.glob("*.whl")
+    return found
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory) -> Path:
+    """Python of a clean environment with the wheel; its dependencies are the tests' own, nothing is downloaded.
+
+    A .pth line adds a folder to the path without reading the .pth files in it: the checkout is not on that path.
+    """
+    venv = tmp_path_factory.mktemp("clean")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", venv], check=True)
+    python = venv / "bin" / "python"
+    install = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", "--no-index", wheel]
+    subprocess.run(install, check=True)
+    (site_packages,) = (venv / "lib").glob("python*/site-packages")
+    (site_packages / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"] + "\n")
+    return python
+
+
+def run(python: Path, *words: str, cwd: Path) -> str:
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run([python, *words], cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_configs_and_builtin_pack_travel_in_the_wheel(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    for path in (ROOT / "task_configs").glob("*.yaml"):
+        assert f"robocas_ms3/data/task_configs/{path.name}" in names
+    manifest = ROOT / "robocas_ms3" / "data" / "packs" / "builtin" / "manifest.json"
+    for asset in json.loads(manifest.read_text())["assets"]:
+        for file in asset["files"]:
+            assert f"robocas_ms3/data/packs/builtin/{asset['id']}/{file}" in names
+    assert not [name for name in names if name.startswith(("tests/", "scripts/", "task_configs/"))]
+    assert wheel.stat().st_size < 60e6
+
+
+def test_an_environment_is_made_from_the_wheel(installed, tmp_path):
+    report = json.loads(run(installed, "-c", MAKE_ENV, cwd=tmp_path).splitlines()[-1])
+    assert Path(report["file"]).is_relative_to(installed.parent.parent)
+    assert report["success"] == [False]
+    assert report["dims"][0] == 1
+
+
+def test_the_command_runs_from_the_wheel(installed, tmp_path):
+    command = installed.with_name("robocas")
+    found = json.loads(run(installed, str(command), "list", "--json", cwd=tmp_path))
+    assert "pick_table_scattered" in {config["name"] for config in found["configs"]}
+    (builtin,) = [pack for pack in found["packs"] if pack["name"] == "builtin"]
+    assert Path(builtin["folder"]).is_relative_to(installed.parent.parent)
+    assert builtin["error"] == ""
