@@ -27,11 +27,12 @@ class JointPath(AbstractGeometricPath):
 
     Args:
         curve: piecewise polynomial over [0, length], values (n,).
+        goal: (n,) the last configuration, to the last bit.
     """
 
-    def __init__(self, curve: PPoly) -> None:
+    def __init__(self, curve: PPoly, goal: Array) -> None:
         super().__init__()
-        self._curve = curve
+        self._curve, self.goal = curve, goal
 
     def __call__(self, path_positions: Array | float, order: int = 0) -> Array:
         """Evaluate positions (m,) or one, or a derivative by the path's length."""
@@ -89,14 +90,14 @@ def rounded(waypoints: Array, radius: float) -> JointPath:
             bend = (directions[i + 1] - direction) / (4 * r)
             pieces.append((bend, direction, points[i + 1] - r * direction))
             breaks.append(breaks[-1] + 2 * r)
-    return JointPath(PPoly(np.array(pieces).transpose(1, 0, 2), np.array(breaks)))
+    return JointPath(PPoly(np.array(pieces).transpose(1, 0, 2), np.array(breaks)), points[-1])
 
 
 def through(waypoints: Array) -> JointPath:
     """Lay a cubic spline through dense configurations (m, n) of a smooth motion."""
     points = np.asarray(waypoints, dtype=np.float64)
     ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    return JointPath(CubicSpline(ends, points, bc_type="not-a-knot" if len(points) > 3 else "natural"))
+    return JointPath(CubicSpline(ends, points, bc_type="not-a-knot" if len(points) > 3 else "natural"), points[-1])
 
 
 def timed(path: JointPath, *, velocity: float, acceleration: float, dt: float) -> Trajectory | None:
@@ -120,7 +121,7 @@ def timed(path: JointPath, *, velocity: float, acceleration: float, dt: float) -
     if motion is None:
         return None
     duration = float(motion.path_interval[1])
-    return sampled(motion, duration, path(path.length), dt) if np.isfinite(duration) else None
+    return sampled(motion, duration, path.goal, dt) if np.isfinite(duration) else None
 
 
 def stopping(waypoints: Array, *, velocity: float, acceleration: float, dt: float) -> Trajectory:

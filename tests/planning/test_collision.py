@@ -1,0 +1,145 @@
+"""mplib's traps around collisions, each closed: numpy 2, voxels, flags, the base frame, points at the base."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import REST, Box, cloud, top_down
+
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.planning.collision import ArmWorld, matrix_to_pose, pose_to_matrix
+from robocas_ms3.planning.protocol import AttachedBody
+
+
+@pytest.fixture
+def world(panda_files) -> ArmWorld:
+    return ArmWorld(panda_files.arm_urdf, panda_files.arm_srdf)
+
+
+def test_numpy_2_is_refused_before_mplib_crashes(panda_files, monkeypatch):
+    monkeypatch.setattr(np, "__version__", "2.1.0")
+    with pytest.raises(RobocasError, match=r"numpy: .*expected < 2, found 2\.1\.0.*pip install"):
+        ArmWorld(panda_files.arm_urdf, panda_files.arm_srdf)
+
+
+def test_kinematics_agree_with_the_description(world, checker):
+    for qpos in np.random.default_rng(0).uniform(-1, 1, (5, 7)):
+        np.testing.assert_allclose(world.tcp(qpos), checker.link_pose("panda_hand_tcp", qpos), atol=1e-9)
+
+
+def test_quaternions_survive_the_round_trip():
+    from scipy.spatial.transform import Rotation
+
+    turns = [Rotation.random(random_state=i) for i in range(20)]
+    turns += [Rotation.from_rotvec(np.pi * axis) for axis in np.eye(3)] + [Rotation.identity()]
+    for turn in turns:
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), (1, 2, 3)
+        np.testing.assert_allclose(pose_to_matrix(matrix_to_pose(matrix)), matrix, atol=1e-12)
+
+
+def test_a_cloud_of_5_mm_spacing_has_no_holes(world):
+    """A pad driven 4 mm into a plane is noticed everywhere; 1 cm above it is free."""
+    rng = np.random.default_rng(0)
+    tcp = world.tcp(REST)
+    lowest = tcp[:3, 3] + 0.008 * tcp[:3, 2]  # pads end 8 mm beyond the TCP
+    grid = np.arange(-0.1, 0.1, 0.005)
+    plane = np.stack([*(axis.ravel() for axis in np.meshgrid(grid, grid)), np.zeros(len(grid) ** 2)], axis=1)
+    for _ in range(40):
+        shift = np.append(rng.uniform(0, 0.005, 2), 0.0)
+        # The plane lies across the approach, so that both pads meet it flat.
+        world.set_points((plane + shift + [0, 0, -0.004]) @ tcp[:3, :3].T + lowest)
+        assert world.contacts(REST, 0.08) == ["cloud", "panda_leftfinger", "panda_rightfinger"]
+        world.set_points((plane + shift + [0, 0, 0.010]) @ tcp[:3, :3].T + lowest)
+        assert world.free(REST)
+
+
+def test_the_cloud_counts_in_the_very_first_check_and_can_be_replaced(world, make_planner):
+    wide = Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))
+    planner = make_planner()
+    planner.set_scene(cloud([wide]))
+    assert planner.ik(planner.tcp(REST), REST) == []  # nothing was asked of this planner before
+    assert len(planner.ik(planner.tcp(REST), REST, avoid_collisions=False)) > 0
+    planner.set_scene(cloud([Box((0.6, 0, 0), (0.1, 0.1, 0.1))]))
+    assert len(planner.ik(planner.tcp(REST), REST)) > 0
+    planner.set_scene(np.zeros((0, 3)))
+    assert planner.collisions(REST) == []
+
+
+def test_recent_clouds_come_back_unchanged(world):
+    wide = cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))])
+    clouds = [cloud([Box((0.6, 0, 0.1 * i), (0.1, 0.1, 0.1))]) for i in range(6)]
+    for _ in range(2):
+        world.set_points(wide)
+        assert not world.free(REST)
+        for points in clouds:
+            world.set_points(points)
+            assert world.free(REST)
+    assert len(world._trees) == 4
+
+
+def test_the_base_stays_at_the_origin(world):
+    np.testing.assert_array_equal(world._robot.get_base_pose(), [0, 0, 0, 1, 0, 0, 0])
+
+
+def test_points_at_the_robots_own_base_are_cut_and_far_ones_too(world):
+    grid = np.arange(-0.5, 0.5, 0.005)
+    x, y = (axis.ravel() for axis in np.meshgrid(grid, grid))
+    inside_pedestal = np.stack([x, y, np.full(len(x), -0.001)], axis=1)
+    inside_pedestal = inside_pedestal[(np.abs(x) < 0.12) & (np.abs(y) < 0.09)]
+    floor = np.stack([x, y, np.full(len(x), -0.49)], axis=1)  # 1 cm below the mobile base
+    world.set_points(np.concatenate([inside_pedestal, floor]))
+    assert world.contacts(REST, 0.08) == []
+    points = np.array(
+        [[0, 0, -0.05], [0.05, 0, 0.1], [0.2, 0, -0.3], [0.3, 0, 0], [0, 0.2, -0.1], [1.51, 0, 0], [1.49, 0, 0]]
+    )
+    np.testing.assert_array_equal(world.keeps(points), [False, False, False, True, True, False, True])
+
+
+def test_points_must_be_finite(world):
+    with pytest.raises(RobocasError, match="finite"):
+        world.set_points(np.array([[0.5, np.nan, 0.0]]))
+
+
+def test_without_the_cloud_the_robot_still_counts(world):
+    world.set_points(cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))]))
+    assert not world.free(REST)
+    assert world.free(REST, cloud=False)
+    folded = np.array([0.0, -1.7, 0.0, -3.0, 0.0, 0.0, 0.0])
+    assert not world.free(folded, cloud=False)
+    assert len(world.contacts(folded, 0.08)) >= 2
+
+
+def test_closed_fingers_fit_where_open_ones_do_not(world):
+    tcp = world.tcp(REST)
+    beside = tcp[:3, 3] + 0.042 * tcp[:3, 1]  # where a pad of the open gripper is
+    world.set_points(beside[None])
+    assert world.contacts(REST, 0.08) == ["cloud", "panda_leftfinger"]
+    assert world.contacts(REST, 0.0) == []
+    world.finger_width = 0.0
+    assert world.free(REST)
+
+
+@pytest.mark.parametrize("quality", ["box", "cloud of points"])
+def test_any_set_of_vertices_can_be_attached(world, quality):
+    rng = np.random.default_rng(0)
+    vertices = (
+        rng.uniform(-0.03, 0.03, (300, 3))
+        if quality != "box"
+        else np.array(np.meshgrid(*[(-0.03, 0.03)] * 3)).reshape(3, -1).T
+    )
+    below = np.eye(4)
+    below[2, 3] = 0.05
+    world.attach(AttachedBody(vertices, below))
+    assert world.free(REST)
+    tcp = world.tcp(REST)
+    world.set_points((tcp[:3, 3] + 0.075 * tcp[:3, 2])[None])  # 25 mm below its centre: inside
+    assert world.contacts(REST, 0.08) in (["attached", "cloud"], [])
+    world.set_points((tcp[:3, 3] + 0.0795 * tcp[:3, 2])[None])  # at its bottom
+    assert world.contacts(REST, 0.08) == ["attached", "cloud"]
+
+
+def test_the_rest_pose_and_top_down_poses_are_free(make_planner):
+    planner = make_planner()
+    assert planner.collisions(REST) == []
+    assert len(planner.ik(top_down(0.5, 0.0, 0.2), REST)) >= 3

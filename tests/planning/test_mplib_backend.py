@@ -1,0 +1,261 @@
+"""The planner as a whole: safe, exactly timed, and failing with reasons that can be counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import REST, Box, cloud, corners, table_scene, top_down
+
+from robocas_ms3.errors import PlanningFailed, RobocasError
+from robocas_ms3.planning.kinematics import pose_error
+from robocas_ms3.planning.mplib_backend import MplibPlanner
+from robocas_ms3.planning.protocol import AttachedBody, Planner
+
+WALL = Box((0.55, 0.0, 0.15), (0.4, 0.03, 0.4))
+
+
+def reason_of(call, *args, **kwargs) -> str:
+    with pytest.raises(PlanningFailed) as caught:
+        call(*args, stage="here", **kwargs)
+    assert caught.value.stage == "here"
+    return caught.value.reason
+
+
+def check_limits(start, trajectory, velocity=0.5, acceleration=0.5):
+    rows = np.vstack([start, start, trajectory.qpos, trajectory.qpos[-1]])
+    speeds = np.diff(rows, axis=0) / trajectory.dt
+    assert np.abs(speeds).max() <= velocity + 1e-3
+    assert np.abs(np.diff(speeds, axis=0) / trajectory.dt).max() <= acceleration * 1.05
+
+
+def test_it_is_a_planner_of_the_protocol(planner):
+    typed: Planner = planner
+    assert all(callable(getattr(typed, name)) for name in vars(Planner) if not name.startswith("_"))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_driven_trajectories_touch_nothing_by_an_independent_check(make_planner, checker, seed):
+    boxes = [*table_scene(seed), WALL]
+    planner, rng = make_planner(dt=0.01), np.random.default_rng(seed)
+    planner.seed(seed)
+    planner.set_scene(cloud(boxes))
+    here, planned, straight = REST, 0, 0
+    for side in (1, -1, 1, -1):
+        goal = top_down(rng.uniform(0.4, 0.6), side * rng.uniform(0.12, 0.3), rng.uniform(0.1, 0.2), rng.uniform(-1, 1))
+        try:
+            trajectory = planner.plan_to_pose(here, goal, stage="reach")
+        except PlanningFailed as error:
+            assert error.reason in ("goal_in_collision", "no_ik")
+            continue
+        planned += 1
+        check_limits(here, trajectory)
+        assert checker.penetration(trajectory.qpos, boxes) <= 0.005
+        here = trajectory.qpos[-1]
+        distance, angle = pose_error(checker.link_pose("panda_hand_tcp", here), goal)
+        assert distance < 2e-4 and angle < 2e-3
+        try:
+            down = planner.plan_straight(here, goal @ shifted(0.06), stage="approach")
+        except PlanningFailed as error:
+            assert error.reason in ("straight_line_blocked", "line_unreachable", "line_joint_jump")
+            continue
+        straight += 1
+        check_limits(here, down)
+        assert checker.penetration(down.qpos, boxes) <= 0.005
+    assert planned >= 2
+    assert straight >= 1
+
+
+def shifted(z):
+    pose = np.eye(4)
+    pose[2, 3] = z
+    return pose
+
+
+def test_the_way_around_a_wall_is_found_and_is_not_a_straight_one(make_planner, checker):
+    planner = make_planner()
+    planner.seed(0)
+    planner.set_scene(cloud([WALL]))
+    start = planner.ik(top_down(0.5, 0.25, 0.1), REST)[0]
+    goal = planner.ik(top_down(0.5, -0.25, 0.1), start)[0]
+    assert planner.plan_to_qpos(REST, [start], stage="x")
+    trajectory = planner.plan_to_qpos(start, [goal], stage="x")
+    check_limits(start, trajectory)
+    np.testing.assert_array_equal(trajectory.qpos[-1], goal)
+    assert checker.penetration(trajectory.qpos, [WALL]) <= 0.005
+    direct = np.linspace(start, goal, 50)
+    assert checker.penetration(direct, [WALL]) > 0.02
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.2])
+def test_no_motion_short_motions_and_exact_ends(make_planner, dt):
+    planner = make_planner(dt=dt)
+    still = planner.plan_to_qpos(REST, [REST.copy()], stage="x")
+    np.testing.assert_array_equal(still.qpos, [REST])
+    for size in (1e-5, 1e-3, 0.03):
+        goal = REST + size
+        trajectory = planner.plan_to_qpos(REST, [goal], stage="x")
+        np.testing.assert_array_equal(trajectory.qpos[-1], goal)
+        assert trajectory.dt == dt
+        check_limits(REST, trajectory)
+    here = planner.tcp(REST)
+    assert len(planner.plan_straight(REST, here, stage="x").qpos) == 1
+    tiny = planner.plan_straight(REST, here @ shifted(0.002), stage="x")
+    assert pose_error(planner.tcp(tiny.qpos[-1]), here @ shifted(0.002))[0] < 1e-5
+
+
+def test_trajectories_do_not_depend_on_the_control_step(make_planner):
+    durations = []
+    for dt in (0.01, 0.05, 0.2):
+        planner = make_planner(dt=dt)
+        planner.seed(1)
+        durations.append(planner.plan_to_pose(REST, top_down(0.5, 0.2, 0.3), stage="x").duration)
+    assert max(durations) - min(durations) <= 0.2  # each is stretched to whole steps
+
+
+def test_the_nearest_reachable_goal_is_taken(planner):
+    near, far = REST + 0.2, REST + np.array([-1.0, 0.3, 0, 0, 0, 0.3, 0])
+    trajectory = planner.plan_to_qpos(REST, [far, near], stage="x")
+    np.testing.assert_array_equal(trajectory.qpos[-1], near)
+    blocked = Box(tuple(planner.tcp(near)[:3, 3]), (0.09, 0.09, 0.03))  # wider than the open gripper
+    planner.set_scene(cloud([blocked]))
+    trajectory = planner.plan_to_qpos(REST, [far, near], stage="x")
+    np.testing.assert_array_equal(trajectory.qpos[-1], far)
+
+
+def test_failures_have_reasons(make_planner):
+    planner = make_planner()
+    assert reason_of(planner.plan_to_pose, REST, top_down(1.3, 0, 0.3)) == "no_ik"
+    planner.set_scene(cloud([Box((0.5, 0, 0.2), (0.1, 0.1, 0.1))]))
+    assert reason_of(planner.plan_to_pose, REST, top_down(0.5, 0, 0.2)) == "goal_in_collision"
+    tcp = planner.tcp(REST)[:3, 3]
+    planner.set_scene(cloud([Box(tuple(tcp), (0.09, 0.09, 0.03))]))
+    assert reason_of(planner.plan_to_qpos, REST, [REST + 0.3]) == "start_in_collision"
+    assert reason_of(planner.plan_straight, REST, planner.tcp(REST) @ shifted(-0.1)) == "start_in_collision"
+    assert reason_of(planner.plan_to_qpos, REST + [0, -1, 0, 0, 0, 0, 0], [REST]) == "start_outside_limits"
+    assert reason_of(planner.plan_to_qpos, REST, [REST + [0, -1, 0, 0, 0, 0, 0]]) == "start_in_collision"
+    planner.set_scene(np.zeros((0, 3)))
+    assert reason_of(planner.plan_to_qpos, REST, [REST + [0, -1, 0, 0, 0, 0, 0]]) == "goal_in_collision"
+
+    hurried = make_planner(planning_time=0.005)  # 50 checks
+    hurried.set_scene(cloud([WALL]))
+    start = hurried.ik(top_down(0.5, 0.25, 0.1), REST)[0]
+    assert reason_of(hurried.plan_to_qpos, start, hurried.ik(top_down(0.5, -0.25, 0.1), start)[:1]) == "rrt_timeout"
+
+
+def test_a_start_in_collision_is_refused_not_perturbed(planner):
+    start = REST + [0, 0, 0, 0, 0, 0, 0.01]
+    pad = planner.tcp(start) @ np.array([[1, 0, 0, 0], [0, 1, 0, 0.042], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    planner.set_scene(pad[None, :3, 3])  # a single point, on the left pad
+    assert reason_of(planner.plan_to_qpos, start, [REST + 0.3]) == "start_in_collision"
+    retreat = planner.plan_straight(start, planner.tcp(start) @ shifted(-0.05), stage="x", check_collisions=False)
+    assert len(retreat.qpos) > 1
+
+
+class TestStraightLines:
+    def test_the_tcp_stays_on_the_line_and_turns_evenly(self, planner, checker):
+        start = planner.ik(top_down(0.5, 0.1, 0.3), REST)[0]
+        begin, goal = planner.tcp(start), top_down(0.55, -0.05, 0.2, yaw=0.6)
+        trajectory = planner.plan_straight(start, goal, stage="x")
+        check_limits(start, trajectory)
+        line = goal[:3, 3] - begin[:3, 3]
+        whole = pose_error(begin, goal)[1]
+        for qpos in trajectory.qpos:
+            tcp = checker.link_pose("panda_hand_tcp", qpos)
+            share = (tcp[:3, 3] - begin[:3, 3]) @ line / (line @ line)
+            assert np.linalg.norm(tcp[:3, 3] - begin[:3, 3] - share * line) < 1e-3
+            assert pose_error(begin, tcp)[1] == pytest.approx(share * whole, abs=0.01)
+        distance, angle = pose_error(checker.link_pose("panda_hand_tcp", trajectory.qpos[-1]), goal)
+        assert distance < 1e-5 and angle < 1e-4
+
+    def test_blocked_by_the_cloud_unless_told_otherwise(self, planner):
+        start = planner.ik(top_down(0.5, 0, 0.3), REST)[0]
+        goal = top_down(0.5, 0, 0.1)
+        planner.set_scene(cloud([Box((0.5, 0, 0.12), (0.09, 0.09, 0.06))]))
+        assert len(planner.plan_straight(start, top_down(0.5, 0, 0.2), stage="x").qpos) > 5
+        assert reason_of(planner.plan_straight, start, goal) == "straight_line_blocked"
+        assert len(planner.plan_straight(start, goal, stage="x", check_collisions=False).qpos) > 5
+
+    def test_the_robot_itself_always_counts(self, planner):
+        start = planner.ik(top_down(0.3, 0, 0.2), REST)[0]
+        for check in (True, False):
+            reason = reason_of(planner.plan_straight, start, top_down(0.12, 0, 0.0), check_collisions=check)
+            assert reason in ("straight_line_blocked", "line_unreachable")
+        planner.attach(AttachedBody(corners(0.05, 0.05, 0.15), np.eye(4)))
+        low = top_down(0.3, 0, 0.1)
+        planner.set_scene(np.zeros((0, 3)))
+        assert len(planner.plan_straight(start, low, stage="x", check_collisions=False).qpos) > 5
+        planner.attach(AttachedBody(corners(0.15, 0.15, 0.15), np.eye(4)))
+        assert reason_of(planner.plan_straight, start, top_down(0.2, 0, 0.0), check_collisions=False) in (
+            "straight_line_blocked",
+            "line_unreachable",
+            "start_in_collision",
+        )
+
+    def test_beyond_reach(self, planner):
+        start = planner.ik(top_down(0.5, 0, 0.3), REST)[0]
+        assert reason_of(planner.plan_straight, start, top_down(1.2, 0, 0.3)) in ("line_unreachable", "line_joint_jump")
+
+    @pytest.mark.parametrize("speed", [1.0, 0.3])
+    def test_speed_scales_both_limits(self, planner, speed):
+        start = planner.ik(top_down(0.5, 0, 0.3), REST)[0]
+        trajectory = planner.plan_straight(start, top_down(0.5, 0, 0.1), stage="x", speed=speed)
+        check_limits(start, trajectory, 0.5 * speed, 0.5 * speed)
+        slowest = planner.plan_straight(start, top_down(0.5, 0, 0.1), stage="x", speed=0.1)
+        assert slowest.duration > trajectory.duration
+
+
+class TestAttachedBodies:
+    def test_it_counts_against_the_cloud(self, planner):
+        start = planner.ik(top_down(0.5, 0, 0.3), REST)[0]
+        planner.set_scene(cloud([Box((0.5, 0, 0.05), (0.3, 0.3, 0.02))]))  # top at 0.06, 0.24 m below the TCP
+        assert planner.collisions(start) == []
+        planner.attach(AttachedBody(corners(0.02, 0.02, 0.10), shifted(0.125)))  # reaches 0.225 m below the TCP
+        assert planner.collisions(start) == []
+        planner.attach(AttachedBody(corners(0.02, 0.02, 0.10), shifted(0.145)))  # 0.245 m
+        assert planner.collisions(start) == ["attached", "cloud"]
+        assert reason_of(planner.plan_to_qpos, start, [REST]) == "start_in_collision"
+        planner.attach(None)
+        assert planner.collisions(start) == []
+
+    def test_it_counts_against_the_links_and_the_base(self, planner):
+        planner.attach(AttachedBody(corners(0.02, 0.02, 0.2), shifted(0.2)))
+        assert planner.collisions(REST) == []
+        planner.attach(AttachedBody(corners(0.02, 0.02, 0.2), shifted(-0.05)))
+        assert "panda_link6" in planner.collisions(REST)
+        near_base = planner.ik(top_down(0.35, 0, 0.05), REST, avoid_collisions=False)[0]
+        planner.attach(None)
+        assert planner.collisions(near_base) == []
+        planner.attach(AttachedBody(corners(0.26, 0.02, 0.02), shifted(0.1)))  # to x = 0.09, 5 cm below panda_link0
+        assert planner.collisions(near_base) == ["attached", "base_link"]
+
+    def test_it_is_carried_around_obstacles(self, planner, checker):
+        planner.seed(0)
+        planner.set_scene(cloud([WALL]))
+        body = corners(0.03, 0.03, 0.1)
+        planner.attach(AttachedBody(body, shifted(0.1)))
+        start = planner.ik(top_down(0.5, 0.25, 0.3), REST)[0]
+        trajectory = planner.plan_to_pose(start, top_down(0.5, -0.25, 0.3), stage="x")
+        for qpos in trajectory.qpos:
+            tcp = checker.link_pose("panda_hand_tcp", qpos) @ shifted(0.1)
+            edges = np.concatenate([np.linspace(a, b, 20) for a in body for b in body])
+            assert WALL.depth(edges @ tcp[:3, :3].T + tcp[:3, 3]) <= 0.005
+
+
+def test_nothing_is_printed(make_planner, capfd):
+    planner = make_planner()
+    planner.set_scene(cloud([WALL]))
+    planner.plan_to_pose(REST, top_down(0.5, 0.25, 0.1), stage="x")
+    with pytest.raises(PlanningFailed):
+        planner.plan_to_pose(REST, top_down(1.5, 0, 0), stage="x")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_wrong_files_and_steps_are_refused(panda_files, tmp_path):
+    with pytest.raises(RobocasError, match="no such robot description"):
+        MplibPlanner(tmp_path / "none.urdf", panda_files.arm_srdf, dt=0.05)
+    with pytest.raises(RobocasError, match="time step must be positive"):
+        MplibPlanner(panda_files.arm_urdf, panda_files.arm_srdf, dt=0.0)
+    lonely = tmp_path / "panda_arm.urdf"
+    lonely.write_bytes(panda_files.arm_urdf.read_bytes())  # its meshes are not beside it
+    with pytest.raises(RobocasError, match="can't load this description"):
+        MplibPlanner(lonely, panda_files.arm_srdf, dt=0.05)

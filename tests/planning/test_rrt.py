@@ -1,0 +1,70 @@
+"""The search, on a plane with a wall."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from robocas_ms3.planning.rrt import PathSearch, _spread
+
+LOW, HIGH = np.array([-2.0, -2.0]), np.array([2.0, 2.0])
+START, GOAL = np.array([-1.0, 0.0]), np.array([1.0, 0.0])
+
+
+def off_the_wall(q):
+    """Free unless within a wall at |x| < 0.1 that has a gap at 1.5 < y < 1.8."""
+    return abs(q[0]) >= 0.1 or 1.5 < q[1] < 1.8
+
+
+def search(valid=off_the_wall, spacing=0.02):
+    return PathSearch(valid, LOW, HIGH, step=0.2, spacing=spacing)
+
+
+def length(path):
+    return np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+
+
+def test_path_leads_through_the_gap_and_is_free():
+    path = search().connect(START, [GOAL], np.random.default_rng(0), max_checks=20000)
+    assert path is not None
+    np.testing.assert_array_equal(path[0], START)
+    np.testing.assert_array_equal(path[-1], GOAL)
+    dense = np.concatenate([np.linspace(a, b, 50) for a, b in zip(path[:-1], path[1:], strict=True)])
+    assert all(map(off_the_wall, dense))
+    assert any(abs(q[0]) < 0.1 and 1.5 < q[1] < 1.8 for q in dense)
+
+
+def test_shortening_keeps_the_ends_and_comes_near_the_shortest_path():
+    finder, rng = search(), np.random.default_rng(1)
+    path = finder.connect(START, [GOAL], rng, max_checks=20000)
+    assert path is not None
+    short = finder.shorten(path, rng, tries=200, max_checks=50000)
+    shortest = 2 * np.hypot(0.9, 1.5) + 0.2
+    assert shortest - 1e-6 <= length(short) <= 1.1 * shortest
+    assert length(short) <= length(path)
+    np.testing.assert_array_equal(short[0], START)
+    np.testing.assert_array_equal(short[-1], GOAL)
+
+
+def test_same_generator_same_path_and_the_budget_counts_checks():
+    runs = [search().connect(START, [GOAL], np.random.default_rng(3), max_checks=20000) for _ in range(2)]
+    np.testing.assert_array_equal(runs[0], runs[1])
+    calls = []
+    blocked = search(lambda q: calls.append(1) or abs(q[0]) >= 0.1)
+    assert blocked.connect(START, [GOAL], np.random.default_rng(0), max_checks=500) is None
+    assert len(calls) == 500
+
+
+def test_several_goals_end_at_one_of_them():
+    path = search().connect(START, [GOAL, np.array([-1.0, 1.0])], np.random.default_rng(0), max_checks=20000)
+    assert path is not None
+    np.testing.assert_array_equal(path[-1], [-1.0, 1.0])  # on this side of the wall
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 32, 100])
+def test_edges_are_checked_everywhere_ends_and_middles_first(count):
+    order = _spread(count)
+    assert sorted(order) == list(range(1, count + 1))
+    assert order[0] == count
+    if count > 2:
+        assert abs(order[1] - count / 2) <= 1
