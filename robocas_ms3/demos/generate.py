@@ -19,7 +19,7 @@ from robocas_ms3.demos.record import merge, open_trajectory, read_json
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import claim_output, make_folder, write_json
 
-_worker: EpisodeGenerator | None = None
+_worker: EpisodeGenerator | Exception | None = None
 
 
 @dataclass(frozen=True)
@@ -173,10 +173,15 @@ def _start_worker(settings: EpisodeSettings) -> None:
     import torch
 
     torch.set_num_threads(1)
-    _worker = EpisodeGenerator(settings)
+    try:
+        _worker = EpisodeGenerator(settings)
+    except Exception as error:  # noqa: BLE001  (raised by the first task: an initializer's own error breaks the pool)
+        _worker = error
 
 
 def _generate(seed: int, folder: Path) -> EpisodeResult:
+    if isinstance(_worker, Exception):
+        raise _worker
     assert _worker is not None
     return _worker.generate(seed, folder, shard_name(seed))
 
