@@ -1,0 +1,26 @@
+#!/usr/bin/env bash
+# Sets up, records three pick episodes, writes a dataset of them with videos, checks it, says where everything lies.
+#
+#   bash scripts/demo.sh [OUT]      OUT: output folder, by default demo_output; what an earlier demo left there goes
+set -euo pipefail
+out=$(realpath -m "${1:-"$(dirname "${BASH_SOURCE[0]}")/../demo_output"}")
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+bash scripts/setup.sh
+robocas=${ROBOCAS_VENV:-.venv}/bin/robocas
+"$robocas" generate pick -n 3 --seed 0 --out "$out/demonstrations" --overwrite
+if ! "${robocas%robocas}python" robocas_ms3/doctor/probes.py render >/dev/null 2>&1; then
+    echo "No render device: the demonstrations are recorded, but no pictures can be made of them; see robocas doctor."
+    echo "demonstrations  $out/demonstrations/trajectory.h5"
+    exit 0
+fi
+"$robocas" convert "$out/demonstrations/trajectory.h5" --to robocas --out "$out/dataset" --overwrite
+"$robocas" validate "$out/dataset"
+
+echo
+echo "demonstrations  $out/demonstrations/trajectory.h5"
+echo "dataset         $out/dataset"
+for video in "$out"/dataset/preview/episode_*.mp4; do
+    echo "video           $video"
+done
+echo "contact sheet   $out/dataset/preview/contact_sheet.png"
