@@ -1,0 +1,163 @@
+"""Recorded states seen through ManiSkill's own cameras."""
+
+import json
+
+import gymnasium as gym
+import h5py
+import numpy as np
+import pytest
+
+from robocas_ms3.datasets import geometry
+from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.render import EnvFrames
+from robocas_ms3.datasets.trajectory import TrajectoryFile
+from robocas_ms3.datasets.validate import validate
+from robocas_ms3.errors import DatasetError
+
+ENV_ID = "robocas_ms3:RoboCASPick-v1"
+SIZE = (96, 72)
+STEPS = 9
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory, needs_renderer):
+    """A short motion of the real environment in the generator's form, and what its cameras and links were like then."""
+    path = tmp_path_factory.mktemp("recorded") / "F.h5"
+    env = gym.make(
+        ENV_ID,
+        obs_mode="rgb+depth",
+        control_mode="pd_joint_pos",
+        sensor_configs=dict(zip(("width", "height"), SIZE, strict=True)),
+    )
+    base = env.unwrapped
+    obs, _ = env.reset(seed=11)
+    goal = np.array([0.3, 0.3, 0.2, -1.7, 0.1, 2.0, 1.2])
+    states, seen, tcp, actions = [base.get_state_dict()], [obs["sensor_data"]], [base.agent.tcp.pose], []
+    start = base.agent.robot.get_qpos()[0, 3:10].numpy()
+    for step in range(STEPS):
+        arm = start + (goal - start) * min(1, (step + 1) / 6)
+        actions.append(np.append(arm, 1 if step < 5 else -1).astype(np.float32))
+        obs, *_ = env.step(actions[-1])
+        states.append(base.get_state_dict())
+        seen.append(obs["sensor_data"])
+        tcp.append(base.agent.tcp.pose)
+    instruction = base.get_language_instruction()[0]
+    env.close()
+    with h5py.File(path, "w") as file:
+        group = file.create_group("traj_0")
+        group["actions"] = np.stack(actions)
+        for kind in ("actors", "articulations"):
+            for name in states[0][kind]:
+                group[f"env_states/{kind}/{name}"] = np.concatenate([state[kind][name].numpy() for state in states])
+    goals = [
+        {"goal_type": "move and grasp", "goal_description": "grasp it", "goal_range": [0, 4]},
+        {"goal_type": "transfer object", "goal_description": "drop it", "goal_range": [5, STEPS - 1]},
+    ]
+    episode = {
+        "episode_id": 0, "episode_seed": 11, "control_mode": "pd_joint_pos", "elapsed_steps": STEPS,
+        "reset_kwargs": {"seed": 11}, "success": True, "robocas": {"instruction": instruction, "subgoals": goals},
+    }  # fmt: skip
+    env_info = {"env_id": ENV_ID, "env_kwargs": {"control_mode": "pd_joint_pos", "obs_mode": "none"}}
+    metadata = {"env_info": env_info, "episodes": [episode], "robocas": {"control_freq": 20}}
+    path.with_suffix(".json").write_text(json.dumps(metadata))
+    return path, seen, [pose.to_transformation_matrix()[0].numpy() for pose in tcp]
+
+
+@pytest.fixture(scope="module")
+def recording(recorded):
+    with TrajectoryFile(recorded[0]) as file:
+        yield file.recording(0)
+
+
+@pytest.fixture(scope="module")
+def source(recorded, recording):
+    with TrajectoryFile(recorded[0]) as file:
+        frames = EnvFrames(file.env_info, "pd_joint_pos", SIZE)
+    frames.load(recording)
+    yield frames
+    frames.close()
+
+
+def test_states_look_as_they_did(source, recording, recorded):
+    _, seen, tcp = recorded
+    for index in (0, 4, STEPS):
+        frame = source.frame(recording.state(index))
+        np.testing.assert_allclose(frame.tcp_in_world, tcp[index], atol=1e-5)
+        for camera in frame.rgb:
+            then = seen[index][camera]
+            difference = np.abs(frame.rgb[camera].astype(int) - then["rgb"][0].numpy()).max(axis=2)
+            assert np.mean(difference > 8) < 0.01, (index, camera)
+            deeper = np.abs(frame.depth[camera].astype(int) - then["depth"][0, ..., 0].numpy())
+            assert np.mean(deeper > 2) < 0.01, (index, camera)
+
+
+def test_nothing_moves_while_states_are_shown(source, recording):
+    state = recording.state(5)
+    source.frame(state)
+    now = source.env.unwrapped.get_state_dict()
+    for kind, arrays in state.items():
+        for name, array in arrays.items():
+            np.testing.assert_allclose(now[kind][name].numpy()[:, :7], array[:, :7], atol=1e-6, err_msg=name)
+
+
+def test_camera_poses_are_the_declared_ones(source):
+    """By hand, OpenCV axes: base camera 1.2 - 0.23 m above the arm's base, 25 deg down; gripper camera along z."""
+    cameras = source.cameras()
+    s, c = np.sin(np.deg2rad(25)), np.cos(np.deg2rad(25))
+    expected = {
+        "base_camera": [[0, -s, c, 0], [-1, 0, 0, -0.3], [0, -c, -s, 0.97]],
+        "gripper_camera": [[0, -1, 0, 0.05], [1, 0, 0, 0], [0, 0, 1, 0.05 - 0.1334]],
+        "static_camera": [[-1, 0, 0, 1], [0, np.sqrt(0.75), -0.5, 1.5], [0, -0.5, -np.sqrt(0.75), 1.5]],
+    }
+    for name, pose in expected.items():
+        np.testing.assert_allclose(cameras[name].camera_in_parent[:3], pose, atol=2e-5, err_msg=name)
+        np.testing.assert_allclose(cameras[name].intrinsic, [36, 36, 48, 36], atol=1e-4)
+
+
+def test_depth_agrees_with_the_cameras(source, recording):
+    steps = []
+    for index in (0, 5, STEPS):
+        frame = source.frame(recording.state(index))
+        parents = {"gripper_camera": frame.tcp_in_world, "base_camera": frame.arm_base_in_world}
+        steps.append(
+            [
+                geometry.View(n, frame.depth[n], m.intrinsic, parents.get(n, np.eye(4)) @ m.camera_in_parent)
+                for n, m in source.cameras().items()
+            ]
+        )
+    assert list(geometry.check(steps)) == []
+    # The table's top is a plane at 0.61 m: most of what lies there does so to the millimetre.
+    heights = steps[0][-1].points()[:, 2]
+    assert np.median(np.abs(heights[np.abs(heights - 0.61) < 0.01] - 0.61)) < 0.0025
+
+
+def test_another_scene_is_refused(source, recording):
+    import dataclasses
+
+    def spoiled(**changes):
+        return dataclasses.replace(recording, **changes)
+
+    moved = {kind: dict(arrays) for kind, arrays in recording.states.items()}
+    moved["actors"]["object_3"] = moved["actors"]["object_3"] + np.float32(0.01)
+    with pytest.raises(DatasetError, match="seed 11, object_3: the seed builds another scene.* 17.3 mm away"):
+        source.load(spoiled(states=moved))
+    fewer = {kind: dict(arrays) for kind, arrays in recording.states.items()}
+    del fewer["actors"]["object_3"]
+    with pytest.raises(DatasetError, match="the seed builds another scene"):
+        source.load(spoiled(states=fewer))
+    with pytest.raises(DatasetError, match="expected fly away"):
+        source.load(spoiled(instruction="fly away"))
+    source.load(recording)
+
+
+def test_a_real_dataset_is_valid(recorded, tmp_path):
+    done = convert(recorded[0], tmp_path / "out", embeddings=False, size=SIZE)
+    assert [episode.steps for episode in done.episodes] == [4]  # states 0, 4, 8, 9
+    assert validate(tmp_path / "out").violations == []
+    with np.load(tmp_path / "out" / "episode_0000000" / "episode_info.npz") as arrays:
+        assert arrays["gripper_status"].tolist() == [True, True, False, False]
+        # The mobile base stands at (0.7, 0.15), turned by 90 deg; the arm's base above it.
+        np.testing.assert_allclose(arrays["agv_pose"], [[0.7, 0.15, np.pi / 2]] * 4, atol=1e-3)
+        np.testing.assert_allclose(arrays["base_pos"][:, :2], [[0.7, 0.15]] * 4, atol=1e-3)
