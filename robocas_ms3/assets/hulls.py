@@ -1,0 +1,150 @@
+"""Convex hulls of an asset: the ``hulls.obj`` file, and what can be worked out from it. Metres, the asset's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from robocas_ms3.errors import AssetError
+
+Array = NDArray[np.float64]
+
+# Points of one hull count as hidden when they lie deeper than this in another, m
+_HIDDEN_DEPTH = 0.0005
+
+
+@dataclass(frozen=True)
+class Hull:
+    """One convex hull.
+
+    Attributes:
+        vertices: (V, 3) m.
+        faces: (F, 3) indices of ``vertices``.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+
+
+def read_hulls(path: Path) -> list[Hull]:
+    """Read ``hulls.obj``: one ``o`` group a hull, triangles only.
+
+    Raises:
+        AssetError: the file is cut short, is no OBJ, or holds no hull.
+    """
+    vertices: list[list[float]] = []
+    groups: list[list[list[int]]] = []
+    try:
+        for line in path.read_text(encoding="ascii").splitlines():
+            if line.startswith("v "):
+                vertices.append([float(word) for word in line.split()[1:4]])
+            elif line.startswith("o "):
+                groups.append([])
+            elif line.startswith("f "):
+                groups[-1].append([int(word) - 1 for word in line.split()[1:4]])
+        points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+        hulls = []
+        for group in groups:
+            faces = np.array(group, dtype=np.int64).reshape(-1, 3)
+            used, local = np.unique(faces, return_inverse=True)
+            hulls.append(Hull(_frozen(points[used]), _frozen(local.reshape(-1, 3))))
+    except (ValueError, IndexError, UnicodeDecodeError) as error:
+        raise AssetError(
+            "can't read the convex hulls", where=path, found=str(error), fix="Make the pack again."
+        ) from error
+    if not hulls or any(len(hull.faces) < 4 for hull in hulls):
+        raise AssetError("no convex hull in the file", where=path, fix="Make the pack again.")
+    return hulls
+
+
+def write_hulls(path: Path, hulls: Sequence[Array]) -> None:
+    """Write ``hulls.obj``, one ``o`` group a hull, faces turned outwards.
+
+    Args:
+        path: the file.
+        hulls: (V, 3) points each, m; their convex hulls are written.
+    """
+    lines, offset = [], 1
+    for number, points in enumerate(hulls):
+        vertices, faces = convex_faces(points)
+        lines.append(f"o hull_{number}")
+        lines += [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in vertices]
+        lines += [f"f {a} {b} {c}" for a, b, c in faces + offset]
+        offset += len(vertices)
+    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (V, 3) and outward triangles (F, 3) of the convex hull of points (P, 3).
+
+    Raises:
+        AssetError: the points lie in a plane.
+    """
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError) as error:
+        raise AssetError("the points of a convex hull lie in a plane", found=f"{len(points)} points") from error
+    used, local = np.unique(hull.simplices, return_inverse=True)
+    vertices, faces = np.asarray(points, dtype=np.float64)[used], local.reshape(-1, 3)
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return vertices, faces
+
+
+def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
+    """Points on the surface of the union of hulls, about ``spacing`` apart and the same on every call.
+
+    Args:
+        hulls: in one frame.
+        spacing: m.
+
+    Returns:
+        (P, 3) m; points of one hull that lie inside another are left out.
+    """
+    equations = [ConvexHull(hull.vertices).equations for hull in hulls]
+    kept = []
+    for index, hull in enumerate(hulls):
+        points = sample_triangles(hull.vertices[hull.faces], spacing)
+        for other, planes in enumerate(equations):
+            if other != index and len(points):
+                depth = np.max(points @ planes[:, :3].T + planes[:, 3], axis=1)
+                points = points[depth > -_HIDDEN_DEPTH]
+        kept.append(points)
+    return thin(np.concatenate(kept), spacing)
+
+
+def sample_triangles(corners: Array, spacing: float) -> Array:
+    """Points (P, 3) of grids on triangles (F, 3, 3), at most ``spacing`` apart, corners and edges included."""
+    lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    longest = np.argmax(lengths, axis=1)
+    rows = np.arange(len(corners))
+    a, b, c = (corners[rows, (longest + k) % 3] for k in range(3))
+    base = lengths[rows, longest]
+    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(base, 1e-12)
+    counts = np.stack([np.ceil(base / spacing), np.ceil(height / spacing)], axis=1).astype(int).clip(1)
+    points = []
+    for along, up in np.unique(counts, axis=0):
+        chosen = np.all(counts == (along, up), axis=1)
+        s, t = (grid.ravel() for grid in np.meshgrid(np.linspace(0, 1, along + 1), np.linspace(0, 1, up + 1)))
+        weights = np.stack([(1 - t) * (1 - s), (1 - t) * s, t], axis=1)
+        points.append(np.einsum("pk,fki->fpi", weights, np.stack([a, b, c], axis=1)[chosen]).reshape(-1, 3))
+    return np.concatenate(points)
+
+
+def thin(points: Array, spacing: float) -> Array:
+    """Keep one point (P, 3) per cube of edge ``spacing / 2``: the first one given."""
+    cells = np.floor(points / (spacing / 2) + 0.25).astype(np.int64)
+    first = np.unique(cells, axis=0, return_index=True)[1]
+    return points[np.sort(first)]
+
+
+def _frozen(array: NDArray) -> NDArray:
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from robocas_ms3.assets.hulls import convex_faces, read_hulls, sample_surface, sample_triangles, write_hulls
+from robocas_ms3.errors import AssetError
+
+CUBE = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)], dtype=float)
+
+
+def test_hulls_survive_writing_and_reading(tmp_path):
+    write_hulls(tmp_path / "hulls.obj", [CUBE, CUBE + [0.2, 0, 0]])
+    first, second = read_hulls(tmp_path / "hulls.obj")
+    assert first.vertices.shape == (8, 3) and first.faces.shape == (12, 3)
+    np.testing.assert_allclose(second.vertices - [0.2, 0, 0], first.vertices, atol=1e-7)
+    corners = first.vertices[first.faces]
+    volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert volume == pytest.approx(0.001)  # positive: the faces look outwards
+
+
+def test_points_in_a_plane_are_no_hull():
+    with pytest.raises(AssetError, match="lie in a plane"):
+        convex_faces(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype=float))
+
+
+@pytest.mark.parametrize("content", ["", "o hull_0\nv 0 0 0\nf 1 2 3\n", "v 0 0 0\nf 1 1 1\n", "o a\nv 0 zero 0\n"])
+def test_damaged_hulls_name_the_file(tmp_path, content):
+    path = tmp_path / "hulls.obj"
+    path.write_text(content)
+    with pytest.raises(AssetError, match=r"hulls\.obj"):
+        read_hulls(path)
+
+
+def test_grid_of_a_triangle():
+    points = sample_triangles(np.array([[[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]]], dtype=float), 0.005)
+    assert np.all(points >= -1e-12) and np.all(points[:, 0] + points[:, 1] <= 0.01 + 1e-12)
+    for corner in ([0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]):
+        assert np.linalg.norm(points - corner, axis=1).min() < 1e-9
+    # The middle of the long edge lies at most half a step from a point
+    assert np.linalg.norm(points - [0.005, 0.005, 0], axis=1).min() <= 0.0025
+
+
+def test_surface_of_a_union_leaves_out_what_is_inside(tmp_path):
+    # Two cubes that overlap by half: the union is a 0.15 x 0.1 x 0.1 box
+    write_hulls(tmp_path / "hulls.obj", [CUBE, CUBE + [0.05, 0, 0]])
+    points = sample_surface(read_hulls(tmp_path / "hulls.obj"), 0.005)
+    low, high = np.zeros(3), np.array([0.15, 0.1, 0.1])
+    depth = np.minimum(points - low, high - points).min(axis=1)
+    assert np.abs(depth).max() < 0.001
+    # Every 5 mm of the box's surface has a point near it
+    side = np.stack(np.meshgrid(np.linspace(0, 0.15, 31), np.linspace(0, 0.1, 21)), -1).reshape(-1, 2)
+    top = np.column_stack([side, np.full(len(side), 0.1)])
+    assert cKDTree(points).query(top)[0].max() < 0.005

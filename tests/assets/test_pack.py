@@ -1,0 +1,138 @@
+import json
+import os
+
+import numpy as np
+import pytest
+
+from robocas_ms3.assets.hulls import write_hulls
+from robocas_ms3.assets.manifest import ObjectAsset, PackManifest
+from robocas_ms3.assets.pack import Annotations, available_packs, load_pack, sha256
+from robocas_ms3.errors import AssetError
+
+BOX = np.array([[x, y, z] for x in (-0.05, 0.05) for y in (-0.03, 0.03) for z in (-0.02, 0.02)])
+
+
+def notes(**changes):
+    upright, on_end = np.eye(4), np.eye(4)
+    upright[2, 3] = 0.02
+    on_end[:3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]
+    on_end[2, 3] = 0.05
+    values = {
+        "resting_poses": np.stack([upright, on_end]),
+        "resting_probabilities": np.array([0.7, 0.3]),
+        "display_pose": 0,
+        "grasps_tcp_in_object": np.eye(4)[None],
+        "grasp_widths": np.array([0.06]),
+        "grasp_qualities": np.array([0.1]),
+        "surface_points": BOX,
+        "surface_normals": np.tile([0.0, 0, 1], (8, 1)),
+    }
+    return Annotations(**{**values, **changes})
+
+
+@pytest.fixture
+def box_pack(tmp_path):
+    root = tmp_path / "packs" / "boxes"
+    folder = root / "box"
+    folder.mkdir(parents=True)
+    write_hulls(folder / "hulls.obj", [BOX])
+    notes().save(folder / "annotations.npz")
+    (folder / "visual.glb").write_bytes(b"glTF")
+    names = ("hulls.obj", "annotations.npz", "visual.glb")
+    asset = ObjectAsset(
+        id="box",
+        name="box",
+        category="box",
+        source="test",
+        licence="MIT",
+        attribution="none",
+        extents=(0.1, 0.06, 0.04),
+        mass=0.1,
+        center_of_mass=(0, 0, 0),
+        inertia=(1e-5, 1e-5, 1e-5),
+        hull_count=1,
+        volume_iou=1.0,
+        grasp_count=1,
+        files={name: sha256(folder / name) for name in names},
+    )
+    (root / "manifest.json").write_text(PackManifest(name="boxes", assets=[asset]).model_dump_json())
+    return root
+
+
+def test_a_pack_is_found_by_name_and_by_path(box_pack, monkeypatch):
+    monkeypatch.setenv("ROBOCAS_DATA", str(box_pack.parent.parent))
+    assert "boxes" in available_packs()
+    assert load_pack("boxes").objects.keys() == load_pack(box_pack).objects.keys() == {"box"}
+    with pytest.raises(AssetError, match=r"spam: no such asset pack.*boxes"):
+        load_pack("spam")
+
+
+def test_geometry_of_an_object(box_pack):
+    box = load_pack(box_pack).objects["box"]
+    assert [len(hull) for hull in box.hulls] == [8]
+    np.testing.assert_allclose(np.ptp(box.footprint(0), axis=0), [0.1, 0.06], atol=1e-6)
+    np.testing.assert_allclose(np.ptp(box.footprint(1), axis=0), [0.04, 0.06], atol=1e-6)
+    points = box.surface_points(0.01)
+    assert points is box.surface_points(0.01)
+    np.testing.assert_allclose(np.abs(points).max(axis=0), [0.05, 0.03, 0.02], atol=1e-6)
+    assert box.annotations.display_pose == 0 and box.annotations.grasp_widths[0] == pytest.approx(0.06)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.unlink(), r"hulls\.obj: this file of the asset pack is missing"),
+        (lambda path: path.write_text(path.read_text()[:-20]), r"hulls\.obj: .*changed or cut short"),
+        (lambda path: path.write_text(""), r"hulls\.obj: .*is empty"),
+    ],
+)
+def test_damaged_files_are_found_even_after_a_good_load(box_pack, damage, message):
+    load_pack(box_pack)
+    damage(box_pack / "box" / "hulls.obj")
+    with pytest.raises(AssetError, match=message) as caught:
+        load_pack(box_pack)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_damaged_manifest_says_where(box_pack):
+    path = box_pack / "manifest.json"
+    data = json.loads(path.read_text())
+    data["assets"][0]["mass"] = -1
+    path.write_text(json.dumps(data))
+    with pytest.raises(AssetError, match=r"manifest\.json: the manifest is damaged .*mass"):
+        load_pack(box_pack)
+    path.write_text(path.read_text()[:100])
+    with pytest.raises(AssetError, match="the manifest is damaged"):
+        load_pack(box_pack)
+
+
+def test_a_manifest_that_forgets_a_file(box_pack):
+    path = box_pack / "manifest.json"
+    data = json.loads(path.read_text())
+    del data["assets"][0]["files"]["hulls.obj"]
+    path.write_text(json.dumps(data))
+    with pytest.raises(AssetError, match=r"lists no such file \(expected box/hulls\.obj"):
+        load_pack(box_pack)
+
+
+def test_annotations_refuse_wrong_shapes_and_pickles(tmp_path):
+    with pytest.raises(AssetError, match="grasps_tcp_in_object"):
+        notes(grasp_widths=np.zeros(3))
+    with pytest.raises(AssetError, match="display_pose"):
+        notes(display_pose=2)
+    with pytest.raises(AssetError, match="surface_points"):
+        notes(surface_points=np.full((8, 3), np.nan))
+    path = tmp_path / "annotations.npz"
+    np.savez(path, resting_poses=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(AssetError, match="can't read the annotations"):
+        Annotations.load(path)
+
+
+def test_unchanged_files_are_hashed_once(box_pack, monkeypatch):
+    load_pack(box_pack)
+    monkeypatch.setattr("hashlib.sha256", lambda: pytest.fail("read a file again"))
+    load_pack(box_pack)
+    path = box_pack / "box" / "visual.glb"
+    os.utime(path, ns=(1, 1))
+    with pytest.raises(pytest.fail.Exception):
+        load_pack(box_pack)
