@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.interpolate import CubicSpline
 
@@ -9,7 +11,7 @@ from asset_tools.builtin.mesh import Shape, Size, fitted
 from asset_tools.builtin.surfaces import Section, loft, sweep
 
 
-def _spline_rings(points: list[tuple[float, float]], count: int) -> np.ndarray:
+def _spline_rings(points: Sequence[tuple[float, float]], count: int) -> np.ndarray:
     """Rings (count, 4) of a smooth profile through (radius, z), level where it meets the axis at both ends."""
     line = np.array(points)
     t = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
@@ -21,7 +23,7 @@ def _spline_rings(points: list[tuple[float, float]], count: int) -> np.ndarray:
 
 def fruit(
     size: Size,
-    profile: list[tuple[float, float]],
+    profile: Sequence[tuple[float, float]],
     *,
     lobes: float = 0.0,
     lean: float = 0.0,

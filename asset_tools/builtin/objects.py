@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -64,7 +64,9 @@ def _product(
     return ObjectSpec(id, category, size, mass, shape, partial(paint, label=LABELS[id]), roughness)
 
 
-def _fruit(id: str, size: Size, mass: float, profile: list[tuple[float, float]], roughness: float, skin: dict, **form):
+def _fruit(
+    id: str, size: Size, mass: float, profile: Sequence[tuple[float, float]], roughness: float, skin: dict, **form
+):
     shape = partial(fruits.fruit, profile=profile, **form)
     return ObjectSpec(id, "fruit", size, mass, shape, partial(paint_fruit, **skin), roughness)
 
@@ -82,7 +84,7 @@ PEAR = [(0, 3), (12, 1), (30, 20), (32, 37), (22, 62), (15, 78), (8, 88), (0, 87
 LEMON = [(0, 0), (5, 3), (11, 9), (23, 23), (26, 36), (22, 51), (10, 63), (5, 69), (0, 72)]
 
 
-def _metres(profile: list[tuple[float, float]]) -> list[tuple[float, float]]:
+def _metres(profile: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return [(r / 1000, z / 1000) for r, z in profile]
 
 

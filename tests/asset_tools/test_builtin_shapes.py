@@ -1,0 +1,138 @@
+from functools import cache
+
+import numpy as np
+import pytest
+
+from asset_tools.builtin import bottles, fruits, shapes, surfaces
+from asset_tools.builtin.mesh import Patch, build_shape, fitted, pack_regions
+from asset_tools.builtin.objects import SPECS
+from asset_tools.builtin.surfaces import rounded_box
+
+GRIPPER_OPENING = 0.072  # m, what the gripper takes with some room
+
+
+@cache
+def built(name):
+    spec = next(spec for spec in SPECS if spec.id == name)
+    return spec.shape(spec.size)
+
+
+def test_table_of_objects():
+    ids = [spec.id for spec in SPECS]
+    assert len(ids) == len(set(ids)) >= 14
+    assert {"sugar_box", "tomato_soup_can", "mustard_bottle", "banana", "mug", "apple", "toothpaste_tube"} <= set(ids)
+    assert {spec.category for spec in SPECS} >= {"bottle", "tube", "box", "can", "fruit", "mug"}
+    for spec in SPECS:
+        assert 0.03 < spec.mass < 0.7
+        assert min(spec.size) <= GRIPPER_OPENING or spec.id == "mug"  # that one is held by its wall
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.id)
+def test_closed_and_of_the_declared_size(spec):
+    shape = built(spec.id)
+    surface = shape.closed()
+    assert surface.is_watertight and surface.is_winding_consistent and surface.body_count == 1
+    assert surface.volume > 0
+    np.testing.assert_allclose(surface.extents, spec.size, atol=1e-4)
+    np.testing.assert_allclose(surface.bounds.mean(0), 0, atol=1e-6)
+    assert len(shape.faces) <= 6000
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.id)
+def test_uv_and_normals(spec):
+    shape = built(spec.id)
+    assert shape.uv.min() >= 0 and shape.uv.max() <= 1
+    np.testing.assert_allclose(np.linalg.norm(shape.normals, axis=1), 1, atol=1e-6)
+    corners = shape.vertices[shape.faces]
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    large = np.linalg.norm(face_normals, axis=1) > 1e-8
+    agreement = np.einsum("fi,fci->fc", face_normals, shape.normals[shape.faces])
+    assert (agreement[large] > 0).all()
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.id)
+def test_texture_is_not_mirrored(spec):
+    """Seen from outside, u x v points outwards: the determinant of the map from the texture keeps its sign."""
+    shape = built(spec.id)
+    uv = shape.uv[shape.faces]
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    assert (area > -1e-9).all()
+
+
+@pytest.mark.parametrize("name", ["tomato_soup_can", "mustard_bottle", "sugar_box"])
+def test_front_of_the_label_faces_the_front(name):
+    shape = built(name)
+    region = shape.regions["side" if "side" in shape.regions else "front"]
+    left, top, right, bottom = region.box
+    middle = np.array([(left + right) / 2, shape.texture_size - (top + bottom) / 2]) / shape.texture_size
+    nearest = np.argmin(np.linalg.norm(shape.uv - middle, axis=1) + (shape.normals[:, 1] > -0.9))
+    assert shape.vertices[nearest, 1] < 0 and abs(shape.vertices[nearest, 0]) < 0.05
+
+
+def test_volumes_by_hand():
+    box = rounded_box((0.1, 0.2, 0.3), 0.0)
+    assert build_shape([box]).closed().volume == pytest.approx(0.006)
+    r, h = 0.033, 0.101
+    assert built("tomato_soup_can").closed().volume == pytest.approx(np.pi * r**2 * h, rel=0.12)  # rims, sunk lids
+    # Steiner's formula: inner box + slabs + quarter cylinders + a ball.
+    size, radius = np.array([0.06, 0.05, 0.04]), 0.01
+    inner = size - 2 * radius
+    steiner = inner.prod() + 2 * radius * (inner[0] * inner[1] + inner[1] * inner[2] + inner[0] * inner[2])
+    steiner += np.pi * radius**2 * inner.sum() + 4 / 3 * np.pi * radius**3
+    rounded = build_shape([rounded_box((0.06, 0.05, 0.04), radius, steps=8)])
+    assert rounded.closed().volume == pytest.approx(steiner, rel=2e-3)
+
+
+def test_sharp_box_has_flat_normals_and_ball_has_radial_ones():
+    box = build_shape([rounded_box((0.1, 0.1, 0.1), 0.0)])
+    assert np.sort(np.abs(box.normals), axis=1)[:, :2].max() < 1e-9
+    half_circle = [(0.03 * np.sin(a), -0.03 * np.cos(a)) for a in np.linspace(0, np.pi, 13)]
+    ball = fruits.fruit((0.06, 0.06, 0.06), half_circle)
+    radial = ball.vertices / np.linalg.norm(ball.vertices, axis=1, keepdims=True)
+    assert np.einsum("ij,ij->i", radial, ball.normals).min() > 0.995
+
+
+def test_mug_is_hollow_and_has_a_hole_in_its_handle():
+    surface = built("mug").closed()
+    assert surface.euler_number == 0  # one handle: a torus
+    inside = surface.contains([[-0.015, 0, 0], [-0.015, 0, 0.03], [0.012, 0, -0.0405]])
+    assert inside.tolist() == [False, False, True]
+    assert surface.volume < 0.35 * surface.convex_hull.volume
+
+
+def test_tube_keeps_its_circumference():
+    tube = built("face_wash_tube")
+    side = next(p for p in [tube.closed().section([0, 0, 1], [0, 0, z]) for z in (0.0,)] if p is not None)
+    assert side.length == pytest.approx(2 * np.pi * 0.020, rel=0.02)
+    top = built("face_wash_tube").closed().section([0, 0, 1], [0, 0, 0.074])
+    assert top is not None and top.length == pytest.approx(2 * np.pi * 0.020, rel=0.03)
+
+
+def test_loft_columns_close_exactly():
+    points = surfaces.ring_points(np.array([[0.03, 0.02, 0.0, 3.0]]), 40)
+    assert (points[:, 0] == points[:, -1]).all()
+
+
+def test_bad_shapes_are_refused():
+    with pytest.raises(ValueError, match="for a shape of"):
+        fitted([rounded_box((0.1, 0.1, 0.1), 0.0)], (0.2, 0.1, 0.1))
+    with pytest.raises(ValueError, match="not closed"):
+        build_shape([rounded_box((0.1, 0.1, 0.1), 0.0)[:5], rounded_box((0.1, 0.1, 0.1), 0.0, center=(0.05, 0, 0))])
+    flat, uv = np.zeros((2, 2, 3)), np.zeros((2, 2, 2))
+    with pytest.raises(ValueError, match="differ"):
+        pack_regions([Patch("a", flat, uv, (1, 1)), Patch("a", flat, uv, (1, 2))], 64)
+
+
+def test_regions_do_not_overlap():
+    for shape in (
+        *(built(spec.id) for spec in SPECS),
+        shapes.carton((0.2, 0.01, 0.1)),
+        bottles.drink_bottle((0.05, 0.05, 0.18)),
+    ):
+        taken = np.zeros((shape.texture_size, shape.texture_size), dtype=int)
+        for region in shape.regions.values():
+            left, top, right, bottom = region.box
+            assert 0 < left < right < shape.texture_size and 0 < top < bottom < shape.texture_size
+            taken[top:bottom, left:right] += 1
+        assert taken.max() == 1
