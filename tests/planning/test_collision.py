@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import REST, Box, cloud, top_down
+from planning_scenes import REST, Box, cloud, top_down
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.planning.collision import ArmWorld, matrix_to_pose, pose_to_matrix

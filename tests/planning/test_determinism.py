@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REST, Box, cloud, table_scene, top_down
+from planning_scenes import REST, Box, cloud, table_scene, top_down
 
 from robocas_ms3.errors import PlanningFailed
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import REST, top_down
+from planning_scenes import REST, top_down
 
 from robocas_ms3.planning.collision import ArmWorld
 from robocas_ms3.planning.kinematics import DISTINCT, LIMIT_MARGIN, ArmKinematics, pose_error

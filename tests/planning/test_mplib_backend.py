@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import REST, Box, cloud, corners, table_scene, top_down
+from planning_scenes import REST, Box, cloud, corners, table_scene, top_down
 
 from robocas_ms3.errors import PlanningFailed, RobocasError
 from robocas_ms3.planning.kinematics import pose_error

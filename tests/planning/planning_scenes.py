@@ -1,0 +1,159 @@
+"""A table scene of known boxes, and a checker of trajectories that shares no code with the planner."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+REST = np.array([0, -1.02, 0, -2.51, 0, 1.35, 0.78])
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box in the arm's base frame: centre, edge lengths (m), turn about z (rad)."""
+
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    yaw: float = 0.0
+
+    def matrix(self) -> np.ndarray:
+        return Rotation.from_euler("z", self.yaw).as_matrix()
+
+    def surface(self, spacing: float = 0.005) -> np.ndarray:
+        """Points (P, 3) on all six faces, at most ``spacing`` apart."""
+        faces = []
+        for axis in range(3):
+            u, v = (i for i in range(3) if i != axis)
+            grids = [np.linspace(-s / 2, s / 2, int(np.ceil(s / spacing)) + 1) for s in (self.size[u], self.size[v])]
+            a, b = (grid.ravel() for grid in np.meshgrid(*grids))
+            for side in (-1, 1):
+                face = np.zeros((len(a), 3))
+                face[:, u], face[:, v], face[:, axis] = a, b, side * self.size[axis] / 2
+                faces.append(face)
+        return np.concatenate(faces) @ self.matrix().T + np.array(self.center)
+
+    def depth(self, points: np.ndarray) -> float:
+        """How deep the deepest of points (P, 3) lies inside, m; 0 when none does."""
+        inside = (np.array(self.size) / 2 - np.abs(_in_box(self, points))).min(axis=1)
+        return float(max(0.0, inside.max()))
+
+
+def table_scene(seed: int, count: int = 15) -> list[Box]:
+    """A table top 4 cm below the arm's base and boxes on it."""
+    rng = np.random.default_rng(seed)
+    boxes = [Box((0.6, 0.0, -0.045), (0.5, 0.7, 0.01))]
+    for _ in range(count):
+        size = rng.uniform(0.04, 0.12, 3)
+        x, y = rng.uniform((0.4, -0.3), (0.8, 0.3))
+        boxes.append(Box((x, y, -0.04 + size[2] / 2), tuple(size), rng.uniform(-3, 3)))
+    return boxes
+
+
+def cloud(boxes: list[Box], spacing: float = 0.005) -> np.ndarray:
+    return np.concatenate([box.surface(spacing) for box in boxes])
+
+
+class Checker:
+    """Forward kinematics and penetration depths straight from the URDF's geometry."""
+
+    def __init__(self, urdf: Path, samples: int = 100) -> None:
+        root = ElementTree.parse(urdf).getroot()
+        self._joints = {}
+        for joint in root.iterfind("joint"):
+            axis = joint.find("axis")
+            self._joints[joint.find("child").attrib["link"]] = (
+                joint.attrib["name"],
+                joint.attrib["type"],
+                joint.find("parent").attrib["link"],
+                _origin(joint),
+                np.array([float(v) for v in axis.attrib["xyz"].split()]) if axis is not None else np.zeros(3),
+            )
+        self.surfaces: dict[str, list[np.ndarray]] = {}
+        self._hulls: dict[str, list[np.ndarray]] = {}
+        for link in root.iterfind("link"):
+            for collision in link.iterfind("collision"):
+                pose, shape = _origin(collision), collision.find("geometry")
+                box = shape.find("box")
+                if box is not None:
+                    mesh = trimesh.creation.box([float(v) for v in box.attrib["size"].split()])
+                else:
+                    mesh = trimesh.load(urdf.parent / shape.find("mesh").attrib["filename"], force="mesh").convex_hull
+                mesh.apply_transform(pose)
+                sampled, _ = trimesh.sample.sample_surface(mesh, samples, seed=0)
+                points = np.concatenate([mesh.vertices, sampled])
+                self.surfaces.setdefault(link.attrib["name"], []).append(points)
+                self._hulls.setdefault(link.attrib["name"], []).append(ConvexHull(mesh.vertices).equations)
+
+    def poses(self, link: str, qpos: np.ndarray, finger: float = 0.04) -> np.ndarray:
+        """Poses (T, 4, 4) of a link at configurations (T, 7)."""
+        pose = np.tile(np.eye(4), (len(qpos), 1, 1))
+        if link not in self._joints:
+            return pose
+        name, kind, parent, origin, axis = self._joints[link]
+        if kind == "revolute":
+            pose[:, :3, :3] = Rotation.from_rotvec(qpos[:, int(name[-1]) - 1, None] * axis).as_matrix()
+        elif kind == "prismatic":
+            pose[:, :3, 3] = axis * finger
+        return self.poses(parent, qpos, finger) @ origin @ pose
+
+    def link_pose(self, link: str, qpos: np.ndarray) -> np.ndarray:
+        return self.poses(link, np.asarray(qpos)[None])[0]
+
+    def penetration(self, trajectory: np.ndarray, boxes: list[Box]) -> float:
+        """Depth (m) of the worst contact of configurations (T, 7) with boxes: link points in boxes, and the reverse."""
+        worst = 0.0
+        for link, surfaces in self.surfaces.items():
+            if link in ("panda_link0", "base_link"):
+                continue
+            poses, local = self.poses(link, trajectory), np.concatenate(surfaces)
+            radius = np.linalg.norm(local, axis=1).max()
+            for box in boxes:
+                gap = np.linalg.norm(
+                    np.maximum(np.abs(_in_box(box, poses[:, :3, 3])) - np.array(box.size) / 2, 0), axis=1
+                )
+                rows = poses[gap < radius]
+                if len(rows) == 0:
+                    continue
+                points = local @ rows[:, :3, :3].transpose(0, 2, 1) + rows[:, None, :3, 3]
+                worst = max(worst, box.depth(points.reshape(-1, 3)))
+                surface = box.surface(0.01)
+                for row in rows[::20]:
+                    back = (surface - row[:3, 3]) @ row[:3, :3]
+                    back = back[np.all((back >= local.min(0)) & (back <= local.max(0)), axis=1)]
+                    for planes in self._hulls[link] if len(back) else ():
+                        depth = (-(back @ planes[:, :3].T + planes[:, 3])).min(axis=1).max()
+                        worst = max(worst, float(depth))
+        return worst
+
+
+def _in_box(box: Box, points: np.ndarray) -> np.ndarray:
+    return (points - np.array(box.center)) @ box.matrix()
+
+
+def _origin(element: ElementTree.Element) -> np.ndarray:
+    pose, origin = np.eye(4), element.find("origin")
+    if origin is not None:
+        pose[:3, :3] = Rotation.from_euler(
+            "xyz", [float(v) for v in origin.attrib.get("rpy", "0 0 0").split()]
+        ).as_matrix()
+        pose[:3, 3] = [float(v) for v in origin.attrib.get("xyz", "0 0 0").split()]
+    return pose
+
+
+def top_down(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:
+    """The TCP pointing straight down at a place; at yaw 0 its x axis is the base's."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("z", yaw).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def corners(x: float, y: float, z: float) -> np.ndarray:
+    return np.array(list(itertools.product((-x, x), (-y, y), (-z, z))))

@@ -1,0 +1,219 @@
+"""Grasp choice, by hand: the arm's base at the origin, the object 0.5 m in front of it (along x)."""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.planning.grasps import GRIPPER_BOXES, directions_ok, filter_grasps, gripper_is_clear, rank_grasps
+from robocas_ms3.robots.constants import FINGER_EXTENSION, OPEN_FINGER, STOCK_TCP_IN_HAND
+
+BASE = np.eye(4)
+CENTER = np.array([0.5, 0.0, 0.05])
+NO_POINTS = np.zeros((0, 3))
+
+
+def grasp(lean_deg=0.0, heading_deg=0.0, closing_deg=0.0, at=CENTER):
+    """A grasp leaning from straight down towards a heading, turned by ``closing_deg`` about its own approach."""
+    heading = np.deg2rad(heading_deg)
+    across = np.array([-np.sin(heading), np.cos(heading), 0.0])
+    down = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+    turn = (
+        Rotation.from_rotvec(-np.deg2rad(lean_deg) * across)
+        * down
+        * Rotation.from_euler("z", closing_deg, degrees=True)
+    )
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn.as_matrix(), at
+    return pose
+
+
+def directions_of(pose):
+    return {name: bool(passed[0]) for name, passed in directions_ok(pose[None], CENTER).items()}
+
+
+def test_the_helper_leans_where_it_says():
+    np.testing.assert_allclose(grasp(30, 0)[:3, 2], [0.5, 0, -np.sqrt(0.75)], atol=1e-12)
+    np.testing.assert_allclose(grasp(90, 90)[:3, 2], [0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("lean", "heading", "from_above", "from_the_robots_side"),
+    [
+        (0, 0, True, True),  # straight down comes from no side
+        (10, 180, True, True),  # hardly leaning
+        (20, 180, True, False),  # from behind the object
+        (30, 0, True, True),
+        (30, 44, True, True),
+        (30, 46, True, False),
+        (60, -44, True, True),
+        (89, 0, True, True),
+        (91, 0, False, True),  # upwards
+    ],
+)
+def test_approach_directions(lean, heading, from_above, from_the_robots_side):
+    found = directions_of(grasp(lean, heading))
+    assert (found["from_above"], found["from_the_robots_side"]) == (from_above, from_the_robots_side)
+
+
+def test_the_direction_turns_with_the_object():
+    sideways = grasp(30, 90)
+    assert directions_ok(sideways[None], np.array([0.0, 0.5, -0.4]))["from_the_robots_side"][0]
+    assert not directions_ok(sideways[None], np.array([0.5, 0.0, -0.4]))["from_the_robots_side"][0]
+
+
+@pytest.mark.parametrize(
+    ("closing", "level"), [(0, True), (59, True), (61, False), (90, False), (119, False), (121, True)]
+)
+def test_the_closing_axis_may_tilt_by_60_degrees(closing, level):
+    # An approach along x: turning about it by c tilts the closing axis (y) by c from the horizontal.
+    assert directions_of(grasp(90, 0, closing))["closing_is_level"] is level
+
+
+@pytest.mark.parametrize(
+    ("point", "clear"),
+    [
+        ((0.0, 0.0, 0.0), True),  # between the pads
+        ((0.0, 0.039, 0.0), True),
+        ((0.0, 0.042, 0.0), False),  # in a pad
+        ((0.0, -0.042, 0.008), False),  # at the other pad's end, 8 mm beyond the TCP
+        ((0.0, 0.042, 0.010), True),  # just below it
+        ((0.011, 0.042, 0.0), True),  # beside it
+        ((0.0, 0.055, 0.0), True),  # outside of it
+        ((0.0, 0.055, -0.05), False),  # in the knuckle
+        ((0.0, 0.0, -0.06), True),  # under the palm
+        ((0.0, 0.0, -0.07), False),  # in the palm
+        ((0.03, -0.10, -0.1), False),
+        ((0.03, -0.11, -0.1), True),
+        ((0.0, 0.042, -0.12), False),  # swept by a pad and now in the palm
+        ((0.0, 0.0, -0.25), False),  # swept by the palm
+        ((0.0, 0.0, -0.29), True),  # above the pre-grasp's palm
+    ],
+)
+def test_points_in_the_open_gripper(point, clear):
+    for turn in (0, 180):
+        pose = grasp(30, 10, turn)
+        inside = pose[:3, :3] @ (np.array(point) * ([1, 1, 1] if turn == 0 else [-1, -1, 1])) + pose[:3, 3]
+        assert gripper_is_clear(pose[None], inside[None])[0] == clear
+
+
+def test_without_a_sweep_only_the_grasp_itself_counts():
+    above = grasp()[:3, 3] + [0, 0.042, 0.2]  # 0.2 m above the pad
+    assert not gripper_is_clear(grasp()[None], above[None], sweep=0.1)[0]
+    assert gripper_is_clear(grasp()[None], above[None], sweep=0.0)[0]
+
+
+def test_boxes_hold_the_real_fingers_and_hand(panda_files, checker):
+    """Every collision shape of the open left finger and of the hand lies in the boxes, to 1.5 mm."""
+    tcp_in_hand = STOCK_TCP_IN_HAND + FINGER_EXTENSION
+    finger = np.concatenate(checker.surfaces["panda_leftfinger"]) + [0, OPEN_FINGER, 0.0584 - tcp_in_hand]
+    hand = np.concatenate(checker.surfaces["panda_hand"]) - [0, 0, tcp_in_hand]
+    points = np.concatenate([finger, hand]) * [1, 1, 1]
+    points[:, 1] = np.abs(points[:, 1])
+    gaps = [
+        np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0), axis=1) for low, high in GRIPPER_BOXES
+    ]
+    assert np.min(gaps, axis=0).max() < 1.5e-3
+    joints = {j.attrib["name"]: j for j in ElementTree.parse(panda_files.arm_urdf).getroot().iterfind("joint")}
+    assert joints["panda_finger_joint1"].find("origin").attrib["xyz"] == "0 0 0.0584"
+
+
+def test_filter_counts_what_fell_where_and_adds_the_turned_twin():
+    poses = np.array(
+        [grasp(), grasp(), grasp(100), grasp(40, 180), grasp(80, 0, 80), grasp(0, 0, 0, CENTER + [0, 0.1, 0])]
+    )
+    widths = np.array([0.05, 0.09, 0.05, 0.05, 0.05, 0.05])
+    obstacle = CENTER + [0, 0.142, 0]  # in a pad of the last one
+    kept = filter_grasps(
+        poses,
+        widths,
+        arm_base_in_world=BASE,
+        object_center_in_world=CENTER,
+        scene_points_in_world=obstacle[None],
+        qualities=np.arange(6.0),
+    )
+    assert kept.rejected == {
+        "narrow_enough": 1,
+        "from_above": 1,
+        "from_the_robots_side": 1,
+        "closing_is_level": 1,
+        "gripper_is_clear": 1,
+    }
+    np.testing.assert_array_equal(kept.index, [0, 0])
+    np.testing.assert_array_equal(kept.widths, [0.05, 0.05])
+    assert len(kept) == 2
+    np.testing.assert_allclose(kept.tcp_in_world[0], poses[0])
+    np.testing.assert_allclose(kept.tcp_in_world[1][:3, 2:], poses[0][:3, 2:])  # same approach, same place
+    np.testing.assert_allclose(kept.tcp_in_world[1][:3, :2], -poses[0][:3, :2])
+
+
+def test_nothing_in_nothing_out():
+    kept = filter_grasps(
+        np.zeros((0, 4, 4)),
+        np.zeros(0),
+        arm_base_in_world=BASE,
+        object_center_in_world=CENTER,
+        scene_points_in_world=NO_POINTS,
+    )
+    assert len(kept) == 0 and kept.tcp_in_world.shape == (0, 4, 4)
+    order = rank_grasps(
+        kept.tcp_in_world,
+        kept.qualities,
+        object_center=CENTER,
+        qpos=np.zeros((0, 7)),
+        near=np.zeros(7),
+        rng=np.random.default_rng(0),
+    )
+    assert len(order) == 0
+
+
+class TestRanking:
+    NEAR = np.zeros(7)
+
+    def rank(self, poses, qualities, qpos=None, seed=0, temperature=0.0):
+        qpos = np.zeros((len(poses), 7)) if qpos is None else qpos
+        return rank_grasps(
+            np.array(poses),
+            np.array(qualities),
+            object_center=CENTER,
+            qpos=qpos,
+            near=self.NEAR,
+            rng=np.random.default_rng(seed),
+            temperature=temperature,
+        ).tolist()
+
+    def test_quality(self):
+        assert self.rank([grasp()] * 3, [0.2, 1.0, 0.6]) == [1, 2, 0]
+
+    def test_distance_from_the_centre(self):
+        assert self.rank([grasp(at=CENTER + [0.05, 0, 0]), grasp(), grasp(at=CENTER + [0, 0.02, 0])], [1, 1, 1]) == [
+            1,
+            2,
+            0,
+        ]
+
+    def test_steepness(self):
+        assert self.rank([grasp(60), grasp(0), grasp(30)], [1, 1, 1]) == [1, 2, 0]
+
+    def test_joint_space(self):
+        qpos = np.zeros((3, 7))
+        qpos[0, 6], qpos[2, 0] = 3.0, 1.0
+        assert self.rank([grasp()] * 3, [1, 1, 1], qpos) == [1, 2, 0]
+
+    def test_weights_by_hand(self):
+        # 1 + 1 + 0.7 + 0.7 = 3.4 against 0.5 + 1 + 0.7 + 0.7 = 2.9 against 1 + 1 + 0.35 + 0.7 = 3.05
+        assert self.rank([grasp(), grasp(), grasp(60)], [1.0, 0.5, 1.0]) == [0, 2, 1]
+
+    def test_chance_differs_between_retries_and_repeats_with_the_seed(self):
+        poses, qualities = [grasp()] * 20, [1.0] * 20
+        orders = [self.rank(poses, qualities, seed=seed, temperature=0.15) for seed in (0, 0, 1)]
+        assert orders[0] == orders[1] != orders[2]
+        assert sorted(orders[0]) == list(range(20))
+
+    def test_a_small_lead_loses_one_time_in_four(self):
+        # Scores 0.15 apart at temperature 0.15: the lesser comes first with probability 1 / (1 + e) = 0.27.
+        first = [self.rank([grasp()] * 2, [1.0, 0.85], seed=seed, temperature=0.15)[0] for seed in range(1000)]
+        assert np.mean(first) == pytest.approx(1 / (1 + np.e), abs=0.04)
