@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.episode import invert
 from robocas_ms3.datasets.trajectory import Recording
