@@ -1,0 +1,134 @@
+"""How fast the planner is: inverse kinematics, joint-space plans, straight lines, batched reachability. Prints JSON.
+
+Each scene is a table with 15 boxes as a cloud of 5 mm spacing (about 50,000 points). The arm goes to top-down poses
+over the table and straight down or up from there.
+
+    python benchmarks/planner.py --scenes 5 --plans 20
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.mplib_backend import MplibPlanner
+from robocas_ms3.planning.protocol import Array
+from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.robots.constants import ARM_REST
+from robocas_ms3.robots.urdf import robot_files
+
+SPACING = 0.005
+
+
+def box_surface(center: Array, size: Array, yaw: float) -> Array:
+    """Points (P, 3) on the six faces of a box."""
+    faces = []
+    for axis in range(3):
+        u, v = (i for i in range(3) if i != axis)
+        steps = [np.linspace(-s / 2, s / 2, int(np.ceil(s / SPACING)) + 1) for s in (size[u], size[v])]
+        a, b = (grid.ravel() for grid in np.meshgrid(*steps))
+        for side in (-0.5, 0.5):
+            face = np.zeros((len(a), 3))
+            face[:, u], face[:, v], face[:, axis] = a, b, side * size[axis]
+            faces.append(face)
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.concatenate(faces) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + center
+
+
+def table(rng: np.random.Generator) -> Array:
+    """Cloud of a table top 4 cm below the arm's base with 15 boxes on it."""
+    pieces = [box_surface(np.array([0.6, 0, -0.05]), np.array([0.5, 0.7, 0.02]), 0.0)]
+    for _ in range(15):
+        size = rng.uniform(0.03, 0.1, 3)
+        x, y = rng.uniform((0.4, -0.3), (0.8, 0.3))
+        pieces.append(box_surface(np.array([x, y, -0.04 + size[2] / 2]), size, rng.uniform(-3, 3)))
+    return np.concatenate(pieces)
+
+
+def top_down(rng: np.random.Generator) -> Array:
+    """A pose of the TCP over the table, pointing down."""
+    yaw = rng.uniform(-np.pi, np.pi)
+    c, s = np.cos(yaw), np.sin(yaw)
+    pose = np.eye(4)
+    pose[:3, :3] = [[c, s, 0], [s, -c, 0], [0, 0, -1]]
+    pose[:3, 3] = rng.uniform((0.4, -0.35, 0.06), (0.7, 0.35, 0.3))
+    return pose
+
+
+class Stopwatch:
+    """Collects milliseconds and outcomes by name."""
+
+    def __init__(self) -> None:
+        self.milliseconds: dict[str, list[float]] = {}
+        self.outcomes: dict[str, Counter[str]] = {}
+
+    def run(self, name: str, call: Callable, *args, **kwargs):
+        """Time a call; a failure to plan counts as an outcome and gives none."""
+        start = time.perf_counter()
+        try:
+            result, outcome = call(*args, **kwargs), "ok"
+        except PlanningFailed as error:
+            result, outcome = None, error.reason
+        self.milliseconds.setdefault(name, []).append((time.perf_counter() - start) * 1e3)
+        self.outcomes.setdefault(name, Counter())[outcome] += 1
+        return result
+
+    def summary(self) -> dict:
+        """Median and 95th percentile (ms) and outcomes of every name."""
+        return {
+            name: {
+                "median_ms": round(float(np.median(values)), 2),
+                "p95_ms": round(float(np.percentile(values, 95)), 2),
+                "outcomes": dict(self.outcomes[name]),
+            }
+            for name, values in self.milliseconds.items()
+        }
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=int, default=5)
+    parser.add_argument("--plans", type=int, default=20, help="plans in each scene")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+
+    files, watch, points, seconds = robot_files(), Stopwatch(), [], []
+    planner = MplibPlanner(files.arm_urdf, files.arm_srdf, dt=0.05)
+    reachability = Reachability(files.arm_urdf)
+    for scene in range(options.seed, options.seed + options.scenes):
+        rng = np.random.default_rng(scene)
+        cloud = table(rng)
+        points.append(len(cloud))
+        planner.seed(scene)
+        watch.run("set_scene", planner.set_scene, cloud)
+        here = np.array(ARM_REST)
+        for _ in range(options.plans):
+            goal = top_down(rng)
+            watch.run("ik", planner.ik, goal, here)
+            trajectory = watch.run("plan_to_pose", planner.plan_to_pose, here, goal, stage="reach")
+            if trajectory is None:
+                continue
+            here = trajectory.qpos[-1]
+            seconds.append(trajectory.duration)
+            lift = goal.copy()
+            lift[2, 3] += rng.choice((-0.05, 0.1))
+            watch.run("plan_straight", planner.plan_straight, here, lift, stage="straight")
+        poses = np.array([top_down(rng) for _ in range(256)])
+        watch.run("reachability_256", reachability.reachable, poses, np.array(ARM_REST))
+    result = {
+        "points": int(np.median(points)),
+        "trajectory_seconds_median": round(float(np.median(seconds)), 2),
+        **watch.summary(),
+    }
+    print(json.dumps(result, indent=2))
+
+
+if __name__ == "__main__":
+    main()
