@@ -43,7 +43,9 @@ archive_of() {
             END { if (!found) finish() }
         ' "${files[@]}" | grep . && return
     fi
-    files=(/etc/apt/sources.list /etc/apt/sources.list.d/*.list)
+    files=(/etc/apt/sources.list.d/*.list)
+    if [ -f /etc/apt/sources.list ]; then files+=(/etc/apt/sources.list); fi
+    [ ${#files[@]} -gt 0 ] || return 1
     awk -v suite="$suite" '
         $1 != "deb" { next }
         {
@@ -58,7 +60,7 @@ archive_of() {
             split(line, field, " ")
             if (field[3] == suite) { print field[2] "\t" key; exit }
         }
-    ' "${files[@]}" 2>/dev/null
+    ' "${files[@]}"
 }
 
 install_backport() {

@@ -39,8 +39,8 @@ make_venv() {
     # Debian and Ubuntu keep ensurepip in a package of its own.
     if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
         say "installing python3-venv"
-        apt-get update -qq || true
-        DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends python3-venv >/dev/null
+        apt-get update -qq >/dev/null 2>&1 || true
+        DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends python3-venv >/dev/null 2>&1 || true
         if "$base" -m venv --clear "$venv" >/dev/null 2>&1; then return; fi
     fi
     fail "$base can't make a virtual environment. Install its venv module (Debian, Ubuntu: apt-get install python3-venv)."
