@@ -135,7 +135,7 @@ class EpisodeGenerator:
             begun, first = time.perf_counter(), len(executor.actions)
             # seeded by seed and attempt alone: what was planned before must not matter
             entropy = np.random.SeedSequence([executor.seed, attempt])
-            self.planner.seed(int(entropy.generate_state(1)[0] % (2**31 - 1)) + 1)
+            self.planner.seed(int(entropy.generate_state(1)[0]))
             try:
                 self.solver.attempt(executor, np.random.default_rng(entropy))
                 result.success, result.steps = True, len(executor.actions)

@@ -47,10 +47,17 @@ class AttachedBody:
 
 
 class Planner(Protocol):
-    """What a backend offers. Every planning method raises ``PlanningFailed(stage, reason)``; none returns a sentinel."""
+    """What a backend offers; every planning method raises ``PlanningFailed(stage, reason)``, none returns a sentinel.
+
+    Attributes:
+        finger_width: m between the pads in all collision checks; 0.08 is fully open.
+    """
+
+    finger_width: float
 
     def seed(self, seed: int) -> None:
         """Make everything that follows repeat exactly for the same calls."""
+        ...
 
     def set_scene(self, points_in_base: Array) -> None:
         """Replace the obstacles by a point cloud.
@@ -58,9 +65,11 @@ class Planner(Protocol):
         Args:
             points_in_base: (P, 3) samples of all obstacle surfaces, m. Points inside the robot's own base are cut out.
         """
+        ...
 
     def attach(self, body: AttachedBody | None) -> None:
         """Attach a held object to the TCP, or nothing."""
+        ...
 
     def tcp(self, qpos: Array) -> Array:
         """Forward kinematics: (7,) -> 4x4 TCP in the arm's base frame."""
@@ -68,6 +77,7 @@ class Planner(Protocol):
 
     def collisions(self, qpos: Array, finger_width: float = 0.08) -> list[str]:
         """Name what touches at a configuration: links, 'cloud', 'attached'. Empty: free."""
+        ...
 
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
         """Solve inverse kinematics.
@@ -80,12 +90,15 @@ class Planner(Protocol):
         Returns:
             Distinct solutions (7,), nearest to ``near`` first; empty when there is none.
         """
+        ...
 
     def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str) -> Trajectory:
         """Plan a collision-free motion to the best of several configurations."""
+        ...
 
     def plan_to_pose(self, start: Array, tcp_in_base: Array, *, stage: str) -> Trajectory:
         """Plan a collision-free motion that ends with the TCP at a pose."""
+        ...
 
     def plan_straight(
         self, start: Array, tcp_in_base: Array, *, stage: str, check_collisions: bool = True, speed: float = 1.0
@@ -99,3 +112,4 @@ class Planner(Protocol):
             check_collisions: whether points of the cloud may not be touched (self-collisions always count).
             speed: fraction of the velocity and acceleration limits.
         """
+        ...

@@ -11,7 +11,7 @@ from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.drops import sample_drops
 from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
-from robocas_ms3.planning.grasps import filter_grasps, rank_grasps
+from robocas_ms3.planning.grasps import MAX_WIDTH, filter_grasps, rank_grasps
 from robocas_ms3.planning.protocol import Array, AttachedBody, Planner, Trajectory
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.scene import PlanningScene, inverse, transform
@@ -67,7 +67,7 @@ class PickSolver:
         scene = PlanningScene(self.env)
         slot = int(self.env.target_slot[0])
         words = self.env.target_asset().asset.name, self.env.task_config.support
-        self.planner.attach(None)
+        self._let_go()
         executor.label(**subgoal("move and grasp", *words))
         end = self._grasp(executor, scene, slot, rng)
         executor.label(**subgoal("transfer object", *words))
@@ -77,7 +77,7 @@ class PickSolver:
     def recover(self, executor: Executor) -> None:
         """After a failed attempt that stays in the record: open the gripper and back out of whatever is there."""
         scene = PlanningScene(self.env)
-        self.planner.attach(None)
+        self._let_go()
         qpos = scene.arm_qpos
         executor.move_gripper(OPEN, qpos, seconds=self.settings.open_seconds)
         with executor.seconds.spent_on("planning"):
@@ -208,6 +208,7 @@ class PickSolver:
         drops, qpos = drops[solved], qpos[solved]
         self.planner.set_scene(scene.obstacles_in_base(without=slot))
         self.planner.attach(AttachedBody(vertices, object_in_tcp))
+        self.planner.finger_width = float(self.env.agent.gripper_width[0])
         failure = PlanningFailed("transfer", "no_plan")
         for index in np.argsort(np.abs(qpos - start).max(axis=1))[: self.settings.drops_planned]:
             try:
@@ -225,7 +226,7 @@ class PickSolver:
     def _release(self, executor: Executor, scene: PlanningScene, slot: int, end: Array) -> None:
         executor.move_gripper(OPEN, end, seconds=self.settings.open_seconds)
         with executor.seconds.spent_on("planning"):
-            self.planner.attach(None)
+            self._let_go()
             self.planner.set_scene(scene.obstacles_in_base(without=slot))
             retreat = self._plan_retreat(end, self.planner.tcp(end))
             home = self.planner.plan_to_qpos(retreat.qpos[-1], [np.array(ARM_REST)], stage="home")
@@ -233,6 +234,10 @@ class PickSolver:
         # The object settles while the arm goes home; the demonstration ends as soon as it lies still.
         if not executor.follow(home, until="success"):
             raise PlanningFailed("release", self._why_not(executor))
+
+    def _let_go(self) -> None:
+        self.planner.attach(None)
+        self.planner.finger_width = MAX_WIDTH
 
     def _holds(self, slot: int) -> bool:
         return bool(self.env.grasped()[0, slot])
