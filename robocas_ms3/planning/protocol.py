@@ -1,7 +1,8 @@
 """The small interface between scripted policies and a motion planner.
 
 Everything is in the arm's base frame (``panda_link0``), so the mobile base never matters to a backend. Poses are 4x4
-float64 matrices in metres; ``tcp_in_base`` is ManiSkill's TCP (z approach, y closing). ``qpos`` are the 7 arm joints, rad.
+float64 matrices in metres; ``tcp_in_base`` is ManiSkill's TCP (z approach, y closing). ``qpos`` are the 7 arm joints in
+rad.
 """
 
 from __future__ import annotations
@@ -47,13 +48,15 @@ class AttachedBody:
 
 
 class Planner(Protocol):
-    """What a backend offers; every planning method raises ``PlanningFailed(stage, reason)``, none returns a sentinel.
+    """What a backend offers. Every planning method raises ``PlanningFailed(stage, reason)``, never a sentinel."""
 
-    Attributes:
-        finger_width: m between the pads in all collision checks; 0.08 is fully open.
-    """
+    @property
+    def finger_width(self) -> float:
+        """Distance between the pads in all collision checks, m; 0.08 is fully open."""
+        ...
 
-    finger_width: float
+    @finger_width.setter
+    def finger_width(self, width: float) -> None: ...
 
     def seed(self, seed: int) -> None:
         """Make everything that follows repeat exactly for the same calls."""
