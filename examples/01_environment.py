@@ -1,0 +1,19 @@
+"""Make the environment, read the instruction, step it, look at the task's stages. Needs no renderer."""
+
+import gymnasium as gym
+import numpy as np
+
+import robocas_ms3  # noqa: F401  (registers the environments)
+
+env = gym.make("RoboCASPick-v1", obs_mode="state_dict", control_mode="pd_ee_delta_pose", render_backend="none")
+obs, info = env.reset(seed=0)
+print(env.unwrapped.get_language_instruction()[0])
+
+# 7 numbers in the gripper's frame: move and turn, in fractions of their limits, and the gripper, +1 = open.
+# This goes straight ahead, along the approach, for half a second.
+ahead = np.array([0, 0, 1, 0, 0, 0, 1], dtype=np.float32)
+for _ in range(10):
+    obs, reward, terminated, truncated, info = env.step(ahead)
+stages = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_in_basket", "success")
+print({stage: bool(info[stage][0]) for stage in stages})
+env.close()

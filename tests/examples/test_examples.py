@@ -1,0 +1,48 @@
+"""The examples run as they stand, each in a process of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+pytestmark = pytest.mark.slow
+
+
+def run(name: str, *words: object, cwd: Path) -> list[str]:
+    command = [sys.executable, str(EXAMPLES / name), *map(str, words)]
+    done = subprocess.run(command, cwd=cwd, env=os.environ, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> tuple[Path, list[str]]:
+    folder = tmp_path_factory.mktemp("recorded")
+    return folder / "out", run("02_record.py", "out", cwd=folder)
+
+
+def test_no_example_is_left_out():
+    tested = Path(__file__).read_text()
+    assert all(f'"{path.name}"' in tested for path in EXAMPLES.glob("*.py"))
+
+
+def test_environment(tmp_path):
+    instruction, stages = run("01_environment.py", cwd=tmp_path)[-2:]
+    assert instruction.startswith("grasp the ")
+    assert "'success': False" in stages
+
+
+def test_record(recorded):
+    _, lines = recorded
+    assert lines[-1].startswith("replayed seed ")
+    assert "success True, states differ by 0.0" in lines[-1]
+
+
+def test_read_dataset(recorded, needs_renderer, tmp_path):
+    lines = run("03_read_dataset.py", recorded[0] / "trajectory.h5", "dataset", cwd=tmp_path)
+    assert lines[0].startswith("0: grasp the ")
+    assert any("move and grasp" in line and "(240, 320, 3)" in line for line in lines)
+    assert any("transfer object" in line for line in lines)
