@@ -1,0 +1,131 @@
+"""End to end on the builtin pack: generation, the record, determinism, resuming, replay."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.demos.generate import generate
+from robocas_ms3.demos.record import merge, open_trajectory, read_json
+from robocas_ms3.demos.replay import replay
+from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.robots.constants import ARM_SLICE
+
+pytestmark = pytest.mark.slow
+SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
+SEEDS = 3
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    out = tmp_path_factory.mktemp("demos") / "pick"
+    return generate(SETTINGS, out, episodes=SEEDS), out
+
+
+def load(path):
+    with h5py.File(path) as file:
+        return {
+            name: {k: group[k][()] for k in ("actions", "success")} | {"states": state(group)}
+            for name, group in file.items()
+        }
+
+
+def state(group) -> dict[str, np.ndarray]:
+    found = {}
+    group["env_states"].visititems(
+        lambda name, item: found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None
+    )
+    return found
+
+
+def test_the_record_is_maniskills_with_what_it_lacks(run):
+    summary, out = run
+    assert summary.episodes == SEEDS
+    data = read_json(summary.trajectory)
+    assert data["env_info"]["env_id"] == "robocas_ms3:RoboCASPick-v1"
+    assert data["env_info"]["env_kwargs"]["config"] == "pick_table_scattered"
+    assert "render_backend" not in data["env_info"]["env_kwargs"]
+    assert data["robocas"]["control_freq"] == 20
+    assert data["robocas"]["versions"]["numpy"].startswith("1.")
+    episodes = load(summary.trajectory)
+    for episode in data["episodes"]:
+        recorded = episodes[f"traj_{episode['episode_id']}"]
+        extra = episode["robocas"]
+        assert episode["success"] is True
+        assert recorded["success"][-1]
+        assert len(recorded["actions"]) == episode["elapsed_steps"]
+        assert extra["target"]["name"] in extra["instruction"]
+        ranges = [goal["goal_range"] for goal in extra["subgoals"]]
+        assert [goal["goal_type"] for goal in extra["subgoals"]] == ["move and grasp", "transfer object"]
+        assert ranges[0][0] == 0
+        assert ranges[0][1] + 1 == ranges[1][0]
+        assert ranges[1][1] == episode["elapsed_steps"] - 1
+    assert not (out / "episodes").exists()
+
+
+def test_motion_is_a_robots(run):
+    for episode in load(run[0].trajectory).values():
+        arm = episode["actions"][:, :7]
+        speed = np.abs(np.diff(arm, axis=0)) * 20
+        assert speed.max() <= 0.5 + 1e-3
+        qpos = episode["states"]["articulations/robocas_mobile_panda"][:, 13:25][:, ARM_SLICE]
+        assert np.abs(np.diff(qpos, axis=0)).max() * 20 <= 1.0  # no jump of the arm itself
+        still = (np.abs(np.diff(arm, axis=0)) < 1e-5).all(axis=1)
+        longest = max((len(run) for run in "".join("s" if s else " " for s in still).split()), default=0)
+        assert longest <= 10  # 0.5 s
+
+
+def test_the_same_seed_gives_the_same_episode_bit_for_bit(run, tmp_path):
+    summary, _ = run
+    generator = EpisodeGenerator(SETTINGS)
+    last = read_json(summary.trajectory)["episodes"][-1]
+    result = generator.generate(last["episode_seed"], tmp_path, "again")  # first here, last there
+    generator.close()
+    assert result.success
+    again = load(tmp_path / "again.h5")["traj_0"]
+    recorded = load(summary.trajectory)[f"traj_{last['episode_id']}"]
+    assert np.array_equal(again["actions"], recorded["actions"])
+    assert again["states"].keys() == recorded["states"].keys()
+    for name, values in again["states"].items():
+        assert np.array_equal(values, recorded["states"][name]), name
+
+
+def test_action_replay_is_exact_and_ee_deltas_succeed(run):
+    summary, _ = run
+    assert [(r.success, r.state_error) for r in replay(summary.trajectory)] == [(True, 0.0)] * SEEDS
+    assert all(r.success for r in replay(summary.trajectory, use_env_states=True, count=1))
+    assert all(r.success for r in replay(summary.trajectory, control_mode="pd_ee_delta_pose"))
+
+
+def test_resuming_adds_episodes_and_equals_an_uninterrupted_run(run, tmp_path):
+    summary, _ = run
+    out = tmp_path / "resumed"
+    generate(SETTINGS, out, episodes=1)
+    with pytest.raises(OutputExistsError, match="--resume"):
+        generate(SETTINGS, out, episodes=2)
+    resumed = generate(SETTINGS, out, episodes=2, resume=True)
+    assert resumed.episodes == 2
+    whole, parts = load(summary.trajectory), load(resumed.trajectory)
+    for name in ("traj_0", "traj_1"):
+        assert np.array_equal(whole[name]["actions"], parts[name]["actions"])
+    with pytest.raises(RobocasError, match="settings differ"):
+        generate(
+            EpisodeSettings("pick", "pick_table_scattered", "builtin", control_freq=5), out, episodes=2, resume=True
+        )
+
+
+def test_files_that_cannot_be_read_are_one_clear_line(run, tmp_path):
+    summary, _ = run
+    cut = tmp_path / "cut.h5"
+    content = summary.trajectory.read_bytes()
+    cut.write_bytes(content[: len(content) // 2])
+    with pytest.raises(DatasetError, match="JSON is missing"):
+        read_json(cut)
+    with pytest.raises(DatasetError, match="no readable HDF5 file.*cut short"):
+        open_trajectory(cut)
+    cut.with_suffix(".json").write_text(json.dumps(read_json(summary.trajectory)))
+    with pytest.raises(DatasetError, match="cut short"):
+        merge([cut], tmp_path / "merged.h5")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.h5", "cut.json"]

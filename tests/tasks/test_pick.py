@@ -1,0 +1,136 @@
+"""Stages and success of pick, by putting bodies where they matter and asking the environment."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from mani_skill.utils.structs import Pose
+
+import robocas_ms3  # noqa: F401
+from robocas_ms3.errors import ConfigError
+from robocas_ms3.tasks.pick import STAGES
+
+STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = gym.make("RoboCASPick-v1", **STATE_ONLY)
+    yield env
+    env.close()
+
+
+def settle(env, steps: int = 20) -> dict:
+    qpos = env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy()
+    for _ in range(steps):
+        *_, info = env.step(np.append(qpos, 1.0).astype(np.float32))
+    return {name: bool(info[name][0]) for name in (*STAGES, "success")}
+
+
+def put_target_into_basket(env) -> None:
+    base = env.unwrapped
+    target = base.objects[int(base.target_slot[0])]
+    target.set_pose(Pose.create_from_pq(base.fixtures.basket.pose.p + torch.tensor([[0, 0, 0.05]]), target.pose.q))
+
+
+def test_an_object_that_was_never_lifted_does_not_count(env):
+    env.reset(seed=0)
+    put_target_into_basket(env)
+    flags = settle(env, 40)
+    assert flags["target_in_basket"]
+    assert not flags["success"]
+    assert not flags["reached_any"]
+
+
+def test_success_needs_all_of_its_conditions(env):
+    env.reset(seed=0)
+    base = env.unwrapped
+    put_target_into_basket(env)
+    base._stages["target_lifted"][:] = True
+    assert settle(env, 40)["success"]
+    # a basket that was pushed too far
+    basket = base.fixtures.basket
+    home = basket.pose.raw_pose.clone()
+    target = base.objects[int(base.target_slot[0])]
+    for actor in (basket, target):
+        actor.set_pose(Pose.create_from_pq(actor.pose.p + torch.tensor([[0, 0.12, 0]]), actor.pose.q))
+    flags = settle(env, 10)
+    assert flags["target_in_basket"]
+    assert not flags["success"]
+    assert not bool(base.target_measures()["basket_stands"][0])
+    basket.set_pose(Pose.create(home))
+
+
+def test_a_moving_target_is_no_success(env):
+    env.reset(seed=0)
+    base = env.unwrapped
+    put_target_into_basket(env)
+    base._stages["target_lifted"][:] = True
+    settle(env, 40)
+    base.objects[int(base.target_slot[0])].set_linear_velocity(torch.tensor([[0.0, 0.0, 0.5]]))
+    assert not bool(base.target_measures()["at_rest"][0])
+
+
+def test_stages_are_sticky_until_the_next_reset(env):
+    env.reset(seed=0)
+    put_target_into_basket(env)
+    assert settle(env, 5)["target_in_basket"]
+    base = env.unwrapped
+    target = base.objects[int(base.target_slot[0])]
+    target.set_pose(Pose.create_from_pq(target.pose.p + torch.tensor([[0, 0, 1.0]]), target.pose.q))
+    assert settle(env, 1)["target_in_basket"]
+    _, info = env.reset(seed=0)
+    assert not any(bool(info[stage][0]) for stage in STAGES)
+
+
+def test_the_instruction_names_the_target(env):
+    env.reset(seed=0)
+    name = env.unwrapped.target_asset().asset.name
+    assert env.unwrapped.get_language_instruction() == [f"grasp the {name} on the table and move it to the basket"]
+
+
+def test_same_named_objects_mean_the_nearest():
+    config = {"ids": ["banana", "mug"], "count": 4}
+    env = gym.make("RoboCASPick-v1", config=changed(objects=config), **STATE_ONLY)
+    for seed in range(4):
+        env.reset(seed=seed)
+        base = env.unwrapped
+        names = [asset.asset.name for asset in base.object_assets[0]]
+        target = int(base.target_slot[0])
+        distance = (base.object_poses[0, :, :2] - torch.tensor(base.task_config.robot.position[:2])).norm(dim=1)
+        same = [i for i, name in enumerate(names) if name == names[target]]
+        assert len(same) == 2
+        assert target == min(same, key=lambda i: distance[i])
+    env.close()
+
+
+def test_five_hertz_by_sim_config():
+    env = gym.make("RoboCASPick-v1", sim_config={"control_freq": 5}, **STATE_ONLY)
+    assert env.unwrapped.control_freq == 5
+    assert env.unwrapped.sim_freq == 100
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"objects": {"ids": ["unicorn"], "count": 2}}, ["objects.ids", "unicorn", "banana"]),
+        ({"room": {"asset": "ballroom"}}, ["room.asset", "ballroom"]),
+        ({"surface": {"furniture": "table", "name": "roof"}}, ["surface.name", "roof", "top"]),
+        (
+            {"surface": {"furniture": "table", "name": "top", "min_xy": [0.0, 0.0], "max_xy": [0.9, 0.3]}},
+            ["outside surface 'top'", "0.9"],
+        ),
+    ],
+)
+def test_configurations_that_do_not_fit_the_assets(changes, words):
+    with pytest.raises(ConfigError) as error:
+        gym.make("RoboCASPick-v1", config=changed(**changes), **STATE_ONLY)
+    for word in words:
+        assert word in str(error.value)
+
+
+def changed(**changes) -> dict:
+    from robocas_ms3.config import load_task_config
+
+    return {**load_task_config("pick_table_scattered").model_dump(mode="json"), **changes}

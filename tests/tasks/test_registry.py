@@ -1,0 +1,107 @@
+"""Contract of every registered task: it makes, resets, steps, and repeats for the same seed."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from mani_skill.agents.registration import REGISTERED_AGENTS
+from mani_skill.utils.registration import REGISTERED_ENVS
+
+import robocas_ms3  # noqa: F401
+from robocas_ms3.tasks import TASKS
+
+STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos"}
+
+
+@pytest.fixture(params=sorted(TASKS), scope="module")
+def env(request):
+    env = gym.make(TASKS[request.param].env_id, obs_mode="state_dict", **STATE_ONLY)
+    yield env
+    env.close()
+
+
+def hold(env, gripper: float = 1.0) -> np.ndarray:
+    return np.append(env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy(), gripper).astype(np.float32)
+
+
+def test_import_registers_tasks_and_robot():
+    for spec in TASKS.values():
+        assert spec.env_id in REGISTERED_ENVS
+        assert gym.spec(spec.env_id).max_episode_steps == spec.max_episode_steps
+    assert "robocas_mobile_panda" in REGISTERED_AGENTS
+
+
+def test_observations_are_finite_and_batched(env):
+    obs, info = env.reset(seed=3)
+    assert env.unwrapped.control_freq == 20
+    count = env.unwrapped.task_config.objects.count
+    assert obs["extra"]["object_poses"].shape == (1, count * 7)
+    assert obs["extra"]["target"].sum() == 1
+    assert obs["agent"]["qpos"].shape == (1, 12)
+    assert obs["agent"]["tcp_in_arm_base"].shape == (1, 7)
+    obs, reward, terminated, truncated, info = env.step(hold(env))
+    for value in [*obs["agent"].values(), *obs["extra"].values()]:
+        assert torch.isfinite(value).all()
+    for name in ("reached_any", "picked_any", "reached_target", "target_grasped", "target_in_basket", "success"):
+        assert info[name].shape == (1,)
+        assert info[name].dtype == torch.bool
+        assert not info[name].any()
+    assert reward.item() == 0
+    assert not terminated.any()
+    assert not truncated.any()
+
+
+def test_same_seed_same_scene_other_seed_other_scene(env):
+    states, words = [], []
+    for seed in (5, 6, 5):
+        env.reset(seed=seed)
+        for _ in range(3):
+            env.step(hold(env))
+        states.append(env.unwrapped.get_state())
+        words.append((env.unwrapped.get_language_instruction(), [a.asset.id for a in env.unwrapped.object_assets[0]]))
+    assert torch.equal(states[0], states[2])
+    assert words[0] == words[2]
+    assert words[0] != words[1]
+
+
+def test_an_unseeded_reset_gives_another_scene(env):
+    env.reset(seed=5)
+    first = env.unwrapped.object_poses
+    env.reset()
+    assert not torch.equal(first, env.unwrapped.object_poses)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_layouts_are_settled_apart_and_on_the_surface(env, seed):
+    env.reset(seed=seed)
+    base = env.unwrapped
+    before = base.object_poses[0, :, :3].clone()
+    for _ in range(10):  # 0.5 s
+        env.step(hold(env))
+    moved = (base.object_poses[0, :, :3] - before).norm(dim=1)
+    assert moved.max() < 0.002
+    ids = {o._bodies[0].entity.per_scene_id: i for i, o in enumerate(base.objects)}
+    for contact in base.scene.px.get_contacts():
+        pair = [body.entity.per_scene_id for body in contact.bodies]
+        impulse = sum(np.linalg.norm(point.impulse) for point in contact.points)
+        assert impulse == 0 or not all(body in ids for body in pair), "two objects touch"
+    inverse = np.linalg.inv(base._support_in_world)
+    for asset, pose in zip(base.object_assets[0], base.object_poses[0].numpy(), strict=True):
+        from scipy.spatial.transform import Rotation
+
+        points = np.concatenate(asset.hulls) @ Rotation.from_quat(pose[[4, 5, 6, 3]]).as_matrix().T + pose[:3]
+        local = points @ inverse[:3, :3].T + inverse[:3, 3]
+        assert (local[:, :2] >= np.array(base._region.min_xy) - 0.002).all()
+        assert (local[:, :2] <= np.array(base._region.max_xy) + 0.002).all()
+        assert abs(local[:, 2].min() - base._region.z) < 0.002
+
+
+def test_visual_modes_hold_nothing_only_a_simulator_knows():
+    from robocas_ms3.tasks.pick import RoboCASPickEnv
+
+    class Mode:
+        state = False
+
+    env = RoboCASPickEnv.__new__(RoboCASPickEnv)
+    env.obs_mode_struct, env._obs_mode = Mode(), "rgb+depth"
+    assert env._get_obs_extra({}) == {}
