@@ -47,8 +47,13 @@ def main(cfg: Convert) -> int:
 
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console) as progress:
-        bar = progress.add_task("episodes", total=None)
+    progress = Progress(*columns, console=console)  # shown when there is something to do: an error is one line
+
+    def start(count: int) -> None:
+        progress.add_task("episodes", total=count)
+        progress.start()
+
+    try:
         done = convert(
             cfg.trajectory,
             cfg.out,
@@ -59,12 +64,14 @@ def main(cfg: Convert) -> int:
             overwrite=cfg.overwrite,
             resume=cfg.resume,
             jobs=cfg.jobs,
-            on_start=lambda count: progress.update(bar, total=count),
-            on_episode=lambda _: progress.advance(bar),
+            on_start=start,
+            on_episode=lambda _: progress.advance(progress.task_ids[0]),
         )
         if cfg.video:
             videos = progress.add_task("videos", total=len(done.episodes) + done.kept)
             write_previews(cfg.out, on_video=lambda _: progress.advance(videos))
+    finally:
+        progress.stop()
     steps = sum(episode.steps for episode in done.episodes)
     megabytes = sum(episode.size for episode in done.episodes) / 1e6
     each = done.seconds / max(1, len(done.episodes))

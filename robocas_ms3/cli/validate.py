@@ -29,8 +29,11 @@ def main(cfg: Validate) -> int:
     from robocas_ms3.datasets.validate import validate
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
-        bar = progress.add_task("episodes", total=None)
-        report = validate(cfg.dataset, on_episode=lambda done, all: progress.update(bar, completed=done, total=all))
+        bar = progress.add_task("episodes", total=None, visible=False)
+        report = validate(
+            cfg.dataset,
+            on_episode=lambda done, all: progress.update(bar, completed=done, total=all, visible=True),
+        )
     console = Console(soft_wrap=True, highlight=False, markup=False)
     if cfg.json:
         console.print(json.dumps(report.as_json(), indent=2, ensure_ascii=False))

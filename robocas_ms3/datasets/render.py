@@ -38,7 +38,7 @@ class EnvFrames:
             size: width and height of the pictures; None leaves the cameras' own, 640 x 480.
 
         Raises:
-            DatasetError: there is no render device.
+            DatasetError: there is no render device, or no such environment.
         """
         kwargs = dict(env_info["env_kwargs"])
         sensors = dict(kwargs.pop("sensor_configs", None) or {})
@@ -47,15 +47,18 @@ class EnvFrames:
         for key in ("render_backend", "render_mode", "sim_backend", "num_envs", "obs_mode", "control_mode"):
             kwargs.pop(key, None)
         require_renderer()
-        self.env = gym.make(
-            env_info["env_id"],
-            obs_mode="rgb+depth",
-            control_mode=control_mode,
-            num_envs=1,
-            sim_backend="physx_cpu",
-            sensor_configs=sensors,
-            **kwargs,
-        )
+        try:
+            self.env = gym.make(
+                env_info["env_id"],
+                obs_mode="rgb+depth",
+                control_mode=control_mode,
+                num_envs=1,
+                sim_backend="physx_cpu",
+                sensor_configs=sensors,
+                **kwargs,
+            )
+        except gym.error.Error as error:
+            raise DatasetError("no such environment", where=env_info["env_id"], found=str(error)) from error
         self._base: Any = self.env.unwrapped
         self._loaded = False
         self.gripper_column, self.finger_range = 0, (0.0, 0.0)
