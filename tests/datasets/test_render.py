@@ -1,12 +1,14 @@
 """Recorded states seen through ManiSkill's own cameras."""
 
 import json
+import shutil
 
 import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
 
+from robocas_ms3.cli.convert import Convert, main
 from robocas_ms3.datasets import geometry
 from robocas_ms3.datasets.convert import convert
 from robocas_ms3.datasets.render import EnvFrames
@@ -152,11 +154,23 @@ def test_another_scene_is_refused(source, recording):
     source.load(recording)
 
 
-def test_a_real_dataset_is_valid(recorded, tmp_path):
-    done = convert(recorded[0], tmp_path / "out", embeddings=False, size=SIZE)
-    assert [episode.steps for episode in done.episodes] == [4]  # states 0, 4, 8, 9
-    assert validate(tmp_path / "out").violations == []
-    with np.load(tmp_path / "out" / "episode_0000000" / "episode_info.npz") as arrays:
+def test_a_scene_that_is_another_leaves_nothing_behind(recorded, tmp_path):
+    path = shutil.copy(recorded[0], tmp_path / "F.h5")
+    metadata = json.loads(recorded[0].with_suffix(".json").read_text())
+    metadata["episodes"][0]["episode_seed"] = 12
+    (tmp_path / "F.json").write_text(json.dumps(metadata))
+    with pytest.raises(DatasetError, match="episode 0, seed 12, object_0: the seed builds another scene"):
+        convert(path, tmp_path / "out", embeddings=False, size=SIZE)
+    assert {entry.name for entry in tmp_path.iterdir()} == {"F.h5", "F.json"}
+
+
+def test_a_real_dataset_is_valid(recorded, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(Convert(recorded[0], out, embeddings=False, size=SIZE)) == 0
+    assert "1 episodes, 4 steps" in capsys.readouterr().out  # states 0, 4, 8, 9
+    assert {path.name for path in (out / "preview").iterdir()} == {"episode_0000000.mp4", "contact_sheet.png"}
+    assert validate(out).violations == []
+    with np.load(out / "episode_0000000" / "episode_info.npz") as arrays:
         assert arrays["gripper_status"].tolist() == [True, True, False, False]
         # The mobile base stands at (0.7, 0.15), turned by 90 deg; the arm's base above it.
         np.testing.assert_allclose(arrays["agv_pose"], [[0.7, 0.15, np.pi / 2]] * 4, atol=1e-3)
