@@ -7,7 +7,7 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 python=${ROBOCAS_SETUP_PYTHON:-.venv/bin/python}
-tried=$(dirname "$python")/../.robocas-renderer-tried
+tried=${python%/bin/python}/.robocas-renderer-tried
 export DEBIAN_FRONTEND=noninteractive
 
 say() { printf 'setup: %s\n' "$*"; }
