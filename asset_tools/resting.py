@@ -1,0 +1,297 @@
+"""Poses in which an object rests on a plane: found on its convex hull, then proved in the physics engine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import sapien
+from sapien import physx
+from scipy.spatial import ConvexHull, QhullError
+
+from robocas_ms3.errors import AssetError
+
+Array = np.ndarray
+
+LIMIT = 12  # poses of an object at most
+FALLBACK = 3  # poses tried where each is improbable
+SAME_DEG = 5.0  # poses whose up directions are nearer than this count as one
+SAME_HEIGHT = 0.0005  # m: poses with their centre of mass this level are of one family (a cylinder on its side)
+UPRIGHT_DEG = 10.0
+BELOW = 0.0004  # m: how far corners of the object may reach below the plane
+ROUNDS = 6  # seconds an object may roll until it stays
+MOVED, TURNED_DEG = 0.001, 2.0  # in one second, afresh: less is at rest
+TIME_STEP, STEPS = 0.01, 100
+DAMPING, TABLE_FRICTION = 0.1, 0.99
+SPACING = 10.0  # m between objects that are simulated at once
+
+
+@dataclass(frozen=True)
+class RestingPoses:
+    """How an object rests on a plane. S poses, the most probable first.
+
+    Attributes:
+        poses: (S, 4, 4) ``T_plane_object``: the object's frame in a frame whose z = 0 is the plane, the centre of
+            mass at x = y = 0; turned from the object's own axes the shortest way, so with no yaw of their own.
+        probabilities: (S,) share of random drops that end in each; they sum to 1.
+        display_pose: index of the pose in which the object's +z points up within 10 deg, or -1.
+    """
+
+    poses: Array
+    probabilities: Array
+    display_pose: int
+
+
+@dataclass(frozen=True)
+class _Body:
+    hulls: Sequence[Array]
+    points: Array  # (K, 3) corners of the hull of everything
+    cooked: Array  # (L, 3) the same of the shapes that the engine makes of it
+    mass: float
+    center_of_mass: Array
+    inertia: Array
+    inertia_wxyz: Array
+    friction: float
+
+    def rest(self, up: Array) -> Array:
+        """Pose (4, 4) that stands the object on the plane with a direction (3,) of its own frame up."""
+        pose = np.eye(4)
+        pose[:3, :3] = _turn_up(up)
+        pose[:2, 3] = -(pose[:2, :3] @ self.center_of_mass)
+        # the engine's shapes touch the plane, but corners it dropped may not reach far below
+        pose[2, 3] = max(-(self.cooked @ pose[2, :3]).min(), -(self.points @ pose[2, :3]).min() - BELOW)
+        return pose
+
+
+def resting_poses(
+    hulls: list[Array],
+    *,
+    mass: float,
+    center_of_mass: Sequence[float] | Array,
+    inertia: Sequence[float] | Array,
+    inertia_wxyz: Sequence[float] | Array,
+    friction: float = 0.99,
+    minimum_probability: float = 0.02,
+) -> RestingPoses:
+    """Find the poses in which an object stays where it is put. The same input gives the same poses.
+
+    Args:
+        hulls: vertices (V, 3) of each convex collision piece, m, in the object's frame.
+        mass: kg.
+        center_of_mass: (3,) m, in the object's frame.
+        inertia: (3,) principal moments about the centre of mass, kg m2.
+        inertia_wxyz: (4,) principal axes in the object's frame.
+        friction: of the object; the table's is 0.99.
+        minimum_probability: rarer poses are left out, unless all are rare. Poses of one height count together: a
+            cylinder has many on its side.
+
+    Raises:
+        AssetError: the hulls are flat, the centre of mass is outside of them, or no pose stays.
+    """
+    center = np.asarray(center_of_mass, float)
+    vertices = np.concatenate([np.asarray(hull, float) for hull in hulls])
+    try:
+        points = vertices[ConvexHull(vertices).vertices]
+        # the engine drops corners of detailed hulls: what is stable is decided on the shapes it really has
+        hull = ConvexHull(np.concatenate([_cook(piece, physx.PhysxMaterial(1, 1, 0)).vertices for piece in hulls]))
+    except (QhullError, ValueError, RuntimeError) as error:
+        raise AssetError("the convex hulls enclose no volume", found=str(error).split("\n")[0]) from error
+    directions, probabilities, heights = _stable_directions(hull, center)
+    kept = _select(directions, probabilities, heights, minimum_probability)
+    probabilities = _pool(directions, probabilities, kept)
+    body = _Body(
+        hulls,
+        points,
+        hull.points[hull.vertices],
+        float(mass),
+        center,
+        np.asarray(inertia, float),
+        np.asarray(inertia_wxyz, float),
+        friction,
+    )
+    settled, which = _settle(body, directions[kept])
+    if not which:
+        raise AssetError("the object stays in no pose", expected=f"one of {len(kept)} to hold", fix="Check its mass.")
+    directions, probabilities, _ = _merge(settled, probabilities[which], np.zeros(len(which)))
+    poses = np.array([body.rest(up) for up in directions])
+    upright = np.flatnonzero(poses[:, 2, 2] > np.cos(np.radians(UPRIGHT_DEG)))
+    return RestingPoses(poses, probabilities / probabilities.sum(), int(upright[0]) if len(upright) else -1)
+
+
+def _turn_up(up: Array) -> Array:
+    """Shortest rotation (3, 3) that takes a unit vector to +z; half a turn about x for -z."""
+    x, y, z = up
+    if z < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    k = 1 / (1 + z)
+    return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])
+
+
+def _stable_directions(hull: ConvexHull, center: Array) -> tuple[Array, Array, Array]:
+    """Up directions (N, 3) of the facets the object can rest on, their probabilities and centre of mass heights.
+
+    Each facet gets the solid angle under which it is seen from the centre of mass; where the foot of the
+    perpendicular is outside of a facet, the object topples over that edge (Goldberg et al. 1999).
+    """
+    normals, heights = hull.equations[:, :3], -(hull.equations[:, :3] @ center + hull.equations[:, 3])
+    if heights.min() <= 0:
+        raise AssetError("the centre of mass is outside the hulls", found=np.round(center, 4).tolist())
+    corners = hull.points[hull.simplices] - center
+    a, b, c = corners.transpose(1, 0, 2)
+    la, lb, lc = np.linalg.norm(corners, axis=-1).T
+    volume = np.abs(np.einsum("ij,ij->i", a, np.cross(b, c)))
+    below = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
+    shares = np.arctan2(volume, below) / (2 * np.pi)  # solid angle / 4 pi
+    feet = normals * heights[:, None]
+    overhang = np.empty((len(feet), 3))
+    for k, (opposite, p, q) in enumerate(((a, b, c), (b, c, a), (c, a, b))):
+        out = np.cross(q - p, normals)
+        out *= -np.sign(np.einsum("ij,ij->i", out, opposite - p))[:, None]
+        length = np.maximum(np.linalg.norm(out, axis=1), 1e-12)
+        overhang[:, k] = np.einsum("ij,ij->i", out, feet - p) / length
+    here = np.arange(len(feet))
+    beyond = hull.neighbors[here, overhang.argmax(1)]
+    # never uphill, so that rounding can't send it round in circles
+    topples = (overhang.max(1) > 1e-7) & (heights[beyond] <= heights + 1e-9)
+    follow = np.where(topples, beyond, here)
+    for _ in range(int(np.log2(len(feet))) + 1):
+        follow = follow[follow]
+    pooled = np.bincount(follow, shares, len(feet))
+    ends = np.flatnonzero(pooled > 0)
+    return _merge(-normals[ends], pooled[ends] / pooled.sum(), heights[ends])
+
+
+def _merge(directions: Array, probabilities: Array, heights: Array) -> tuple[Array, Array, Array]:
+    """Unite poses of nearly the same up direction under their most probable one; the most probable first."""
+    kept: list[int] = []
+    sums: list[float] = []
+    # rounded, so that noise does not decide between equals
+    for i in np.argsort(-np.round(probabilities, 9), kind="stable"):
+        if kept:
+            cosines = directions[kept] @ directions[i]
+            if cosines.max() > np.cos(np.radians(SAME_DEG)):
+                sums[int(cosines.argmax())] += probabilities[i]
+                continue
+        kept.append(i)
+        sums.append(probabilities[i])
+    order = np.array(kept)[np.argsort(-np.round(sums, 9), kind="stable")]
+    return directions[order], np.array(sums)[np.argsort(-np.round(sums, 9), kind="stable")], heights[order]
+
+
+def _select(directions: Array, probabilities: Array, heights: Array, minimum: float) -> list[int]:
+    """Indices of the poses to try: those of probable families, the families' heads first, then well spread.
+
+    The upright pose is among them however improbable it is: that is how people put things down.
+    """
+    family = np.full(len(heights), -1)
+    for i in range(len(heights)):
+        if family[i] < 0:
+            family[(family < 0) & (np.abs(heights - heights[i]) < SAME_HEIGHT)] = i
+    shares = np.bincount(family, probabilities, len(heights))
+    allowed = np.flatnonzero(shares[family] >= minimum)
+    limit = LIMIT
+    if not len(allowed):
+        allowed, limit = np.arange(len(heights)), FALLBACK
+    upright = np.flatnonzero(directions[:, 2] > np.cos(np.radians(UPRIGHT_DEG)))[:1]
+    heads = np.unique(family[allowed])
+    heads = heads[np.argsort(-shares[heads], kind="stable")]
+    kept = [int(i) for i in dict.fromkeys([*upright, *heads])][:limit]
+    while len(kept) < min(limit, len(allowed)):
+        nearest = np.clip(directions[allowed] @ directions[kept].T, -1, 1).max(1)
+        score = np.round(np.arccos(nearest) * probabilities[allowed], 9)
+        score[np.isin(allowed, kept)] = -1
+        kept.append(int(allowed[score.argmax()]))
+    return kept
+
+
+def _pool(directions: Array, probabilities: Array, kept: list[int]) -> Array:
+    """Probabilities of the kept poses with those of all others added to the nearest."""
+    nearest = (directions @ directions[kept].T).argmax(1)
+    return np.bincount(nearest, probabilities, len(kept))
+
+
+def _settle(body: _Body, directions: Array) -> tuple[Array, list[int]]:
+    """Put the object down in each pose, and afresh in the one it ends in, until it stays where it was put.
+
+    Returns:
+        the up directions (M, 3) that stay, and which of the given ones led there.
+    """
+    waiting, ups, found = list(range(len(directions))), directions.copy(), {}
+    for _ in range(ROUNDS):
+        starts = np.array([body.rest(ups[i]) for i in waiting])
+        ends = _simulate(body, starts)
+        for i, start, end in zip(waiting, starts, ends, strict=True):
+            points = np.stack([body.center_of_mass, np.zeros(3)])
+            moved = np.linalg.norm(points @ (end - start)[:3, :3].T + (end - start)[:3, 3], axis=1).max()
+            cosine = (np.trace(start[:3, :3].T @ end[:3, :3]) - 1) / 2
+            if moved < MOVED and cosine > np.cos(np.radians(TURNED_DEG)):
+                found[i] = ups[i]
+            else:
+                ups[i] = end[2, :3] / np.linalg.norm(end[2, :3])
+        waiting = [i for i in waiting if i not in found]
+        if not waiting:
+            break
+    which = sorted(found)
+    return np.array([found[i] for i in which]).reshape(-1, 3), which
+
+
+@contextmanager
+def _engine_settings() -> Iterator[None]:
+    """ManiSkill's defaults; the engine keeps them for the whole process, so they are put back afterwards."""
+    scene, body, shape = physx.get_scene_config(), physx.get_body_config(), physx.get_shape_config()
+    physx.set_scene_config(gravity=np.array([0, 0, -9.81]))
+    physx.set_body_config(solver_position_iterations=15, solver_velocity_iterations=1, sleep_threshold=0.005)
+    physx.set_shape_config(contact_offset=0.02, rest_offset=0.0)
+    try:
+        yield
+    finally:
+        physx.set_scene_config(scene)
+        physx.set_body_config(body)
+        physx.set_shape_config(shape)
+
+
+def _simulate(body: _Body, starts: Array) -> Array:
+    """Poses (N, 4, 4) one second after the object was put down in each of the poses (N, 4, 4), one object each."""
+    with _engine_settings():
+        scene = sapien.Scene([physx.PhysxCpuSystem()])
+        scene.set_timestep(TIME_STEP)
+        material = physx.PhysxMaterial(body.friction, body.friction, 0.0)
+        table = physx.PhysxMaterial(TABLE_FRICTION, TABLE_FRICTION, 0.0)
+        offsets = np.zeros((len(starts), 3))
+        offsets[:, 0], offsets[:, 1] = np.arange(len(starts)) % 4 * SPACING, np.arange(len(starts)) // 4 * SPACING
+        entities = []
+        for start, offset in zip(starts, offsets, strict=True):
+            ground = physx.PhysxRigidStaticComponent()
+            ground.attach(physx.PhysxCollisionShapeBox([1.0, 1.0, 0.05], table))
+            _add(scene, ground, sapien.Pose(offset - [0, 0, 0.05]))
+            free = physx.PhysxRigidDynamicComponent()
+            for piece in body.hulls:
+                free.attach(_cook(piece, material))
+            free.mass = body.mass
+            free.cmass_local_pose = sapien.Pose(body.center_of_mass, body.inertia_wxyz)
+            free.inertia = body.inertia
+            free.linear_damping = free.angular_damping = DAMPING
+            pose = start.copy()
+            pose[:3, 3] += offset
+            entities.append(_add(scene, free, sapien.Pose(pose)))
+        for _ in range(STEPS):
+            scene.step()
+        ends = np.array([entity.pose.to_transformation_matrix() for entity in entities], float)
+    ends[:, :3, 3] -= offsets
+    return ends
+
+
+def _cook(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeConvexMesh:
+    return physx.PhysxCollisionShapeConvexMesh(
+        vertices=np.asarray(vertices, np.float32), scale=[1, 1, 1], material=material
+    )
+
+
+def _add(scene: sapien.Scene, component: physx.PhysxRigidBaseComponent, pose: sapien.Pose) -> sapien.Entity:
+    entity = sapien.Entity()
+    entity.add_component(component)
+    entity.set_pose(pose)
+    scene.add_entity(entity)
+    return entity
