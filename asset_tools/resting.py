@@ -23,9 +23,17 @@ UPRIGHT_DEG = 10.0
 BELOW = 0.0004  # m: how far corners of the object may reach below the plane
 ROUNDS = 6  # seconds an object may roll until it stays
 MOVED, TURNED_DEG = 0.001, 2.0  # in one second, afresh: less is at rest
+YAWS = tuple(np.arange(8) * 0.8)  # rad: it must stay however it is turned, for the engine's contacts depend on it
+DROP = 0.0005  # m above the plane at the start: scenes leave a gap as well
 TIME_STEP, STEPS = 0.01, 100
 DAMPING, TABLE_FRICTION = 0.1, 0.99
 SPACING = 10.0  # m between objects that are simulated at once
+
+LIFT = np.zeros((4, 4))
+LIFT[2, 3] = DROP
+TURNS = [np.eye(4) for _ in YAWS]
+for _turn, _yaw in zip(TURNS, YAWS, strict=True):
+    _turn[:2, :2] = [[np.cos(_yaw), -np.sin(_yaw)], [np.sin(_yaw), np.cos(_yaw)]]
 
 
 @dataclass(frozen=True)
@@ -219,17 +227,23 @@ def _settle(body: _Body, directions: Array) -> tuple[Array, list[int]]:
         the up directions (M, 3) that stay, and which of the given ones led there.
     """
     waiting, ups, found = list(range(len(directions))), directions.copy(), {}
+    points = np.stack([body.center_of_mass, np.zeros(3)])
     for _ in range(ROUNDS):
-        starts = np.array([body.rest(ups[i]) for i in waiting])
-        ends = _simulate(body, starts)
-        for i, start, end in zip(waiting, starts, ends, strict=True):
-            points = np.stack([body.center_of_mass, np.zeros(3)])
-            moved = np.linalg.norm(points @ (end - start)[:3, :3].T + (end - start)[:3, 3], axis=1).max()
-            cosine = (np.trace(start[:3, :3].T @ end[:3, :3]) - 1) / 2
-            if moved < MOVED and cosine > np.cos(np.radians(TURNED_DEG)):
+        placed = np.array([turn @ body.rest(ups[i]) for i in waiting for turn in TURNS])
+        ends = _simulate(body, placed + LIFT)
+        moves = np.linalg.norm(
+            points @ (ends - placed)[:, :3, :3].transpose(0, 2, 1) + (ends - placed)[:, None, :3, 3], axis=2
+        ).max(1)
+        cosines = (np.einsum("nij,nij->n", placed[:, :3, :3], ends[:, :3, :3]) - 1) / 2
+        calm = (moves < MOVED) & (cosines > np.cos(np.radians(TURNED_DEG)))
+        tilted = ends[:, 2, :3] / np.linalg.norm(ends[:, 2, :3], axis=1, keepdims=True)
+        for i, stays, landed in zip(
+            waiting, calm.reshape(-1, len(YAWS)), tilted.reshape(-1, len(YAWS), 3), strict=True
+        ):
+            if stays.all():
                 found[i] = ups[i]
             else:
-                ups[i] = end[2, :3] / np.linalg.norm(end[2, :3])
+                ups[i] = landed[int(stays.argmin())]  # where the first that moved came to lie
         waiting = [i for i in waiting if i not in found]
         if not waiting:
             break
