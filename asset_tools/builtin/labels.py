@@ -125,7 +125,7 @@ def paint_wrapped(shape: Shape, rng: np.random.Generator, label: Label, *, metal
     elif "lid" in shape.regions:
         with painter.region("lid", label.cap) as canvas:
             ink = (70, 70, 74) if sum(label.cap) > 380 else (244, 244, 240)
-            canvas.text(label.title.replace("-\n", "").replace("\n", " "), (0.2, 0.3, 0.8, 0.7), ink, bold=0.03)
+            canvas.text(label.title, (0.2, 0.28, 0.8, 0.72), ink, bold=0.03)
     return painter.image()
 
 

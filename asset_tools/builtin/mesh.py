@@ -6,7 +6,8 @@ make a *part*; parts are united into a *shape*. Frames: metres, z up, front towa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -56,6 +57,7 @@ class Shape:
         vertices: (n, 3) m. faces: (f, 3). normals: (n, 3) unit, outward. uv: (n, 2) in [0, 1], v upwards.
         regions: the texture's regions by name.
         texture_size: width and height of the square texture in pixels.
+        pieces: convex collision pieces, points (k, 3) each, where the formulas know them better than a decomposition.
     """
 
     vertices: np.ndarray
@@ -64,6 +66,7 @@ class Shape:
     uv: np.ndarray
     regions: dict[str, Region]
     texture_size: int
+    pieces: tuple[np.ndarray, ...] = ()
 
     def closed(self) -> trimesh.Trimesh:
         """The bare surface, welded by position: watertight, for volume and hulls."""
@@ -80,12 +83,6 @@ class Shape:
             self.vertices, self.faces, vertex_normals=self.normals, visual=visual, process=False, validate=False
         )
 
-    def moved(self, offset: tuple[float, float, float] | np.ndarray) -> Shape:
-        """The same shape elsewhere (metres)."""
-        return Shape(
-            self.vertices + np.asarray(offset), self.faces, self.normals, self.uv, self.regions, self.texture_size
-        )
-
 
 def build_shape(parts: list[list[Patch]], *, texture_size: int = 512, crease_deg: float = CREASE_DEG) -> Shape:
     """Unite closed parts into one shape with one texture atlas.
@@ -99,8 +96,8 @@ def build_shape(parts: list[list[Patch]], *, texture_size: int = 512, crease_deg
     return _with_normals(vertices, uv, faces, regions, texture_size, crease_deg)
 
 
-def fitted(parts: list[list[Patch]], size: Size, *, tolerance: float = 0.2) -> Shape:
-    """Build the shape, centred and stretched to its exact size.
+def fitted(parts: list[list[Patch]], size: Size, *, pieces: Sequence[np.ndarray] = (), tolerance: float = 0.2) -> Shape:
+    """Build the shape, centred and stretched to its exact size; its convex ``pieces`` likewise.
 
     Raises:
         ValueError: an axis would have to be stretched by more than ``tolerance``.
@@ -110,11 +107,11 @@ def fitted(parts: list[list[Patch]], size: Size, *, tolerance: float = 0.2) -> S
     factor = np.asarray(size) / (high - low)
     if np.abs(factor - 1).max() > tolerance:
         raise ValueError(f"the formulas give {high - low} m for a shape of {size} m")
+    middle = (low + high) / 2
     stretched = [
-        [Patch(p.region, (p.points - (low + high) / 2) * factor, p.uv, p.size, p.detail) for p in part]
-        for part in parts
+        [Patch(p.region, (p.points - middle) * factor, p.uv, p.size, p.detail) for p in part] for part in parts
     ]
-    return build_shape(stretched)
+    return replace(build_shape(stretched), pieces=tuple((piece - middle) * factor for piece in pieces))
 
 
 def weld(vertices: np.ndarray, tolerance: float = WELD) -> tuple[np.ndarray, np.ndarray]:

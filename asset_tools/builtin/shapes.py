@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from asset_tools.builtin.mesh import Shape, Size, fitted
-from asset_tools.builtin.surfaces import Section, loft, oval_rings, round_rings, rounded_box, sweep
+from asset_tools.builtin.surfaces import Section, loft, oval_rings, ring_points, round_rings, rounded_box, sweep
 
 
 def carton(size: Size, *, radius: float = 0.0012) -> Shape:
@@ -130,9 +130,24 @@ def mug(size: Size, *, wall: float = 0.004) -> Shape:
     bow = np.sign(np.cos(t)) * np.abs(np.cos(t)) ** 0.75
     path = np.stack([r - wall * 0.55 + bow * (reach - r + wall * 0.55), 0 * t, h * 0.5 + np.sin(t) * h * 0.31], axis=-1)
     radii = np.full((len(t), 2), (0.0045, 0.0065))
-    # Flat ends inside the wall: three times the end point, the outer one closed.
+    # Flat ends inside the wall.
     path, radii = np.concatenate([path[:1], path, path[-1:]]), np.concatenate([[[0, 0]], radii, [[0, 0]]])
     path[0, 0] -= 2e-4
     path[-1, 0] -= 2e-4
     handle = sweep("handle", path, radii, normal=(0, 1, 0), segments=16, detail=0.5)
-    return fitted([loft(sections), handle], size)
+    pieces = _ring_pieces(inner, r, (0.0, h), count=14)
+    pieces.append(ring_points(np.array([[inner, inner, z, 2.0] for z in (0.0, floor)]), 24).reshape(-1, 3))
+    rings = handle[0].points[1:-1, ::2]
+    pieces += [rings[i : i + 4].reshape(-1, 3) for i in range(0, len(rings) - 1, 3)]
+    return fitted([loft(sections), handle], size, pieces=pieces)
+
+
+def _ring_pieces(inner: float, outer: float, heights: tuple[float, float], *, count: int) -> list[np.ndarray]:
+    """Convex pieces (k, 3) of an upright pipe: arcs whose inner sides are flat, the gap's volume shared out."""
+    pieces = []
+    step = 2 * np.pi / count
+    flat = inner * 2 / (1 + np.cos(step / 2))  # corners outside, middle inside the true wall by the same amount
+    for angle in np.arange(count) * step:
+        corners = [(outer, a) for a in np.linspace(angle, angle + step, 4)] + [(flat, angle + step), (flat, angle)]
+        pieces.append(np.array([(q * np.cos(a), q * np.sin(a), z) for q, a in corners for z in heights]))
+    return pieces
