@@ -1,0 +1,158 @@
+"""Convex hulls of a closed mesh: one hull where that is close enough, else CoACD; cached by content."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from robocas_ms3.errors import AssetError, MissingExtraError
+from robocas_ms3.files import replacing
+
+Array = NDArray[np.float64]
+
+MAX_VERTICES = 48  # a hull; PhysX takes up to 64 on a GPU, but thins hulls of more than about 50 by itself
+MAX_HULLS = 32
+CONVEX_ENOUGH = 0.92  # overlap at which a single hull stands for the body
+WANTED_OVERLAP = 0.9
+THRESHOLDS = (0.08, 0.05, 0.03)  # CoACD's concavity, coarse first
+COACD_FACES = 4000  # more only costs time
+SAMPLES = 40_000
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """Convex hulls of a body.
+
+    Attributes:
+        hulls: (V, 3) vertices each, m.
+        volume_iou: overlap of their union with the body they were made from.
+    """
+
+    hulls: list[Array]
+    volume_iou: float
+
+
+def decompose(closed: trimesh.Trimesh, *, cache: Path | None = None) -> Decomposition:
+    """Decompose a closed mesh; the same mesh gives the same hulls.
+
+    Args:
+        closed: watertight, metres.
+        cache: folder that results are kept in, by the mesh's content; none: no cache.
+
+    Raises:
+        AssetError: the mesh isn't closed, or CoACD makes nothing of it.
+        MissingExtraError: CoACD is not installed.
+    """
+    if not closed.is_watertight or closed.volume <= 0:
+        raise AssetError("can't decompose a mesh that isn't closed", expected="watertight, volume > 0")
+    path = None if cache is None else cache / f"{_content_hash(closed)}.npz"
+    if path is not None and path.is_file():
+        with np.load(path, allow_pickle=False) as file:
+            return Decomposition([file[f"hull_{i}"] for i in range(int(file["count"]))], float(file["volume_iou"]))
+    result = _decompose(closed)
+    if path is not None:
+        arrays = {f"hull_{i}": hull for i, hull in enumerate(result.hulls)}
+        with replacing(path) as tmp:
+            np.savez(tmp, count=len(result.hulls), volume_iou=result.volume_iou, **arrays)
+    return result
+
+
+def volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
+    """Volume of the intersection over that of the union, of a body and the union of convex hulls, by sampling.
+
+    Args:
+        closed: watertight mesh.
+        hulls: (V, 3) vertices each, in its frame.
+    """
+    everything = np.concatenate([closed.vertices, *hulls])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    points = np.random.default_rng(0).uniform(low, high, (SAMPLES, 3))
+    in_body = closed.contains(points)
+    in_hulls = np.zeros(len(points), dtype=bool)
+    for hull in hulls:
+        planes = ConvexHull(hull).equations
+        in_hulls |= (points @ planes[:, :3].T + planes[:, 3] <= 1e-9).all(axis=1)
+    return float((in_body & in_hulls).sum() / max(1, (in_body | in_hulls).sum()))
+
+
+def few_vertices(points: Array, limit: int = MAX_VERTICES) -> Array:
+    """Vertices of the convex hull of points, or ``limit`` of them that keep most of its shape and all of its volume.
+
+    Beginning with a few extreme ones, the vertex farthest outside of the hull so far is added, again and again. What is
+    left lies inside of the hull, so that it is blown up a little to the hull's volume.
+    """
+    hull = ConvexHull(points)
+    vertices = points[hull.vertices]
+    if len(vertices) <= limit:
+        return vertices
+    directions = np.concatenate([np.eye(3), -np.eye(3), np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T])
+    chosen = list(dict.fromkeys(np.argmax(vertices @ directions.T, axis=0).tolist()))
+    while len(chosen) < limit:
+        planes = ConvexHull(vertices[chosen]).equations
+        outside = (vertices @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+        outside[chosen] = -1
+        chosen.append(int(outside.argmax()))
+    kept = vertices[chosen]
+    center = kept.mean(axis=0)
+    return center + (kept - center) * np.cbrt(hull.volume / ConvexHull(kept).volume)
+
+
+def _decompose(closed: trimesh.Trimesh) -> Decomposition:
+    best: Decomposition | None = None
+    if closed.volume / closed.convex_hull.volume >= CONVEX_ENOUGH - 0.02:
+        hulls = [few_vertices(np.asarray(closed.vertices))]
+        best = Decomposition(hulls, volume_iou(closed, hulls))
+        if best.volume_iou >= CONVEX_ENOUGH:
+            return best
+    for threshold in THRESHOLDS:
+        hulls = _run_coacd(closed, threshold)
+        if not hulls:
+            continue
+        found = Decomposition(hulls, volume_iou(closed, hulls))
+        if best is None or found.volume_iou > best.volume_iou + 0.01:
+            best = found
+        if best.volume_iou >= WANTED_OVERLAP:
+            break
+    if best is None:
+        raise AssetError("the convex decomposition found no hulls", fix="Check the mesh for slivers or zero volume.")
+    return best
+
+
+def _run_coacd(closed: trimesh.Trimesh, threshold: float) -> list[Array]:
+    try:
+        import coacd
+    except ImportError as error:
+        raise MissingExtraError("CoACD is not installed", fix="pip install 'robocas-ms3[assets]'") from error
+    coacd.set_log_level("error")
+    body = closed
+    if len(body.faces) > COACD_FACES:
+        body = body.simplify_quadric_decimation(face_count=COACD_FACES)
+    parts = coacd.run_coacd(
+        coacd.Mesh(np.asarray(body.vertices), np.asarray(body.faces)),
+        threshold=threshold,
+        max_convex_hull=MAX_HULLS,
+        preprocess_mode="off",  # it thickens thin walls; what comes in is closed already
+        resolution=1000,
+        mcts_iterations=60,
+        mcts_nodes=12,
+        max_ch_vertex=MAX_VERTICES,
+        decimate=True,
+        seed=0,
+    )
+    return [few_vertices(np.asarray(vertices, dtype=float)) for vertices, _ in parts if len(vertices) >= 4]
+
+
+def _content_hash(mesh: trimesh.Trimesh) -> str:
+    from importlib.metadata import version
+
+    digest = hashlib.sha256(f"{_VERSION} {version('coacd')} {THRESHOLDS} {MAX_HULLS} {COACD_FACES}".encode())
+    digest.update(np.round(np.asarray(mesh.vertices), 7).tobytes())
+    digest.update(np.asarray(mesh.faces, dtype=np.int64).tobytes())
+    return digest.hexdigest()[:32]
