@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from asset_tools.decompose import decompose
+from asset_tools.decompose import Decomposition, decompose, volume_iou
 from asset_tools.grasps import sample_grasps
 from asset_tools.resting import resting_poses
 from asset_tools.visual import to_display, write_glb
@@ -42,6 +42,7 @@ class ObjectSource:
         licence: of the mesh.
         attribution: whom to name.
         repairs: what had to be mended.
+        pieces: (V, 3) corners of convex pieces, in the mesh's frame, where they are known; none: by decomposition.
     """
 
     id: str
@@ -55,6 +56,7 @@ class ObjectSource:
     licence: str = "MIT"
     attribution: str = "robocas_ms3"
     repairs: tuple[str, ...] = ()
+    pieces: list[np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,11 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
     closed.apply_translation(shift)
 
     write_glb(to_display(mesh), folder / VISUAL)
-    parts = decompose(closed, cache=hull_cache)
+    if source.pieces is None:
+        parts = decompose(closed, cache=hull_cache)
+    else:
+        pieces = [piece + shift for piece in source.pieces]
+        parts = Decomposition(pieces, volume_iou(closed, pieces))
     write_hulls(folder / HULLS, parts.hulls)
 
     center = np.asarray(closed.center_mass)
