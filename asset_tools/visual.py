@@ -1,0 +1,348 @@
+"""Light copies of scanned meshes for rendering, and GLB files of them that are the same bytes every time."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import fast_simplification
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import KDTree
+from trimesh.visual.color import to_rgba
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
+
+from robocas_ms3.errors import AssetError, MissingExtraError
+from robocas_ms3.files import replacing
+
+Array = NDArray[np.float64]
+
+DEFAULT_ROUGHNESS = 0.6
+JPEG_QUALITY = 88
+CREASE = np.cos(np.deg2rad(40))  # faces that meet more sharply get an edge, not a smooth normal
+SAMPLES = 150_000  # on the original surface, to find the face that a texel shows
+NORMAL_WEIGHT = 0.02  # of the diagonal; keeps the two sides of a thin shell apart, hardly moves anything else
+
+
+def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: int = 512) -> trimesh.Trimesh:
+    """A copy of a mesh with few faces and one small texture, in the same frame, its normals outward.
+
+    A textured mesh within the limit keeps its vertices and UVs. A larger one is simplified and unwrapped anew, and
+    its colours are baked into the new texture; so are vertex and face colours. One of a single colour has no texture.
+    Transparency is dropped.
+
+    Args:
+        mesh: textured, coloured or plain; any unit.
+        triangles: most faces of the result.
+        texture_size: largest side of its texture, pixels.
+
+    Returns:
+        A mesh with a ``PBRMaterial`` and vertex normals.
+
+    Raises:
+        AssetError: the mesh has no faces, is not finite or can't be simplified so far.
+        MissingExtraError: xatlas is not installed.
+    """
+    if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+        raise AssetError(
+            "can't show this mesh", expected="faces, and finite vertices", found=f"{len(mesh.faces)} faces"
+        )
+    source = _Source(mesh)
+    if len(mesh.faces) <= triangles and (source.plain or source.image is not None):
+        vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+        normals = np.array(mesh.vertex_normals)
+        if mesh.volume < 0:
+            faces, normals = faces[:, ::-1], -normals
+        uv = None if source.plain else source.uv
+        texture = None if source.image is None else _shrunk(source.image, texture_size)
+    else:
+        body = _simplified(mesh, triangles)
+        corner_normals = _crease_normals(body)
+        faces, uv, texture = np.asarray(body.faces), None, None
+        origin = np.arange(len(body.vertices))
+        if not source.plain:
+            origin, faces, uv = _unwrapped(body, texture_size)
+            texture = _baked(mesh, source, body, uv[faces], corner_normals, texture_size)
+        # a vertex for every different pair of UV vertex and normal
+        keys = np.column_stack([faces.reshape(-1), np.rint(corner_normals.reshape(-1, 3) * 1e4)])
+        _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        vertices = np.asarray(body.vertices)[origin[faces.reshape(-1)[first]]]
+        uv = None if uv is None else uv[faces.reshape(-1)[first]]
+        normals, faces = corner_normals.reshape(-1, 3)[first], inverse.reshape(-1, 3)
+    material = PBRMaterial(
+        baseColorTexture=texture,
+        baseColorFactor=np.array([*source.factor[:3], 255], dtype=np.uint8),
+        metallicFactor=0.0,
+        roughnessFactor=source.roughness,
+    )
+    visual = TextureVisuals(uv=uv, material=material)
+    return trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
+
+
+def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
+    """Write a mesh from `to_display` as GLB with its texture inside as JPEG; the same mesh gives the same bytes.
+
+    Raises:
+        AssetError: the mesh has no ``PBRMaterial``.
+    """
+    material = getattr(mesh.visual, "material", None)
+    if not isinstance(material, PBRMaterial):
+        raise AssetError("can't write this mesh", where=path, expected="a PBRMaterial", fix="Use to_display first.")
+    vertices = np.asarray(mesh.vertices, dtype="<f4")
+    normals = np.asarray(mesh.vertex_normals, dtype="<f4")
+    indices = np.asarray(mesh.faces, dtype="<u2" if len(vertices) < 65535 else "<u4").reshape(-1)
+    views: list[dict] = []
+    blob = bytearray()
+
+    def view(data: bytes, **more: int) -> int:
+        views.append({"buffer": 0, "byteOffset": len(blob), "byteLength": len(data), **more})
+        blob.extend(data + b"\0" * (-len(data) % 4))
+        return len(views) - 1
+
+    limits = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
+    float_view = {"componentType": 5126, "count": len(vertices)}
+    whole = {"componentType": 5123 if indices.itemsize == 2 else 5125, "count": len(indices), "type": "SCALAR"}
+    accessors = [
+        {"bufferView": view(vertices.tobytes(), target=34962), **float_view, "type": "VEC3", **limits},
+        {"bufferView": view(normals.tobytes(), target=34962), **float_view, "type": "VEC3"},
+        {"bufferView": view(indices.tobytes(), target=34963), **whole},
+    ]
+    shading: dict[str, Any] = {
+        "baseColorFactor": (_rgba(material.baseColorFactor) / 255).tolist(),
+        "metallicFactor": float(material.metallicFactor or 0),
+        "roughnessFactor": _roughness(material),
+    }
+    primitive = {"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": 2, "material": 0}
+    tree: dict = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+    uv = getattr(mesh.visual, "uv", None)
+    if material.baseColorTexture is not None and uv is not None:
+        flipped = np.column_stack([uv[:, 0], 1 - uv[:, 1]]).astype("<f4")  # glTF counts v from the top
+        accessors.append({"bufferView": view(flipped.tobytes(), target=34962), **float_view, "type": "VEC2"})
+        primitive["attributes"]["TEXCOORD_0"] = 3
+        jpeg = io.BytesIO()
+        material.baseColorTexture.convert("RGB").save(jpeg, format="JPEG", quality=JPEG_QUALITY, optimize=True)
+        shading["baseColorTexture"] = {"index": 0}
+        tree["images"] = [{"bufferView": view(jpeg.getvalue()), "mimeType": "image/jpeg"}]
+        tree["textures"] = [{"source": 0}]
+    tree |= {
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [{"pbrMetallicRoughness": shading}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(blob)}],
+    }
+    head = json.dumps(tree, separators=(",", ":")).encode()
+    head += b" " * (-len(head) % 4)
+    start = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(head) + len(blob), len(head), b"JSON")
+    with replacing(path) as tmp:
+        tmp.write_bytes(start + head + struct.pack("<I4s", len(blob), b"BIN\0") + blob)
+
+
+class _Source:
+    """How the original looks: texture and UVs, or else (F, 3, 3) colours of the corners, 0 to 255."""
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        visual: Any = mesh.visual
+        material: Any = getattr(visual, "material", None)
+        self.roughness, self.factor = _roughness(material), _rgba(None)
+        uv, image = getattr(visual, "uv", None), None
+        if isinstance(material, PBRMaterial):
+            image, self.factor = material.baseColorTexture, _rgba(material.baseColorFactor)
+        elif material is not None:
+            image = material.image  # a diffuse colour beside a texture is a mere default in most OBJ files
+        self.image = None if image is None or uv is None else image.convert("RGB")
+        self.uv = np.zeros((0, 2)) if uv is None else np.array(uv, dtype=float)
+        if visual.kind == "face":
+            self.colors = np.repeat(np.asarray(visual.face_colors, dtype=float)[:, None, :3], 3, axis=1)
+        elif visual.kind == "vertex":
+            self.colors = np.asarray(visual.vertex_colors, dtype=float)[mesh.faces][:, :, :3]
+        else:
+            color = _rgba(None if material is None else material.main_color)
+            self.colors = np.broadcast_to(color[:3], (len(mesh.faces), 3, 3))
+        self.plain = self.image is None and bool((self.colors == self.colors[0, 0]).all())
+        if self.plain:
+            self.factor = self.colors[0, 0]
+
+
+def _roughness(material: Any) -> float:
+    value = getattr(material, "roughnessFactor", None)
+    return DEFAULT_ROUGHNESS if value is None else float(value)
+
+
+def _rgba(color: Any) -> Array:
+    return np.asarray((255,) * 4 if color is None else to_rgba(color), dtype=float)
+
+
+def _shrunk(image: Image.Image, size: int) -> Image.Image:
+    scale = size / max(image.size)
+    if scale >= 1:
+        return image
+    width, height = (max(1, round(side * scale)) for side in image.size)
+    return image.resize((width, height), Image.Resampling.BOX if scale <= 0.5 else Image.Resampling.LANCZOS)
+
+
+def _simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
+    """Vertices merged by position, faces collapsed to the limit, wound outward."""
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    body.merge_vertices(digits_vertex=None)
+    center, size = body.bounds.mean(axis=0), float(np.linalg.norm(body.extents))
+    vertices, faces = (np.asarray(body.vertices) - center) / size, np.asarray(body.faces)
+    for aggression in (5, 7, 9, 12):  # gentle first: it may stop above the limit
+        if len(faces) <= triangles:
+            break
+        vertices, faces = fast_simplification.simplify(
+            np.ascontiguousarray(vertices), faces.astype(np.int32), target_count=triangles, agg=aggression
+        )[:2]
+    if len(faces) > triangles or len(faces) == 0:
+        raise AssetError("can't simplify this mesh so far", expected=f"1 to {triangles} faces", found=len(faces))
+    body = trimesh.Trimesh(vertices * size + center, faces, process=False)
+    body.update_faces(body.nondegenerate_faces())
+    body.remove_unreferenced_vertices()
+    if not body.is_winding_consistent:
+        trimesh.repair.fix_winding(body)
+    if body.volume < 0:
+        body.invert()
+    return body
+
+
+def _crease_normals(body: trimesh.Trimesh) -> Array:
+    """(F, 3, 3) normals of the corners: the mean of those faces round the vertex that bend away little."""
+    faces = np.asarray(body.faces)
+    corner_vertex = faces.reshape(-1)
+    order = np.argsort(corner_vertex, kind="stable")
+    counts = np.bincount(corner_vertex, minlength=len(body.vertices))
+    starts = np.cumsum(counts) - counts
+    many = counts[corner_vertex]
+    one = np.repeat(np.arange(len(corner_vertex)), many)
+    step = np.arange(len(one)) - np.repeat(np.cumsum(many) - many, many)
+    other = order[np.repeat(starts[corner_vertex], many) + step]
+    normals = np.asarray(body.face_normals)
+    smooth = (normals[one // 3] * normals[other // 3]).sum(axis=1) >= CREASE
+    one, other = one[smooth], other[smooth]
+    weighted = normals[other // 3] * np.asarray(body.face_angles).reshape(-1)[other, None]
+    total = np.stack([np.bincount(one, weighted[:, axis], len(corner_vertex)) for axis in range(3)], axis=1)
+    total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+    return total.reshape(-1, 3, 3)
+
+
+def _unwrapped(body: trimesh.Trimesh, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """The vertex that each UV vertex comes from, faces of UV vertices and (V, 2) UVs in 0 to 1, without overlaps."""
+    try:
+        import xatlas
+    except ImportError as error:
+        raise MissingExtraError("xatlas is not installed", fix="pip install 'robocas-ms3[assets]'") from error
+    scaled = (np.asarray(body.vertices) - body.bounds[0]) / np.linalg.norm(body.extents)
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(scaled.astype(np.float32), np.asarray(body.faces, dtype=np.uint32))
+    options = xatlas.PackOptions()
+    options.resolution, options.padding, options.bilinear = size, 2, True
+    atlas.generate(pack_options=options)
+    origin, faces, uv = atlas[0]
+    return origin.astype(np.int64), faces.astype(np.int64), uv.astype(float)
+
+
+def _baked(
+    mesh: trimesh.Trimesh, source: _Source, body: trimesh.Trimesh, corner_uv: Array, corner_normals: Array, size: int
+) -> Image.Image:
+    """The new texture: every texel shows the point of the original surface next to it."""
+    rows, columns, face, weights = _rasterised(corner_uv, size)
+    points = np.einsum("nc,ncd->nd", weights, np.asarray(body.triangles)[face])
+    normals = np.einsum("nc,ncd->nd", weights, corner_normals[face])
+    origin_face, origin_weights = _closest(mesh, points, normals)
+    if source.image is None:
+        colors = np.einsum("nc,ncd->nd", origin_weights, source.colors[origin_face])
+    else:
+        origin_uv = source.uv[mesh.faces]
+        spread = _double_area(origin_uv).sum() / 2 * source.image.width * source.image.height / max(1, len(points))
+        image = source.image.reduce(max(1, round(np.sqrt(spread))))  # finer detail would only alias
+        colors = _bilinear(
+            np.asarray(image, dtype=np.float32), np.einsum("nc,ncd->nd", origin_weights, origin_uv[origin_face])
+        )
+    picture = np.zeros((size, size, 3), dtype=np.uint8)
+    empty = np.ones((size, size), dtype=bool)
+    picture[rows, columns] = np.clip(np.rint(colors), 0, 255)
+    empty[rows, columns] = False
+    near: Any = distance_transform_edt(empty, return_distances=False, return_indices=True)
+    return Image.fromarray(picture[near[0], near[1]])  # gaps show their neighbours, so that no seam is dark
+
+
+def _rasterised(corner_uv: Array, size: int) -> tuple[NDArray, NDArray, NDArray, Array]:
+    """Row, column, face and (N, 3) barycentric weights of each texel that a face covers, or that lies one beside."""
+    corners = corner_uv * (size, -size) + (-0.5, size - 0.5)  # (F, 3, 2) column, row; whole numbers are centres
+    areas = _double_area(corners)
+    index = np.flatnonzero(areas > 1e-9)
+    low = np.clip(np.floor(corners[index].min(axis=1)).astype(int), 0, size - 1)
+    high = np.clip(np.ceil(corners[index].max(axis=1)).astype(int), 0, size - 1)
+    extent = high - low + 1
+    many = extent.prod(axis=1)
+    pick = np.repeat(np.arange(len(index)), many)
+    step = np.arange(len(pick)) - np.repeat(np.cumsum(many) - many, many)
+    column, row = low[pick, 0] + step % extent[pick, 0], low[pick, 1] + step // extent[pick, 0]
+    face = index[pick]
+    weights = _barycentric(corners, face, np.column_stack([column, row]))
+    edges = np.linalg.norm(corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]], axis=2)
+    inside = (weights * areas[face, None] / edges[face]).min(axis=1)  # distance to the nearest edge, texels
+    keep = np.flatnonzero(inside > -1)
+    keep = keep[np.argsort(inside[keep], kind="stable")][::-1]  # the face that holds a texel best comes first
+    _, first = np.unique(row[keep] * size + column[keep], return_index=True)
+    keep = keep[first]
+    return row[keep], column[keep], face[keep], _clamped(weights[keep])
+
+
+def _closest(mesh: trimesh.Trimesh, points: Array, normals: Array) -> tuple[NDArray, Array]:
+    """Face of the original next to each point, among those that look the same way, and (N, 3) weights there."""
+    triangles = np.asarray(mesh.triangles)
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    areas = np.linalg.norm(cross, axis=1)
+    facing = cross / np.maximum(areas, 1e-30)[:, None] * (-1 if mesh.volume < 0 else 1)
+    solid = np.flatnonzero(areas > 0)
+    count = 1 + np.floor(SAMPLES * areas[solid] / areas.sum()).astype(int)
+    face = np.repeat(solid, count)
+    spots = np.random.default_rng(0).dirichlet((1, 1, 1), len(face))
+    reach = NORMAL_WEIGHT * float(np.linalg.norm(mesh.extents))
+    places = np.einsum("nc,ncd->nd", spots, triangles[face])
+    tree = KDTree(np.hstack([places, reach * facing[face]]), balanced_tree=False, compact_nodes=False)
+    lengths = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    found = face[tree.query(np.hstack([points, reach * normals / lengths]))[1]]
+    return found, _clamped(_barycentric(triangles, found, points))
+
+
+def _barycentric(triangles: Array, face: NDArray, points: Array) -> Array:
+    """(N, 3) weights of points, projected to the plane of their face, in any dimension."""
+    first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    aa, ab, bb = (first * first).sum(axis=1), (first * second).sum(axis=1), (second * second).sum(axis=1)
+    scale = 1 / np.maximum(aa * bb - ab * ab, 1e-300)
+    to_second = (first * bb[:, None] - second * ab[:, None]) * scale[:, None]
+    to_third = (second * aa[:, None] - first * ab[:, None]) * scale[:, None]
+    offset = points - triangles[face, 0]
+    beta, gamma = (offset * to_second[face]).sum(axis=1), (offset * to_third[face]).sum(axis=1)
+    return np.column_stack([1 - beta - gamma, beta, gamma])
+
+
+def _clamped(weights: Array) -> Array:
+    weights = np.maximum(weights, 0)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def _double_area(corners: Array) -> Array:
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+
+
+def _bilinear(image: NDArray[np.float32], uv: Array) -> Array:
+    """(N, 3) colours at (N, 2) UVs, v upward; outside of 0 to 1 the image repeats."""
+    height, width = image.shape[:2]
+    column, row = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
+    left, top = np.floor(column).astype(int), np.floor(row).astype(int)
+    across, down = (column - left)[:, None], (row - top)[:, None]
+    left, right, top, bottom = left % width, (left + 1) % width, top % height, (top + 1) % height
+    upper = image[top, left] * (1 - across) + image[top, right] * across
+    lower = image[bottom, left] * (1 - across) + image[bottom, right] * across
+    return upper * (1 - down) + lower * down
