@@ -35,7 +35,7 @@ def squeeze_bottle(size: Size) -> Shape:
             detail=0.4,
         ),
         Section("side", oval_rings(side)),
-        Section("shoulder", oval_rings(shoulder, steps=5), detail=0.4),
+        Section("shoulder", oval_rings(shoulder, steps=4), detail=0.4),
         Section("cap", oval_rings(cap), detail=0.6),
     ]
     return fitted([loft(sections)], size)
@@ -66,7 +66,7 @@ def flip_top_bottle(size: Size, *, exponent: float = 2.4, cap_height: float = 0.
             detail=0.4,
         ),
         Section("side", oval_rings(side)),
-        Section("shoulder", oval_rings(shoulder, steps=5), detail=0.4),
+        Section("shoulder", oval_rings(shoulder, steps=4), detail=0.4),
         Section("cap", oval_rings(cap), detail=0.6),
         Section("lid", oval_rings([cap[-1], (0, 0, h, 2.2, 0)]), flat=True, detail=0.6),
     ]
@@ -92,7 +92,7 @@ def drink_bottle(size: Size) -> Shape:
             "bottom", round_rings([(0, 0.005, 0), (r * 0.6, 0.003, 0.008), (r * 0.8, 0, 0)]), flat=True, detail=0.4
         ),
         Section("side", round_rings(side)),
-        Section("shoulder", round_rings(shoulder, steps=5), detail=0.4),
+        Section("shoulder", round_rings(shoulder, steps=4), detail=0.4),
         Section("cap", round_rings(cap), detail=0.6),
         Section("lid", round_rings([(0.012, h, 0), (0, h, 0)]), flat=True, detail=0.6),
     ]
@@ -123,7 +123,7 @@ def screw_cap_bottle(size: Size) -> Shape:
             detail=0.4,
         ),
         Section("side", oval_rings(side)),
-        Section("shoulder", oval_rings(shoulder, steps=5), detail=0.4),
+        Section("shoulder", oval_rings(shoulder, steps=4), detail=0.4),
         Section("cap", oval_rings(cap), detail=0.6),
         Section("lid", oval_rings([cap[-1], (0, 0, h, 2, 0)]), flat=True, detail=0.6),
     ]
@@ -161,16 +161,16 @@ def pump_bottle(size: Size) -> Shape:
             detail=0.4,
         ),
         Section("side", oval_rings(side)),
-        Section("shoulder", oval_rings(shoulder, steps=5), detail=0.4),
+        Section("shoulder", oval_rings(shoulder, steps=4), detail=0.4),
         Section("cap", oval_rings(cap, steps=3), detail=0.5),
     ]
-    t = np.linspace(0, 1, 9)
+    t = np.linspace(0, 1, 7)
     path = np.stack([0.004 + (a - 0.006) * t, 0 * t, h * 0.972 - 0.009 * t**3], axis=-1)
     radii = np.stack([0.0048 - 0.0014 * t, 0.0062 - 0.0024 * t], axis=-1)
     path, radii = np.concatenate([path[:1], path, path[-1:]]), np.concatenate([[[0, 0]], radii, [[0, 0]]])
     path[0, 0] -= 1e-4
     path[-1, 0] += 1e-4
-    spout = sweep("spout", path, radii, normal=(0, 1, 0), segments=16, detail=0.5)
+    spout = sweep("spout", path, radii, normal=(0, 1, 0), segments=10, detail=0.5)
     return fitted([loft(sections), spout], size)
 
 
@@ -187,7 +187,7 @@ def tube(size: Size, *, cap_radius: float, cap_height: float) -> Shape:
 
     start, crimp = cap_height + 0.007, h - 0.008
     body = [(cap_radius, cap_radius, cap_height, 2.0), (r * 0.96, r * 0.96, start - 0.001, 2.0)]
-    for fraction in np.linspace(0, 1, 13):
+    for fraction in np.linspace(0, 1, 11):
         half_y = r + (thick - r) * fraction**1.25
         body.append((half_x(half_y), half_y, start + (crimp - start) * fraction, 2.0))
     flat = body[-1][0]
@@ -204,7 +204,7 @@ def tube(size: Size, *, cap_radius: float, cap_height: float) -> Shape:
         Section("cap", round_rings(cap), detail=0.6),
         Section("side", np.array(body)),
     ]
-    return fitted([loft(sections, segments=40)], size)
+    return fitted([loft(sections)], size)
 
 
 def _ellipse_perimeter(a: float, b: float) -> float:

@@ -29,7 +29,7 @@ def fruit(
     lean: float = 0.0,
     groove: float = 0.0,
     stem: tuple[float, float, float] | None = None,
-    rings: int = 29,
+    rings: int = 25,
 ) -> Shape:
     """A body of revolution made a little irregular. Regions: skin (angle to the right, profile upwards), stem.
 
@@ -55,7 +55,7 @@ def fruit(
         moved[..., 0] += lean * height * np.clip(level, 0, 1) ** 2
         return moved
 
-    parts = [loft([Section("skin", _spline_rings(profile, rings))], segments=36, warp=warp)]
+    parts = [loft([Section("skin", _spline_rings(profile, rings))], segments=28, warp=warp)]
     if stem:
         foot, tip, radius = stem
         t = np.linspace(0, 1, 7)
@@ -64,14 +64,14 @@ def fruit(
         path, radii = np.concatenate([path[:1], path, path[-1:]]), np.concatenate([[[0, 0]], radii, [[0, 0]]])
         path[-1, 2] += 1e-4
         path[0, 2] -= 1e-4
-        parts.append(sweep("stem", path, radii, normal=(0, 1, 0), segments=10, detail=0.6))
+        parts.append(sweep("stem", path, radii, normal=(0, 1, 0), segments=8, detail=0.6))
     return fitted(parts, size)
 
 
 def banana(size: Size) -> Shape:
     """A banana on its side, bent in the xy plane. Region: skin (around to the right, stem to tip upwards)."""
     chord, thick = size[0], size[2] / 2
-    t = np.linspace(0, 1, 45)
+    t = np.linspace(0, 1, 37)
     # The bend is stronger in the middle and the stem goes straight on.
     heading = 1.0 - 2.0 * np.clip((t - 0.08) / 0.92, 0, 1) ** 0.9
     step = np.stack([np.cos(heading), np.sin(heading), 0 * t], axis=-1)
@@ -87,6 +87,6 @@ def banana(size: Size) -> Shape:
     path, radii = np.concatenate([path[:1], path, path[-1:]]), np.concatenate([[[0, 0]], radii, [[0, 0]]])
     path[0] -= step[0] * 1e-4
     path[-1] += step[-1] * 1e-4
-    theta = 2 * np.pi * np.arange(25) / 25
+    theta = 2 * np.pi * np.arange(20) / 20
     section = 1 + 0.045 * np.cos(5 * theta)
-    return fitted([sweep("skin", path, radii, normal=(0, 0, 1), section=section, segments=25)], size)
+    return fitted([sweep("skin", path, radii, normal=(0, 0, 1), section=section, segments=20)], size)

@@ -33,7 +33,7 @@ def soap_bar(size: Size) -> Shape:
         Section("side", oval_rings(side)),
         Section("top", oval_rings(high), flat=True),
     ]
-    return fitted([loft(sections, segments=40)], size)
+    return fitted([loft(sections, segments=32)], size)
 
 
 def can(size: Size, *, exponent: float = 2.0) -> Shape:
@@ -47,7 +47,7 @@ def can(size: Size, *, exponent: float = 2.0) -> Shape:
     axis = (0.0, 0.0)
     low = [ring(rim, 0.0008), ring(0.002, 0), ring(0, 0, 0.001), ring(0, rim * 0.7, 0.0008), ring(0.001, rim)]
     high = [(*entry[:2], h - entry[2], *entry[3:]) for entry in reversed(low)]
-    segments = 40 if exponent == 2.0 else 56
+    segments = 32 if exponent == 2.0 else 40
     sections = [
         Section("bottom", oval_rings([(*axis, sunk, exponent, 0), ring(rim, sunk), low[0]]), flat=True, detail=0.6),
         Section("rim", oval_rings(low, steps=2), detail=0.5),
@@ -126,7 +126,7 @@ def mug(size: Size, *, wall: float = 0.004) -> Shape:
         Section("floor", round_rings([(inner * 0.7, floor, 0), (0, floor, 0)]), flat=True, detail=0.3),
     ]
     reach = size[0] - r - 0.005  # the handle's centre line, outermost
-    t = np.linspace(-0.5, 0.5, 23) * np.pi
+    t = np.linspace(-0.5, 0.5, 19) * np.pi
     bow = np.sign(np.cos(t)) * np.abs(np.cos(t)) ** 0.75
     path = np.stack([r - wall * 0.55 + bow * (reach - r + wall * 0.55), 0 * t, h * 0.5 + np.sin(t) * h * 0.31], axis=-1)
     radii = np.full((len(t), 2), (0.0045, 0.0065))
@@ -134,10 +134,10 @@ def mug(size: Size, *, wall: float = 0.004) -> Shape:
     path, radii = np.concatenate([path[:1], path, path[-1:]]), np.concatenate([[[0, 0]], radii, [[0, 0]]])
     path[0, 0] -= 2e-4
     path[-1, 0] -= 2e-4
-    handle = sweep("handle", path, radii, normal=(0, 1, 0), segments=16, detail=0.5)
+    handle = sweep("handle", path, radii, normal=(0, 1, 0), segments=12, detail=0.5)
     pieces = _ring_pieces(inner, r, (0.0, h), count=14)
     pieces.append(ring_points(np.array([[inner, inner, z, 2.0] for z in (0.0, floor)]), 24).reshape(-1, 3))
-    rings = handle[0].points[1:-1, ::2]
+    rings = handle[0].points[1:-1]
     pieces += [rings[i : i + 4].reshape(-1, 3) for i in range(0, len(rings) - 1, 3)]
     return fitted([loft(sections), handle], size, pieces=pieces)
 

@@ -32,7 +32,7 @@ class Section:
     detail: float = 1.0
 
 
-def soften(points: list[tuple[float, ...]], steps: int = 3) -> np.ndarray:
+def soften(points: list[tuple[float, ...]], steps: int = 2) -> np.ndarray:
     """A polyline with rounded corners.
 
     Args:
@@ -60,13 +60,13 @@ def soften(points: list[tuple[float, ...]], steps: int = 3) -> np.ndarray:
     return np.array(result)[keep]
 
 
-def round_rings(profile: list[tuple[float, float, float]], steps: int = 3) -> np.ndarray:
+def round_rings(profile: list[tuple[float, float, float]], steps: int = 2) -> np.ndarray:
     """Rings (m, 4) of a surface of revolution from (radius, z, corner cut), see ``soften``."""
     line = soften(list(profile), steps)
     return np.column_stack([line[:, 0], line[:, 0], line[:, 1], np.full(len(line), 2.0)])
 
 
-def oval_rings(profile: list[tuple[float, float, float, float, float]], steps: int = 3) -> np.ndarray:
+def oval_rings(profile: list[tuple[float, float, float, float, float]], steps: int = 2) -> np.ndarray:
     """Rings (m, 4) from (half_x, half_y, z, exponent, corner cut)."""
     # Exponents are scaled down so that they don't count as lengths.
     line = soften([(a, b, z, n * 1e-3, cut) for a, b, z, n, cut in profile], steps)
@@ -85,7 +85,7 @@ def ring_points(rings: np.ndarray, segments: int) -> np.ndarray:
 
 
 def loft(
-    sections: list[Section], *, segments: int = 40, warp: Callable[[np.ndarray], np.ndarray] | None = None
+    sections: list[Section], *, segments: int = 32, warp: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> list[Patch]:
     """A closed part of rings; ``warp`` moves the points (..., 3) at the end, UVs stay as they were."""
     patches = []
