@@ -70,8 +70,8 @@ class ScatteredLayout(StrictModel):
     """Objects apart from each other, each in a stable pose, at a random yaw."""
 
     kind: Literal["scattered"]
-    min_gap: Annotated[float, Field(ge=0, le=0.2)] = Field(default=0.02, description="space between two objects, m")
-    max_tries: Annotated[int, Field(ge=1)] = 2000
+    min_gap: Annotated[float, Field(ge=0, le=0.2)] = Field(default=0.01, description="space between two objects, m")
+    max_tries: Annotated[int, Field(ge=1)] = 40_000
 
 
 class ObjectsConfig(StrictModel):

@@ -12,6 +12,8 @@ from robocas_ms3.errors import LayoutError
 
 Array = NDArray[np.float64]
 
+_TRIES_AT_ONCE = 40  # positions of one object before the layout starts over
+
 
 @dataclass(frozen=True)
 class Placeable:
@@ -66,8 +68,6 @@ def sample_scattered(
     Raises:
         LayoutError: the objects don't fit.
     """
-    size = np.subtract(region.max_xy, region.min_xy)
-    tries_per_object = 40
     tries = 0
     while tries < max_tries:
         poses = np.zeros((len(placeables), 4, 4))
@@ -76,31 +76,38 @@ def sample_scattered(
         placed: list[shapely.Polygon] = []
         for index in np.argsort(areas)[::-1]:
             placeable, choice = placeables[index], choices[index]
-            for _ in range(tries_per_object):
-                tries += 1
-                yaw = rng.uniform(-np.pi, np.pi)
-                outline = placeable.footprints[choice] @ planar_pose(0, 0, 0, yaw)[:2, :2].T
-                low, high = outline.min(axis=0), outline.max(axis=0)
-                free = size - (high - low)
-                if (free < 0).any():
-                    continue
-                position = np.add(region.min_xy, rng.uniform(0, 1, 2) * free) - low
-                polygon = shapely.Polygon(outline + position)
-                if placed and shapely.distance(polygon, placed).min() < min_gap:
-                    continue
-                placed.append(polygon)
-                poses[index] = planar_pose(position[0], position[1], region.z, yaw) @ placeable.resting_poses[choice]
-                break
-            else:
+            tries += _TRIES_AT_ONCE
+            yaws, positions, outlines = _candidates(rng, placeable.footprints[choice], region)
+            if placed and len(yaws):
+                gaps = shapely.distance(outlines[:, None], np.array(placed)[None]).min(axis=1)
+                yaws, positions, outlines = (values[gaps >= min_gap] for values in (yaws, positions, outlines))
+            if not len(yaws):
                 break  # no room for this one: start over
+            placed.append(outlines[0])
+            x, y = positions[0]
+            poses[index] = planar_pose(x, y, region.z, yaws[0]) @ placeable.resting_poses[choice]
         if len(placed) == len(placeables):
             return poses
+    size = np.subtract(region.max_xy, region.min_xy)
     raise LayoutError(
         f"{len(placeables)} objects don't fit {min_gap * 100:.1f} cm apart on {size[0]:.2f} x {size[1]:.2f} m",
         where="layout",
         found=f"{max_tries} tries used up",
         fix="Lower objects.count or layout.min_gap, enlarge the surface, or raise layout.max_tries.",
     )
+
+
+def _candidates(rng: np.random.Generator, footprint: Array, region: Region) -> tuple[Array, Array, NDArray]:
+    """Random yaws (n,), positions (n, 2) and outlines (n,) of a footprint inside a region; fewer where it is narrow."""
+    yaws = rng.uniform(-np.pi, np.pi, _TRIES_AT_ONCE)
+    shares = rng.uniform(0, 1, (_TRIES_AT_ONCE, 2))
+    cos, sin = np.cos(yaws), np.sin(yaws)
+    turned = np.einsum("nij,kj->nki", np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], 1), footprint)
+    low, high = turned.min(axis=1), turned.max(axis=1)
+    free = np.subtract(region.max_xy, region.min_xy) - (high - low)
+    positions = np.add(region.min_xy, shares * free) - low
+    fits = (free >= 0).all(axis=1)
+    return yaws[fits], positions[fits], shapely.polygons((turned + positions[:, None])[fits])
 
 
 def _choose_pose(rng: np.random.Generator, placeable: Placeable) -> int:
