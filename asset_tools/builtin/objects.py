@@ -114,11 +114,12 @@ PEAR_SKIN = {
 ORANGE_SKIN = {"base": (242, 138, 20), "blush": (232, 116, 12), "pores": 0.07, "poles": (186, 140, 50)}
 PEACH_SKIN = {"base": (246, 190, 98), "blush": (208, 70, 58), "blush_amount": 0.55, "poles": (236, 190, 100)}
 
+# Some are narrower than the real things: a gripper that opens 0.08 m can take each from above however it lies.
 SPECS: tuple[ObjectSpec, ...] = (
-    _product("sugar_box", "box", (0.089, 0.038, 0.175), 0.514, shapes.carton, paint_carton, 0.7),
+    _product("sugar_box", "box", (0.068, 0.038, 0.150), 0.330, shapes.carton, paint_carton, 0.7),
     _product("tomato_soup_can", "can", (0.066, 0.066, 0.101), 0.349, shapes.can, metal_wrapped, 0.4),
-    _product("mustard_bottle", "bottle", (0.095, 0.058, 0.190), 0.603, bottles.squeeze_bottle, paint_wrapped),
-    _product("potted_meat_can", "can", (0.097, 0.050, 0.082), 0.370, tin, metal_wrapped, 0.4),
+    _product("mustard_bottle", "bottle", (0.070, 0.048, 0.175), 0.400, bottles.squeeze_bottle, paint_wrapped),
+    _product("potted_meat_can", "can", (0.092, 0.046, 0.068), 0.250, tin, metal_wrapped, 0.4),
     ObjectSpec("banana", "fruit", (0.178, 0.074, 0.036), 0.118, fruits.banana, paint_banana, 0.6),
     _product("mug", "mug", (0.105, 0.075, 0.085), 0.280, shapes.mug, paint_mug, 0.25),
     _product("chips_can", "can", (0.070, 0.070, 0.235), 0.205, shapes.canister, paint_wrapped, 0.55),

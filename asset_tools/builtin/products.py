@@ -10,7 +10,7 @@ LABELS: dict[str, Label] = {
     "sugar_box": Label(
         title="FINE\nSUGAR",
         subtitle="white cane sugar",
-        amount="500 g",
+        amount="330 g",
         base=(250, 206, 40),
         accent=(28, 66, 150),
         ink=NAVY,
@@ -33,7 +33,7 @@ LABELS: dict[str, Label] = {
     "mustard_bottle": Label(
         title="YELLOW\nMUSTARD",
         subtitle="mild and smooth",
-        amount="560 g",
+        amount="380 g",
         base=(244, 196, 24),
         accent=(252, 244, 214),
         ink=(150, 24, 20),
@@ -44,7 +44,7 @@ LABELS: dict[str, Label] = {
     "potted_meat_can": Label(
         title="POTTED\nMEAT",
         subtitle="smoked ham",
-        amount="340 g",
+        amount="220 g",
         base=(20, 60, 140),
         accent=(240, 196, 40),
         ink=WHITE,
