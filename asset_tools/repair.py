@@ -1,0 +1,202 @@
+"""Closing scans: from whatever a scanner left to a solid whose volume, hulls and grasps can be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from robocas_ms3.errors import AssetError, MissingExtraError
+
+Array = NDArray[np.float64]
+
+LOOSE = 0.02  # share of the surface below which a separate piece is scanner dirt
+FILLED = 0.35  # share of the surface that may be filled in
+LEAST_VOLUME = 0.01  # of the convex hull's: less is a sheet, not a body
+FACES = 5000  # of the solid at most; more only costs time
+TOLERANCES = (0.0005, 0.001, 0.0015, 0.002, 0.003)  # of the diagonal, tried in turn to get there
+CELLS = 64  # of the grid that a mesh is re-meshed on, along its longest side
+WINDING_FACES, WINDING_CHUNK = 1500, 4096
+
+
+@dataclass(frozen=True)
+class Closed:
+    """A solid made of a scan.
+
+    Attributes:
+        mesh: watertight, faces outwards, in the scan's frame and unit.
+        repairs: what had to be mended, in words.
+    """
+
+    mesh: trimesh.Trimesh
+    repairs: tuple[str, ...]
+
+
+def close(scan: trimesh.Trimesh) -> Closed:
+    """Make a watertight solid of a scan: weld, drop dirt, fill holes; what still isn't closed is meshed anew.
+
+    A shell inside of the outer surface (an empty can scanned through) is dropped: things are solid.
+
+    Args:
+        scan: any unit; may have UV seams.
+
+    Raises:
+        AssetError: it encloses nothing (a sheet), or can't be closed.
+    """
+    repairs: list[str] = []
+    mesh = _welded(scan, repairs)
+    mesh = _outer_pieces(mesh, repairs)
+    if not mesh.is_winding_consistent:
+        trimesh.repair.fix_winding(mesh)
+        repairs.append("turned faces the same way round")
+    if not mesh.is_watertight:
+        mesh = _filled(mesh, repairs)
+    solid = _as_solid(mesh)
+    if solid is None:
+        solid = _as_solid(_remeshed(mesh))
+        repairs.append("meshed anew around the scan")
+    hull_volume = float(scan.convex_hull.volume) if np.ptp(scan.vertices, axis=0).min() > 0 else 0.0
+    if solid is None or solid.volume() < LEAST_VOLUME * hull_volume or hull_volume <= 0:
+        raise AssetError(
+            "the mesh can't be closed to a solid",
+            expected="a surface around a volume, with at most small holes",
+            found=f"{_open_edges(mesh)} open edges of {len(mesh.edges_unique)}",
+            fix="Repair the scan, or leave it out.",
+        )
+    return Closed(_light(solid, float(np.linalg.norm(scan.extents))), tuple(repairs))
+
+
+def _welded(scan: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
+    mesh = trimesh.Trimesh(np.array(scan.vertices), np.array(scan.faces), process=False)
+    # scans are written with 5 or 6 digits, so that corners of one point may differ in the last
+    tolerance = 1e-6 * float(np.linalg.norm(mesh.extents))
+    mesh.vertices = mesh.vertices / tolerance
+    mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=0)
+    mesh.vertices = mesh.vertices * tolerance
+    count = len(mesh.faces)
+    a, b, c = mesh.faces.T
+    mesh.update_faces(mesh.unique_faces() & (a != b) & (b != c) & (c != a))
+    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) == 0:
+        raise AssetError("the mesh has no faces of any size", expected="triangles", found=f"{count} slivers")
+    if len(mesh.faces) < count:
+        repairs.append(f"dropped {count - len(mesh.faces)} double or degenerate faces")
+    return mesh
+
+
+def _outer_pieces(mesh: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
+    """Drop dirt and shells inside of others."""
+    pieces = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1)
+    if len(pieces) < 2:
+        return mesh
+    areas = np.array([mesh.area_faces[piece].sum() for piece in pieces])
+    pieces = [pieces[i] for i in np.argsort(-areas) if areas[i] >= LOOSE * areas.sum()]
+    kept: list = []
+    for piece in pieces:
+        corners = mesh.vertices[np.unique(mesh.faces[piece])]
+        outer = [trimesh.Trimesh(mesh.vertices, mesh.faces[other], process=False) for other in kept]
+        if not any(shell.is_watertight and shell.contains(corners[:: len(corners) // 50 + 1]).all() for shell in outer):
+            kept.append(piece)
+    if len(kept) < len(areas):
+        repairs.append(f"dropped {len(areas) - len(kept)} loose or inner pieces")
+    mesh.update_faces(np.sort(np.concatenate(kept)))
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+def _filled(mesh: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
+    """Close each hole by a fan around its middle, if its rim is a simple loop."""
+    edges = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+    following = {int(a): int(b) for b, a in edges}  # the fill runs along the rim the other way
+    if len(following) < len(edges):
+        return mesh  # two holes meet in a vertex: left to re-meshing
+    vertices, faces = [np.asarray(mesh.vertices)], [np.asarray(mesh.faces)]
+    count, holes, area = len(mesh.vertices), 0, 0.0
+    while following:
+        start, end = following.popitem()
+        loop = [start]
+        while end != start:
+            loop.append(end)
+            if end not in following:
+                return mesh
+            end = following.pop(end)
+        rim = mesh.vertices[loop]
+        middle = rim.mean(axis=0)
+        area += float(np.linalg.norm(np.cross(rim - middle, np.roll(rim, -1, axis=0) - middle), axis=1).sum() / 2)
+        vertices.append(middle[None])
+        faces.append(np.column_stack([loop, np.roll(loop, -1), np.full(len(loop), count + holes)]))
+        holes += 1
+    if area > FILLED * mesh.area:
+        return mesh
+    repairs.append(f"filled {holes} hole{'s' if holes > 1 else ''}")
+    return trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
+
+
+def _as_solid(mesh: trimesh.Trimesh):
+    """The mesh as a manifold3d solid with outward faces; none if it isn't closed or encloses nothing."""
+    try:
+        from manifold3d import Error, Manifold, Mesh64
+    except ImportError as error:
+        raise MissingExtraError("manifold3d is not installed", fix="pip install 'robocas-ms3[assets]'") from error
+    faces = mesh.faces if mesh.volume >= 0 else mesh.faces[:, ::-1]
+    solid = Manifold(Mesh64(np.asarray(mesh.vertices, np.float64), np.asarray(faces, np.uint64)))
+    ok = mesh.is_watertight and solid.status() == Error.NoError and solid.volume() > 0
+    return solid if ok else None
+
+
+def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Zero level of the distance to the surface, signed by the winding number, on a grid."""
+    try:
+        from skimage.measure import marching_cubes
+    except ImportError as error:
+        raise MissingExtraError("scikit-image is not installed", fix="pip install 'robocas-ms3[assets]'") from error
+    pitch = float(mesh.extents.max()) / CELLS
+    low = mesh.bounds[0] - 2 * pitch
+    shape = np.ceil(mesh.extents / pitch).astype(int) + 5
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3) * pitch + low
+    # even samples: a distance to them is within a small part of a cell of the distance to the surface
+    samples = trimesh.sample.sample_surface(mesh, int(min(4e5, 50 * mesh.area / pitch**2)), seed=0)[0]
+    distance = KDTree(samples).query(grid)[0]
+    inside = winding_number(mesh, grid)
+    if np.median(inside[distance < pitch]) < 0:
+        inside = -inside
+    field = np.where(inside > 0.5, -distance, distance).reshape(shape)
+    if field.min() >= 0:
+        return trimesh.Trimesh()
+    vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(pitch,) * 3)
+    closed = trimesh.Trimesh(vertices + low, faces, process=True)
+    bodies = closed.split(only_watertight=True)
+    return max(bodies, key=lambda body: abs(body.volume)) if len(bodies) else closed
+
+
+def winding_number(mesh: trimesh.Trimesh, points: Array) -> Array:
+    """How often a surface, closed or not, runs around points (N, 3): 1 inside, 0 outside, between them near a hole."""
+    if len(mesh.faces) > WINDING_FACES:
+        mesh = mesh.simplify_quadric_decimation(face_count=WINDING_FACES)
+    corners = np.asarray(mesh.triangles, np.float32)
+    result = np.empty(len(points))
+    for start in range(0, len(points), WINDING_CHUNK):
+        chunk = slice(start, start + WINDING_CHUNK)
+        a, b, c = (corners[None, :, k] - points[chunk, None].astype(np.float32) for k in range(3))
+        la, lb, lc = (np.sqrt(np.einsum("pfi,pfi->pf", side, side)) for side in (a, b, c))
+        ab, bc, ca = (np.einsum("pfi,pfi->pf", p, q) for p, q in ((a, b), (b, c), (c, a)))
+        volume = np.einsum("pfi,pfi->pf", a, np.cross(b, c))
+        result[chunk] = np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1) / (2 * np.pi)
+    return result
+
+
+def _light(solid, diagonal: float) -> trimesh.Trimesh:
+    """The solid with few faces; it stays closed, within a thousandth or so of its size."""
+    for tolerance in TOLERANCES:
+        if solid.num_tri() <= FACES:
+            break
+        solid = solid.simplify(tolerance * diagonal)
+    mesh = solid.to_mesh64()
+    return trimesh.Trimesh(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts, np.int64), process=False)
+
+
+def _open_edges(mesh: trimesh.Trimesh) -> int:
+    return len(trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1))
