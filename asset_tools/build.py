@@ -24,6 +24,7 @@ from robocas_ms3.files import replacing_folder
 from robocas_ms3.paths import cache_dir
 
 SURFACE_POINTS = 1024
+GRASPS = 800  # many, since of an object on a table most are from below or blocked by neighbours
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
         friction=source.friction,
     )
     rng = np.random.default_rng(zlib.crc32(source.id.encode()))
-    grasps = sample_grasps(closed, center, rng)
+    grasps = sample_grasps(closed, center, rng, count=GRASPS)
     points, faces = trimesh.sample.sample_surface(closed, SURFACE_POINTS, seed=0)[:2]
     Annotations(
         rest.poses,

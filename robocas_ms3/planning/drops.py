@@ -17,7 +17,7 @@ def sample_drops(
     inner_high: Array,
     vertices_in_tcp: Array,
     center_in_tcp: Array,
-    clearance: tuple[float, float] = (0.02, 0.10),
+    clearance: tuple[float, float] = (0.02, 0.06),
     max_tilt_deg: float = 70.0,
     spread: float = 0.25,
 ) -> Array:
@@ -60,3 +60,24 @@ def sample_drops(
     poses[:, :2, 3] = above[:, :2] - center[:, :2]
     poses[:, 2, 3] = above[:, 2] + rng.uniform(*clearance, count) - lowest
     return poses
+
+
+def overhangs(
+    tcp_in_base: Array, container_in_base: Array, inner_low: Array, inner_high: Array, vertices_in_tcp: Array
+) -> Array:
+    """How far a held object sticks out sideways of the opening below it.
+
+    Args:
+        tcp_in_base: (n, 4, 4) poses of the TCP.
+        container_in_base: 4x4.
+        inner_low: (3,) least corner of the container's inside, in its frame, m.
+        inner_high: (3,) greatest corner.
+        vertices_in_tcp: (V, 3) the object's hull, m.
+
+    Returns:
+        (n,) m; 0 where it would fall straight in.
+    """
+    rotation, origin = container_in_base[:3, :3], container_in_base[:3, 3]
+    points = np.einsum("nij,vj->nvi", tcp_in_base[:, :3, :3], vertices_in_tcp) + tcp_in_base[:, None, :3, 3]
+    local = (points - origin) @ rotation
+    return np.maximum(np.maximum(inner_low - local, local - inner_high)[..., :2].max(axis=(1, 2)), 0)

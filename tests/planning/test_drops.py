@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robocas_ms3.planning.drops import sample_drops
+from robocas_ms3.planning.drops import overhangs, sample_drops
 
 CONTAINER = np.array([[0, -1, 0, 0.6], [1, 0, 0, 0.2], [0, 0, 1, 0.1], [0, 0, 0, 1.0]])  # turned by 90 degrees
 LOW, HIGH = np.array([-0.2, -0.1, -0.1]), np.array([0.2, 0.1, 0.1])
@@ -25,7 +25,7 @@ def test_objects_hang_above_the_container_clear_of_its_rim():
     rim = 0.1 + 0.1
     for pose in poses:
         world = BOX @ pose[:3, :3].T + pose[:3, 3]
-        assert rim + 0.02 - 1e-9 <= world[:, 2].min() <= rim + 0.10 + 1e-9
+        assert rim + 0.02 - 1e-9 <= world[:, 2].min() <= rim + 0.06 + 1e-9
         center = pose[:3, :3] @ [0, 0, 0.05] + pose[:3, 3]
         # the container's x is the base's y
         assert abs(center[0] - 0.6) <= 0.25 * 0.1 + 1e-9
@@ -42,3 +42,13 @@ def test_approach_points_down_and_tilts_away_from_the_arm():
     outward = np.array([0.6, 0.2]) / np.hypot(0.6, 0.2)
     assert (tilted[:, :2] @ outward > 0).all()
     assert np.linalg.det(poses[:, :3, :3]) == pytest.approx(np.ones(200))
+
+
+def test_overhang_is_what_sticks_out_sideways():
+    # straight down above the middle; the container's opening is 0.4 along the base's y, 0.2 along its x
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[:3, 3] = [0.6, 0.2, 0.5]
+    bar = np.array([[x, 0, 0] for x in (-0.15, 0.15)])
+    turned = pose @ np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+    found = overhangs(np.stack([pose, turned]), CONTAINER, LOW, HIGH, bar)
+    assert found == pytest.approx([0.05, 0.0])

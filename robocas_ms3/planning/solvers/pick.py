@@ -9,7 +9,7 @@ import numpy as np
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.language.templates import subgoal
-from robocas_ms3.planning.drops import sample_drops
+from robocas_ms3.planning.drops import overhangs, sample_drops
 from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
 from robocas_ms3.planning.grasps import MAX_WIDTH, filter_grasps, rank_grasps
 from robocas_ms3.planning.protocol import Array, AttachedBody, Planner, Trajectory
@@ -29,8 +29,8 @@ class PickSettings:
     close_seconds: float = 0.45
     open_seconds: float = 0.30
     grasps_planned: int = 12
-    drops_sampled: int = 128
-    drops_planned: int = 6
+    drops_sampled: int = 192
+    drops_planned: int = 10
 
 
 @dataclass(frozen=True)
@@ -164,9 +164,7 @@ class PickSolver:
         for qpos in self.planner.ik(pregrasp, near)[:4]:
             try:
                 approach = self.planner.plan_straight(qpos, tcp_in_base, stage="approach")
-                lift = self.planner.plan_straight(
-                    approach.qpos[-1], raised(tcp_in_base, self.settings.lift_height), stage="lift"
-                )
+                lift = self._first_line(approach.qpos[-1], self._ways_up(tcp_in_base), stage="lift")
             except PlanningFailed as error:
                 failure = error
                 continue
@@ -174,6 +172,27 @@ class PickSolver:
         if not entries:
             raise failure
         return entries
+
+    def _ways_up(self, tcp_in_base: Array) -> list[Array]:
+        """Where to lift to: straight up, or between that and back the way the gripper came in."""
+        up, back = np.array([0, 0, 1.0]), -tcp_in_base[:3, 2]
+        goals = []
+        for share in (0.0, 0.5, 1.0):
+            direction = (1 - share) * up + share * back
+            if direction[2] > 0.2:
+                goals.append(tcp_in_base.copy())
+                goals[-1][:3, 3] += self.settings.lift_height / direction[2] * direction
+        return goals
+
+    def _first_line(self, start: Array, goals: list[Array], *, stage: str, check_collisions: bool = True) -> Trajectory:
+        """Plan a straight line to the first of several poses that one leads to."""
+        failure = PlanningFailed(stage, "no_goal")
+        for goal in goals:
+            try:
+                return self.planner.plan_straight(start, goal, stage=stage, check_collisions=check_collisions)
+            except PlanningFailed as error:
+                failure = error
+        raise failure
 
     # ------------------------------------------------------------------ carry and release
 
@@ -191,6 +210,7 @@ class PickSolver:
         asset = self.env.object_assets[0][slot]
         object_in_tcp = inverse(scene.tcp_in_base) @ scene.object_in_base(slot)
         vertices = np.concatenate(asset.hulls)
+        vertices_in_tcp = transform(object_in_tcp, vertices)
         inner = self.env.furniture_pack.furniture[self.env.task_config.basket.asset].asset.inner
         assert inner is not None  # the environment saw to it
         drops = sample_drops(
@@ -199,18 +219,21 @@ class PickSolver:
             container_in_base=scene.basket_in_base,
             inner_low=np.array(inner.min),
             inner_high=np.array(inner.max),
-            vertices_in_tcp=transform(object_in_tcp, vertices),
+            vertices_in_tcp=vertices_in_tcp,
             center_in_tcp=transform(object_in_tcp, np.array([asset.asset.center_of_mass]))[0],
         )
         solved, qpos = self.reachability.reachable(drops, start)
         if not solved.any():
             raise PlanningFailed("transfer", "unreachable")
         drops, qpos = drops[solved], qpos[solved]
+        # first those in which the object fits through the opening, then those that are near
+        overhang = overhangs(drops, scene.basket_in_base, np.array(inner.min), np.array(inner.max), vertices_in_tcp)
+        order = np.lexsort((np.abs(qpos - start).max(axis=1), np.ceil(overhang / 0.02)))
         self.planner.set_scene(scene.obstacles_in_base(without=slot))
         self.planner.attach(AttachedBody(vertices, object_in_tcp))
         self.planner.finger_width = float(self.env.agent.gripper_width[0])
         failure = PlanningFailed("transfer", "no_plan")
-        for index in np.argsort(np.abs(qpos - start).max(axis=1))[: self.settings.drops_planned]:
+        for index in order[: self.settings.drops_planned]:
             try:
                 carry = self.planner.plan_to_pose(start, drops[index], stage="transfer")
                 self._plan_retreat(carry.qpos[-1], drops[index])  # no way up from there: no place to let go
@@ -220,8 +243,11 @@ class PickSolver:
         raise failure
 
     def _plan_retreat(self, start: Array, tcp_in_base: Array) -> Trajectory:
-        goal = raised(tcp_in_base, self.settings.retreat_height)
-        return self.planner.plan_straight(start, goal, stage="retreat", check_collisions=False)
+        height = self.settings.retreat_height
+        back = tcp_in_base.copy()
+        back[:3, 3] -= height * tcp_in_base[:3, 2]
+        goals = [raised(tcp_in_base, height), back, raised(back, height / 2), raised(tcp_in_base, height / 2)]
+        return self._first_line(start, goals, stage="retreat", check_collisions=False)
 
     def _release(self, executor: Executor, scene: PlanningScene, slot: int, end: Array) -> None:
         executor.move_gripper(OPEN, end, seconds=self.settings.open_seconds)
