@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import logging
 import operator
 import os
 import sys
@@ -47,6 +48,9 @@ def run(argv: Sequence[str]) -> int:
     debug = len(arguments) < len(argv) or os.environ.get("ROBOCAS_DEBUG", "0") not in {"", "0"}
     if arguments[:1] == ["--version"]:
         return _say(f"robocas {__version__}", sys.stdout, 0)
+    if not debug:
+        # ManiSkill's logger (the blank is in its name) remarks on its own installation, and on CPUs without a GPU.
+        logging.getLogger("mani_skill ").addFilter(lambda record: record.levelno >= logging.ERROR)
     try:
         return _dispatch(arguments)
     except KeyboardInterrupt:
