@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import root_scalar
 
 from asset_tools.builtin.mesh import Shape, Size, fitted
-from asset_tools.builtin.surfaces import Section, loft, oval_rings, round_rings, sweep
+from asset_tools.builtin.surfaces import Section, chained_pieces, loft, oval_rings, round_rings, stacked_pieces, sweep
 
 
 def squeeze_bottle(size: Size) -> Shape:
@@ -38,7 +38,8 @@ def squeeze_bottle(size: Size) -> Shape:
         Section("shoulder", oval_rings(shoulder, steps=4), detail=0.4),
         Section("cap", oval_rings(cap), detail=0.6),
     ]
-    return fitted([loft(sections)], size)
+    part = loft(sections)
+    return fitted([part], size, pieces=stacked_pieces(part, [h * 0.835, h * 0.9]))
 
 
 def flip_top_bottle(size: Size, *, exponent: float = 2.4, cap_height: float = 0.2, taper: float = 0.82) -> Shape:
@@ -70,7 +71,8 @@ def flip_top_bottle(size: Size, *, exponent: float = 2.4, cap_height: float = 0.
         Section("cap", oval_rings(cap), detail=0.6),
         Section("lid", oval_rings([cap[-1], (0, 0, h, 2.2, 0)]), flat=True, detail=0.6),
     ]
-    return fitted([loft(sections)], size)
+    part = loft(sections)
+    return fitted([part], size, pieces=stacked_pieces(part, [cap_z]))
 
 
 def drink_bottle(size: Size) -> Shape:
@@ -96,7 +98,8 @@ def drink_bottle(size: Size) -> Shape:
         Section("cap", round_rings(cap), detail=0.6),
         Section("lid", round_rings([(0.012, h, 0), (0, h, 0)]), flat=True, detail=0.6),
     ]
-    return fitted([loft(sections)], size)
+    part = loft(sections)
+    return fitted([part], size, pieces=stacked_pieces(part, [h * 0.22, h * 0.87, h * 0.905]))
 
 
 def screw_cap_bottle(size: Size) -> Shape:
@@ -127,7 +130,8 @@ def screw_cap_bottle(size: Size) -> Shape:
         Section("cap", oval_rings(cap), detail=0.6),
         Section("lid", oval_rings([cap[-1], (0, 0, h, 2, 0)]), flat=True, detail=0.6),
     ]
-    return fitted([loft(sections)], size)
+    part = loft(sections)
+    return fitted([part], size, pieces=stacked_pieces(part, [h * 0.77, h * 0.8]))
 
 
 def pump_bottle(size: Size) -> Shape:
@@ -171,7 +175,9 @@ def pump_bottle(size: Size) -> Shape:
     path[0, 0] -= 1e-4
     path[-1, 0] += 1e-4
     spout = sweep("spout", path, radii, normal=(0, 1, 0), segments=10, detail=0.5)
-    return fitted([loft(sections), spout], size)
+    part = loft(sections)
+    pieces = stacked_pieces(part, [h * 0.765, h * 0.855, h * 0.93]) + chained_pieces(spout[0], 2)
+    return fitted([part, spout], size, pieces=pieces)
 
 
 def tube(size: Size, *, cap_radius: float, cap_height: float) -> Shape:
@@ -204,7 +210,8 @@ def tube(size: Size, *, cap_radius: float, cap_height: float) -> Shape:
         Section("cap", round_rings(cap), detail=0.6),
         Section("side", np.array(body)),
     ]
-    return fitted([loft(sections)], size)
+    part = loft(sections)
+    return fitted([part], size, pieces=stacked_pieces(part, [cap_height, start]))
 
 
 def _ellipse_perimeter(a: float, b: float) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from asset_tools.builtin.mesh import Shape, Size, fitted
-from asset_tools.builtin.surfaces import Section, loft, sweep
+from asset_tools.builtin.surfaces import Section, chained_pieces, loft, stacked_pieces, sweep
 
 
 def _spline_rings(points: Sequence[tuple[float, float]], count: int) -> np.ndarray:
@@ -29,6 +29,7 @@ def fruit(
     lean: float = 0.0,
     groove: float = 0.0,
     stem: tuple[float, float, float] | None = None,
+    cuts: Sequence[float] = (),
     rings: int = 25,
 ) -> Shape:
     """A body of revolution made a little irregular. Regions: skin (angle to the right, profile upwards), stem.
@@ -40,6 +41,7 @@ def fruit(
         lean: how far the top is moved sideways (+x), as a fraction of the height.
         groove: depth of a groove along the front, as a fraction of the radius.
         stem: z of the stem's foot and tip, and its radius, m.
+        cuts: heights at which the profile is concave, m.
         rings: along the profile.
     """
     heights = [z for _, z in profile]
@@ -56,6 +58,7 @@ def fruit(
         return moved
 
     parts = [loft([Section("skin", _spline_rings(profile, rings))], segments=28, warp=warp)]
+    pieces = stacked_pieces(parts[0], cuts)
     if stem:
         foot, tip, radius = stem
         t = np.linspace(0, 1, 7)
@@ -65,7 +68,8 @@ def fruit(
         path[-1, 2] += 1e-4
         path[0, 2] -= 1e-4
         parts.append(sweep("stem", path, radii, normal=(0, 1, 0), segments=8, detail=0.6))
-    return fitted(parts, size)
+        pieces += chained_pieces(parts[1][0], 1)
+    return fitted(parts, size, pieces=pieces)
 
 
 def banana(size: Size) -> Shape:
@@ -89,4 +93,5 @@ def banana(size: Size) -> Shape:
     path[-1] += step[-1] * 1e-4
     theta = 2 * np.pi * np.arange(20) / 20
     section = 1 + 0.045 * np.cos(5 * theta)
-    return fitted([sweep("skin", path, radii, normal=(0, 0, 1), section=section, segments=20)], size)
+    part = sweep("skin", path, radii, normal=(0, 0, 1), section=section, segments=20)
+    return fitted([part], size, pieces=chained_pieces(part[0], 6))

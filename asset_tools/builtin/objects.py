@@ -136,6 +136,7 @@ SPECS: tuple[ObjectSpec, ...] = (
         PEAR_SKIN,
         lobes=0.02,
         lean=0.06,
+        cuts=(0.066,),
         stem=(0.08, 0.1, 0.0016),
     ),
     _fruit("orange", (0.069, 0.069, 0.065), 0.150, _ball(0.034, 0.95, 0.0025), 0.5, ORANGE_SKIN, lobes=0.008),

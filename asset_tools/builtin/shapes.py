@@ -9,7 +9,17 @@ from __future__ import annotations
 import numpy as np
 
 from asset_tools.builtin.mesh import Shape, Size, fitted
-from asset_tools.builtin.surfaces import Section, loft, oval_rings, ring_points, round_rings, rounded_box, sweep
+from asset_tools.builtin.surfaces import (
+    Section,
+    chained_pieces,
+    loft,
+    oval_rings,
+    ring_points,
+    round_rings,
+    rounded_box,
+    stacked_pieces,
+    sweep,
+)
 
 
 def carton(size: Size, *, radius: float = 0.0012) -> Shape:
@@ -39,7 +49,7 @@ def soap_bar(size: Size) -> Shape:
 def can(size: Size, *, exponent: float = 2.0) -> Shape:
     """A tin with rims and sunk lids, round or (exponent > 2) rectangular. Regions: side, rim, lid, bottom."""
     a, b, h = size[0] / 2, size[1] / 2, size[2]
-    rim, sunk = 0.004, 0.003
+    rim, sunk = 0.004, 0.002
 
     def ring(inset: float, z: float, cut: float = 0.0) -> tuple[float, float, float, float, float]:
         return a - inset, b - inset, z, exponent, cut
@@ -57,7 +67,8 @@ def can(size: Size, *, exponent: float = 2.0) -> Shape:
             "lid", oval_rings([high[-1], ring(rim, h - sunk), (*axis, h - sunk, exponent, 0)]), flat=True, detail=0.8
         ),
     ]
-    return fitted([loft(sections, segments=segments)], size)
+    part = loft(sections, segments=segments)
+    return fitted([part], size, pieces=stacked_pieces(part))
 
 
 def canister(size: Size) -> Shape:
@@ -81,7 +92,8 @@ def canister(size: Size) -> Shape:
             "lid", round_rings([(r - 0.004, h, 0), (r - 0.006, h - 0.002, 0), (0, h - 0.002, 0)]), flat=True, detail=0.6
         ),
     ]
-    return fitted([loft(sections)], size)
+    part = loft(sections)
+    return fitted([part], size, pieces=stacked_pieces(part))
 
 
 def jar(size: Size) -> Shape:
@@ -103,7 +115,8 @@ def jar(size: Size) -> Shape:
             detail=0.8,
         ),
     ]
-    return fitted([loft(sections)], size)
+    part = loft(sections)
+    return fitted([part], size, pieces=stacked_pieces(part, [h - lid]))
 
 
 def mug(size: Size, *, wall: float = 0.004) -> Shape:
@@ -137,8 +150,7 @@ def mug(size: Size, *, wall: float = 0.004) -> Shape:
     handle = sweep("handle", path, radii, normal=(0, 1, 0), segments=12, detail=0.5)
     pieces = _ring_pieces(inner, r, (0.0, h), count=14)
     pieces.append(ring_points(np.array([[inner, inner, z, 2.0] for z in (0.0, floor)]), 24).reshape(-1, 3))
-    rings = handle[0].points[1:-1]
-    pieces += [rings[i : i + 4].reshape(-1, 3) for i in range(0, len(rings) - 1, 3)]
+    pieces += chained_pieces(handle[0], 6)
     return fitted([loft(sections), handle], size, pieces=pieces)
 
 

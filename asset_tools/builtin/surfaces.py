@@ -7,12 +7,14 @@ middle of a region's width faces the front (-y).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from asset_tools.builtin.mesh import Patch
+from asset_tools.decompose import few_vertices
 
 
 @dataclass(frozen=True)
@@ -151,6 +153,35 @@ def sweep(
     points = np.concatenate([points, points[:, :1]], axis=1)
     uv, size = unrolled_uv(points)
     return [Patch(region, points, uv, size, detail)]
+
+
+def stacked_pieces(patches: list[Patch], cuts: Sequence[float] = ()) -> list[np.ndarray]:
+    """Convex pieces (k, 3) of an upright part, cut at heights where its profile is concave; hollows are filled.
+
+    Args:
+        patches: their rows are level.
+        cuts: ascending heights, m.
+    """
+    rows = np.concatenate([patch.points[:, :-1] for patch in patches])
+    height = rows[:, 0, 2]
+    edges = [-np.inf, *cuts, np.inf]
+    for cut in cuts:
+        low, high = height[:-1] - cut, height[1:] - cut
+        for i in np.flatnonzero(low * high < 0):
+            share = low[i] / (low[i] - high[i])
+            rows = np.concatenate([rows, (1 - share) * rows[i : i + 1] + share * rows[i + 1 : i + 2]])
+    height = rows[:, 0, 2]
+    return [
+        few_vertices(rows[(height >= low - 1e-9) & (height <= high + 1e-9)].reshape(-1, 3))
+        for low, high in itertools.pairwise(edges)
+    ]
+
+
+def chained_pieces(patch: Patch, count: int) -> list[np.ndarray]:
+    """Convex pieces (k, 3) of a swept tube, each of an equal share of its rings."""
+    rows = patch.points[1:-1, :-1]
+    bounds = np.round(np.linspace(0, len(rows) - 1, count + 1)).astype(int)
+    return [few_vertices(rows[a : b + 1].reshape(-1, 3)) for a, b in itertools.pairwise(bounds.tolist())]
 
 
 FACES = {  # right, up as seen from outside: (axis, sign) each
