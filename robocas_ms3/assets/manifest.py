@@ -64,8 +64,8 @@ class ObjectAsset(AssetBase):
     kind: Literal["object"] = "object"
     mass: Positive = Field(description="kg")
     center_of_mass: Vec3 = Field(description="m, in the asset's frame")
-    inertia: tuple[Positive, Positive, Positive] = Field(description="principal moments about the centre of mass, kg m2")
-    inertia_wxyz: tuple[float, float, float, float] = Field((1, 0, 0, 0), description="principal axes in the asset's frame")
+    inertia: tuple[Positive, Positive, Positive] = Field(description="principal moments, kg m2")
+    inertia_wxyz: tuple[float, float, float, float] = Field((1, 0, 0, 0), description="principal axes")
     hull_count: int = Field(ge=1)
     volume_iou: float = Field(ge=0, le=1, description="overlap of the hulls with the closed mesh they were made from")
     grasp_count: int = Field(ge=0)

@@ -85,6 +85,9 @@ class TargetConfig(StrictModel):
     """Which of the objects may be the target."""
 
     min_grasps: Annotated[int, Field(ge=1)] = Field(default=20, description="fewer annotated grasps: never the target")
+    min_free_grasps: Annotated[int, Field(ge=0)] = Field(
+        default=6, description="fewer of them from the robot's side and clear of everything else: not the target"
+    )
     max_distance: Annotated[float, Field(gt=0)] = Field(
         default=0.8, description="horizontal distance from the arm's base to the object's centre, m"
     )

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.scenes import build
+from robocas_ms3.scenes.placement import transform
 from robocas_ms3.tasks.base import RoboCASEnv
 
 # Upstream's: samples of the meshes at 5 mm, none farther than 1.5 m from the robot
@@ -22,11 +23,6 @@ def matrix(raw_pose: torch.Tensor) -> Array:
     result[:3, :3] = Rotation.from_quat(values[[4, 5, 6, 3]]).as_matrix()
     result[:3, 3] = values[:3]
     return result
-
-
-def transform(pose: Array, points: Array) -> Array:
-    """Points (P, 3) moved by a 4x4."""
-    return points @ pose[:3, :3].T + pose[:3, 3]
 
 
 def inverse(pose: Array) -> Array:

@@ -13,7 +13,7 @@ from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
 from robocas_ms3.assets.spawn import spawn
 from robocas_ms3.config.task import BasketConfig, FurnitureConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.errors import ConfigError
-from robocas_ms3.scenes.placement import Placeable, Region, planar_pose
+from robocas_ms3.scenes.placement import Placeable, Region, planar_pose, transform
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,16 @@ def basket_pose(config: BasketConfig, basket: LoadedFurniture) -> np.ndarray:
     pose = fixture_pose(config.pose)
     pose[2, 3] += basket.asset.origin_height
     return pose
+
+
+def fixture_points(config: TaskConfig, pack: Pack) -> np.ndarray:
+    """Samples (P, 3) of the collision surfaces of furniture and basket where the configuration puts them, world, m."""
+    pieces = []
+    for name, item in config.furniture.items():
+        asset = find_furniture(pack, item.asset, key=f"furniture.{name}.asset")
+        pieces.append(transform(fixture_pose(item.pose), asset.surface_points()))
+    basket = find_container(pack, config.basket)
+    return np.concatenate([*pieces, transform(basket_pose(config.basket, basket), basket.surface_points())])
 
 
 def build_fixtures(scene: ManiSkillScene, config: TaskConfig, furniture_pack: Pack) -> Fixtures:

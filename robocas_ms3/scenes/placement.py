@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,11 @@ def planar_pose(x: float, y: float, z: float, yaw: float) -> Array:
     """4x4 of a turn by ``yaw`` (rad) about the vertical, then a shift (m)."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, z], [0, 0, 0, 1.0]])
+
+
+def transform(pose: Array, points: Array) -> Array:
+    """Points (P, 3) moved by a 4x4."""
+    return points @ pose[:3, :3].T + pose[:3, 3]
 
 
 def sample_scattered(
@@ -125,7 +131,12 @@ def choose_objects(rng: np.random.Generator, ids: list[str], count: int) -> list
 
 
 def choose_target(
-    rng: np.random.Generator, names: list[str], positions_xy: Array, eligible: NDArray[np.bool_], robot_xy: Array
+    rng: np.random.Generator,
+    names: list[str],
+    positions_xy: Array,
+    eligible: NDArray[np.bool_],
+    robot_xy: Array,
+    graspable: Callable[[int], bool] = lambda index: True,
 ) -> int | None:
     """Draw the target of a pick among the eligible objects.
 
@@ -136,8 +147,9 @@ def choose_target(
         rng: source of all randomness.
         names: K names.
         positions_xy: (K, 2) m.
-        eligible: (K,) which objects can be grasped and reached.
+        eligible: (K,) which objects may be the target.
         robot_xy: (2,) m, same frame.
+        graspable: a test that takes longer, asked of one drawn object after the other until one passes.
 
     Returns:
         Index of the target; None if no object qualifies.
@@ -147,4 +159,7 @@ def choose_target(
     for index in np.argsort(distances, kind="stable"):
         nearest.setdefault(names[index], int(index))
     candidates = sorted(index for index in nearest.values() if eligible[index])
-    return int(rng.choice(candidates)) if candidates else None
+    for index in rng.permutation(np.array(candidates, dtype=int)):
+        if graspable(int(index)):
+            return int(index)
+    return None

@@ -21,7 +21,8 @@ from robocas_ms3.errors import ConfigError, LayoutError
 from robocas_ms3.robots.constants import HAND_LINK
 from robocas_ms3.robots.mobile_panda import RoboCASMobilePanda
 from robocas_ms3.scenes import build
-from robocas_ms3.scenes.placement import choose_objects, choose_target, sample_scattered
+from robocas_ms3.scenes.grasping import count_free_grasps
+from robocas_ms3.scenes.placement import choose_objects, choose_target, sample_scattered, transform
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.contacts import contact_forces
 from robocas_ms3.tasks.spec import TaskSpec
@@ -79,6 +80,7 @@ class RoboCASEnv(BaseEnv):
         self._support_in_world = build.fixture_pose(support.pose)
         furniture = build.find_furniture(self.furniture_pack, support.asset, key=f"furniture.{surface.furniture}.asset")
         self._region = build.find_region(surface, furniture)
+        self._fixture_points = build.fixture_points(self.task_config, self.furniture_pack)
         self._basket_asset = build.find_container(self.furniture_pack, self.task_config.basket)
         if reconfiguration_freq is None:
             reconfiguration_freq = 1 if num_envs == 1 else 0
@@ -192,7 +194,15 @@ class RoboCASEnv(BaseEnv):
         distance = np.linalg.norm(poses[:, :2, 3] - robot_xy, axis=1)
         graspable = np.array([asset.asset.grasp_count >= rules.min_grasps for asset in assets])
         names = [asset.asset.name for asset in assets]
-        return choose_target(rng, names, poses[:, :2, 3], graspable & (distance <= rules.max_distance), robot_xy)
+        eligible = graspable & (distance <= rules.max_distance)
+
+        def has_free_grasps(slot: int) -> bool:
+            others = [transform(p, a.surface_points()) for a, p in zip(assets, poses, strict=True)]
+            del others[slot]
+            points = np.concatenate([self._fixture_points, *others])
+            return count_free_grasps(assets[slot], poses[slot], points, robot_xy) >= rules.min_free_grasps
+
+        return choose_target(rng, names, poses[:, :2, 3], eligible, robot_xy, has_free_grasps)
 
     # ------------------------------------------------------------------ state
 

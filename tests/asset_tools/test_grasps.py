@@ -6,7 +6,7 @@ import trimesh
 
 from asset_tools.grasps import sample_grasps
 from robocas_ms3.errors import AssetError
-from robocas_ms3.planning.grasps import gripper_is_clear
+from robocas_ms3.scenes.grasping import gripper_is_clear
 
 
 def cup():

@@ -11,11 +11,12 @@ from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.drops import overhangs, sample_drops
 from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
-from robocas_ms3.planning.grasps import MAX_WIDTH, filter_grasps, rank_grasps
 from robocas_ms3.planning.protocol import Array, AttachedBody, Planner, Trajectory
 from robocas_ms3.planning.reachability import Reachability
-from robocas_ms3.planning.scene import PlanningScene, inverse, transform
+from robocas_ms3.planning.scene import PlanningScene, inverse
 from robocas_ms3.robots.constants import ARM_REST
+from robocas_ms3.scenes.grasping import MAX_WIDTH, filter_grasps, rank_grasps
+from robocas_ms3.scenes.placement import transform
 from robocas_ms3.tasks.base import RoboCASEnv
 
 
@@ -131,7 +132,7 @@ class PickSolver:
             arm_base_in_world=base,
             object_center_in_world=(base @ object_in_base)[:3, 3],
             scene_points_in_world=transform(base, others),
-            qualities=notes.grasp_qualities,
+            qualities=1.1 - notes.grasp_qualities,  # upstream's scale: more is better
         )
         tcp_in_base = inverse(base) @ kept.tcp_in_world
         if not len(tcp_in_base):

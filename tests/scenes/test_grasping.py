@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.planning.grasps import GRIPPER_BOXES, directions_ok, filter_grasps, gripper_is_clear, rank_grasps
 from robocas_ms3.robots.constants import FINGER_EXTENSION, OPEN_FINGER, STOCK_TCP_IN_HAND
+from robocas_ms3.scenes.grasping import GRIPPER_BOXES, directions_ok, filter_grasps, gripper_is_clear, rank_grasps
 
 BASE = np.eye(4)
 CENTER = np.array([0.5, 0.0, 0.05])

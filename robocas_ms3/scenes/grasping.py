@@ -11,7 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.planning.protocol import Array
+from robocas_ms3.assets.pack import LoadedObject
+
+Array = NDArray[np.float64]
 
 MAX_WIDTH = 0.08  # m, the gripper's opening
 MAX_CLOSING_TILT_DEG = 60.0  # of the closing axis from the horizontal
@@ -30,6 +32,8 @@ GRIPPER_BOXES = np.array(
     ]
 )
 GRIPPER_RADIUS = 0.22  # m from the TCP, holds all boxes
+
+NEIGHBOURHOOD = 0.5  # m from an object's centre, beyond which the gripper at one of its grasps does not reach
 
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -184,3 +188,28 @@ def rank_grasps(
     score = quality + np.exp(-distance / 0.03) + 0.7 * -tcp[:, 2, 2] + 0.7 * np.exp(-turn)
     # Gumbel noise turns scores into draws without replacement, weighted by exp(score / temperature).
     return np.argsort(-(score + temperature * rng.gumbel(size=len(score))), kind="stable")
+
+
+def count_free_grasps(
+    asset: LoadedObject, object_in_world: Array, scene_points_in_world: Array, robot_xy: Array
+) -> int:
+    """How many of an object's grasps come from the robot's side and touch nothing else on their way in.
+
+    Args:
+        asset: the object.
+        object_in_world: 4x4.
+        scene_points_in_world: (P, 3) surfaces of everything else.
+        robot_xy: (2,) where the arm's base stands, m.
+    """
+    notes, center = asset.annotations, object_in_world[:3, 3]
+    near = scene_points_in_world[np.linalg.norm(scene_points_in_world - center, axis=1) < NEIGHBOURHOOD]
+    base = np.eye(4)
+    base[:2, 3] = robot_xy
+    kept = filter_grasps(
+        object_in_world @ notes.grasps_tcp_in_object,
+        notes.grasp_widths,
+        arm_base_in_world=base,
+        object_center_in_world=center,
+        scene_points_in_world=near,
+    )
+    return len(kept) // 2
