@@ -114,7 +114,7 @@ def build_object(source: ObjectSource, folder: Path, *, hull_cache: Path | None 
 def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> ObjectAsset:
     folder.mkdir(parents=True, exist_ok=True)
     shift = -source.mesh.bounds.mean(axis=0)
-    mesh, closed = source.mesh.copy(), source.closed.copy()
+    mesh, closed = source.mesh.copy(include_cache=True), source.closed.copy()
     mesh.apply_translation(shift)
     closed.apply_translation(shift)
 

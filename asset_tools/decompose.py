@@ -18,11 +18,9 @@ Array = NDArray[np.float64]
 
 MAX_VERTICES = 48  # a hull; PhysX takes up to 64 on a GPU, but thins hulls of more than about 50 by itself
 MAX_HULLS = 32
-CONVEX_ENOUGH = 0.92  # overlap at which a single hull stands for the body
-WANTED_OVERLAP = 0.9
+WANTED_OVERLAP = 0.9  # the fewest hulls that reach it are taken
 THRESHOLDS = (0.08, 0.05, 0.03)  # CoACD's concavity, coarse first
 COACD_FACES = 4000  # more only costs time
-SAMPLES = 40_000
 _VERSION = 1
 
 
@@ -65,21 +63,23 @@ def decompose(closed: trimesh.Trimesh, *, cache: Path | None = None) -> Decompos
 
 
 def volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
-    """Volume of the intersection over that of the union, of a body and the union of convex hulls, by sampling.
+    """Volume of the intersection over that of the union, of a body and the union of convex hulls.
 
     Args:
         closed: watertight mesh.
         hulls: (V, 3) vertices each, in its frame.
+
+    Raises:
+        AssetError: the mesh is no solid.
     """
-    everything = np.concatenate([closed.vertices, *hulls])
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    points = np.random.default_rng(0).uniform(low, high, (SAMPLES, 3))
-    in_body = closed.contains(points)
-    in_hulls = np.zeros(len(points), dtype=bool)
-    for hull in hulls:
-        planes = ConvexHull(hull).equations
-        in_hulls |= (points @ planes[:, :3].T + planes[:, 3] <= 1e-9).all(axis=1)
-    return float((in_body & in_hulls).sum() / max(1, (in_body | in_hulls).sum()))
+    from manifold3d import Error, Manifold, Mesh, OpType
+
+    solid = Manifold(Mesh(np.asarray(closed.vertices, np.float32), np.asarray(closed.faces, np.uint32)))
+    if solid.status() != Error.NoError:
+        raise AssetError("the mesh is no solid", found=str(solid.status()), fix="Close it first.")
+    union = Manifold.batch_boolean([Manifold.hull_points(hull) for hull in hulls], OpType.Add)
+    shared = (solid ^ union).volume()
+    return float(shared / (solid.volume() + union.volume() - shared))
 
 
 def few_vertices(points: Array, limit: int = MAX_VERTICES) -> Array:
@@ -106,10 +106,10 @@ def few_vertices(points: Array, limit: int = MAX_VERTICES) -> Array:
 
 def _decompose(closed: trimesh.Trimesh) -> Decomposition:
     best: Decomposition | None = None
-    if closed.volume / closed.convex_hull.volume >= CONVEX_ENOUGH - 0.02:
+    if closed.volume / closed.convex_hull.volume >= WANTED_OVERLAP - 0.02:
         hulls = [few_vertices(np.asarray(closed.vertices))]
         best = Decomposition(hulls, volume_iou(closed, hulls))
-        if best.volume_iou >= CONVEX_ENOUGH:
+        if best.volume_iou >= WANTED_OVERLAP:
             return best
     for threshold in THRESHOLDS:
         hulls = _run_coacd(closed, threshold)

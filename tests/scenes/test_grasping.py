@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from xml.etree import ElementTree
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.robots.constants import FINGER_EXTENSION, OPEN_FINGER, STOCK_TCP_IN_HAND
-from robocas_ms3.scenes.grasping import GRIPPER_BOXES, directions_ok, filter_grasps, gripper_is_clear, rank_grasps
+from robocas_ms3.scenes.grasping import directions_ok, filter_grasps, gripper_is_clear, rank_grasps
 
 BASE = np.eye(4)
 CENTER = np.array([0.5, 0.0, 0.05])
@@ -104,21 +101,6 @@ def test_without_a_sweep_only_the_grasp_itself_counts():
     above = grasp()[:3, 3] + [0, 0.042, 0.2]  # 0.2 m above the pad
     assert not gripper_is_clear(grasp()[None], above[None], sweep=0.1)[0]
     assert gripper_is_clear(grasp()[None], above[None], sweep=0.0)[0]
-
-
-def test_boxes_hold_the_real_fingers_and_hand(panda_files, checker):
-    """Every collision shape of the open left finger and of the hand lies in the boxes, to 1.5 mm."""
-    tcp_in_hand = STOCK_TCP_IN_HAND + FINGER_EXTENSION
-    finger = np.concatenate(checker.surfaces["panda_leftfinger"]) + [0, OPEN_FINGER, 0.0584 - tcp_in_hand]
-    hand = np.concatenate(checker.surfaces["panda_hand"]) - [0, 0, tcp_in_hand]
-    points = np.concatenate([finger, hand]) * [1, 1, 1]
-    points[:, 1] = np.abs(points[:, 1])
-    gaps = [
-        np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0), axis=1) for low, high in GRIPPER_BOXES
-    ]
-    assert np.min(gaps, axis=0).max() < 1.5e-3
-    joints = {j.attrib["name"]: j for j in ElementTree.parse(panda_files.arm_urdf).getroot().iterfind("joint")}
-    assert joints["panda_finger_joint1"].find("origin").attrib["xyz"] == "0 0 0.0584"
 
 
 def test_filter_counts_what_fell_where_and_adds_the_turned_twin():
