@@ -6,6 +6,7 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
+import fast_simplification
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ Array = NDArray[np.float64]
 MAX_VERTICES = 48  # a hull; PhysX takes up to 64 on a GPU, but thins hulls of more than about 50 by itself
 MAX_HULLS = 32
 WANTED_OVERLAP = 0.9  # the fewest hulls that reach it are taken
-THRESHOLDS = (0.08, 0.05, 0.03)  # CoACD's concavity, coarse first
+THRESHOLDS = (0.15, 0.12, 0.1, 0.07, 0.04)  # CoACD's concavity, coarse first
 COACD_FACES = 4000  # more only costs time
 _VERSION = 1
 
@@ -133,7 +134,9 @@ def _run_coacd(closed: trimesh.Trimesh, threshold: float) -> list[Array]:
     coacd.set_log_level("error")
     body = closed
     if len(body.faces) > COACD_FACES:
-        body = body.simplify_quadric_decimation(face_count=COACD_FACES)
+        vertices, faces = np.array(body.vertices, np.float64), np.array(body.faces, np.int64)
+        vertices, faces = fast_simplification.simplify(vertices, faces, target_count=COACD_FACES)
+        body = trimesh.Trimesh(vertices, faces)
     parts = coacd.run_coacd(
         coacd.Mesh(np.asarray(body.vertices), np.asarray(body.faces)),
         threshold=threshold,
