@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -143,11 +144,11 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
         rest.poses,
         rest.probabilities,
         rest.display_pose,
-        grasps.tcp_in_object.astype(np.float32),
-        grasps.widths.astype(np.float32),
-        grasps.qualities.astype(np.float32),
-        np.asarray(points, dtype=np.float32),
-        np.asarray(closed.face_normals[faces], dtype=np.float32),
+        _light(grasps.tcp_in_object),
+        _light(grasps.widths),
+        _light(grasps.qualities),
+        _light(points),
+        _light(closed.face_normals[faces]),
     ).save(folder / ANNOTATIONS)
     return ObjectAsset(
         id=source.id,
@@ -230,6 +231,11 @@ def principal_inertia(closed: trimesh.Trimesh, mass: float) -> tuple[np.ndarray,
         vectors[:, 0] *= -1
     xyzw = Rotation.from_matrix(vectors).as_quat()
     return moments, xyzw[[3, 0, 1, 2]]
+
+
+def _light(values: Any) -> Any:
+    """Single precision: half the size on disk, and still a thousandth of a millimetre."""
+    return np.asarray(values, dtype=np.float32)
 
 
 def _hashes(folder: Path) -> dict[str, str]:

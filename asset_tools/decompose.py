@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import fast_simplification
 import numpy as np
@@ -134,9 +135,9 @@ def _run_coacd(closed: trimesh.Trimesh, threshold: float) -> list[Array]:
     coacd.set_log_level("error")
     body = closed
     if len(body.faces) > COACD_FACES:
-        vertices, faces = np.array(body.vertices, np.float64), np.array(body.faces, np.int64)
-        vertices, faces = fast_simplification.simplify(vertices, faces, target_count=COACD_FACES)
-        body = trimesh.Trimesh(vertices, faces)
+        vertices, faces = np.array(body.vertices, np.float64), np.array(body.faces, np.int32)
+        simplified: Any = fast_simplification.simplify(vertices, faces, target_count=COACD_FACES)
+        body = trimesh.Trimesh(simplified[0], simplified[1])
     parts = coacd.run_coacd(
         coacd.Mesh(np.asarray(body.vertices), np.asarray(body.faces)),
         threshold=threshold,

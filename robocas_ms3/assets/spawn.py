@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import sapien
@@ -36,7 +37,7 @@ def spawn(
     Raises:
         AssetError: the physics engine refused a hull.
     """
-    builder = scene.create_actor_builder()
+    builder: Any = scene.create_actor_builder()
     facts = asset.asset
     material = sapien.physx.PhysxMaterial(facts.friction, facts.friction, 0.0)
     builder.add_multiple_convex_collisions_from_file(str(asset.hulls_path), material=material)

@@ -59,7 +59,9 @@ def main(cfg: Show) -> int:
 
     obs, _ = env.reset(seed=cfg.seed)
     pictures = {name: data["rgb"][0] for name, data in obs["sensor_data"].items()}
-    pictures["overview"] = base_env.render_rgb_array()[0]
+    overview = base_env.render_rgb_array()
+    assert overview is not None  # there is a render device, and the environment has a camera for it
+    pictures["overview"] = overview[0]
     console = Console(highlight=False, soft_wrap=True)
     for name, pixels in pictures.items():
         path = cfg.out / f"{Path(cfg.config).stem}_seed{cfg.seed}_{name}.png"
