@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -15,11 +16,12 @@ Array = NDArray[np.float64]
 
 LOOSE = 0.02  # share of the surface below which a separate piece is scanner dirt
 FILLED = 0.35  # share of the surface that may be filled in
+HOPELESS = 0.4  # share of the edges that are open: no surface, but confetti
 LEAST_VOLUME = 0.01  # of the convex hull's: less is a sheet, not a body
 FACES = 5000  # of the solid at most; more only costs time
 TOLERANCES = (0.0005, 0.001, 0.0015, 0.002, 0.003)  # of the diagonal, tried in turn to get there
 CELLS = 64  # of the grid that a mesh is re-meshed on, along its longest side
-WINDING_FACES, WINDING_CHUNK = 1500, 4096
+WINDING_SAMPLES, WINDING_CHUNK = 4000, 2048
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ def close(scan: trimesh.Trimesh) -> Closed:
     if not mesh.is_watertight:
         mesh = _filled(mesh, repairs)
     solid = _as_solid(mesh)
-    if solid is None:
+    if solid is None and _open_edges(mesh) <= HOPELESS * len(mesh.edges_unique):
         solid = _as_solid(_remeshed(mesh))
         repairs.append("meshed anew around the scan")
     hull_volume = float(scan.convex_hull.volume) if np.ptp(scan.vertices, axis=0).min() > 0 else 0.0
@@ -130,7 +132,12 @@ def _filled(mesh: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
         faces.append(np.column_stack([loop, np.roll(loop, -1), np.full(len(loop), count + holes)]))
         holes += 1
     if area > FILLED * mesh.area:
-        return mesh
+        raise AssetError(
+            "the mesh can't be closed to a solid",
+            expected=f"holes of at most {FILLED:.0%} of its surface",
+            found=f"{area / mesh.area:.0%}",
+            fix="Scan it from all sides, or leave it out.",
+        )
     repairs.append(f"filled {holes} hole{'s' if holes > 1 else ''}")
     return trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
 
@@ -138,13 +145,19 @@ def _filled(mesh: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
 def _as_solid(mesh: trimesh.Trimesh):
     """The mesh as a manifold3d solid with outward faces; none if it isn't closed or encloses nothing."""
     try:
-        from manifold3d import Error, Manifold, Mesh64
+        from manifold3d import Error, Manifold, Mesh64, OpType
     except ImportError as error:
         raise MissingExtraError("manifold3d is not installed", fix="pip install 'robocas-ms3[assets]'") from error
+    if not mesh.is_watertight:
+        return None
     faces = mesh.faces if mesh.volume >= 0 else mesh.faces[:, ::-1]
     solid = Manifold(Mesh64(np.asarray(mesh.vertices, np.float64), np.asarray(faces, np.uint64)))
-    ok = mesh.is_watertight and solid.status() == Error.NoError and solid.volume() > 0
-    return solid if ok else None
+    if solid.status() != Error.NoError or solid.volume() <= 0:
+        return None
+    bodies = solid.decompose()
+    if len(bodies) > 1 and all(body.volume() > 0 for body in bodies):
+        solid = Manifold.batch_boolean(bodies, OpType.Add)  # where they overlap would count twice
+    return solid
 
 
 def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -157,12 +170,25 @@ def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     low = mesh.bounds[0] - 2 * pitch
     shape = np.ceil(mesh.extents / pitch).astype(int) + 5
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3) * pitch + low
-    # even samples: a distance to them is within a small part of a cell of the distance to the surface
-    samples = trimesh.sample.sample_surface(mesh, int(min(4e5, 50 * mesh.area / pitch**2)), seed=0)[0]
-    distance = KDTree(samples).query(grid)[0]
-    inside = winding_number(mesh, grid)
-    if np.median(inside[distance < pitch]) < 0:
-        inside = -inside
+    # dense samples: the distance to them is that to the surface within a small part of a cell
+    count = int(min(4e5, 50 * mesh.area / pitch**2))
+    samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
+    normals = mesh.face_normals[faces]
+    found: Any = KDTree(samples).query(grid, k=6)
+    distance, nearest = found
+    few = slice(None, None, max(1, count // WINDING_SAMPLES))
+    scale = 1 / pitch  # single precision likes numbers near 1
+    middle = grid.mean(axis=0)
+    inside = winding_number(
+        (grid - middle) * scale, (samples[few] - middle) * scale, normals[few], mesh.area * scale**2
+    )
+    outwards = 1.0 if np.abs(inside.max()) >= np.abs(inside.min()) else -1.0
+    inside *= outwards
+    # nearer than the samples' spacing the surface itself tells
+    near = distance[:, 0] < 2 * np.sqrt(mesh.area / len(samples[few]))
+    height = np.einsum("nki,nki->nk", grid[near, None] - samples[nearest[near]], normals[nearest[near]]).mean(axis=1)
+    inside[near] = height * outwards < 0
+    distance = distance[:, 0]
     field = np.where(inside > 0.5, -distance, distance).reshape(shape)
     if field.min() >= 0:
         return trimesh.Trimesh()
@@ -172,20 +198,28 @@ def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return max(bodies, key=lambda body: abs(body.volume)) if len(bodies) else closed
 
 
-def winding_number(mesh: trimesh.Trimesh, points: Array) -> Array:
-    """How often a surface, closed or not, runs around points (N, 3): 1 inside, 0 outside, between them near a hole."""
-    if len(mesh.faces) > WINDING_FACES:
-        mesh = mesh.simplify_quadric_decimation(face_count=WINDING_FACES)
-    corners = np.asarray(mesh.triangles, np.float32)
+def winding_number(points: Array, samples: Array, normals: Array, area: float) -> Array:
+    """How often a surface, closed or not, runs around points: 1 inside, 0 outside, between them near a hole.
+
+    Each sample stands for its share of the surface, which holds from about two samples' spacing on.
+
+    Args:
+        points: (N, 3).
+        samples: (S, 3) spread evenly over the surface.
+        normals: (S, 3) outward unit normals there.
+        area: of the surface.
+
+    Returns:
+        (N,)
+    """
+    at, out = samples.astype(np.float32), normals.astype(np.float32)
+    reach = np.einsum("si,si->s", at, out)
     result = np.empty(len(points))
     for start in range(0, len(points), WINDING_CHUNK):
-        chunk = slice(start, start + WINDING_CHUNK)
-        a, b, c = (corners[None, :, k] - points[chunk, None].astype(np.float32) for k in range(3))
-        la, lb, lc = (np.sqrt(np.einsum("pfi,pfi->pf", side, side)) for side in (a, b, c))
-        ab, bc, ca = (np.einsum("pfi,pfi->pf", p, q) for p, q in ((a, b), (b, c), (c, a)))
-        volume = np.einsum("pfi,pfi->pf", a, np.cross(b, c))
-        result[chunk] = np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1) / (2 * np.pi)
-    return result
+        p = points[start : start + WINDING_CHUNK].astype(np.float32)
+        squared = np.maximum((p * p).sum(axis=1)[:, None] + (at * at).sum(axis=1) - 2 * p @ at.T, 1e-12)
+        result[start : start + len(p)] = ((reach - p @ out.T) / (squared * np.sqrt(squared))).sum(axis=1)
+    return result * area / (4 * np.pi * len(samples))
 
 
 def _light(solid, diagonal: float) -> trimesh.Trimesh:
