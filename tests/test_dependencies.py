@@ -1,0 +1,67 @@
+"""What the code imports is what pyproject.toml declares; a clean installation lacks nothing."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).resolve().parents[1]
+DISTRIBUTIONS = metadata.packages_distributions()
+# Import name -> who brings it, where that is not a declaration of ours.
+BROUGHT = {"mplib": "mani_skill pins it"}
+
+
+def declared(*extras: str) -> set[str]:
+    """Normalised names of what an installation with these extras asks for."""
+    items = [Requirement(line) for line in metadata.requires("robocas-ms3") or []]
+    return {
+        item.name.lower().replace("_", "-")
+        for item in items
+        if item.marker is None or any(item.marker.evaluate({"extra": extra}) for extra in extras)
+    }
+
+
+def third_party(path: Path) -> set[str]:
+    """Top-level modules a file imports that are neither Python's nor this project's."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found.add(node.module.partition(".")[0])
+    return found - set(sys.stdlib_module_names) - {"robocas_ms3", "asset_tools"}
+
+
+@pytest.mark.parametrize(
+    ("folder", "extras"),
+    [("robocas_ms3", ()), ("robocas_ms3/language", ("language",)), ("asset_tools", ("assets",)), ("examples", ())],
+)
+def test_imports_are_declared(folder, extras):
+    known = declared(*extras)
+    undeclared = {}
+    for path in (ROOT / folder).rglob("*.py"):
+        if folder == "robocas_ms3" and "language" in path.parts:
+            continue
+        for module in third_party(path) - BROUGHT.keys():
+            names = {name.lower().replace("_", "-") for name in DISTRIBUTIONS.get(module, ["(not installed)"])}
+            if not names & known:
+                undeclared[module] = (str(path.relative_to(ROOT)), sorted(names))
+    assert undeclared == {}
+
+
+def test_locked_versions_are_the_ones_installed():
+    locked = {}
+    for line in (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines():
+        if line and not line.startswith("#"):
+            item = Requirement(line)
+            if item.marker is None or item.marker.evaluate():
+                locked[item.name] = str(item.specifier).removeprefix("==")
+    assert locked["numpy"].startswith("1.26.")
+    for name in declared():
+        installed = metadata.version(name).partition("+")[0]
+        assert locked[name] == installed, f"{name}: run scripts/setup.sh"
