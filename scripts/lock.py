@@ -2,7 +2,8 @@
 
     python scripts/lock.py python3.10 python3.11 python3.12
 
-Needs Python 3.11 itself. Packages that come with one build of torch only (CUDA libraries) stay out, so that the lock suits every build.
+Needs Python 3.11 itself. Packages that come with one build of torch only (CUDA libraries) stay out, so that the lock
+suits every build.
 """
 
 import json
