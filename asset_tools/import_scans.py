@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 import shutil
 import unicodedata
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 
 import trimesh
+from scipy.spatial import QhullError
 
 from asset_tools.build import ObjectSource, build_object, new_pack
 from asset_tools.repair import close
@@ -86,17 +87,13 @@ def import_scans(
     units = settings.units or guess_unit([longest_side(path) for path in scans.values()])
     results = []
     with new_pack(out, name=out.name, description=f"{len(scans)} scans") as pack:
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            futures = [pool.submit(_import_one, id_, path, pack.folder, settings, units) for id_, path in scans.items()]
-            for future in futures:
-                result = future.result()
-                if result.asset is None and not skip_bad:
-                    pool.shutdown(cancel_futures=True)
-                    raise AssetError(result.error, fix="Mend it, or pass --skip-bad to leave it out.")
-                if result.asset is not None:
-                    pack.add(result.asset)
-                results.append(result)
-                on_result(result)
+        for result in _run([(id_, path, pack.folder, settings, units) for id_, path in scans.items()], jobs):
+            if result.asset is None and not skip_bad:
+                raise AssetError(result.error, fix="Mend it, or pass --skip-bad to leave it out.")
+            if result.asset is not None:
+                pack.add(result.asset)
+            results.append(result)
+            on_result(result)
         if not pack.assets:
             raise AssetError("none of the scans could be imported", where=source)
     return results
@@ -139,6 +136,18 @@ def estimate_mass(closed: trimesh.Trimesh) -> float:
     return round(min(max(DENSITY * float(closed.volume), MASS_RANGE[0]), MASS_RANGE[1]), 4)
 
 
+def _run(tasks: list[tuple], jobs: int) -> Iterator[Imported]:
+    if jobs <= 1:
+        yield from (_import_one(*task) for task in tasks)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        futures = [pool.submit(_import_one, *task) for task in tasks]
+        try:
+            yield from (future.result() for future in futures)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
 def _import_one(id_: str, path: Path, parent: Path, settings: ImportSettings, units: Unit) -> Imported:
     try:
         scan = load_scan(path)
@@ -159,7 +168,9 @@ def _import_one(id_: str, path: Path, parent: Path, settings: ImportSettings, un
             repairs=solid.repairs,
         )
         return Imported(id_, build_object(source, parent / id_), up=up)
-    except AssetError as error:
+    except (AssetError, QhullError) as error:
+        if isinstance(error, QhullError):
+            error = AssetError("the scan is flat or has too few points", where=path, expected="a closed body")
         shutil.rmtree(parent / id_, ignore_errors=True)
         message = str(error)
         return Imported(id_, None, message if id_ in message or str(path) in message else f"{id_}: {message}")
