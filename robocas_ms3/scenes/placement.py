@@ -77,7 +77,9 @@ def sample_scattered(
     tries = 0
     while tries < max_tries:
         poses = np.zeros((len(placeables), 4, 4))
-        choices = [_choose_pose(rng, placeable) for placeable in placeables]
+        # Where it gets tight, objects rather stand than lie: of several poses drawn, the one covering least is taken.
+        draws = 1 + int(4 * tries / max_tries)
+        choices = [_choose_pose(rng, placeable, draws) for placeable in placeables]
         areas = [shapely.Polygon(p.footprints[c]).area for p, c in zip(placeables, choices, strict=True)]
         placed: list[shapely.Polygon] = []
         for index in np.argsort(areas)[::-1]:
@@ -116,9 +118,10 @@ def _candidates(rng: np.random.Generator, footprint: Array, region: Region) -> t
     return yaws[fits], positions[fits], shapely.polygons((turned + positions[:, None])[fits])
 
 
-def _choose_pose(rng: np.random.Generator, placeable: Placeable) -> int:
+def _choose_pose(rng: np.random.Generator, placeable: Placeable, draws: int) -> int:
     weights = np.asarray(placeable.probabilities, dtype=float)
-    return int(rng.choice(len(weights), p=weights / weights.sum()))
+    drawn = rng.choice(len(weights), size=draws, p=weights / weights.sum())
+    return int(min(drawn, key=lambda index: shapely.Polygon(placeable.footprints[index]).area))
 
 
 def choose_objects(rng: np.random.Generator, ids: list[str], count: int) -> list[str]:
