@@ -30,7 +30,9 @@ def check_limits(start, trajectory, velocity=0.5, acceleration=0.5):
 
 def test_it_is_a_planner_of_the_protocol(planner):
     typed: Planner = planner
-    assert all(callable(getattr(typed, name)) for name in vars(Planner) if not name.startswith("_"))
+    assert all(hasattr(typed, name) for name in vars(Planner) if not name.startswith("_"))
+    typed.finger_width = 0.05
+    assert typed.finger_width == 0.05
 
 
 @pytest.mark.parametrize("seed", range(3))
