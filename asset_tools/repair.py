@@ -22,6 +22,7 @@ FACES = 5000  # of the solid at most; more only costs time
 TOLERANCES = (0.0005, 0.001, 0.0015, 0.002, 0.003)  # of the diagonal, tried in turn to get there
 CELLS = 64  # of the grid that a mesh is re-meshed on, along its longest side
 WINDING_SAMPLES, WINDING_CHUNK = 4000, 2048
+NEIGHBOURS = 6  # samples that tell on which side of the surface a point near it lies
 
 
 @dataclass(frozen=True)
@@ -174,8 +175,9 @@ def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     count = int(min(4e5, 50 * mesh.area / pitch**2))
     samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
     normals = mesh.face_normals[faces]
-    found: Any = KDTree(samples).query(grid, k=6)
-    distance, nearest = found
+    # the bound spares it the points in the middle, which are as far from half of the samples
+    found: Any = KDTree(samples).query(grid, k=NEIGHBOURS, distance_upper_bound=4 * pitch)
+    distance, nearest = np.minimum(found[0], 4 * pitch), np.minimum(found[1], count - 1)
     few = slice(None, None, max(1, count // WINDING_SAMPLES))
     scale = 1 / pitch  # single precision likes numbers near 1
     middle = grid.mean(axis=0)
@@ -185,7 +187,7 @@ def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     outwards = 1.0 if np.abs(inside.max()) >= np.abs(inside.min()) else -1.0
     inside *= outwards
     # nearer than the samples' spacing the surface itself tells
-    near = distance[:, 0] < 2 * np.sqrt(mesh.area / len(samples[few]))
+    near = distance[:, 0] < min(2 * np.sqrt(mesh.area / len(samples[few])), 3 * pitch)
     height = np.einsum("nki,nki->nk", grid[near, None] - samples[nearest[near]], normals[nearest[near]]).mean(axis=1)
     inside[near] = height * outwards < 0
     distance = distance[:, 0]

@@ -12,6 +12,7 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from PIL import Image
 from shapely import MultiPoint
 
 from robocas_ms3.errors import AssetError
@@ -27,7 +28,7 @@ PLAUSIBLE = (0.005, 1.5)  # m, longest side of a thing that a hand can pick up, 
 TYPICAL = 0.15  # m, longest side of a household object
 STANDS = 0.27  # thickness over height down to which people put a box on its end
 BOX_FILL = 0.93  # share of its rectangle that a box's outline fills; an ellipse fills 0.785
-FLAT_MAPS = ("map_kd", "map_ka")  # colour; other maps are not used
+COLOUR_MAPS = ("map_kd", "map_ka")  # others are not used
 
 
 def find_mesh(path: Path) -> Path:
@@ -55,7 +56,7 @@ def load_scan(path: Path) -> trimesh.Trimesh:
         AssetError: the file is missing, damaged, empty, of no size or not finite, or a texture it names is missing.
     """
     path = find_mesh(path)
-    _check_textures(path)
+    textures = _textures(path)
     try:
         loaded = trimesh.load_scene(path, process=False)
         mesh = loaded.to_mesh() if loaded.geometry else trimesh.Trimesh()
@@ -70,12 +71,9 @@ def load_scan(path: Path) -> trimesh.Trimesh:
         )
     if np.ptp(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0).max() <= 0:
         raise AssetError("the mesh has no size", where=path, found="all vertices in one point")
-    image = getattr(getattr(mesh.visual, "material", None), "image", None)
-    if image is not None:
-        try:
-            image.load()
-        except (OSError, SyntaxError) as error:
-            raise AssetError("can't read the texture", where=path, found=str(error)) from error
+    material = getattr(mesh.visual, "material", None)
+    if len(textures) == 1 and material is not None and getattr(material, "image", textures) is None:
+        material.image = textures[0]  # the loader stumbles over options and spaces in names
     return mesh
 
 
@@ -150,12 +148,13 @@ def _plain(file: Path) -> bool:
     return "nontextured" in file.stem.lower() or file.suffix.lower() in (".stl", ".off")
 
 
-def _check_textures(path: Path) -> None:
-    """Loaders leave out textures they can't find without a word; here that is an error."""
+def _textures(path: Path) -> list[Image.Image]:
+    """The textures of an OBJ; loaders leave out those they can't find without a word, here that is an error."""
+    found: list[Image.Image] = []
     if path.suffix.lower() == ".obj":
         for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
             if line.startswith("mtllib "):
-                _check_mtl(path.parent / line[7:].strip())
+                found += _textures_of_mtl(path.parent / line[7:].strip())
     elif path.suffix.lower() == ".gltf":
         try:
             tree = json.loads(path.read_text(encoding="utf-8"))
@@ -165,17 +164,24 @@ def _check_textures(path: Path) -> None:
             uri = entry.get("uri", "data:")
             if not uri.startswith("data:") and not (path.parent / unquote(uri)).is_file():
                 raise AssetError("a file this mesh names is missing", where=path.parent / unquote(uri))
+    return found
 
 
-def _check_mtl(path: Path) -> None:
+def _textures_of_mtl(path: Path) -> list[Image.Image]:
     if not path.is_file():
         raise AssetError("the material file that the mesh names is missing", where=path)
+    found: dict[Path, Image.Image] = {}
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         words = line.strip().split(maxsplit=1)
-        if len(words) == 2 and words[0].lower() in FLAT_MAPS:
-            # options (-s 1 1 1, -clamp on) may stand before the name, and the name may hold spaces
-            name = re.sub(r"^(-\w+(\s+(on|off|-?[\d.]+))*\s+)+", "", words[1])
-            if not (path.parent / name).is_file():
-                raise AssetError(
-                    "the texture file that the material names is missing", where=path.parent / name, found=path.name
-                )
+        if len(words) < 2 or words[0].lower() not in COLOUR_MAPS:
+            continue
+        # options (-s 1 1 1, -clamp on) may stand before the name, and the name may hold spaces
+        file = path.parent / re.sub(r"^(-\w+(\s+(on|off|-?[\d.]+))*\s+)+", "", words[1])
+        if not file.is_file():
+            raise AssetError("the texture file that the material names is missing", where=file, found=path.name)
+        try:
+            found[file] = Image.open(file)
+            found[file].load()
+        except (OSError, SyntaxError) as error:
+            raise AssetError("can't read the texture", where=file, found=error) from error
+    return list(found.values())

@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+import trimesh
+
+from asset_tools.repair import close, winding_number
+from robocas_ms3.errors import AssetError
+
+RADIUS, HEIGHT = 0.03, 0.1
+
+
+@pytest.fixture
+def can():
+    return trimesh.creation.cylinder(RADIUS, HEIGHT, sections=48).subdivide()
+
+
+def closed_volume(mesh, words):
+    solid = close(mesh)
+    assert solid.mesh.is_watertight and solid.mesh.is_winding_consistent
+    assert any(words in repair for repair in solid.repairs) or (not words and not solid.repairs)
+    return solid.mesh.volume
+
+
+def test_a_closed_mesh_stays_as_it_is(can):
+    assert closed_volume(can, "") == pytest.approx(can.volume, rel=1e-6)
+
+
+def test_inside_out_is_turned(can):
+    volume = can.volume
+    can.invert()
+    assert closed_volume(can, "") == pytest.approx(volume, rel=1e-6)
+
+
+def test_faces_turned_at_random_are_made_consistent(can):
+    turned = np.random.default_rng(0).random(len(can.faces)) < 0.3
+    faces = np.where(turned[:, None], can.faces[:, ::-1], can.faces)
+    mixed = trimesh.Trimesh(can.vertices, faces, process=False)
+    assert closed_volume(mixed, "same way round") == pytest.approx(can.volume, rel=1e-6)
+
+
+def test_a_can_without_lid_and_bottom_is_filled(can):
+    volume = can.volume
+    can.update_faces(np.abs(can.triangles_center[:, 2]) < 0.49 * HEIGHT)
+    assert closed_volume(can, "filled 2 holes") == pytest.approx(volume, rel=1e-6)
+
+
+def test_a_shell_becomes_solid(can):
+    inner = trimesh.creation.cylinder(RADIUS - 0.001, HEIGHT - 0.002, sections=48)
+    inner.invert()
+    shell = trimesh.util.concatenate([can, inner])
+    assert shell.volume < 0.1 * can.volume
+    assert closed_volume(shell, "inner") == pytest.approx(can.volume, rel=1e-6)
+
+
+def test_dirt_is_dropped(can):
+    fin = trimesh.Trimesh([[0.05, 0, 0], [0.05, 0, 0.01], [0.06, 0, 0]], [[0, 1, 2]])
+    assert closed_volume(trimesh.util.concatenate([can, fin]), "loose") == pytest.approx(can.volume, rel=1e-6)
+
+
+def test_bodies_that_overlap_count_once(can):
+    box = trimesh.creation.box([0.02, 0.02, 0.02])  # lies with half of itself on the lid
+    box.apply_translation([0, 0, HEIGHT / 2])
+    assert closed_volume(trimesh.util.concatenate([can, box]), "") == pytest.approx(can.volume + 4e-6, rel=1e-4)
+
+
+def test_seams_of_the_texture_are_no_holes(can):
+    split = trimesh.Trimesh(can.triangles.reshape(-1, 3), np.arange(3 * len(can.faces)).reshape(-1, 3), process=False)
+    assert not split.is_watertight
+    assert closed_volume(split, "") == pytest.approx(can.volume, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_a_sieve_is_meshed_anew(can):
+    volume = can.volume
+    can.update_faces(np.random.default_rng(0).random(len(can.faces)) > 0.08)
+    assert closed_volume(can, "meshed anew") == pytest.approx(volume, rel=0.02)
+
+
+def test_what_encloses_nothing_is_an_error():
+    confetti = np.random.default_rng(0).random((300, 3))
+    cap = trimesh.creation.icosphere(3)
+    cap.update_faces(cap.triangles_center[:, 2] > 0.7)
+    plate = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    for mesh in (plate, cap, trimesh.Trimesh(confetti, np.arange(300).reshape(-1, 3), process=False)):
+        with pytest.raises(AssetError, match="can't be closed to a solid"):
+            close(mesh)
+
+
+def test_faces_without_size_are_an_error():
+    with pytest.raises(AssetError, match="no faces of any size"):
+        close(trimesh.Trimesh([[0, 0, 0], [1, 0, 0]], [[0, 1, 1], [0, 0, 1]], process=False))
+
+
+def test_winding_number_of_a_ball_with_and_without_a_cap():
+    ball = trimesh.creation.icosphere(4)
+    points = np.array([[0, 0, 0], [0, 0, 0.5], [0, 0, 3.0], [2.0, 0, 0]])
+    full = winding_number(points, ball.triangles_center, ball.face_normals, ball.area)
+    np.testing.assert_allclose(full, [1, 1, 0, 0], atol=0.02)
+    keep = ball.triangles_center[:, 2] < 0.6  # the missing cap covers (1 - 0.6) / 2 of the directions from the middle
+    rest = winding_number(points[:1], ball.triangles_center[keep], ball.face_normals[keep], ball.area_faces[keep].sum())
+    assert rest[0] == pytest.approx(0.8, abs=0.02)
