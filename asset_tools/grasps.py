@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
+from robocas_ms3.assets.gripper import GRIPPER_BOXES
 from robocas_ms3.errors import AssetError
-from robocas_ms3.scenes.grasping import GRIPPER_BOXES
 
 Array = NDArray[np.float64]
 

@@ -2,8 +2,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from robocas_ms3.assets.gripper import GRIPPER_BOXES
 from robocas_ms3.robots.constants import FINGER_EXTENSION, OPEN_FINGER, STOCK_TCP_IN_HAND
-from robocas_ms3.scenes.grasping import GRIPPER_BOXES
 
 
 def test_boxes_hold_the_real_fingers_and_hand(panda_files, checker):
