@@ -17,7 +17,7 @@ from asset_tools.decompose import Decomposition, decompose, volume_iou
 from asset_tools.grasps import sample_grasps
 from asset_tools.resting import resting_poses
 from asset_tools.visual import to_display, write_glb
-from robocas_ms3.assets.hulls import write_hulls
+from robocas_ms3.assets.hulls import read_hulls, write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, InnerBox, ObjectAsset, PackManifest, Surface
 from robocas_ms3.assets.pack import ANNOTATIONS, HULLS, MANIFEST, VISUAL, Annotations, sha256
 from robocas_ms3.errors import AssetError
@@ -126,11 +126,13 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
         pieces = [piece + shift for piece in source.pieces]
         parts = Decomposition(pieces, volume_iou(closed, pieces))
     write_hulls(folder / HULLS, parts.hulls)
+    # what the simulator will load: a round thing rests differently on a facet that was rounded away
+    hulls = [hull.vertices for hull in read_hulls(folder / HULLS)]
 
     center = np.asarray(closed.center_mass)
     inertia, axes = principal_inertia(closed, source.mass)
     rest = resting_poses(
-        parts.hulls,
+        hulls,
         mass=source.mass,
         center_of_mass=center,
         inertia=inertia,

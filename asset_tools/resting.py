@@ -25,6 +25,7 @@ ROUNDS = 6  # seconds an object may roll until it stays
 MOVED, TURNED_DEG = 0.001, 2.0  # in one second, afresh: less is at rest
 YAWS = tuple(np.arange(8) * 0.8)  # rad: it must stay however it is turned, for the engine's contacts depend on it
 DROP = 0.0005  # m above the plane at the start: scenes leave a gap as well
+MIN_TOPPLING_DEG = 3.0  # a pose that gives way to less is no pose to put things down in
 TIME_STEP, STEPS = 0.01, 100
 DAMPING, TABLE_FRICTION = 0.1, 0.99
 SPACING = 10.0  # m between objects that are simulated at once
@@ -120,6 +121,7 @@ def resting_poses(
         friction,
     )
     settled, which = _settle(body, directions[kept])
+    settled, which = _firm(body, settled, which)
     if not which:
         raise AssetError("the object stays in no pose", expected=f"one of {len(kept)} to hold", fix="Check its mass.")
     directions, probabilities, _ = _merge(settled, probabilities[which], np.zeros(len(which)))
@@ -249,6 +251,35 @@ def _settle(body: _Body, directions: Array) -> tuple[Array, list[int]]:
             break
     which = sorted(found)
     return np.array([found[i] for i in which]).reshape(-1, 3), which
+
+
+def _firm(body: _Body, directions: Array, which: list[int]) -> tuple[Array, list[int]]:
+    """Leave out poses that a touch would topple, unless there are no others; arguments and result as of `_settle`."""
+    if len(directions) == 0:
+        return directions, which
+    margins = np.array([toppling_angle(body.cooked, body.center_of_mass, up) for up in directions])
+    firm = np.flatnonzero(margins >= min(MIN_TOPPLING_DEG, margins.max()))
+    return directions[firm], [which[i] for i in firm]
+
+
+def toppling_angle(points: Array, center_of_mass: Array, up: Array) -> float:
+    """Angle in degrees by which a body can be tilted, in the worst direction, before it topples.
+
+    Args:
+        points: (V, 3) its corners, m.
+        center_of_mass: (3,).
+        up: (3,) unit, the direction of its frame that points up.
+    """
+    heights = points @ up
+    feet = points[heights - heights.min() < BELOW]
+    across = np.linalg.svd(up[None])[2][1:]
+    outline = (feet - center_of_mass) @ across.T
+    try:
+        edges = ConvexHull(outline).equations
+    except (QhullError, ValueError):
+        return 0.0  # it stands on an edge or a corner
+    reach = float((-edges[:, 2]).min())
+    return float(np.degrees(np.arctan2(reach, center_of_mass @ up - heights.min())))
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from sapien import physx
 from asset_tools import resting
 from asset_tools.builtin.fruits import banana
 from asset_tools.builtin.shapes import mug
-from asset_tools.resting import RestingPoses, resting_poses
+from asset_tools.resting import RestingPoses, resting_poses, toppling_angle
 from robocas_ms3.errors import AssetError
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
@@ -190,3 +190,12 @@ def test_the_engine_lets_things_fall_and_tip() -> None:
     assert second[2, 3] == pytest.approx(0.02, abs=5e-4)
     assert abs(second[2, 0]) == pytest.approx(1, abs=1e-3)
     assert np.linalg.norm(second[:2, 3]) < 0.2  # the box's own place, not its place in the row
+
+
+def test_toppling_angle_of_a_box_is_known():
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)], float)
+    up = np.array([0, 0, 1.0])
+    # 1 to the nearest edge, 3 high
+    assert toppling_angle(corners, np.zeros(3), up) == pytest.approx(np.degrees(np.arctan2(1, 3)))
+    assert toppling_angle(corners, np.array([0.9, 0, 0]), up) == pytest.approx(np.degrees(np.arctan2(0.1, 3)))
+    assert toppling_angle(corners, np.zeros(3), np.array([1, 0, 1]) / np.sqrt(2)) == 0  # on an edge
