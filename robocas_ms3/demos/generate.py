@@ -83,6 +83,7 @@ def generate(
         RobocasError: ``out`` was made with other settings, or far too many seeds fail.
     """
     claim_output(out, overwrite=overwrite, resume=resume)
+    fresh = not out.exists()
     make_folder(out)
     run = {"settings": asdict(settings), "first_seed": first_seed}
     _check_same_run(out / "run.json", run)
@@ -111,6 +112,10 @@ def generate(
                         found=f"{len(results) - good} of {len(results)}",
                         fix=f"See {ledger.path.name}; a smaller objects.count may help.",
                     )
+    except RobocasError:
+        if fresh and not results:
+            shutil.rmtree(out)  # it never began: a wrong pack or configuration
+        raise
     finally:
         results.sort(key=lambda r: r.seed)
     return _finish(out, shards, ledger, results)

@@ -129,3 +129,9 @@ def test_files_that_cannot_be_read_are_one_clear_line(run, tmp_path):
     with pytest.raises(DatasetError, match="cut short"):
         merge([cut], tmp_path / "merged.h5")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.h5", "cut.json"]
+
+
+def test_a_wrong_pack_leaves_nothing_behind(tmp_path):
+    with pytest.raises(RobocasError, match="no such asset pack"):
+        generate(EpisodeSettings("pick", "pick_table_scattered", "nowhere"), tmp_path / "out", episodes=1)
+    assert not (tmp_path / "out").exists()
