@@ -82,6 +82,8 @@ def generate(
         OutputExistsError: ``out`` has content and neither flag is set.
         RobocasError: ``out`` was made with other settings, or far too many seeds fail.
     """
+    if overwrite and out.is_dir() and any(out.iterdir()) and not (out / "run.json").is_file():
+        raise RobocasError("this folder was not made by `robocas generate`", where=out, fix="It stays; choose another.")
     claim_output(out, overwrite=overwrite, resume=resume)
     fresh = not out.exists()
     make_folder(out)

@@ -135,3 +135,10 @@ def test_a_wrong_pack_leaves_nothing_behind(tmp_path):
     with pytest.raises(RobocasError, match="no such asset pack"):
         generate(EpisodeSettings("pick", "pick_table_scattered", "nowhere"), tmp_path / "out", episodes=1)
     assert not (tmp_path / "out").exists()
+
+
+def test_overwrite_deletes_only_what_generate_made(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(RobocasError, match="was not made by `robocas generate`"):
+        generate(SETTINGS, tmp_path, episodes=1, overwrite=True)
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
