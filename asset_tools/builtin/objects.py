@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import trimesh
 from PIL import Image
 
 from asset_tools.builtin import bottles, fruits, shapes
@@ -16,41 +13,7 @@ from asset_tools.builtin.labels import paint_carton, paint_mug, paint_soap, pain
 from asset_tools.builtin.mesh import Shape, Size
 from asset_tools.builtin.products import LABELS
 from asset_tools.builtin.skins import paint_banana, paint_fruit
-
-Paint = Callable[[Shape, np.random.Generator], Image.Image]
-
-
-@dataclass(frozen=True)
-class ObjectSpec:
-    """One object of the pack.
-
-    Args:
-        id: its folder's name. category: its kind.
-        size: outer size (x, y, z), upright or as it usually lies, m.
-        mass: kg.
-        shape: makes the shape of that size. paint: makes its texture.
-        roughness: of the surface, 0 mirror to 1 chalk.
-    """
-
-    id: str
-    category: str
-    size: Size
-    mass: float
-    shape: Callable[[Size], Shape]
-    paint: Paint
-    roughness: float
-
-    @property
-    def name(self) -> str:
-        """For language: 'sugar box'."""
-        return self.id.replace("_", " ")
-
-    def build(self) -> tuple[Shape, trimesh.Trimesh]:
-        """The shape, and the textured mesh to render; the same every time."""
-        shape = self.shape(self.size)
-        rng = np.random.default_rng(zlib.crc32(self.id.encode()))
-        return shape, shape.textured(self.paint(shape, rng), roughness=self.roughness)
-
+from asset_tools.builtin.spec import ObjectSpec
 
 def _product(
     id: str,

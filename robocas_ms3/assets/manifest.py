@@ -2,13 +2,17 @@
 
 A pack is a folder::
 
-    manifest.json            PackManifest
-    <asset id>/visual.glb    textured mesh for rendering, decimated
-              /hulls.obj     convex hulls for physics, one ``o`` group each
-              /annotations.npz   (objects only) see ``Annotations`` in ``pack.py``
+    manifest.json                 PackManifest
+    <asset id>/visual_fast.glb    textured mesh for rendering, about 1000 triangles
+              /visual_full.glb    the same with all the detail worth showing
+              /hulls.obj          convex hulls for physics, one ``o`` group each
+              /annotations.npz    (objects only) see ``Annotations`` in ``annotations.py``
+              /links/<link>/...   (articulated furniture only) the same three files of each moving part
+              /finishes/<part>_<finish>.glb    (rooms only) a part that comes in several finishes
 
-All meshes of an asset share one frame: metres, z up, origin at the centre of the visual mesh's bounding box for
-objects; furniture keeps the frame its task numbers are given in.
+All meshes of an asset share one frame: metres, z up. An object's origin is the centre of its visual mesh's bounding
+box. Furniture keeps the frame its task numbers are given in: x forward (out of its front) or as upstream has it. The
+frames of all links of a piece of furniture coincide with its own when every joint is at 0, which is closed.
 """
 
 from __future__ import annotations
@@ -17,10 +21,14 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 Vec3 = tuple[float, float, float]
+Quaternion = Annotated[tuple[float, float, float, float], Field(description="wxyz")]
 Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
 
 
 class StrictModel(BaseModel):
@@ -32,9 +40,11 @@ class StrictModel(BaseModel):
 class Surface(StrictModel):
     """A horizontal rectangle of a piece of furniture on which objects may stand, in the furniture's frame (metres)."""
 
+    link: str = Field("", description="the moving part it belongs to; empty: the fixed body")
     min_xy: tuple[float, float]
     max_xy: tuple[float, float]
     z: float
+    headroom: Positive | None = Field(None, description="free height above it, m; none: open to the sky")
 
 
 class InnerBox(StrictModel):
@@ -44,17 +54,78 @@ class InnerBox(StrictModel):
     max: Vec3
 
 
+class Joint(StrictModel):
+    """How a moving part hangs on the rest, everything in the furniture's frame with all joints at 0."""
+
+    name: Name
+    kind: Literal["prismatic", "revolute"]
+    axis: Vec3 = Field(description="unit vector: the way it slides, or turns by the right-hand rule")
+    origin: Vec3 = Field((0, 0, 0), description="a point on the axis, m")
+    limits: tuple[float, float] = Field(description="m or rad; 0, which is closed, lies within")
+    friction: NotNegative = Field(description="Coulomb friction, as PhysX has it")
+    damping: NotNegative = Field(description="N s/m or N m s/rad")
+
+
+class Link(StrictModel):
+    """A moving part of a piece of furniture."""
+
+    name: Name
+    parent: str = Field("", description="name of another link; empty: the fixed body")
+    joint: Joint
+    mass: Positive
+    center_of_mass: Vec3
+    inertia: tuple[Positive, Positive, Positive] = Field(description="principal moments, kg m2")
+    inertia_wxyz: Quaternion = (1, 0, 0, 0)
+
+
+class Handle(StrictModel):
+    """Where a gripper takes hold of a moving part: the pose of the TCP (z approach, y closing) in the furniture's
+    frame with all joints at 0."""
+
+    link: Name
+    position: Vec3
+    wxyz: Quaternion
+    width: Positive = Field(description="of the handle between the fingers, m")
+
+
+class ObjectQuality(StrictModel):
+    """What was measured of an object when it was made; see docs/assets.md for how."""
+
+    compact: bool = Field(description="False: thin or hollow, judged by surface distance instead of volume")
+    hull_count: int = Field(ge=1)
+    hull_vertices: int = Field(ge=4, description="of the largest hull")
+    volume_iou: Share = Field(description="overlap of the hulls with the closed mesh they were made from")
+    surface_p95: NotNegative = Field(description="95th percentile of the distances between both surfaces, m")
+    rest_share: Share = Field(description="of drops that end in a listed resting pose, at rest in time, not jittering")
+    rest_time: NotNegative = Field(description="median time until at rest after the drop, s")
+    penetration: NotNegative = Field(description="deepest into the plane at rest, m")
+    jitter: NotNegative = Field(description="largest kinetic energy once at rest, J")
+    grasps_tried: int = Field(ge=0)
+    grasps_held: Share = Field(description="of those tried: still in the hand after lifting and shaking")
+
+
+class FurnitureQuality(StrictModel):
+    """What was measured of a piece of furniture when it was made."""
+
+    hull_count: int = Field(ge=1)
+    hull_vertices: int = Field(ge=4)
+    joints_open: Share | None = Field(None, description="share of joints that a force opens and closes again")
+    surfaces_hold: Share | None = Field(None, description="share of surfaces on which objects stay")
+
+
 class AssetBase(StrictModel):
     """What every asset says of itself."""
 
-    id: str = Field(pattern=r"^[a-z0-9_]+$")
+    id: Name
     name: str = Field(min_length=1, description="for language: 'sugar box'")
     category: str
-    source: str = Field(description="where the geometry comes from: 'builtin', 'scan', ...")
+    source: str = Field(description="where the geometry comes from: 'builtin', 'scan', 'graspnet', 'ycb', 'partnet'")
     licence: str
     attribution: str
+    units: Literal["m"] = "m"
     extents: Vec3 = Field(description="size of the visual mesh's bounding box, m")
     friction: Positive = 0.99
+    repairs: tuple[str, ...] = Field((), description="what the importer had to mend in the source mesh")
     files: dict[str, str] = Field(description="path inside the asset's folder -> sha256")
 
 
@@ -62,26 +133,30 @@ class ObjectAsset(AssetBase):
     """A thing to pick up."""
 
     kind: Literal["object"] = "object"
+    graspnet_id: int | None = Field(None, ge=0, description="of GraspNet-1Billion, which upstream's configs use")
     mass: Positive = Field(description="kg")
     center_of_mass: Vec3 = Field(description="m, in the asset's frame")
     inertia: tuple[Positive, Positive, Positive] = Field(description="principal moments, kg m2")
-    inertia_wxyz: tuple[float, float, float, float] = Field((1, 0, 0, 0), description="principal axes")
-    hull_count: int = Field(ge=1)
-    volume_iou: float = Field(ge=0, le=1, description="overlap of the hulls with the closed mesh they were made from")
+    inertia_wxyz: Quaternion = (1, 0, 0, 0)
     grasp_count: int = Field(ge=0)
-    repairs: tuple[str, ...] = Field((), description="what the importer had to mend in the source mesh")
+    no_grasps_because: str = Field("", description="why there are fewer grasps than usual, if so")
+    quality: ObjectQuality
 
 
 class FurnitureAsset(AssetBase):
     """A table, a basket, a room: scenery, with named surfaces."""
 
     kind: Literal["furniture"] = "furniture"
-    mass: Positive | None = Field(None, description="kg; none: it can't move")
+    mass: Positive | None = Field(None, description="kg; none: its body can't move")
     center_of_mass: Vec3 = (0, 0, 0)
     inertia: tuple[Positive, Positive, Positive] | None = None
     origin_height: float = Field(0.0, description="height of the frame's origin above the lowest point, m")
-    surfaces: dict[str, Surface] = {}
+    surfaces: dict[Name, Surface] = {}
     inner: InnerBox | None = Field(None, description="containers only")
+    links: tuple[Link, ...] = Field((), description="moving parts, parents first")
+    handles: dict[Name, Handle] = {}
+    finishes: dict[Name, tuple[Name, ...]] = Field({}, description="part -> its finishes, the default first")
+    quality: FurnitureQuality
 
 
 Asset = Annotated[ObjectAsset | FurnitureAsset, Field(discriminator="kind")]
@@ -90,7 +165,7 @@ Asset = Annotated[ObjectAsset | FurnitureAsset, Field(discriminator="kind")]
 class PackManifest(StrictModel):
     """``manifest.json``."""
 
-    schema_version: Literal[1] = SCHEMA_VERSION
+    schema_version: Literal[2] = SCHEMA_VERSION
     name: str = Field(pattern=r"^[a-z0-9_\-]+$")
     description: str = ""
     assets: list[Asset]
