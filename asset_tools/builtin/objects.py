@@ -15,6 +15,7 @@ from asset_tools.builtin.products import LABELS
 from asset_tools.builtin.skins import paint_banana, paint_fruit
 from asset_tools.builtin.spec import ObjectSpec
 
+
 def _product(
     id: str,
     category: str,
