@@ -1,11 +1,10 @@
-"""From a textured mesh to a finished asset of a pack: display mesh, hulls, resting poses, grasps, mass properties."""
+"""From what an asset is made from to its finished files: display meshes, hulls, annotations, mass properties, quality."""
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,115 +14,24 @@ from scipy.spatial.transform import Rotation
 
 from asset_tools.decompose import Decomposition, decompose, volume_iou
 from asset_tools.grasps import sample_grasps
+from asset_tools.quality.furniture import measure_furniture
+from asset_tools.quality.measure import measure_object
 from asset_tools.resting import resting_poses
+from asset_tools.sources import FurnitureSource, LinkSource, ObjectSource
 from asset_tools.visual import to_display, write_glb
+from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.hulls import read_hulls, write_hulls
-from robocas_ms3.assets.manifest import FurnitureAsset, InnerBox, ObjectAsset, PackManifest, Surface
-from robocas_ms3.assets.pack import ANNOTATIONS, HULLS, MANIFEST, VISUAL, Annotations, sha256
+from robocas_ms3.assets.manifest import FurnitureAsset, Link, ObjectAsset, PackManifest
+from robocas_ms3.assets.pack import ANNOTATIONS, FINISHES, HULLS, LINKS, MANIFEST, VISUALS, sha256
 from robocas_ms3.errors import AssetError
 from robocas_ms3.files import replacing_folder
 from robocas_ms3.paths import cache_dir
 
 SURFACE_POINTS = 1024
 GRASPS = 800  # many, since of an object on a table most are from below or blocked by neighbours
-
-
-@dataclass(frozen=True)
-class ObjectSource:
-    """What an object is made from.
-
-    Attributes:
-        id: folder name.
-        name: for language.
-        category: what kind of thing it is.
-        mesh: to look at; textured, metres, z up, any origin.
-        closed: watertight mesh of the same body in the same frame, for volume, hulls and grasps.
-        mass: kg.
-        friction: of its surface.
-        source: where the geometry comes from.
-        licence: of the mesh.
-        attribution: whom to name.
-        repairs: what had to be mended.
-        graspnet_id: of the object of GraspNet-1Billion that it is or stands in for.
-        pieces: (V, 3) corners of convex pieces, in the mesh's frame, where they are known; none: by decomposition.
-        grasps: in the mesh's frame, where they are known; none: sampled.
-        hollow: a container or a thin thing, whose hulls are judged by distance.
-    """
-
-    id: str
-    name: str
-    category: str
-    mesh: trimesh.Trimesh
-    closed: trimesh.Trimesh
-    mass: float
-    friction: float = 0.99
-    source: str = "builtin"
-    licence: str = "MIT"
-    attribution: str = "robocas_ms3"
-    repairs: tuple[str, ...] = ()
-    graspnet_id: int | None = None
-    pieces: list[np.ndarray] | None = None
-    grasps: Grasps | None = None
-    hollow: bool = False
-
-
-@dataclass(frozen=True)
-class LinkSource:
-    """A moving part of a piece of furniture, in the furniture's frame with all joints at 0; metres.
-
-    Attributes:
-        name: of the link.
-        joint: how it hangs on its parent.
-        mesh: to look at.
-        pieces: (V, 3) corners of each convex collision piece.
-        mass: kg; its centre and inertia are those of the pieces, solid.
-        parent: name of another link; empty: the fixed body.
-    """
-
-    name: str
-    joint: Joint
-    mesh: trimesh.Trimesh
-    pieces: list[np.ndarray]
-    mass: float
-    parent: str = ""
-
-
-@dataclass(frozen=True)
-class FurnitureSource:
-    """What a piece of furniture is made from; everything in its own frame, metres.
-
-    Attributes:
-        id: folder name.
-        name: for language.
-        category: what kind of thing it is.
-        mesh: to look at, of the fixed body.
-        pieces: (V, 3) corners of each convex collision piece of the fixed body.
-        mass: kg; none: it can't move. Its centre and inertia are those of the pieces, solid.
-        origin_height: of the frame above the lowest point.
-        surfaces: where objects may stand.
-        inner: inside of a container.
-        links: moving parts, parents first.
-        handles: where to take hold of them.
-        finishes: part -> finish -> mesh of that part; the first is the default. Not in ``mesh``.
-    """
-
-    id: str
-    name: str
-    category: str
-    mesh: trimesh.Trimesh
-    pieces: list[np.ndarray]
-    mass: float | None = None
-    origin_height: float = 0.0
-    surfaces: dict[str, Surface] = field(default_factory=dict)
-    inner: InnerBox | None = None
-    links: tuple[LinkSource, ...] = ()
-    handles: dict[str, Handle] = field(default_factory=dict)
-    finishes: dict[str, dict[str, trimesh.Trimesh]] = field(default_factory=dict)
-    friction: float = 0.99
-    source: str = "builtin"
-    licence: str = "MIT"
-    attribution: str = "robocas_ms3"
-    repairs: tuple[str, ...] = ()
+FEW_GRASPS = 50  # with fewer, the manifest says why
+FAST, FAST_ENOUGH = 1000, 1500  # triangles: what `fast` is decimated to, and what is left as it is
+FULL, FULL_TEXTURE = 12_000, 1024
 
 
 def build_object(source: ObjectSource, folder: Path, *, hull_cache: Path | None = None) -> ObjectAsset:
@@ -148,8 +56,8 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
     mesh, closed = source.mesh.copy(include_cache=True), source.closed.copy()
     mesh.apply_translation(shift)
     closed.apply_translation(shift)
+    write_visuals(mesh, folder)
 
-    write_glb(to_display(mesh), folder / VISUAL)
     if source.pieces is None:
         parts = decompose(closed, cache=hull_cache)
     else:
@@ -161,27 +69,34 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
 
     center = np.asarray(closed.center_mass)
     inertia, axes = principal_inertia(closed, source.mass)
-    rest = resting_poses(
-        hulls,
-        mass=source.mass,
-        center_of_mass=center,
-        inertia=inertia,
-        inertia_wxyz=axes,
-        friction=source.friction,
-    )
-    rng = np.random.default_rng(zlib.crc32(source.id.encode()))
-    grasps = sample_grasps(closed, center, rng, count=GRASPS)
+    body: dict[str, Any] = {
+        "mass": source.mass,
+        "center_of_mass": center,
+        "inertia": inertia,
+        "inertia_wxyz": axes,
+        "friction": source.friction,
+    }
+    rest = resting_poses(hulls, **body)
+    grasps, reason = source.grasps, ""
+    if grasps is None:
+        grasps = sample_grasps(closed, center, np.random.default_rng(zlib.crc32(source.id.encode())), count=GRASPS)
+    else:
+        grasps = grasps.moved(shift)
+    if len(grasps) < FEW_GRASPS:
+        reason = f"only {len(grasps)} places where the gripper, open 0.08 m, fits around it and friction holds it"
     points, faces = trimesh.sample.sample_surface(closed, SURFACE_POINTS, seed=0)[:2]
-    Annotations(
-        rest.poses,
-        rest.probabilities,
-        rest.display_pose,
-        _light(grasps.tcp_in_object),
-        _light(grasps.widths),
-        _light(grasps.qualities),
-        _light(points),
-        _light(closed.face_normals[faces]),
-    ).save(folder / ANNOTATIONS)
+    notes = Annotations(
+        resting_poses=rest.poses,
+        footprints=_light(footprints(hulls, rest.poses)),
+        resting_probabilities=rest.probabilities,
+        display_pose=rest.display_pose,
+        grasps_tcp_in_object=_light(grasps.tcp_in_object),
+        grasp_widths=_light(grasps.widths),
+        grasp_qualities=_light(grasps.qualities),
+        surface_points=_light(points),
+        surface_normals=_light(closed.face_normals[faces]),
+    )
+    notes.save(folder / ANNOTATIONS)
     return ObjectAsset(
         id=source.id,
         name=source.name,
@@ -191,23 +106,32 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
         attribution=source.attribution,
         extents=_triple(mesh.extents),
         friction=source.friction,
+        repairs=source.repairs,
         files=_hashes(folder),
+        graspnet_id=source.graspnet_id,
         mass=source.mass,
         center_of_mass=_triple(center),
         inertia=_triple(inertia),
-        inertia_wxyz=tuple(float(x) for x in axes),  # pyright: ignore[reportArgumentType]
-        hull_count=len(parts.hulls),
-        volume_iou=round(parts.volume_iou, 4),
-        grasp_count=len(grasps.widths),
-        repairs=source.repairs,
+        inertia_wxyz=axes,
+        grasp_count=len(grasps),
+        no_grasps_because=reason,
+        quality=measure_object(closed, hulls, notes, hollow=source.hollow, **body),
     )
 
 
 def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
     """Make a piece of furniture's files in a folder and say what the manifest says of it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_glb(source.mesh, folder / VISUAL)
-    write_hulls(folder / HULLS, source.pieces)
+    _write_body(source.mesh, source.pieces, folder)
+    for link in source.links:
+        _write_body(link.mesh, link.pieces, folder / LINKS / link.name)
+    for part, finishes in source.finishes.items():
+        (folder / FINISHES).mkdir(exist_ok=True)
+        for name, mesh in finishes.items():
+            write_glb(mesh, folder / FINISHES / f"{part}_{name}.glb")
+    body: dict[str, Any] = {}
+    if source.mass is not None:
+        center, inertia, axes = piece_inertia(source.pieces, source.mass)
+        body = {"mass": source.mass, "center_of_mass": _triple(center), "inertia": _triple(inertia), "inertia_wxyz": axes}
     return FurnitureAsset(
         id=source.id,
         name=source.name,
@@ -217,13 +141,44 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
         attribution=source.attribution,
         extents=_triple(source.mesh.extents),
         friction=source.friction,
+        repairs=source.repairs,
         files=_hashes(folder),
-        mass=source.mass,
-        center_of_mass=source.center_of_mass,
-        inertia=source.inertia,
         origin_height=source.origin_height,
-        surfaces=source.surfaces or {},
+        surfaces=source.surfaces,
         inner=source.inner,
+        links=tuple(_link(link) for link in source.links),
+        handles=source.handles,
+        finishes={part: tuple(finishes) for part, finishes in source.finishes.items()},
+        quality=measure_furniture(source),
+        **body,
+    )
+
+
+def write_visuals(mesh: trimesh.Trimesh, folder: Path) -> None:
+    """Write a textured mesh at both levels of detail."""
+    fast = to_display(mesh, triangles=FAST_ENOUGH if len(mesh.faces) <= FAST_ENOUGH else FAST)
+    write_glb(fast, folder / VISUALS["fast"])
+    write_glb(to_display(mesh, triangles=FULL, texture_size=FULL_TEXTURE), folder / VISUALS["full"])
+
+
+def _write_body(mesh: trimesh.Trimesh, pieces: list[np.ndarray], folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    # furniture is looked at from farther away than what stands on it: one mesh, of few triangles, serves both levels
+    for name in VISUALS.values():
+        write_glb(mesh, folder / name)
+    write_hulls(folder / HULLS, pieces)
+
+
+def _link(link: LinkSource) -> Link:
+    center, inertia, axes = piece_inertia(link.pieces, link.mass)
+    return Link(
+        name=link.name,
+        parent=link.parent,
+        joint=link.joint,
+        mass=link.mass,
+        center_of_mass=_triple(center),
+        inertia=_triple(inertia),
+        inertia_wxyz=axes,
     )
 
 
@@ -255,14 +210,36 @@ class PackWriter:
         self.assets.append(asset)
 
 
-def principal_inertia(closed: trimesh.Trimesh, mass: float) -> tuple[np.ndarray, np.ndarray]:
+def principal_inertia(closed: trimesh.Trimesh, mass: float) -> tuple[np.ndarray, tuple[float, float, float, float]]:
     """Moments (3,) in kg m2 about the centre of mass and their axes (wxyz) of a solid of even density."""
-    tensor = np.asarray(closed.moment_inertia) * (mass / closed.volume)
+    return _principal(np.asarray(closed.moment_inertia) * (mass / closed.volume))
+
+
+def piece_inertia(
+    pieces: list[np.ndarray], mass: float
+) -> tuple[np.ndarray, np.ndarray, tuple[float, float, float, float]]:
+    """Centre of mass (3,) m, principal moments (3,) kg m2 about it and their axes (wxyz) of convex pieces of even
+    density; what two pieces share counts twice."""
+    hulls = [trimesh.convex.convex_hull(piece) for piece in pieces]
+    volumes = np.array([hull.volume for hull in hulls])
+    masses = mass * volumes / volumes.sum()
+    center = masses @ np.array([hull.center_mass for hull in hulls]) / mass
+    tensor = np.zeros((3, 3))
+    for hull, share in zip(hulls, masses, strict=True):
+        offset = hull.center_mass - center
+        tensor += hull.moment_inertia * share / hull.volume
+        tensor += share * (offset @ offset * np.eye(3) - np.outer(offset, offset))
+    return center, *_principal(tensor)
+
+
+def _principal(tensor: np.ndarray) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    if np.abs(tensor - np.diag(np.diag(tensor))).max() < 1e-9 * np.trace(tensor):
+        return np.diag(tensor).copy(), (1.0, 0.0, 0.0, 0.0)
     moments, vectors = np.linalg.eigh(tensor)
     if np.linalg.det(vectors) < 0:
         vectors[:, 0] *= -1
-    xyzw = Rotation.from_matrix(vectors).as_quat()
-    return moments, xyzw[[3, 0, 1, 2]]
+    x, y, z, w = (float(value) for value in Rotation.from_matrix(vectors).as_quat())
+    return moments, (w, x, y, z)
 
 
 def _light(values: Any) -> Any:
@@ -271,7 +248,8 @@ def _light(values: Any) -> Any:
 
 
 def _hashes(folder: Path) -> dict[str, str]:
-    return {path.name: sha256(path) for path in sorted(folder.iterdir()) if path.is_file()}
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): sha256(path) for path in files}
 
 
 def _triple(values: np.ndarray) -> tuple[float, float, float]:

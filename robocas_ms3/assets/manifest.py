@@ -150,6 +150,7 @@ class FurnitureAsset(AssetBase):
     mass: Positive | None = Field(None, description="kg; none: its body can't move")
     center_of_mass: Vec3 = (0, 0, 0)
     inertia: tuple[Positive, Positive, Positive] | None = None
+    inertia_wxyz: Quaternion = (1, 0, 0, 0)
     origin_height: float = Field(0.0, description="height of the frame's origin above the lowest point, m")
     surfaces: dict[Name, Surface] = {}
     inner: InnerBox | None = Field(None, description="containers only")

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import hashlib
-import zipfile
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import ValidationError
-from scipy.spatial import ConvexHull
 
+from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import Array, Hull, read_hulls, sample_surface
-from robocas_ms3.assets.manifest import FurnitureAsset, ObjectAsset, PackManifest
+from robocas_ms3.assets.kinematics import link_poses
+from robocas_ms3.assets.manifest import SCHEMA_VERSION, FurnitureAsset, ObjectAsset, PackManifest
 from robocas_ms3.errors import AssetError
 from robocas_ms3.paths import builtin_packs_dir, data_dir
 
-MANIFEST, VISUAL, HULLS, ANNOTATIONS = "manifest.json", "visual.glb", "hulls.obj", "annotations.npz"
+VisualLevel = Literal["fast", "full"]
+
+MANIFEST, HULLS, ANNOTATIONS = "manifest.json", "hulls.obj", "annotations.npz"
+VISUALS: dict[VisualLevel, str] = {"fast": "visual_fast.glb", "full": "visual_full.glb"}
+LINKS, FINISHES = "links", "finishes"
 
 # (path, size, mtime) -> sha256, so that only changed files are read again within a process
 _hashes: dict[tuple[str, int, int], str] = {}
@@ -26,77 +32,8 @@ _packs: dict[tuple[str, int, int], Pack] = {}
 
 
 @dataclass(frozen=True)
-class Annotations:
-    """What is known of an object besides its shape. S stable poses, G grasps, P surface points; metres, asset frame.
-
-    Attributes:
-        resting_poses: (S, 4, 4) ``T_plane_object``: the object's frame in a frame whose z = 0 is the plane it rests
-            on, its centre of mass at x = y = 0.
-        resting_probabilities: (S,) share of random drops that end in each pose; they sum to 1.
-        display_pose: index of the pose in which the object stands upright, or -1.
-        grasps_tcp_in_object: (G, 4, 4) TCP poses, z approach, y closing, origin midway between the finger tips.
-        grasp_widths: (G,) finger opening the object needs, m.
-        grasp_qualities: (G,) lowest friction coefficient that closes the grasp; smaller is better.
-        surface_points: (P, 3) points on the visual mesh.
-        surface_normals: (P, 3) their outward unit normals.
-    """
-
-    resting_poses: Array
-    resting_probabilities: Array
-    display_pose: int
-    grasps_tcp_in_object: Array
-    grasp_widths: Array
-    grasp_qualities: Array
-    surface_points: Array
-    surface_normals: Array
-
-    def __post_init__(self) -> None:
-        poses, grasps, points = len(self.resting_poses), len(self.grasp_widths), len(self.surface_points)
-        shapes = {
-            "resting_poses": (poses, 4, 4),
-            "resting_probabilities": (poses,),
-            "grasps_tcp_in_object": (grasps, 4, 4),
-            "grasp_widths": (grasps,),
-            "grasp_qualities": (grasps,),
-            "surface_points": (points, 3),
-            "surface_normals": (points, 3),
-        }
-        for name, shape in shapes.items():
-            found = getattr(self, name)
-            if found.shape != shape or not np.isfinite(found).all():
-                raise AssetError("wrong shape or non-finite numbers", where=name, expected=shape, found=found.shape)
-        if poses == 0 or not -1 <= self.display_pose < poses:
-            raise AssetError("no such resting pose", where="display_pose", found=f"{self.display_pose} of {poses}")
-
-    def save(self, path: Path) -> None:
-        """Write ``annotations.npz``."""
-        np.savez_compressed(path, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
-
-    @classmethod
-    def load(cls, path: Path) -> Annotations:
-        """Read ``annotations.npz``.
-
-        Raises:
-            AssetError: it is damaged, or an array is missing or has the wrong shape.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {f.name: file[f.name] for f in fields(cls)}
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-            raise AssetError(
-                "can't read the annotations", where=path, found=error, fix="Make the pack again."
-            ) from error
-        for array in arrays.values():
-            array.setflags(write=False)
-        try:
-            return cls(**{**arrays, "display_pose": int(arrays["display_pose"])})
-        except AssetError as error:
-            raise AssetError(str(error), where=path, fix="Make the pack again.") from error
-
-
-@dataclass(frozen=True)
-class LoadedAsset:
-    """Files and collision geometry of an asset.
+class Part:
+    """The geometry of one body: files to render, hulls for physics.
 
     Attributes:
         folder: where its files lie.
@@ -105,10 +42,9 @@ class LoadedAsset:
     folder: Path
     _points: dict[float, Array] = field(default_factory=dict, repr=False, compare=False)
 
-    @property
-    def visual_path(self) -> Path:
-        """The textured mesh (GLB)."""
-        return self.folder / VISUAL
+    def visual(self, level: VisualLevel = "fast") -> Path:
+        """The textured mesh (GLB) at a level of detail."""
+        return self.folder / VISUALS[level]
 
     @property
     def hulls_path(self) -> Path:
@@ -139,7 +75,7 @@ class LoadedAsset:
 
 
 @dataclass(frozen=True)
-class LoadedObject(LoadedAsset):
+class LoadedObject(Part):
     """A thing to pick up.
 
     Attributes:
@@ -150,32 +86,45 @@ class LoadedObject(LoadedAsset):
 
     @cached_property
     def annotations(self) -> Annotations:
-        """Resting poses, grasps and surface points."""
+        """Resting poses, footprints, grasps and surface points."""
         return Annotations.load(self.folder / ANNOTATIONS)
-
-    def footprint(self, pose_index: int) -> Array:
-        """What the object covers when it rests in a pose.
-
-        Args:
-            pose_index: row of ``annotations.resting_poses``.
-
-        Returns:
-            (K, 2) convex polygon around the centre of mass, counter-clockwise, m.
-        """
-        pose = self.annotations.resting_poses[pose_index]
-        flat = np.concatenate(self.hulls) @ pose[:2, :3].T + pose[:2, 3]
-        return flat[ConvexHull(flat).vertices]
 
 
 @dataclass(frozen=True)
-class LoadedFurniture(LoadedAsset):
-    """Scenery.
+class LoadedFurniture(Part):
+    """Scenery. As a part, it is the fixed body.
 
     Attributes:
         asset: its entry in the manifest.
+        links: its moving parts by name, in the furniture's frame with all joints at 0.
     """
 
     asset: FurnitureAsset = field(kw_only=True)
+    links: dict[str, Part] = field(default_factory=dict, kw_only=True)
+
+    def all_surface_points(self, positions: Mapping[str, float] | None = None, spacing: float = 0.005) -> Array:
+        """Points (P, 3) on the surfaces of body and links, m, in the furniture's frame.
+
+        Args:
+            positions: of the joints by name, m or rad; those not named are at 0.
+            spacing: distance between neighbours, roughly, m.
+        """
+        pieces = [self.surface_points(spacing)]
+        for name, pose in link_poses(self.asset.links, positions or {}).items():
+            pieces.append(self.links[name].surface_points(spacing) @ pose[:3, :3].T + pose[:3, 3])
+        return np.concatenate(pieces)
+
+    def finish(self, part: str, name: str) -> Path:
+        """The textured mesh (GLB) of a part in one of its finishes.
+
+        Raises:
+            AssetError: there is no such part or finish.
+        """
+        found = self.asset.finishes.get(part, ())
+        if name not in found:
+            what = f"{self.asset.id}: no such finish of {part!r}"
+            raise AssetError(what, expected=f"one of {', '.join(found) or '(none)'}", found=name)
+        return self.folder / FINISHES / f"{part}_{name}.glb"
 
 
 @dataclass(frozen=True)
@@ -284,27 +233,40 @@ def _read(folder: Path, path: Path) -> Pack:
     try:
         manifest = PackManifest.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        first = error.errors()[0]
-        raise AssetError(
-            "the manifest is damaged",
-            where=path,
-            expected=first["msg"],
-            found=f"at {'.'.join(map(str, first['loc'])) or 'the top'}",
-            fix="Make the pack again.",
-        ) from error
-    objects, furniture = {}, {}
+        raise _damaged(path, error) from error
+    objects: dict[str, LoadedObject] = {}
+    furniture: dict[str, LoadedFurniture] = {}
     for asset in manifest.assets:
         if asset.id in objects or asset.id in furniture:
             raise AssetError("two assets of the pack have the same id", where=path, found=asset.id)
-        for name in _required(asset):
+        for name in required_files(asset):
             if name not in asset.files:
                 raise AssetError("the manifest lists no such file", where=path, expected=f"{asset.id}/{name}")
+        home = folder / asset.id
         if isinstance(asset, ObjectAsset):
-            objects[asset.id] = LoadedObject(folder / asset.id, asset=asset)
+            objects[asset.id] = LoadedObject(home, asset=asset)
         else:
-            furniture[asset.id] = LoadedFurniture(folder / asset.id, asset=asset)
+            links = {link.name: Part(home / LINKS / link.name) for link in asset.links}
+            furniture[asset.id] = LoadedFurniture(home, asset=asset, links=links)
     return Pack(manifest.name, folder, manifest, objects, furniture)
 
 
-def _required(asset: ObjectAsset | FurnitureAsset) -> tuple[str, ...]:
-    return (VISUAL, HULLS, ANNOTATIONS) if isinstance(asset, ObjectAsset) else (VISUAL, HULLS)
+def required_files(asset: ObjectAsset | FurnitureAsset) -> list[str]:
+    """The files that an asset must have, relative to its folder."""
+    body = [*VISUALS.values(), HULLS]
+    if isinstance(asset, ObjectAsset):
+        return [*body, ANNOTATIONS]
+    parts = [f"{LINKS}/{link.name}/{name}" for link in asset.links for name in body]
+    finishes = [f"{FINISHES}/{part}_{name}.glb" for part, names in asset.finishes.items() for name in names]
+    return [*body, *parts, *finishes]
+
+
+def _damaged(path: Path, error: ValidationError) -> AssetError:
+    for entry in error.errors():
+        if entry["loc"] == ("schema_version",):
+            fix = "Make the pack again: run the import or build that made it."
+            expected = f"pack format {SCHEMA_VERSION}"
+            return AssetError("this pack has another format", where=path, expected=expected, found=entry["input"], fix=fix)
+    first = error.errors()[0]
+    found = f"at {'.'.join(map(str, first['loc'])) or 'the top'}"
+    return AssetError("the manifest is damaged", where=path, expected=first["msg"], found=found, fix="Make the pack again.")

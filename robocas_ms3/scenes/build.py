@@ -163,5 +163,5 @@ def placeable(asset: LoadedObject) -> Placeable:
         asset.asset.id,
         notes.resting_poses,
         notes.resting_probabilities,
-        [asset.footprint(i) for i in range(len(notes.resting_poses))],
+        [notes.footprint(i) for i in range(len(notes.resting_poses))],
     )

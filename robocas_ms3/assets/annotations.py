@@ -1,0 +1,110 @@
+"""What is known of an object besides its shape: ``annotations.npz``. Metres, the asset's frame."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from robocas_ms3.assets.hulls import Array
+from robocas_ms3.errors import AssetError
+
+
+@dataclass(frozen=True)
+class Annotations:
+    """What is known of an object besides its shape. S stable poses, G grasps, P surface points; metres, asset frame.
+
+    Attributes:
+        resting_poses: (S, 4, 4) ``T_plane_object``: the object's frame in a frame whose z = 0 is the plane it rests
+            on, its centre of mass at x = y = 0.
+        footprints: (S, K, 2) what the object covers of that plane in each pose: convex polygons, counter-clockwise
+            around the centre of mass, their last corner repeated to make up K.
+        resting_probabilities: (S,) share of random drops that end in each pose; they sum to 1.
+        display_pose: index of the pose in which the object stands upright, or -1.
+        grasps_tcp_in_object: (G, 4, 4) TCP poses, z approach, y closing, origin midway between the finger tips.
+        grasp_widths: (G,) finger opening the object needs, m.
+        grasp_qualities: (G,) lowest friction coefficient that closes the grasp; smaller is better.
+        surface_points: (P, 3) points on the visual mesh.
+        surface_normals: (P, 3) their outward unit normals.
+    """
+
+    resting_poses: Array
+    footprints: Array
+    resting_probabilities: Array
+    display_pose: int
+    grasps_tcp_in_object: Array
+    grasp_widths: Array
+    grasp_qualities: Array
+    surface_points: Array
+    surface_normals: Array
+
+    def __post_init__(self) -> None:
+        poses, grasps, points = len(self.resting_poses), len(self.grasp_widths), len(self.surface_points)
+        shapes = {
+            "resting_poses": (poses, 4, 4),
+            "footprints": (poses, self.footprints.shape[1] if self.footprints.ndim == 3 else 3, 2),
+            "resting_probabilities": (poses,),
+            "grasps_tcp_in_object": (grasps, 4, 4),
+            "grasp_widths": (grasps,),
+            "grasp_qualities": (grasps,),
+            "surface_points": (points, 3),
+            "surface_normals": (points, 3),
+        }
+        for name, shape in shapes.items():
+            found = getattr(self, name)
+            if found.shape != shape or not np.isfinite(found).all():
+                raise AssetError("wrong shape or non-finite numbers", where=name, expected=shape, found=found.shape)
+        if poses == 0 or not -1 <= self.display_pose < poses:
+            raise AssetError("no such resting pose", where="display_pose", found=f"{self.display_pose} of {poses}")
+
+    def save(self, path: Path) -> None:
+        """Write ``annotations.npz``."""
+        np.savez_compressed(path, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> Annotations:
+        """Read ``annotations.npz``.
+
+        Raises:
+            AssetError: it is damaged, or an array is missing or has the wrong shape.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {f.name: file[f.name] for f in fields(cls)}
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise AssetError(
+                "can't read the annotations", where=path, found=error, fix="Make the pack again."
+            ) from error
+        for array in arrays.values():
+            array.setflags(write=False)
+        try:
+            return cls(**{**arrays, "display_pose": int(arrays["display_pose"])})
+        except AssetError as error:
+            raise AssetError(str(error), where=path, fix="Make the pack again.") from error
+
+    def footprint(self, pose_index: int) -> Array:
+        """The polygon (K, 2) that the object covers in a resting pose, each corner once, m."""
+        corners = self.footprints[pose_index]
+        return corners[~np.all(corners == np.roll(corners, 1, axis=0), axis=1)]
+
+
+def footprints(hulls: list[Array], poses: Array) -> Array:
+    """What convex hulls cover of the plane in each resting pose.
+
+    Args:
+        hulls: (V, 3) vertices each, m.
+        poses: (S, 4, 4) ``T_plane_object``.
+
+    Returns:
+        (S, K, 2), see `Annotations`.
+    """
+    points = np.concatenate(hulls)
+    polygons = []
+    for pose in poses:
+        flat = points @ pose[:2, :3].T + pose[:2, 3]
+        polygons.append(flat[ConvexHull(flat).vertices])
+    longest = max(len(polygon) for polygon in polygons)
+    return np.stack([np.pad(polygon, ((0, longest - len(polygon)), (0, 0)), mode="edge") for polygon in polygons])

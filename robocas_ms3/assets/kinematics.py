@@ -1,0 +1,50 @@
+"""Where the moving parts of a piece of furniture are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.assets.manifest import Joint, Link
+
+Array = NDArray[np.float64]
+
+
+def joint_motion(joint: Joint, position: float) -> Array:
+    """4x4 by which a joint at a position (m or rad) moves its link from where it is at 0, furniture's frame."""
+    motion = np.eye(4)
+    if joint.kind == "prismatic":
+        motion[:3, 3] = np.multiply(joint.axis, position)
+        return motion
+    motion[:3, :3] = Rotation.from_rotvec(np.multiply(joint.axis, position)).as_matrix()
+    motion[:3, 3] = joint.origin - motion[:3, :3] @ joint.origin
+    return motion
+
+
+def link_poses(links: Sequence[Link], positions: Mapping[str, float]) -> dict[str, Array]:
+    """Poses 4x4 of the links in the furniture's frame; identities where all joints are at 0.
+
+    Args:
+        links: parents first.
+        positions: of the joints by name, m or rad; those not named are at 0.
+    """
+    poses: dict[str, Array] = {}
+    for link in links:
+        above = poses[link.parent] if link.parent else np.eye(4)
+        poses[link.name] = above @ joint_motion(link.joint, positions.get(link.joint.name, 0.0))
+    return poses
+
+
+def joint_frame(joint: Joint) -> Array:
+    """4x4 of a frame whose x runs along the joint's axis, at its origin, in the furniture's frame."""
+    x = np.asarray(joint.axis, dtype=float)
+    x = x / np.linalg.norm(x)
+    y = np.cross(x, np.eye(3)[np.argmin(np.abs(x))])
+    y /= np.linalg.norm(y)
+    frame = np.eye(4)
+    frame[:3, :3] = np.column_stack([x, y, np.cross(x, y)])
+    frame[:3, 3] = joint.origin
+    return frame
