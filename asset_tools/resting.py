@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import sapien
 from sapien import physx
 from scipy.spatial import ConvexHull, QhullError
 
+from asset_tools.physics import Solid, add_body, add_ground, cook, engine_settings, new_scene, places, pose_matrix
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray
@@ -26,9 +25,7 @@ MOVED, TURNED_DEG = 0.001, 2.0  # in one second, afresh: less is at rest
 YAWS = tuple(np.arange(8) * 0.8)  # rad: it must stay however it is turned, for the engine's contacts depend on it
 DROP = 0.0005  # m above the plane at the start: scenes leave a gap as well
 MIN_TOPPLING_DEG = 3.0  # a pose that gives way to less is no pose to put things down in
-TIME_STEP, STEPS = 0.01, 100
-DAMPING, TABLE_FRICTION = 0.1, 0.99
-SPACING = 10.0  # m between objects that are simulated at once
+STEPS = 100  # of TIME_STEP
 
 LIFT = np.zeros((4, 4))
 LIFT[2, 3] = DROP
@@ -104,7 +101,7 @@ def resting_poses(
     try:
         points = vertices[ConvexHull(vertices).vertices]
         # the engine drops corners of detailed hulls: what is stable is decided on the shapes it really has
-        hull = ConvexHull(np.concatenate([_cook(piece, physx.PhysxMaterial(1, 1, 0)).vertices for piece in hulls]))
+        hull = ConvexHull(np.concatenate([cook(piece, physx.PhysxMaterial(1, 1, 0)).vertices for piece in hulls]))
     except (QhullError, ValueError, RuntimeError) as error:
         raise AssetError("the convex hulls enclose no volume", found=str(error).split("\n")[0]) from error
     directions, probabilities, heights = _stable_directions(hull, center)
@@ -282,61 +279,20 @@ def toppling_angle(points: Array, center_of_mass: Array, up: Array) -> float:
     return float(np.degrees(np.arctan2(reach, center_of_mass @ up - heights.min())))
 
 
-@contextmanager
-def _engine_settings() -> Iterator[None]:
-    """ManiSkill's defaults; the engine keeps them for the whole process, so they are put back afterwards."""
-    scene, body, shape = physx.get_scene_config(), physx.get_body_config(), physx.get_shape_config()
-    physx.set_scene_config(gravity=np.array([0, 0, -9.81]))
-    physx.set_body_config(solver_position_iterations=15, solver_velocity_iterations=1, sleep_threshold=0.005)
-    physx.set_shape_config(contact_offset=0.02, rest_offset=0.0)
-    try:
-        yield
-    finally:
-        physx.set_scene_config(scene)
-        physx.set_body_config(body)
-        physx.set_shape_config(shape)
-
-
 def _simulate(body: _Body, starts: Array) -> Array:
     """Poses (N, 4, 4) one second after the object was put down in each of the poses (N, 4, 4), one object each."""
-    with _engine_settings():
-        scene = sapien.Scene([physx.PhysxCpuSystem()])
-        scene.set_timestep(TIME_STEP)
-        material = physx.PhysxMaterial(body.friction, body.friction, 0.0)
-        table = physx.PhysxMaterial(TABLE_FRICTION, TABLE_FRICTION, 0.0)
-        offsets = np.zeros((len(starts), 3))
-        offsets[:, 0], offsets[:, 1] = np.arange(len(starts)) % 4 * SPACING, np.arange(len(starts)) // 4 * SPACING
-        entities = []
+    solid = Solid(body.hulls, body.mass, body.center_of_mass, body.inertia, body.inertia_wxyz, body.friction)
+    offsets = places(len(starts))
+    with engine_settings():
+        scene = new_scene()
+        objects = []
         for start, offset in zip(starts, offsets, strict=True):
-            ground = physx.PhysxRigidStaticComponent()
-            ground.attach(physx.PhysxCollisionShapeBox([1.0, 1.0, 0.05], table))
-            _add(scene, ground, sapien.Pose(offset - [0, 0, 0.05]))
-            free = physx.PhysxRigidDynamicComponent()
-            for piece in body.hulls:
-                free.attach(_cook(piece, material))
-            free.mass = body.mass
-            free.cmass_local_pose = sapien.Pose(body.center_of_mass, body.inertia_wxyz)
-            free.inertia = body.inertia
-            free.linear_damping = free.angular_damping = DAMPING
+            add_ground(scene, offset)
             pose = start.copy()
             pose[:3, 3] += offset
-            entities.append(_add(scene, free, sapien.Pose(pose)))
+            objects.append(add_body(scene, solid, pose))
         for _ in range(STEPS):
             scene.step()
-        ends = np.array([entity.pose.to_transformation_matrix() for entity in entities], float)
+        ends = np.array([pose_matrix(free) for free in objects])
     ends[:, :3, 3] -= offsets
     return ends
-
-
-def _cook(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeConvexMesh:
-    return physx.PhysxCollisionShapeConvexMesh(
-        vertices=np.asarray(vertices, np.float32), scale=[1, 1, 1], material=material
-    )
-
-
-def _add(scene: sapien.Scene, component: physx.PhysxRigidBaseComponent, pose: sapien.Pose) -> sapien.Entity:
-    entity = sapien.Entity()
-    entity.add_component(component)
-    entity.set_pose(pose)
-    scene.add_entity(entity)
-    return entity

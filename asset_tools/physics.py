@@ -1,0 +1,118 @@
+"""Free bodies in a bare PhysX scene, with the settings that the environments simulate them with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import sapien
+from sapien import physx
+
+from robocas_ms3.errors import AssetError
+
+Array = np.ndarray
+
+TIME_STEP = 0.01  # s, the environments'
+DAMPING = 0.1  # 1/s, linear and angular, of every free body
+TABLE_FRICTION = 0.99
+SPACING = 10.0  # m between objects that are simulated at once
+
+
+@dataclass(frozen=True)
+class Solid:
+    """What the engine knows of a free body, in the body's frame; metres, kilograms.
+
+    Attributes:
+        hulls: (V, 3) vertices of each convex collision piece.
+        mass: kg.
+        center_of_mass: (3,).
+        inertia: (3,) principal moments, kg m2.
+        inertia_wxyz: (4,) principal axes.
+        friction: of its surface.
+    """
+
+    hulls: Sequence[Array]
+    mass: float
+    center_of_mass: Array
+    inertia: Array
+    inertia_wxyz: Array
+    friction: float = 0.99
+
+
+@contextmanager
+def engine_settings() -> Iterator[None]:
+    """ManiSkill's defaults; the engine keeps them for the whole process, so they are put back afterwards."""
+    scene, body, shape = physx.get_scene_config(), physx.get_body_config(), physx.get_shape_config()
+    physx.set_scene_config(gravity=np.array([0, 0, -9.81]))
+    physx.set_body_config(solver_position_iterations=15, solver_velocity_iterations=1, sleep_threshold=0.005)
+    physx.set_shape_config(contact_offset=0.02, rest_offset=0.0)
+    try:
+        yield
+    finally:
+        physx.set_scene_config(scene)
+        physx.set_body_config(body)
+        physx.set_shape_config(shape)
+
+
+def new_scene(time_step: float = TIME_STEP) -> sapien.Scene:
+    """An empty scene without a renderer; use it within `engine_settings`."""
+    scene = sapien.Scene([physx.PhysxCpuSystem()])
+    scene.set_timestep(time_step)
+    return scene
+
+
+def add_body(scene: sapien.Scene, solid: Solid, pose: Array) -> physx.PhysxRigidDynamicComponent:
+    """Add a free body at a pose (4, 4) of its frame in the world.
+
+    Raises:
+        AssetError: the engine makes no shape of a hull.
+    """
+    material = physx.PhysxMaterial(solid.friction, solid.friction, 0.0)
+    free = physx.PhysxRigidDynamicComponent()
+    try:
+        for piece in solid.hulls:
+            free.attach(cook(piece, material))
+    except RuntimeError as error:
+        raise AssetError("the physics engine refused a convex hull", found=error) from error
+    free.mass = solid.mass
+    free.cmass_local_pose = sapien.Pose(solid.center_of_mass, solid.inertia_wxyz)
+    free.inertia = np.asarray(solid.inertia)
+    free.linear_damping = free.angular_damping = DAMPING
+    add_component(scene, free, sapien.Pose(pose))
+    return free
+
+
+def add_ground(scene: sapien.Scene, origin: Array) -> None:
+    """Add 2 x 2 m of table, its top at a point (3,)."""
+    ground = physx.PhysxRigidStaticComponent()
+    ground.attach(physx.PhysxCollisionShapeBox([1.0, 1.0, 0.05], physx.PhysxMaterial(*[TABLE_FRICTION] * 2, 0.0)))
+    add_component(scene, ground, sapien.Pose(origin - np.array([0, 0, 0.05])))
+
+
+def places(count: int) -> Array:
+    """Origins (N, 3) of objects that are simulated at once: a grid, four a row."""
+    origins = np.zeros((count, 3))
+    origins[:, 0], origins[:, 1] = np.arange(count) % 4 * SPACING, np.arange(count) // 4 * SPACING
+    return origins
+
+
+def cook(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeConvexMesh:
+    """The engine's shape of a convex hull of points (V, 3)."""
+    return physx.PhysxCollisionShapeConvexMesh(
+        vertices=np.asarray(vertices, np.float32), scale=[1, 1, 1], material=material
+    )
+
+
+def add_component(scene: sapien.Scene, component: physx.PhysxRigidBaseComponent, pose: sapien.Pose) -> None:
+    """Add a body at a pose."""
+    entity = sapien.Entity()
+    entity.add_component(component)
+    entity.set_pose(pose)
+    scene.add_entity(entity)
+
+
+def pose_matrix(body: physx.PhysxRigidBaseComponent) -> Array:
+    """Pose (4, 4) of a body in the world, double precision."""
+    return np.asarray(body.entity_pose.to_transformation_matrix(), float)
