@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from asset_tools.decompose import Decomposition, decompose, volume_iou
 from asset_tools.grasps import sample_grasps
-from asset_tools.quality.furniture import measure_furniture
-from asset_tools.quality.measure import measure_object
 from asset_tools.resting import resting_poses
 from asset_tools.sources import FurnitureSource, LinkSource, ObjectSource
 from asset_tools.visual import to_display, write_glb
@@ -51,6 +50,8 @@ def build_object(source: ObjectSource, folder: Path, *, hull_cache: Path | None 
 
 
 def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> ObjectAsset:
+    from asset_tools.quality.measure import measure_object
+
     folder.mkdir(parents=True, exist_ok=True)
     shift = -source.mesh.bounds.mean(axis=0)
     mesh, closed = source.mesh.copy(include_cache=True), source.closed.copy()
@@ -81,7 +82,9 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
     if grasps is None:
         grasps = sample_grasps(closed, center, np.random.default_rng(zlib.crc32(source.id.encode())), count=GRASPS)
     else:
-        grasps = grasps.moved(shift)
+        poses = grasps.tcp_in_object.copy()
+        poses[:, :3, 3] += shift
+        grasps = replace(grasps, tcp_in_object=poses)
     if len(grasps) < FEW_GRASPS:
         reason = f"only {len(grasps)} places where the gripper, open 0.08 m, fits around it and friction holds it"
     points, faces = trimesh.sample.sample_surface(closed, SURFACE_POINTS, seed=0)[:2]
@@ -121,6 +124,8 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
 
 def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
     """Make a piece of furniture's files in a folder and say what the manifest says of it."""
+    from asset_tools.quality.furniture import measure_furniture
+
     _write_body(source.mesh, source.pieces, folder)
     for link in source.links:
         _write_body(link.mesh, link.pieces, folder / LINKS / link.name)
@@ -131,7 +136,12 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
     body: dict[str, Any] = {}
     if source.mass is not None:
         center, inertia, axes = piece_inertia(source.pieces, source.mass)
-        body = {"mass": source.mass, "center_of_mass": _triple(center), "inertia": _triple(inertia), "inertia_wxyz": axes}
+        body = {
+            "mass": source.mass,
+            "center_of_mass": _triple(center),
+            "inertia": _triple(inertia),
+            "inertia_wxyz": axes,
+        }
     return FurnitureAsset(
         id=source.id,
         name=source.name,
@@ -219,7 +229,8 @@ def piece_inertia(
     pieces: list[np.ndarray], mass: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float, float, float]]:
     """Centre of mass (3,) m, principal moments (3,) kg m2 about it and their axes (wxyz) of convex pieces of even
-    density; what two pieces share counts twice."""
+    density; what two pieces share counts twice.
+    """
     hulls = [trimesh.convex.convex_hull(piece) for piece in pieces]
     volumes = np.array([hull.volume for hull in hulls])
     masses = mass * volumes / volumes.sum()

@@ -79,8 +79,7 @@ class Link(StrictModel):
 
 
 class Handle(StrictModel):
-    """Where a gripper takes hold of a moving part: the pose of the TCP (z approach, y closing) in the furniture's
-    frame with all joints at 0."""
+    """Where to take hold of a moving part: pose of the TCP (z approach, y closing), furniture's frame, joints at 0."""
 
     link: Name
     position: Vec3

@@ -266,7 +266,11 @@ def _damaged(path: Path, error: ValidationError) -> AssetError:
         if entry["loc"] == ("schema_version",):
             fix = "Make the pack again: run the import or build that made it."
             expected = f"pack format {SCHEMA_VERSION}"
-            return AssetError("this pack has another format", where=path, expected=expected, found=entry["input"], fix=fix)
+            return AssetError(
+                "this pack has another format", where=path, expected=expected, found=entry["input"], fix=fix
+            )
     first = error.errors()[0]
     found = f"at {'.'.join(map(str, first['loc'])) or 'the top'}"
-    return AssetError("the manifest is damaged", where=path, expected=first["msg"], found=found, fix="Make the pack again.")
+    return AssetError(
+        "the manifest is damaged", where=path, expected=first["msg"], found=found, fix="Make the pack again."
+    )

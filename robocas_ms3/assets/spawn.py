@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import sapien
 from mani_skill.envs.scene import ManiSkillScene
-from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs import Actor, Articulation
 
-from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject
+from robocas_ms3.assets.kinematics import joint_frame
+from robocas_ms3.assets.manifest import FurnitureAsset, Link, ObjectAsset
+from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Part, VisualLevel
 from robocas_ms3.errors import AssetError
 
 # Upstream's: linear and angular damping of every free body
@@ -23,47 +25,111 @@ def spawn(
     *,
     name: str,
     pose: sapien.Pose,
+    level: VisualLevel = "fast",
+    finishes: Mapping[str, str] | None = None,
     scene_idxs: Sequence[int] | None = None,
 ) -> Actor:
     """Build an asset as one actor: a free body if it has a mass, else a static one.
 
     Args:
         scene: the ManiSkill scene.
-        asset: what to build.
+        asset: what to build; has no moving parts.
         name: unique name of the actor.
         pose: initial pose of the asset's frame in the world.
+        level: of detail of what is rendered.
+        finishes: part -> finish, of rooms; parts not named get their default.
         scene_idxs: sub-scenes to build it in; none: all.
 
     Raises:
-        AssetError: the physics engine refused a hull.
+        AssetError: the physics engine refused a hull, or there is no such finish.
     """
     builder: Any = scene.create_actor_builder()
     facts = asset.asset
-    material = sapien.physx.PhysxMaterial(facts.friction, facts.friction, 0.0)
-    builder.add_multiple_convex_collisions_from_file(str(asset.hulls_path), material=material)
-    if scene.can_render():
-        builder.add_visual_from_file(str(asset.visual_path))
+    _add_shapes(builder, asset, facts.friction, level, render=scene.can_render())
+    if scene.can_render() and isinstance(asset, LoadedFurniture):
+        for part, known in asset.asset.finishes.items():
+            builder.add_visual_from_file(str(asset.finish(part, (finishes or {}).get(part, known[0]))))
     builder.initial_pose = pose
     if scene_idxs is not None:
         builder.set_scene_idxs(list(scene_idxs))
     if facts.mass is None:
         return builder.build_static(name)
-    if facts.inertia is None:
-        raise AssetError("a body with a mass needs its inertia too", where=facts.id)
-    axes = getattr(facts, "inertia_wxyz", (1.0, 0.0, 0.0, 0.0))
-    frame = sapien.Pose(list(facts.center_of_mass), list(axes))
-    builder.set_mass_and_inertia(facts.mass, frame, np.array(facts.inertia))
+    _set_mass(builder, facts)
     actor = builder.build_dynamic(name)
-    # ManiSkill's builder drops shapes that can't be cooked without a word
     for body in actor._bodies:
-        if len(body.collision_shapes) != len(asset.hulls):
-            raise AssetError(
-                "the physics engine refused a convex hull",
-                where=asset.hulls_path,
-                expected=f"{len(asset.hulls)} hulls",
-                found=len(body.collision_shapes),
-                fix="Import the asset again.",
-            )
+        _check_shapes(body, asset)
     actor.set_linear_damping(DAMPING)
     actor.set_angular_damping(DAMPING)
     return actor
+
+
+def spawn_articulation(
+    scene: ManiSkillScene,
+    asset: LoadedFurniture,
+    *,
+    name: str,
+    pose: sapien.Pose,
+    level: VisualLevel = "fast",
+    scene_idxs: Sequence[int] | None = None,
+) -> Articulation:
+    """Build furniture with moving parts, its body fixed in the world, its joints at 0. Arguments as in `spawn`.
+
+    Raises:
+        AssetError: the physics engine refused a hull.
+    """
+    builder: Any = scene.create_articulation_builder()
+    facts = asset.asset
+    root = builder.create_link_builder()
+    root.set_name("body")
+    root.set_joint_name("body")
+    root.set_joint_properties("fixed", [], sapien.Pose(), sapien.Pose())
+    _add_shapes(root, asset, facts.friction, level, render=scene.can_render())
+    made = {"": root}
+    for link in facts.links:
+        part = builder.create_link_builder(made[link.parent])
+        part.set_name(link.name)
+        part.set_joint_name(link.joint.name)
+        # all frames coincide with every joint at 0, so the joint is in the same place in both
+        frame = sapien.Pose(joint_frame(link.joint))
+        part.set_joint_properties(link.joint.kind, [link.joint.limits], frame, frame, damping=link.joint.damping)
+        _add_shapes(part, asset.links[link.name], facts.friction, level, render=scene.can_render())
+        _set_mass(part, link)
+        made[link.name] = part
+    builder.initial_pose = pose
+    if scene_idxs is not None:
+        builder.set_scene_idxs(list(scene_idxs))
+    articulation = builder.build(name)
+    frictions = {link.joint.name: link.joint.friction for link in facts.links}
+    for joint in articulation.active_joints:  # the builder drops what it is told of friction
+        joint.set_friction(frictions[joint.name])
+    parts: dict[str, Part] = {"body": asset, **asset.links}
+    for link in articulation.links:
+        for body in link._bodies:
+            _check_shapes(body, parts[link.name])
+    return articulation
+
+
+def _add_shapes(builder: Any, part: Part, friction: float, level: VisualLevel, *, render: bool) -> None:
+    material = sapien.physx.PhysxMaterial(friction, friction, 0.0)
+    builder.add_multiple_convex_collisions_from_file(str(part.hulls_path), material=material)
+    if render:
+        builder.add_visual_from_file(str(part.visual(level)))
+
+
+def _set_mass(builder: Any, facts: ObjectAsset | FurnitureAsset | Link) -> None:
+    if facts.inertia is None:
+        raise AssetError("a body with a mass needs its inertia too", where=getattr(facts, "id", ""))
+    frame = sapien.Pose(list(facts.center_of_mass), list(facts.inertia_wxyz))
+    builder.set_mass_and_inertia(facts.mass, frame, np.array(facts.inertia))
+
+
+def _check_shapes(body: Any, part: Part) -> None:
+    """ManiSkill's builder drops shapes that can't be cooked without a word."""
+    if len(body.collision_shapes) != len(part.hulls):
+        raise AssetError(
+            "the physics engine refused a convex hull",
+            where=part.hulls_path,
+            expected=f"{len(part.hulls)} hulls",
+            found=len(body.collision_shapes),
+            fix="Import the asset again.",
+        )

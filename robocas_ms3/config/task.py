@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StrictInt, model_validator
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -27,6 +27,7 @@ class RoomConfig(StrictModel):
     """The room: an asset of the furniture pack, standing at the world's origin."""
 
     asset: str
+    finishes: dict[str, str] = Field(default={}, description="part (wall, floor) -> finish; others: the default")
 
 
 class LightConfig(StrictModel):
@@ -39,14 +40,14 @@ class LightConfig(StrictModel):
 
 
 class FurnitureConfig(StrictModel):
-    """A piece of furniture and where it stands."""
+    """A piece of furniture and where its lowest point stands."""
 
     asset: str
     pose: PoseConfig
 
 
 class BasketConfig(FurnitureConfig):
-    """The container that objects go into; ``pose.position`` is where its bottom stands."""
+    """The container that objects go into."""
 
 
 class SurfaceConfig(StrictModel):
@@ -77,7 +78,9 @@ class ScatteredLayout(StrictModel):
 class ObjectsConfig(StrictModel):
     """Which objects are on the surface."""
 
-    ids: list[str] | Literal["all"] = Field(default="all", description="asset ids of the object pack")
+    ids: list[str | StrictInt] | Literal["all"] = Field(
+        default="all", description="asset ids of the object pack, or their numbers in GraspNet-1Billion"
+    )
     count: Annotated[int, Field(ge=1, le=64)] = 10
 
 

@@ -39,10 +39,10 @@ class PlanningScene:
     def __init__(self, env: RoboCASEnv) -> None:
         self.env = env
         config = env.task_config
-        pieces = [
-            transform(build.fixture_pose(item.pose), env.furniture_pack.furniture[item.asset].surface_points(SPACING))
-            for item in config.furniture.values()
-        ]
+        pieces = []
+        for item in config.furniture.values():
+            asset = env.furniture_pack.furniture[item.asset]
+            pieces.append(transform(build.furniture_pose(item, asset), asset.all_surface_points(spacing=SPACING)))
         self._fixed_in_world = np.concatenate(pieces)
 
     @property

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import sapien
 from mani_skill.envs.scene import ManiSkillScene
-from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs import Actor, Articulation
 
-from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
-from robocas_ms3.assets.spawn import spawn
-from robocas_ms3.config.task import BasketConfig, FurnitureConfig, PoseConfig, SurfaceConfig, TaskConfig
+from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack, VisualLevel
+from robocas_ms3.assets.spawn import spawn, spawn_articulation
+from robocas_ms3.config.task import FurnitureConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.scenes.placement import Placeable, Region, planar_pose, transform
 
@@ -21,7 +21,7 @@ class Fixtures:
     """What stays the same in all scenes of a configuration."""
 
     room: Actor
-    furniture: dict[str, Actor]
+    furniture: dict[str, Actor | Articulation]
     basket: Actor
 
 
@@ -30,10 +30,10 @@ def fixture_pose(config: PoseConfig) -> np.ndarray:
     return planar_pose(*config.position, np.deg2rad(config.yaw_deg))
 
 
-def basket_pose(config: BasketConfig, basket: LoadedFurniture) -> np.ndarray:
-    """4x4 of the basket's frame: the configuration says where its bottom stands."""
+def furniture_pose(config: FurnitureConfig, furniture: LoadedFurniture) -> np.ndarray:
+    """4x4 of a piece of furniture's frame: the configuration says where its lowest point stands."""
     pose = fixture_pose(config.pose)
-    pose[2, 3] += basket.asset.origin_height
+    pose[2, 3] += furniture.asset.origin_height
     return pose
 
 
@@ -42,31 +42,43 @@ def fixture_points(config: TaskConfig, pack: Pack) -> np.ndarray:
     pieces = []
     for name, item in config.furniture.items():
         asset = find_furniture(pack, item.asset, key=f"furniture.{name}.asset")
-        pieces.append(transform(fixture_pose(item.pose), asset.surface_points()))
+        pieces.append(transform(furniture_pose(item, asset), asset.all_surface_points()))
     basket = find_container(pack, config.basket)
-    return np.concatenate([*pieces, transform(basket_pose(config.basket, basket), basket.surface_points())])
+    return np.concatenate([*pieces, transform(furniture_pose(config.basket, basket), basket.surface_points())])
 
 
-def build_fixtures(scene: ManiSkillScene, config: TaskConfig, furniture_pack: Pack) -> Fixtures:
-    """Build room, furniture and basket into every sub-scene.
+def build_fixtures(
+    scene: ManiSkillScene, config: TaskConfig, furniture_pack: Pack, level: VisualLevel = "fast"
+) -> Fixtures:
+    """Build room, furniture and basket into every sub-scene; joints of furniture are closed.
 
     Raises:
         ConfigError: an asset is unknown or can't play its part.
     """
     room = find_furniture(furniture_pack, config.room.asset, key="room.asset")
-    actors = {}
+    for part, finish in config.room.finishes.items():
+        known = room.asset.finishes.get(part, ())
+        if finish not in known:
+            expected = f"one of {list(known)}" if known else f"a part among {sorted(room.asset.finishes)}"
+            raise ConfigError(f"room.finishes.{part}: no such finish", expected=expected, found=finish)
+    actors: dict[str, Actor | Articulation] = {}
     for name, item in config.furniture.items():
         asset = find_furniture(furniture_pack, item.asset, key=f"furniture.{name}.asset")
-        actors[name] = spawn(scene, asset, name=name, pose=sapien.Pose(fixture_pose(item.pose)))
+        build_one = spawn_articulation if asset.links else spawn
+        actors[name] = build_one(scene, asset, name=name, pose=sapien.Pose(furniture_pose(item, asset)), level=level)
     basket = find_container(furniture_pack, config.basket)
     return Fixtures(
-        room=spawn(scene, room, name="room", pose=sapien.Pose()),
+        room=spawn(scene, room, name="room", pose=sapien.Pose(), level=level, finishes=config.room.finishes),
         furniture=actors,
-        basket=spawn(scene, basket, name="basket", pose=sapien.Pose(basket_pose(config.basket, basket))),
+        basket=spawn(
+            scene, basket, name="basket", pose=sapien.Pose(furniture_pose(config.basket, basket)), level=level
+        ),
     )
 
 
-def build_object_slot(scene: ManiSkillScene, slot: int, assets: list[LoadedObject]) -> Actor:
+def build_object_slot(
+    scene: ManiSkillScene, slot: int, assets: list[LoadedObject], level: VisualLevel = "fast"
+) -> Actor:
     """Build one slot of objects: env i gets ``assets[i]``; the actors are merged into one batched view.
 
     Until the layout puts them in place they hang apart from each other, high above the room.
@@ -74,7 +86,14 @@ def build_object_slot(scene: ManiSkillScene, slot: int, assets: list[LoadedObjec
     name = f"object_{slot}"
     waiting = sapien.Pose([slot * 0.5, 0, 20.0])
     actors = [
-        spawn(scene, asset, name=f"{name}-env_{i}" if len(assets) > 1 else name, pose=waiting, scene_idxs=[i])
+        spawn(
+            scene,
+            asset,
+            name=f"{name}-env_{i}" if len(assets) > 1 else name,
+            pose=waiting,
+            level=level,
+            scene_idxs=[i],
+        )
         for i, asset in enumerate(assets)
     ]
     if len(actors) == 1:
@@ -114,17 +133,22 @@ def find_container(pack: Pack, config: FurnitureConfig) -> LoadedFurniture:
 
 
 def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
-    """Ids of the configuration's objects.
+    """Ids of the configuration's objects; it may name them by the numbers they have in GraspNet-1Billion.
 
     Raises:
         ConfigError: an id is not in the pack, or the pack has no objects.
     """
     known = sorted(pack.objects)
-    ids = known if config.objects.ids == "all" else list(config.objects.ids)
+    numbers = {
+        loaded.asset.graspnet_id: i for i, loaded in pack.objects.items() if loaded.asset.graspnet_id is not None
+    }
+    wanted = known if config.objects.ids == "all" else config.objects.ids
+    ids = [numbers.get(i, str(i)) if isinstance(i, int) else i for i in wanted]
     unknown = [i for i in ids if i not in pack.objects]
     if unknown:
+        expected = f"one of {known}" + (f", or a GraspNet number of {sorted(numbers)}" if numbers else "")
         raise ConfigError(
-            f"objects.ids: no such object in pack {pack.name!r}", expected=f"one of {known}", found=", ".join(unknown)
+            f"objects.ids: no such object in pack {pack.name!r}", expected=expected, found=", ".join(unknown)
         )
     if not ids:
         raise ConfigError(f"objects.ids: pack {pack.name!r} has no objects to choose from")

@@ -11,11 +11,11 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
-from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs import Actor, Articulation, Pose
 from mani_skill.utils.structs.types import SimConfig
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.assets.pack import LoadedObject, load_pack
+from robocas_ms3.assets.pack import LoadedObject, VisualLevel, load_pack
 from robocas_ms3.config import TaskConfig, load_task_config
 from robocas_ms3.errors import ConfigError, LayoutError
 from robocas_ms3.robots.constants import HAND_LINK
@@ -43,6 +43,7 @@ class RoboCASEnv(BaseEnv):
         config: name, path or content of a task configuration; default: the task's own.
         pack: name or folder of the pack that objects come from.
         furniture_pack: the same for room, furniture and basket.
+        visual_level: ``fast`` or ``full`` meshes to render.
         robot_uids: the robot; only RoboCAS's mobile Panda is supported.
         reconfiguration_freq: see ``BaseEnv``; default 1 for one env, 0 for several.
         kwargs: passed to ``BaseEnv``.
@@ -60,6 +61,7 @@ class RoboCASEnv(BaseEnv):
         config: str | Path | dict | TaskConfig | None = None,
         pack: str | Path = "builtin",
         furniture_pack: str | Path = "builtin",
+        visual_level: VisualLevel = "fast",
         robot_uids: str = "robocas_mobile_panda",
         num_envs: int = 1,
         reconfiguration_freq: int | None = None,
@@ -77,9 +79,10 @@ class RoboCASEnv(BaseEnv):
         self._object_ids = build.find_objects(self.object_pack, self.task_config)
         surface = self.task_config.surface
         support = self.task_config.furniture[surface.furniture]
-        self._support_in_world = build.fixture_pose(support.pose)
         furniture = build.find_furniture(self.furniture_pack, support.asset, key=f"furniture.{surface.furniture}.asset")
+        self._support_in_world = build.furniture_pose(support, furniture)
         self._region = build.find_region(surface, furniture)
+        self._visual_level: VisualLevel = visual_level
         self._fixture_points = build.fixture_points(self.task_config, self.furniture_pack)
         self._basket_asset = build.find_container(self.furniture_pack, self.task_config.basket)
         if reconfiguration_freq is None:
@@ -103,13 +106,15 @@ class RoboCASEnv(BaseEnv):
         super()._load_agent(options, sapien.Pose(build.fixture_pose(self.task_config.robot)))
 
     def _load_scene(self, options: dict) -> None:
-        self.fixtures = build.build_fixtures(self.scene, self.task_config, self.furniture_pack)
+        self.fixtures = build.build_fixtures(self.scene, self.task_config, self.furniture_pack, self._visual_level)
         count = self.task_config.objects.count
         draws = self._draw_seeds(torch.arange(self.num_envs))
         chosen = [choose_objects(np.random.default_rng([d, _OBJECTS]), self._object_ids, count) for d in draws]
         self.object_assets: list[list[LoadedObject]] = [[self.object_pack.objects[i] for i in ids] for ids in chosen]
         self.objects: list[Actor] = [
-            build.build_object_slot(self.scene, slot, [assets[slot] for assets in self.object_assets])
+            build.build_object_slot(
+                self.scene, slot, [assets[slot] for assets in self.object_assets], self._visual_level
+            )
             for slot in range(count)
         ]
         facts = [[asset.asset for asset in assets] for assets in self.object_assets]
@@ -137,7 +142,7 @@ class RoboCASEnv(BaseEnv):
         self.scene.add_directional_light([0, 0, -1], [lights.directional] * 3)
 
     def _basket_pose(self) -> np.ndarray:
-        return build.basket_pose(self.task_config.basket, self._basket_asset)
+        return build.furniture_pose(self.task_config.basket, self._basket_asset)
 
     def _draw_seeds(self, env_idx: torch.Tensor) -> list[int]:
         """Draw the seed of what follows for each env, from its own episode generator.
@@ -153,6 +158,10 @@ class RoboCASEnv(BaseEnv):
             rest = torch.as_tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32)
             self.agent.reset(rest.repeat(count, 1))
             self.agent.robot.set_pose(sapien.Pose(build.fixture_pose(self.task_config.robot)))
+            for furniture in self.fixtures.furniture.values():
+                if isinstance(furniture, Articulation):
+                    furniture.set_qpos(torch.zeros(count, furniture.max_dof))
+                    furniture.set_qvel(torch.zeros(count, furniture.max_dof))
             self.fixtures.basket.set_pose(Pose.create(sapien.Pose(self._basket_pose())))
             poses, targets = self._sample_layouts(env_idx)
             for slot, actor in enumerate(self.objects):
