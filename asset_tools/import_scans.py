@@ -1,22 +1,22 @@
-"""Import a folder of raw scans as an asset pack: one object a mesh file or subfolder."""
+"""Raw scans as assets: one object for each mesh file or subfolder of a folder."""
 
 from __future__ import annotations
 
 import re
-import shutil
 import unicodedata
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+import zlib
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 
 import trimesh
 from scipy.spatial import QhullError
 
-from asset_tools.build import ObjectSource, build_object, new_pack
-from asset_tools.repair import close
-from asset_tools.scan import FORMATS, METRES, Unit, Up, find_mesh, guess_unit, guess_up, load_scan, upright
+from asset_tools.build import build_object
+from asset_tools.pipeline import Job, content_hash
+from asset_tools.prepare import prepare
+from asset_tools.scan import FORMATS, Unit, Up, find_mesh, guess_units, longest_side
+from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
 from robocas_ms3.errors import AssetError
 
@@ -44,59 +44,26 @@ class ImportSettings:
     attribution: str = "unknown"
 
 
-@dataclass(frozen=True)
-class Imported:
-    """What became of one scan.
-
-    Attributes:
-        id: of the object.
-        asset: its entry in the manifest; none where it failed.
-        error: why it failed.
-        up: axis of the file that was taken for up.
-    """
-
-    id: str
-    asset: ObjectAsset | None
-    error: str = ""
-    up: str = ""
-
-
-def import_scans(
-    source: Path,
-    out: Path,
-    settings: ImportSettings,
-    *,
-    jobs: int = 2,
-    skip_bad: bool = False,
-    on_result: Callable[[Imported], None] = lambda result: None,
-) -> list[Imported]:
-    """Import every scan of a folder; the pack appears at ``out`` when all are done, or not at all.
-
-    Args:
-        source: folder with a mesh file or a subfolder for each object.
-        out: folder of the new pack; its name is the pack's.
-        settings: how the scans are read.
-        jobs: processes.
-        skip_bad: leave out scans that can't be imported, instead of giving up.
-        on_result: called after each scan.
+def scan_jobs(source: Path, settings: ImportSettings) -> list[Job]:
+    """What is to be made of a folder of scans.
 
     Raises:
-        AssetError: a scan can't be imported, naming it and why; or there are none.
+        AssetError: there are none, or their unit can't be guessed.
     """
     scans = find_scans(source)
-    units = settings.units or guess_unit([longest_side(path) for path in scans.values()])
-    results = []
-    with new_pack(out, name=out.name, description=f"{len(scans)} scans") as pack:
-        for result in _run([(id_, path, pack.folder, settings, units) for id_, path in scans.items()], jobs):
-            if result.asset is None and not skip_bad:
-                raise AssetError(result.error, fix="Mend it, or pass --skip-bad to leave it out.")
-            if result.asset is not None:
-                pack.add(result.asset)
-            results.append(result)
-            on_result(result)
-        if not pack.assets:
-            raise AssetError("none of the scans could be imported", where=source)
-    return results
+    units: dict[str, Unit] = dict.fromkeys(scans, settings.units) if settings.units else {}
+    units = units or guess_units({id_: longest_side(path) for id_, path in scans.items()})
+    unknown = sorted(set(settings.masses) - set(scans))
+    if unknown:
+        expected = f"ids among {', '.join(scans)}"
+        raise AssetError("masses are given for scans that are not there", expected=expected, found=", ".join(unknown))
+    jobs = []
+    for id_, path in scans.items():
+        job = partial(_make, id_, path, units[id_], settings)
+        mass = settings.masses.get(id_)
+        facts = (id_, units[id_], settings.up, mass, settings.licence, settings.attribution)
+        jobs.append(Job(id_, job, content_hash(*facts, files=scan_files(path))))
+    return jobs
 
 
 def find_scans(source: Path) -> dict[str, Path]:
@@ -120,15 +87,16 @@ def find_scans(source: Path) -> dict[str, Path]:
     return scans
 
 
+def scan_files(mesh: Path) -> list[Path]:
+    """The files that a scan may be made of: the mesh, and what lies beside it that is no other mesh."""
+    beside = (path for path in mesh.parent.rglob("*") if path.is_file() and path.suffix.lower() not in FORMATS)
+    return [mesh, *sorted(beside)]
+
+
 def object_id(name: str) -> str:
-    """A name as an id: small letters, digits and underscores."""
+    """A name as an id: small letters, digits and underscores; one that has none of these gets a number."""
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
-    return re.sub(r"[^a-z0-9]+", "_", plain.lower()).strip("_") or "object"
-
-
-def longest_side(path: Path) -> float:
-    """Longest side of a mesh's bounding box, in its unit."""
-    return float(load_scan(path).extents.max())
+    return re.sub(r"[^a-z0-9]+", "_", plain.lower()).strip("_") or f"object_{zlib.crc32(name.encode()):08x}"
 
 
 def estimate_mass(closed: trimesh.Trimesh) -> float:
@@ -136,41 +104,21 @@ def estimate_mass(closed: trimesh.Trimesh) -> float:
     return round(min(max(DENSITY * float(closed.volume), MASS_RANGE[0]), MASS_RANGE[1]), 4)
 
 
-def _run(tasks: list[tuple], jobs: int) -> Iterator[Imported]:
-    if jobs <= 1:
-        yield from (_import_one(*task) for task in tasks)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        futures = [pool.submit(_import_one, *task) for task in tasks]
-        try:
-            yield from (future.result() for future in futures)
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _import_one(id_: str, path: Path, parent: Path, settings: ImportSettings, units: Unit) -> Imported:
+def _make(id_: str, path: Path, unit: Unit, settings: ImportSettings, folder: Path) -> ObjectAsset:
     try:
-        scan = load_scan(path)
-        up: Up = settings.up or guess_up(scan, path.suffix)
-        mesh = upright(scan, up)
-        mesh.apply_scale(METRES[units])
-        solid = close(mesh)
+        scan = prepare(path, up=settings.up, unit=unit)
         source = ObjectSource(
             id=id_,
             name=id_.replace("_", " "),
             category="scan",
-            mesh=mesh,
-            closed=solid.mesh,
-            mass=settings.masses.get(id_) or estimate_mass(solid.mesh),
+            mesh=scan.mesh,
+            closed=scan.closed,
+            mass=settings.masses.get(id_) or estimate_mass(scan.closed),
             source="scan",
             licence=settings.licence,
             attribution=settings.attribution,
-            repairs=solid.repairs,
+            repairs=scan.repairs,
         )
-        return Imported(id_, build_object(source, parent / id_), up=up)
-    except (AssetError, QhullError) as error:
-        if isinstance(error, QhullError):
-            error = AssetError("the scan is flat or has too few points", where=path, expected="a closed body")
-        shutil.rmtree(parent / id_, ignore_errors=True)
-        message = str(error)
-        return Imported(id_, None, message if id_ in message or str(path) in message else f"{id_}: {message}")
+        return build_object(source, folder)
+    except QhullError as error:
+        raise AssetError("the scan is flat or has too few points", where=path, expected="a closed body") from error

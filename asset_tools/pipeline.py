@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,8 +19,9 @@ from pydantic import TypeAdapter, ValidationError
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, Asset, FurnitureAsset, ObjectAsset
 from robocas_ms3.assets.pack import sha256
 from robocas_ms3.errors import AssetError, RobocasError
-from robocas_ms3.files import replacing_folder
+from robocas_ms3.files import replacing_folder, write_json
 
+MADE_FROM = "made_from.json"  # of a pack: asset id -> hash of what it was made from
 ENTRY = "asset.json"  # what the manifest says of a kept asset; written last
 KEPT_DAYS = 60  # an asset that wasn't asked for in this time is made again
 TOOLS = ("coacd", "trimesh", "manifold3d", "numpy", "scipy", "sapien", "xatlas", "fast-simplification", "embreex")
@@ -170,6 +172,7 @@ def write_pack(
     description: str = "",
     processes: int = 1,
     skip_bad: bool = False,
+    record: bool = True,
     on_made: Callable[[Made], None] = lambda made: None,
 ) -> list[Made]:
     """Make a pack of assets: it appears at ``folder`` when all are done, or not at all.
@@ -181,6 +184,7 @@ def write_pack(
         description: for the manifest.
         processes: how many to make at a time.
         skip_bad: leave out assets that can't be made, instead of giving up.
+        record: write down what each asset was made from, for `up_to_date`.
         on_made: called after each asset.
 
     Raises:
@@ -199,4 +203,15 @@ def write_pack(
             on_made(made)
         if not pack.assets:
             raise AssetError("none of the assets could be made", where=folder)
+        if record:
+            write_json(pack.folder / MADE_FROM, {job.id: job.content for job in jobs})
     return results
+
+
+def up_to_date(jobs: Sequence[Job], folder: Path) -> bool:
+    """Whether a pack was made of just these assets, by this code."""
+    try:
+        found = json.loads((folder / MADE_FROM).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return found == {job.id: job.content for job in jobs}

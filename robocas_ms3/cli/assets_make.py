@@ -1,0 +1,218 @@
+"""``robocas assets build`` and ``robocas assets import-...``: make packs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from asset_tools.pipeline import Job
+
+
+@dataclass(kw_only=True)
+class _Making:
+    jobs: int | None = None
+    """Processes. Default: one for each CPU core."""
+    skip_bad: bool = False
+    """Leave out what can't be made, instead of giving up."""
+    overwrite: bool = False
+    """Replace the pack if it exists and was made from something else."""
+
+
+@dataclass(kw_only=True)
+class ImportScans(_Making):
+    """Make a pack from a folder of raw scans: one object for each mesh file or subfolder.
+
+    Each scan is mended, closed, decomposed into convex hulls, decimated for rendering, and annotated with resting
+    poses and grasps; then it is dropped, grasped and shaken in simulation, and the outcome stored. Finished objects
+    are kept, so an interrupted import goes on where it stopped.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional]
+    """Folder of the scans (OBJ, GLB, PLY, STL, ...)."""
+    pack: str
+    """Name of the new pack."""
+    units: Literal["m", "cm", "mm", "inch"] | None = None
+    """Unit of the files. Default: guessed from the sizes of all of them."""
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    """Axis that points up in the files. Default: guessed for each."""
+    masses: Path | None = None
+    """YAML file with masses in kg by object id. Default: estimated from the volume."""
+    licence: str = "unknown"
+    """Licence of the scans, for the manifest."""
+    attribution: str = "unknown"
+    """Whom to name, for the manifest."""
+
+
+@dataclass(kw_only=True)
+class ImportGraspNet(_Making):
+    """Make a pack from GraspNet-1Billion as downloaded: models/ and, if there, grasp_label/.
+
+    Objects get the ids that the builtin pack uses for their stand-ins, so that a task configuration runs on either.
+    """
+
+    root: Annotated[Path, tyro.conf.Positional]
+    """GraspNet's folder, with models/NNN/textured.obj and grasp_label/NNN_labels.npz."""
+    pack: str = "graspnet"
+    """Name of the new pack."""
+    ids: tuple[int, ...] = ()
+    """GraspNet's numbers. Default: RoboCAS's 46."""
+
+
+@dataclass(kw_only=True)
+class ImportYCB(_Making):
+    """Make a pack from the YCB objects that ManiSkill downloads (python -m mani_skill.utils.download_asset ycb)."""
+
+    root: Annotated[Path | None, tyro.conf.Positional] = None
+    """ManiSkill's YCB folder. Default: where ManiSkill puts it."""
+    pack: str = "ycb"
+    """Name of the new pack."""
+    ids: tuple[str, ...] = ()
+    """Names such as 005_tomato_soup_can. Default: all."""
+
+
+@dataclass(kw_only=True)
+class ImportPartNet(_Making):
+    """Make a pack of furniture from PartNet-Mobility models."""
+
+    models: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of models, each with a mobility.urdf."""
+    pack: str = "partnet"
+    """Name of the new pack."""
+    annotations: Path | None = None
+    """Folder with <id>.yaml for models that none is shipped for."""
+
+
+@dataclass(kw_only=True)
+class Build:
+    """Make the builtin pack anew from its formulas (for people who work on it)."""
+
+    out: Path | None = None
+    """Its folder. Default: where the package has it."""
+    ids: tuple[str, ...] = ()
+    """Only these assets. Default: all."""
+    jobs: int | None = None
+    """Processes. Default: one for each CPU core."""
+
+
+def import_scans(command: ImportScans) -> int:
+    """Run ``import-scans``."""
+    with _tools():
+        from asset_tools.import_scans import ImportSettings, scan_jobs
+    masses = _masses(command.masses)
+    settings = ImportSettings(command.units, command.up, masses, command.licence, command.attribution)
+    return _make(scan_jobs(command.source, settings), command, command.pack, "scans")
+
+
+def import_graspnet(command: ImportGraspNet) -> int:
+    """Run ``import-graspnet``."""
+    with _tools():
+        from asset_tools.graspnet.importer import graspnet_jobs
+    return _make(graspnet_jobs(command.root, command.ids), command, command.pack, "GraspNet objects")
+
+
+def import_ycb(command: ImportYCB) -> int:
+    """Run ``import-ycb``."""
+    with _tools():
+        from asset_tools.import_ycb import ycb_jobs
+    return _make(ycb_jobs(command.root, command.ids), command, command.pack, "YCB objects")
+
+
+def import_partnet(command: ImportPartNet) -> int:
+    """Run ``import-partnet``."""
+    with _tools():
+        from asset_tools.partnet.importer import partnet_jobs
+    return _make(partnet_jobs(command.models, command.annotations), command, command.pack, "PartNet models")
+
+
+def build(command: Build) -> int:
+    """Run ``build``."""
+    with _tools():
+        from asset_tools.builtin.build import DESCRIPTION, NAME, builtin_jobs
+    from robocas_ms3.paths import builtin_packs_dir
+
+    out = command.out or builtin_packs_dir() / NAME
+    making = _Making(jobs=command.jobs, overwrite=True)
+    return _write(builtin_jobs(command.ids), making, out, DESCRIPTION, record=False)
+
+
+def _make(jobs: list[Job], command: _Making, name: str, what: str) -> int:
+    from rich.console import Console
+
+    from asset_tools.pipeline import up_to_date
+    from robocas_ms3.errors import OutputExistsError
+    from robocas_ms3.paths import data_dir
+
+    out = data_dir() / "packs" / name
+    if out.exists() and up_to_date(jobs, out):
+        Console(highlight=False, soft_wrap=True).print(f"{out} is made of just this already")
+        return 0
+    if out.exists() and not command.overwrite:
+        fix = "Pass --overwrite to replace it, or choose another name with --pack."
+        raise OutputExistsError("there is such a pack already, made from something else", where=out, fix=fix)
+    return _write(jobs, command, out, f"{len(jobs)} {what}")
+
+
+def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, record: bool = True) -> int:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from asset_tools.pipeline import Made, write_pack
+    from robocas_ms3.cli.assets_show import Info, info
+    from robocas_ms3.paths import cache_dir
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    console = Console(highlight=False, soft_wrap=True)
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        bar = progress.add_task(out.name, total=len(jobs))
+
+        def on_made(made: Made) -> None:
+            progress.advance(bar)
+            if made.asset is None:
+                progress.console.print(f"left out: {made.error}", highlight=False)
+
+        write_pack(
+            jobs,
+            out,
+            cache_dir() / "assets",
+            description=description,
+            processes=command.jobs or os.cpu_count() or 1,
+            skip_bad=command.skip_bad,
+            record=record,
+            on_made=on_made,
+        )
+    info(Info(pack=str(out)))
+    console.print(f"wrote {out}")
+    return 0
+
+
+def _masses(path: Path | None) -> dict[str, float]:
+    import yaml
+
+    from robocas_ms3.errors import AssetError
+
+    if path is None:
+        return {}
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return {str(key): float(value) for key, value in data.items()}
+    except (OSError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
+        raise AssetError("can't read the masses", where=path, expected="a YAML mapping: object id: kg") from error
+
+
+@contextmanager
+def _tools() -> Iterator[None]:
+    """Say which extra to install where the mesh tools are missing."""
+    from robocas_ms3.errors import MissingExtraError
+
+    try:
+        yield
+    except ImportError as error:
+        what, fix = "mesh tools are not installed", "pip install 'robocas-ms3[assets]'"
+        raise MissingExtraError(what, found=error.name or error, fix=fix) from error

@@ -1,0 +1,141 @@
+"""``robocas assets list | info | verify | sheet``: look at packs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from robocas_ms3.assets.pack import Pack
+
+
+@dataclass
+class ListPacks:
+    """List the asset packs that are there."""
+
+
+@dataclass
+class Info:
+    """Show what is in a pack: size, mass, hulls, grasps, repairs."""
+
+    pack: Annotated[str, tyro.conf.Positional]
+    """Its name, or its folder."""
+
+
+@dataclass
+class Verify:
+    """Check every file of a pack against its manifest, and with --physics every asset in simulation."""
+
+    pack: Annotated[str, tyro.conf.Positional]
+    """Its name, or its folder."""
+    physics: bool = False
+    """Drop, grasp and shake every object, move every joint, and print the table of quality."""
+    json: Path | None = None
+    """With --physics: write the table here too."""
+
+
+@dataclass
+class Sheet:
+    """Draw a contact sheet of a pack: looks, hulls, stable poses, best grasps."""
+
+    pack: Annotated[str, tyro.conf.Positional]
+    """Its name, or its folder."""
+    out: Path | None = None
+    """PNG to write. Default: <pack>.png here."""
+    ids: tuple[str, ...] = ()
+    """Only these assets. Default: all."""
+
+
+def list_packs(command: ListPacks) -> int:
+    """Run ``list``; a pack that can't be read is listed with the reason."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from robocas_ms3.assets.pack import load_pack, pack_folders
+    from robocas_ms3.errors import AssetError
+
+    table = Table("pack", "objects", "furniture", "folder")
+    for name, folder in pack_folders().items():
+        try:
+            pack = load_pack(name)
+            table.add_row(name, str(len(pack.objects)), str(len(pack.furniture)), str(folder))
+        except AssetError as error:
+            table.add_row(name, "-", "-", f"[red]{error}[/red]")
+    Console().print(table)
+    return 0
+
+
+def info(command: Info) -> int:
+    """Run ``info``."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from robocas_ms3.assets.pack import load_pack
+
+    pack = load_pack(command.pack)
+    console = Console()
+    if pack.objects:
+        table = Table("object", "size (mm)", "mass (g)", "hulls", "overlap", "resting poses", "grasps", "repairs")
+        for loaded in pack.objects.values():
+            asset = loaded.asset
+            table.add_row(
+                asset.id,
+                " x ".join(f"{1000 * side:.0f}" for side in asset.extents),
+                f"{1000 * asset.mass:.0f}",
+                str(asset.quality.hull_count),
+                f"{asset.quality.volume_iou:.3f}",
+                str(len(loaded.annotations.resting_poses)),
+                str(asset.grasp_count),
+                "; ".join(asset.repairs),
+            )
+        console.print(table)
+    if pack.furniture:
+        table = Table("furniture", "size (mm)", "surfaces", "joints", "handles", "finishes")
+        for loaded in pack.furniture.values():
+            asset = loaded.asset
+            table.add_row(
+                asset.id,
+                " x ".join(f"{1000 * side:.0f}" for side in asset.extents),
+                ", ".join(asset.surfaces),
+                ", ".join(f"{link.joint.name} ({link.joint.kind})" for link in asset.links),
+                ", ".join(asset.handles),
+                "; ".join(f"{part}: {', '.join(names)}" for part, names in asset.finishes.items()),
+            )
+        console.print(table)
+    return 0
+
+
+def verify(command: Verify) -> int:
+    """Run ``verify``; 1 where an asset falls short of what is asked of packs."""
+    from rich.console import Console
+
+    from robocas_ms3.assets.pack import load_pack
+
+    pack = load_pack(command.pack)
+    for loaded in pack.objects.values():
+        _ = loaded.hulls, loaded.annotations
+    for loaded in pack.furniture.values():
+        _ = loaded.hulls, [part.hulls for part in loaded.links.values()]
+    Console(highlight=False).print(f"{pack.name}: {len(pack.manifest.assets)} assets, every file is as it should be")
+    return _verify_physics(pack, command.json) if command.physics else 0
+
+
+def sheet(command: Sheet) -> int:
+    """Run ``sheet``."""
+    from asset_tools.sheet import contact_sheet
+    from rich.console import Console
+
+    from robocas_ms3.assets.pack import load_pack
+
+    pack = load_pack(command.pack)
+    out = command.out or Path(f"{pack.name}.png")
+    contact_sheet(pack, out, ids=command.ids or None)
+    Console(highlight=False, soft_wrap=True).print(f"wrote {out}")
+    return 0
+
+
+def _verify_physics(pack: Pack, out: Path | None) -> int:
+    raise NotImplementedError
