@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from robocas_ms3.errors import OutputExistsError, RobocasError
+
+ABANDONED = 86400.0  # s without a change: what a killed run left
 
 
 @contextmanager
@@ -38,6 +42,9 @@ def replacing_folder(path: Path | str) -> Iterator[Path]:
     """Yield a fresh folder beside ``path``; on success it becomes ``path`` (an older one goes), else it is removed."""
     path = Path(path)
     make_folder(path.parent)
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+        if time.time() - leftover.stat().st_mtime > ABANDONED:
+            shutil.rmtree(leftover, ignore_errors=True)
     tmp = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
     tmp.chmod(0o755)
     try:

@@ -1,3 +1,5 @@
+import os
+
 import pytest
 
 from robocas_ms3.errors import OutputExistsError, RobocasError
@@ -44,3 +46,14 @@ def test_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path):
     with pytest.raises(RobocasError, match="can't make this folder") as error:
         make_folder(tmp_path / "file" / "sub")
     assert "\n" not in str(error.value)
+
+
+def test_what_a_killed_run_left_is_swept_up_a_day_later(tmp_path):
+    old, young, other = (tmp_path / name for name in (".pack.a.tmp", ".pack.b.tmp", ".spack.c.tmp"))
+    for folder in (old, young, other):
+        folder.mkdir()
+    os.utime(old, (0, 0))
+    os.utime(other, (0, 0))
+    with replacing_folder(tmp_path / "pack"):
+        pass
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".pack.b.tmp", ".spack.c.tmp", "pack"]

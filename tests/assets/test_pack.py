@@ -4,11 +4,25 @@ import os
 import numpy as np
 import pytest
 
+from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.hulls import write_hulls
-from robocas_ms3.assets.manifest import ObjectAsset, PackManifest
-from robocas_ms3.assets.pack import Annotations, available_packs, load_pack, sha256
+from robocas_ms3.assets.manifest import ObjectAsset, ObjectQuality, PackManifest
+from robocas_ms3.assets.pack import available_packs, load_pack, sha256
 from robocas_ms3.errors import AssetError
 
+QUALITY = ObjectQuality(
+    compact=True,
+    hull_count=1,
+    hull_vertices=8,
+    volume_iou=1.0,
+    surface_p95=0.0,
+    rest_share=1.0,
+    rest_time=0.1,
+    penetration=0.0,
+    jitter=0.0,
+    grasps_tried=1,
+    grasps_held=1.0,
+)
 BOX = np.array([[x, y, z] for x in (-0.05, 0.05) for y in (-0.03, 0.03) for z in (-0.02, 0.02)])
 
 
@@ -19,6 +33,7 @@ def notes(**changes):
     on_end[2, 3] = 0.05
     values = {
         "resting_poses": np.stack([upright, on_end]),
+        "footprints": footprints([BOX], np.stack([upright, on_end])),
         "resting_probabilities": np.array([0.7, 0.3]),
         "display_pose": 0,
         "grasps_tcp_in_object": np.eye(4)[None],
@@ -37,8 +52,9 @@ def box_pack(tmp_path):
     folder.mkdir(parents=True)
     write_hulls(folder / "hulls.obj", [BOX])
     notes().save(folder / "annotations.npz")
-    (folder / "visual.glb").write_bytes(b"glTF")
-    names = ("hulls.obj", "annotations.npz", "visual.glb")
+    for name in ("visual_fast.glb", "visual_full.glb"):
+        (folder / name).write_bytes(b"glTF")
+    names = ("hulls.obj", "annotations.npz", "visual_fast.glb", "visual_full.glb")
     asset = ObjectAsset(
         id="box",
         name="box",
@@ -50,9 +66,9 @@ def box_pack(tmp_path):
         mass=0.1,
         center_of_mass=(0, 0, 0),
         inertia=(1e-5, 1e-5, 1e-5),
-        hull_count=1,
-        volume_iou=1.0,
         grasp_count=1,
+        no_grasps_because="one is enough here",
+        quality=QUALITY,
         files={name: sha256(folder / name) for name in names},
     )
     (root / "manifest.json").write_text(PackManifest(name="boxes", assets=[asset]).model_dump_json())
@@ -70,8 +86,8 @@ def test_a_pack_is_found_by_name_and_by_path(box_pack, monkeypatch):
 def test_geometry_of_an_object(box_pack):
     box = load_pack(box_pack).objects["box"]
     assert [len(hull) for hull in box.hulls] == [8]
-    np.testing.assert_allclose(np.ptp(box.footprint(0), axis=0), [0.1, 0.06], atol=1e-6)
-    np.testing.assert_allclose(np.ptp(box.footprint(1), axis=0), [0.04, 0.06], atol=1e-6)
+    np.testing.assert_allclose(np.ptp(box.annotations.footprint(0), axis=0), [0.1, 0.06], atol=1e-6)
+    np.testing.assert_allclose(np.ptp(box.annotations.footprint(1), axis=0), [0.04, 0.06], atol=1e-6)
     points = box.surface_points(0.01)
     assert points is box.surface_points(0.01)
     np.testing.assert_allclose(np.abs(points).max(axis=0), [0.05, 0.03, 0.02], atol=1e-6)
@@ -106,6 +122,22 @@ def test_a_damaged_manifest_says_where(box_pack):
         load_pack(box_pack)
 
 
+def test_a_pack_of_another_format_says_so(box_pack):
+    path = box_pack / "manifest.json"
+    path.write_text(path.read_text().replace('"schema_version":2', '"schema_version":1'))
+    with pytest.raises(AssetError, match=r"another format \(expected pack format 2, found 1\).*Make the pack again"):
+        load_pack(box_pack)
+
+
+def test_a_footprint_has_each_corner_once():
+    slab = np.array([[x, y, z] for x, y in ((0.03, 0), (-0.02, 0.02), (-0.02, -0.02)) for z in (-0.01, 0.01)])
+    poses = np.stack([np.eye(4), np.eye(4)])
+    poses[1, :3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # on its edge: a rectangle of 0.02 x 0.04
+    found = notes(resting_poses=poses, footprints=footprints([slab], poses))
+    assert len(found.footprint(0)) == 3 and len(found.footprint(1)) == 4
+    np.testing.assert_allclose(np.ptp(found.footprint(1), axis=0), [0.02, 0.04])
+
+
 def test_a_manifest_that_forgets_a_file(box_pack):
     path = box_pack / "manifest.json"
     data = json.loads(path.read_text())
@@ -132,7 +164,7 @@ def test_unchanged_files_are_hashed_once(box_pack, monkeypatch):
     load_pack(box_pack)
     monkeypatch.setattr("hashlib.sha256", lambda: pytest.fail("read a file again"))
     load_pack(box_pack)
-    path = box_pack / "box" / "visual.glb"
+    path = box_pack / "box" / "visual_fast.glb"
     os.utime(path, ns=(1, 1))
     with pytest.raises(pytest.fail.Exception):
         load_pack(box_pack)

@@ -1,0 +1,144 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import pytest
+
+from asset_tools.pipeline import Job, content_hash, make_assets, up_to_date, write_pack
+from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality
+from robocas_ms3.assets.pack import HULLS, VISUALS, load_pack, sha256
+from robocas_ms3.errors import AssetError
+
+
+def make(id_, folder, log, fail="", seconds=0.0):
+    """An asset of four small files; says in a log that it was made."""
+    with log.open("a") as file:
+        file.write(f"{id_}\n")
+    time.sleep(seconds)
+    if fail:
+        raise AssetError(fail)
+    for name in (*VISUALS.values(), HULLS):
+        (folder / name).write_text(f"v 0 0 0\n# {id_} {name}")
+    return FurnitureAsset(
+        id=id_,
+        name=id_,
+        category="test",
+        source="test",
+        licence="MIT",
+        attribution="none",
+        extents=(1, 1, 1),
+        files={path.name: sha256(path) for path in folder.iterdir()},
+        quality=FurnitureQuality(hull_count=1, hull_vertices=8),
+    )
+
+
+def jobs(log, **contents):
+    return [Job(id_, partial(make, id_, log=log), content) for id_, content in contents.items()]
+
+
+def made_in(log):
+    return log.read_text().split() if log.exists() else []
+
+
+def test_what_was_made_is_not_made_again(tmp_path):
+    log, kept = tmp_path / "log", tmp_path / "kept"
+    write_pack(jobs(log, a="1" * 64, b="2" * 64), tmp_path / "first", kept)
+    results = write_pack(jobs(log, a="1" * 64, b="3" * 64), tmp_path / "second", kept)
+    assert made_in(log) == ["a", "b", "b"]
+    assert {result.id: result.reused for result in results} == {"a": True, "b": False}
+    assert load_pack(tmp_path / "second").furniture.keys() == {"a", "b"}
+    first, second = (tmp_path / name / "a" / HULLS for name in ("first", "second"))
+    assert first.read_bytes() == second.read_bytes()
+    assert not (tmp_path / "second" / "a" / "asset.json").exists()
+
+
+def test_a_kept_asset_that_was_damaged_is_made_again(tmp_path):
+    log, kept = tmp_path / "log", tmp_path / "kept"
+    write_pack(jobs(log, a="1" * 64), tmp_path / "pack", kept)
+    (hulls,) = kept.glob(f"*/{HULLS}")
+    hulls.write_text("v 0 0")
+    write_pack(jobs(log, a="1" * 64), tmp_path / "pack", kept)
+    assert made_in(log) == ["a", "a"]
+    load_pack(tmp_path / "pack")
+
+
+def test_up_to_date_knows_what_a_pack_was_made_from(tmp_path):
+    log = tmp_path / "log"
+    assert not up_to_date(jobs(log, a="1" * 64), tmp_path / "pack")
+    write_pack(jobs(log, a="1" * 64), tmp_path / "pack", tmp_path / "kept")
+    assert up_to_date(jobs(log, a="1" * 64), tmp_path / "pack")
+    assert not up_to_date(jobs(log, a="2" * 64), tmp_path / "pack")
+    assert not up_to_date(jobs(log, a="1" * 64, b="1" * 64), tmp_path / "pack")
+
+
+def test_a_failure_names_the_asset_leaves_no_pack_and_loses_nothing(tmp_path):
+    log, kept = tmp_path / "log", tmp_path / "kept"
+    bad = Job("bad", partial(make, "bad", log=log, fail="it has no faces"), "9" * 64)
+    todo = [*jobs(log, a="1" * 64), bad]
+    with pytest.raises(AssetError, match="bad: it has no faces"):
+        write_pack(todo, tmp_path / "pack", kept)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["kept", "log"]
+    assert [path.name for path in kept.iterdir()] == ["a-" + "1" * 20]
+    results = write_pack(todo, tmp_path / "pack", kept, skip_bad=True)
+    assert [result.id for result in results if result.asset is None] == ["bad"]
+    assert made_in(log) == ["a", "bad", "bad"]
+    with pytest.raises(AssetError, match="none of the assets could be made"):
+        write_pack([bad], tmp_path / "none", kept, skip_bad=True)
+
+
+def test_content_counts_files_settings_and_code(tmp_path):
+    path = tmp_path / "mesh.obj"
+    path.write_text("v 0 0 0")
+    first = content_hash("m", files=[path])
+    assert first == content_hash("m", files=[path])
+    assert first != content_hash("cm", files=[path])
+    assert first != content_hash("m", files=[path], packages=["builtin"])
+    path.write_text("v 0 0 1")
+    assert first != content_hash("m", files=[path])
+
+
+def test_assets_not_asked_for_in_months_are_forgotten(tmp_path):
+    log, kept = tmp_path / "log", tmp_path / "kept"
+    (tmp_path / "one").mkdir()
+    list(make_assets(jobs(log, a="1" * 64), tmp_path / "one", kept))
+    (place,) = kept.iterdir()
+    os.utime(place, (0, 0))
+    list(make_assets([], tmp_path / "one", kept))
+    assert not place.exists()
+
+
+SCRIPT = """
+import sys
+from functools import partial
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from test_pipeline import make
+from asset_tools.pipeline import Job, write_pack
+if __name__ == "__main__":
+    root = Path({root!r})
+    make_one = partial(make, log=root / "log", seconds=0.3)
+    todo = [Job(f"asset_{{i}}", partial(make_one, f"asset_{{i}}"), str(i) * 64) for i in range(8)]
+    write_pack(todo, root / "pack", root / "kept", processes=2)
+"""
+
+
+def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
+    script = tmp_path / "run.py"
+    script.write_text(SCRIPT.format(tests=os.path.dirname(__file__), root=str(tmp_path)))
+    run = subprocess.Popen([sys.executable, script], start_new_session=True)
+    while len(list((tmp_path / "kept").glob("asset_*/asset.json"))) < 3:
+        time.sleep(0.02)
+        assert run.poll() is None
+    os.killpg(run.pid, signal.SIGKILL)
+    run.wait()
+    assert not (tmp_path / "pack").exists()
+    finished = len(list((tmp_path / "kept").glob("asset_*/asset.json")))
+    before = len(made_in(tmp_path / "log"))
+    assert subprocess.run([sys.executable, script], check=False).returncode == 0
+    assert len(load_pack(tmp_path / "pack").furniture) == 8
+    assert len(made_in(tmp_path / "log")) - before == 8 - finished
+    assert len(json.loads((tmp_path / "pack" / "made_from.json").read_text())) == 8
