@@ -1,10 +1,8 @@
-"""From what an asset is made from to its finished files: display meshes, hulls, annotations, mass properties, quality."""
+"""From an asset's source to its finished files: display meshes, hulls, annotations, mass properties, quality."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,10 +18,9 @@ from asset_tools.sources import FurnitureSource, LinkSource, ObjectSource
 from asset_tools.visual import to_display, write_glb
 from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.hulls import read_hulls, write_hulls
-from robocas_ms3.assets.manifest import FurnitureAsset, Link, ObjectAsset, PackManifest
-from robocas_ms3.assets.pack import ANNOTATIONS, FINISHES, HULLS, LINKS, MANIFEST, VISUALS, sha256
+from robocas_ms3.assets.manifest import FurnitureAsset, Link, ObjectAsset
+from robocas_ms3.assets.pack import ANNOTATIONS, FINISHES, HULLS, LINKS, VISUALS, sha256
 from robocas_ms3.errors import AssetError
-from robocas_ms3.files import replacing_folder
 from robocas_ms3.paths import cache_dir
 
 SURFACE_POINTS = 1024
@@ -192,34 +189,6 @@ def _link(link: LinkSource) -> Link:
     )
 
 
-@contextmanager
-def new_pack(folder: Path, *, name: str, description: str = "") -> Iterator[PackWriter]:
-    """Write a pack: it appears at ``folder`` when everything in it is done, or not at all."""
-    with replacing_folder(folder) as tmp:
-        writer = PackWriter(tmp)
-        yield writer
-        assets = sorted(writer.assets, key=lambda asset: (asset.kind, asset.id))
-        manifest = PackManifest(name=name, description=description, assets=assets)
-        (tmp / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n", encoding="utf-8")
-
-
-class PackWriter:
-    """A pack that is being written.
-
-    Attributes:
-        folder: where the assets' folders go.
-        assets: those that are done.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.assets: list[ObjectAsset | FurnitureAsset] = []
-
-    def add(self, asset: ObjectAsset | FurnitureAsset) -> None:
-        """List an asset whose files lie in ``folder / asset.id``."""
-        self.assets.append(asset)
-
-
 def principal_inertia(closed: trimesh.Trimesh, mass: float) -> tuple[np.ndarray, tuple[float, float, float, float]]:
     """Moments (3,) in kg m2 about the centre of mass and their axes (wxyz) of a solid of even density."""
     return _principal(np.asarray(closed.moment_inertia) * (mass / closed.volume))
@@ -228,8 +197,10 @@ def principal_inertia(closed: trimesh.Trimesh, mass: float) -> tuple[np.ndarray,
 def piece_inertia(
     pieces: list[np.ndarray], mass: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float, float, float]]:
-    """Centre of mass (3,) m, principal moments (3,) kg m2 about it and their axes (wxyz) of convex pieces of even
-    density; what two pieces share counts twice.
+    """Mass properties of convex pieces of even density; what two pieces share counts twice.
+
+    Returns:
+        Centre of mass (3,) m, principal moments (3,) kg m2 about it, their axes (wxyz).
     """
     hulls = [trimesh.convex.convex_hull(piece) for piece in pieces]
     volumes = np.array([hull.volume for hull in hulls])

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from robocas_ms3.assets.manifest import SCHEMA_VERSION, Asset, FurnitureAsset, ObjectAsset
-from robocas_ms3.assets.pack import sha256
+from robocas_ms3.assets.manifest import SCHEMA_VERSION, Asset, FurnitureAsset, ObjectAsset, PackManifest
+from robocas_ms3.assets.pack import MANIFEST, sha256
 from robocas_ms3.errors import AssetError, RobocasError
 from robocas_ms3.files import replacing_folder, write_json
 
@@ -190,21 +190,20 @@ def write_pack(
     Raises:
         AssetError: an asset can't be made, naming it and why; or none can.
     """
-    from asset_tools.build import new_pack
-
     results = []
-    with new_pack(folder, name=folder.name, description=description) as pack:
-        for made in make_assets(jobs, pack.folder, kept, processes=processes):
+    with replacing_folder(folder) as tmp:
+        for made in make_assets(jobs, tmp, kept, processes=processes):
             if made.asset is None and not skip_bad:
                 raise AssetError(made.error, fix="Mend it, or pass --skip-bad to leave it out.")
-            if made.asset is not None:
-                pack.add(made.asset)
             results.append(made)
             on_made(made)
-        if not pack.assets:
+        assets = sorted((made.asset for made in results if made.asset), key=lambda asset: (asset.kind, asset.id))
+        if not assets:
             raise AssetError("none of the assets could be made", where=folder)
+        manifest = PackManifest(name=folder.name, description=description, assets=assets)
+        (tmp / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n", encoding="utf-8")
         if record:
-            write_json(pack.folder / MADE_FROM, {job.id: job.content for job in jobs})
+            write_json(tmp / MADE_FROM, {job.id: job.content for job in jobs})
     return results
 
 
