@@ -1,0 +1,80 @@
+"""Small things to put on a surface, and how much room there is above it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from robocas_ms3.assets.manifest import Surface
+
+Array = np.ndarray
+
+WIDTH = 0.05  # m, of a thing put down
+HEIGHT = 0.1  # m at most
+EDGE = 0.005  # m it keeps from the surface's edge
+SPACING = 0.15  # m between things, at least
+MOST = 5  # along a side
+BLOCKED = 0.01  # m: what lies lower above the surface than this is the surface itself
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A thing to put down.
+
+    Attributes:
+        xy: (2,) where its middle goes, m, in the furniture's frame.
+        corners: (V, 3) m, its bottom at z = 0.
+    """
+
+    xy: Array
+    corners: Array
+
+
+def probes(surface: Surface) -> list[Probe]:
+    """Boxes and cylinders on a grid over a surface, out to its edges; none if it is too small for one."""
+    low = np.add(surface.min_xy, WIDTH / 2 + EDGE)
+    high = np.subtract(surface.max_xy, WIDTH / 2 + EDGE)
+    if (high < low - 1e-9).any():
+        return []
+    axes = []
+    for side in range(2):
+        count = min(MOST, 1 + int(max(0.0, (high - low)[side]) / SPACING))
+        axes.append(np.linspace(low[side], high[side], count) if count > 1 else (low + high)[side : side + 1] / 2)
+    height = min(HEIGHT, (surface.headroom or np.inf) - 0.002)
+    spots = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    return [Probe(xy, _prism(4 if index % 2 else 16, height)) for index, xy in enumerate(spots)]
+
+
+def _prism(sides: int, height: float) -> Array:
+    angles = (np.arange(sides) + 0.5) * 2 * np.pi / sides
+    radius = WIDTH / 2 / np.cos(np.pi / sides)
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1) * radius
+    return np.concatenate([np.column_stack([ring, np.full(sides, z)]) for z in (0.0, height)])
+
+
+def clearances(pieces: Sequence[Array], points: Array) -> tuple[Array, Array]:
+    """Free height below and above points, m.
+
+    Args:
+        pieces: (V, 3) corners of convex hulls.
+        points: (P, 3).
+
+    Returns:
+        (P,) distances straight down and straight up to the nearest hull: infinite where there is none, 0 within one.
+    """
+    below, above = np.full(len(points), np.inf), np.full(len(points), np.inf)
+    for piece in pieces:
+        planes = ConvexHull(piece).equations
+        slope, offset = planes[:, 2], points @ planes[:, :3].T + planes[:, 3]  # inside: offset + slope t <= 0
+        upright = np.abs(slope) < 1e-9
+        missed = (offset[:, upright] > 0).any(axis=1)
+        times = -offset[:, ~upright] / slope[~upright]
+        enter = np.where(slope[~upright] < 0, times, -np.inf).max(axis=1)
+        leave = np.where(slope[~upright] > 0, times, np.inf).min(axis=1)
+        hit = ~missed & (enter < leave)
+        above[hit & (leave >= 0)] = np.minimum(above, enter.clip(0))[hit & (leave >= 0)]
+        below[hit & (enter <= 0)] = np.minimum(below, (-leave).clip(0))[hit & (enter <= 0)]
+    return below, above
