@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 SCHEMA_VERSION = 2
 
@@ -40,11 +40,11 @@ class StrictModel(BaseModel):
 class Surface(StrictModel):
     """A horizontal rectangle of a piece of furniture on which objects may stand, in the furniture's frame (metres)."""
 
-    link: str = Field("", description="the moving part it belongs to; empty: the fixed body")
+    link: str = Field(default="", description="the moving part it belongs to; empty: the fixed body")
     min_xy: tuple[float, float]
     max_xy: tuple[float, float]
     z: float
-    headroom: Positive | None = Field(None, description="free height above it, m; none: open to the sky")
+    headroom: Positive | None = Field(default=None, description="free height above it, m; none: open to the sky")
 
 
 class InnerBox(StrictModel):
@@ -60,17 +60,25 @@ class Joint(StrictModel):
     name: Name
     kind: Literal["prismatic", "revolute"]
     axis: Vec3 = Field(description="unit vector: the way it slides, or turns by the right-hand rule")
-    origin: Vec3 = Field((0, 0, 0), description="a point on the axis, m")
+    origin: Vec3 = Field(default=(0, 0, 0), description="a point on the axis, m")
     limits: tuple[float, float] = Field(description="m or rad; 0, which is closed, lies within")
     friction: NotNegative = Field(description="Coulomb friction, as PhysX has it")
     damping: NotNegative = Field(description="N s/m or N m s/rad")
+
+    @model_validator(mode="after")
+    def _sound(self) -> Joint:
+        if abs(sum(x * x for x in self.axis) - 1) > 1e-6:
+            raise ValueError(f"axis {self.axis} is no unit vector")
+        if not self.limits[0] <= 0 <= self.limits[1] or self.limits[0] == self.limits[1]:
+            raise ValueError(f"0, which is closed, must lie within limits {self.limits}")
+        return self
 
 
 class Link(StrictModel):
     """A moving part of a piece of furniture."""
 
     name: Name
-    parent: str = Field("", description="name of another link; empty: the fixed body")
+    parent: str = Field(default="", description="name of another link; empty: the fixed body")
     joint: Joint
     mass: Positive
     center_of_mass: Vec3
@@ -108,8 +116,8 @@ class FurnitureQuality(StrictModel):
 
     hull_count: int = Field(ge=1)
     hull_vertices: int = Field(ge=4)
-    joints_open: Share | None = Field(None, description="share of joints that a force opens and closes again")
-    surfaces_hold: Share | None = Field(None, description="share of surfaces on which objects stay")
+    joints_open: Share | None = Field(default=None, description="share of joints that a force opens and closes again")
+    surfaces_hold: Share | None = Field(default=None, description="share of surfaces on which objects stay")
 
 
 class AssetBase(StrictModel):
@@ -124,7 +132,7 @@ class AssetBase(StrictModel):
     units: Literal["m"] = "m"
     extents: Vec3 = Field(description="size of the visual mesh's bounding box, m")
     friction: Positive = 0.99
-    repairs: tuple[str, ...] = Field((), description="what the importer had to mend in the source mesh")
+    repairs: tuple[str, ...] = Field(default=(), description="what the importer had to mend in the source mesh")
     files: dict[str, str] = Field(description="path inside the asset's folder -> sha256")
 
 
@@ -132,13 +140,15 @@ class ObjectAsset(AssetBase):
     """A thing to pick up."""
 
     kind: Literal["object"] = "object"
-    graspnet_id: int | None = Field(None, ge=0, description="of GraspNet-1Billion, which upstream's configs use")
+    graspnet_id: int | None = Field(
+        default=None, ge=0, description="of GraspNet-1Billion, which upstream's configs use"
+    )
     mass: Positive = Field(description="kg")
     center_of_mass: Vec3 = Field(description="m, in the asset's frame")
     inertia: tuple[Positive, Positive, Positive] = Field(description="principal moments, kg m2")
     inertia_wxyz: Quaternion = (1, 0, 0, 0)
     grasp_count: int = Field(ge=0)
-    no_grasps_because: str = Field("", description="why there are fewer grasps than usual, if so")
+    no_grasps_because: str = Field(default="", description="why there are fewer grasps than usual, if so")
     quality: ObjectQuality
 
 
@@ -146,17 +156,30 @@ class FurnitureAsset(AssetBase):
     """A table, a basket, a room: scenery, with named surfaces."""
 
     kind: Literal["furniture"] = "furniture"
-    mass: Positive | None = Field(None, description="kg; none: its body can't move")
+    mass: Positive | None = Field(default=None, description="kg; none: its body can't move")
     center_of_mass: Vec3 = (0, 0, 0)
     inertia: tuple[Positive, Positive, Positive] | None = None
     inertia_wxyz: Quaternion = (1, 0, 0, 0)
-    origin_height: float = Field(0.0, description="height of the frame's origin above the lowest point, m")
+    origin_height: float = Field(default=0.0, description="height of the frame's origin above the lowest point, m")
     surfaces: dict[Name, Surface] = {}
-    inner: InnerBox | None = Field(None, description="containers only")
-    links: tuple[Link, ...] = Field((), description="moving parts, parents first")
+    inner: InnerBox | None = Field(default=None, description="containers only")
+    links: tuple[Link, ...] = Field(default=(), description="moving parts, parents first")
     handles: dict[Name, Handle] = {}
-    finishes: dict[Name, tuple[Name, ...]] = Field({}, description="part -> its finishes, the default first")
+    finishes: dict[Name, tuple[Name, ...]] = Field(default={}, description="part -> its finishes, the default first")
     quality: FurnitureQuality
+
+    @model_validator(mode="after")
+    def _parts_exist(self) -> FurnitureAsset:
+        known = {""}
+        for link in self.links:
+            if link.parent not in known:
+                raise ValueError(f"link {link.name!r} hangs on {link.parent!r}, which does not come before it")
+            known.add(link.name)
+        named = {name: part.link for name, part in [*self.surfaces.items(), *self.handles.items()]}
+        for name, link_name in named.items():
+            if link_name not in known:
+                raise ValueError(f"{name!r} belongs to link {link_name!r}, which is not there")
+        return self
 
 
 Asset = Annotated[ObjectAsset | FurnitureAsset, Field(discriminator="kind")]

@@ -3,10 +3,20 @@ import os
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.hulls import write_hulls
-from robocas_ms3.assets.manifest import ObjectAsset, ObjectQuality, PackManifest
+from robocas_ms3.assets.manifest import (
+    FurnitureAsset,
+    FurnitureQuality,
+    Joint,
+    Link,
+    ObjectAsset,
+    ObjectQuality,
+    PackManifest,
+    Surface,
+)
 from robocas_ms3.assets.pack import available_packs, load_pack, sha256
 from robocas_ms3.errors import AssetError
 
@@ -127,6 +137,43 @@ def test_a_pack_of_another_format_says_so(box_pack):
     path.write_text(path.read_text().replace('"schema_version":2', '"schema_version":1'))
     with pytest.raises(AssetError, match=r"another format \(expected pack format 2, found 1\).*Make the pack again"):
         load_pack(box_pack)
+
+
+JOINT = {"name": "j", "kind": "prismatic", "axis": (1, 0, 0), "limits": (0, 0.3), "friction": 0.1, "damping": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"axis": (1, 1, 0)}, "no unit vector"),
+        ({"limits": (0.1, 0.3)}, "0, which is closed"),
+        ({"limits": (0, 0)}, "0,"),
+    ],
+)
+def test_joints_that_make_no_sense(changes, message):
+    Joint(**JOINT)
+    with pytest.raises(ValidationError, match=message):
+        Joint(**JOINT | changes)
+
+
+def test_parts_that_are_not_there():
+    facts = {
+        "id": "cabinet",
+        "name": "cabinet",
+        "category": "cabinet",
+        "source": "test",
+        "licence": "MIT",
+        "attribution": "none",
+        "extents": (1, 1, 1),
+        "files": {},
+        "quality": FurnitureQuality(hull_count=1, hull_vertices=8),
+    }
+    surface = Surface(link="drawer", min_xy=(0, 0), max_xy=(1, 1), z=0)
+    with pytest.raises(ValidationError, match="'top' belongs to link 'drawer', which is not there"):
+        FurnitureAsset(**facts, surfaces={"top": surface})
+    link = Link(name="knob", parent="door", joint=Joint(**JOINT), mass=1, center_of_mass=(0, 0, 0), inertia=(1, 1, 1))
+    with pytest.raises(ValidationError, match="hangs on 'door'"):
+        FurnitureAsset(**facts, links=(link,))
 
 
 def test_a_footprint_has_each_corner_once():
