@@ -9,10 +9,13 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from asset_tools.decompose import Decomposition, decompose, volume_iou
 from asset_tools.grasps import sample_grasps
+from asset_tools.inertia import piece_inertia, principal_inertia
+from asset_tools.physics import Solid
+from asset_tools.quality.furniture import measure_furniture
+from asset_tools.quality.measure import measure_object
 from asset_tools.resting import resting_poses
 from asset_tools.sources import FurnitureSource, LinkSource, ObjectSource
 from asset_tools.visual import to_display, write_glb
@@ -47,8 +50,6 @@ def build_object(source: ObjectSource, folder: Path, *, hull_cache: Path | None 
 
 
 def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> ObjectAsset:
-    from asset_tools.quality.measure import measure_object
-
     folder.mkdir(parents=True, exist_ok=True)
     shift = -source.mesh.bounds.mean(axis=0)
     mesh, closed = source.mesh.copy(include_cache=True), source.closed.copy()
@@ -67,14 +68,15 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
 
     center = np.asarray(closed.center_mass)
     inertia, axes = principal_inertia(closed, source.mass)
-    body: dict[str, Any] = {
-        "mass": source.mass,
-        "center_of_mass": center,
-        "inertia": inertia,
-        "inertia_wxyz": axes,
-        "friction": source.friction,
-    }
-    rest = resting_poses(hulls, **body)
+    solid = Solid(hulls, source.mass, center, inertia, np.array(axes), source.friction)
+    rest = resting_poses(
+        hulls,
+        mass=source.mass,
+        center_of_mass=center,
+        inertia=inertia,
+        inertia_wxyz=axes,
+        friction=source.friction,
+    )
     grasps, reason = source.grasps, ""
     if grasps is None:
         grasps = sample_grasps(closed, center, np.random.default_rng(zlib.crc32(source.id.encode())), count=GRASPS)
@@ -115,14 +117,12 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
         inertia_wxyz=axes,
         grasp_count=len(grasps),
         no_grasps_because=reason,
-        quality=measure_object(closed, hulls, notes, hollow=source.hollow, **body),
+        quality=measure_object(closed, solid, notes, hollow=source.hollow),
     )
 
 
 def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
     """Make a piece of furniture's files in a folder and say what the manifest says of it."""
-    from asset_tools.quality.furniture import measure_furniture
-
     _write_body(source.mesh, source.pieces, folder)
     for link in source.links:
         _write_body(link.mesh, link.pieces, folder / LINKS / link.name)
@@ -187,41 +187,6 @@ def _link(link: LinkSource) -> Link:
         inertia=_triple(inertia),
         inertia_wxyz=axes,
     )
-
-
-def principal_inertia(closed: trimesh.Trimesh, mass: float) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Moments (3,) in kg m2 about the centre of mass and their axes (wxyz) of a solid of even density."""
-    return _principal(np.asarray(closed.moment_inertia) * (mass / closed.volume))
-
-
-def piece_inertia(
-    pieces: list[np.ndarray], mass: float
-) -> tuple[np.ndarray, np.ndarray, tuple[float, float, float, float]]:
-    """Mass properties of convex pieces of even density; what two pieces share counts twice.
-
-    Returns:
-        Centre of mass (3,) m, principal moments (3,) kg m2 about it, their axes (wxyz).
-    """
-    hulls = [trimesh.convex.convex_hull(piece) for piece in pieces]
-    volumes = np.array([hull.volume for hull in hulls])
-    masses = mass * volumes / volumes.sum()
-    center = masses @ np.array([hull.center_mass for hull in hulls]) / mass
-    tensor = np.zeros((3, 3))
-    for hull, share in zip(hulls, masses, strict=True):
-        offset = hull.center_mass - center
-        tensor += hull.moment_inertia * share / hull.volume
-        tensor += share * (offset @ offset * np.eye(3) - np.outer(offset, offset))
-    return center, *_principal(tensor)
-
-
-def _principal(tensor: np.ndarray) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    if np.abs(tensor - np.diag(np.diag(tensor))).max() < 1e-9 * np.trace(tensor):
-        return np.diag(tensor).copy(), (1.0, 0.0, 0.0, 0.0)
-    moments, vectors = np.linalg.eigh(tensor)
-    if np.linalg.det(vectors) < 0:
-        vectors[:, 0] *= -1
-    x, y, z, w = (float(value) for value in Rotation.from_matrix(vectors).as_quat())
-    return moments, (w, x, y, z)
 
 
 def _light(values: Any) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 import sapien
 from sapien import physx
 
-from asset_tools.build import piece_inertia
+from asset_tools.inertia import piece_inertia
 from asset_tools.physics import TIME_STEP, add_component, cook, engine_settings, new_scene, pose_matrix
 from asset_tools.quality.surfaces import BLOCKED, Probe, clearances, probes
 from asset_tools.sources import FurnitureSource
