@@ -77,7 +77,7 @@ def sample_grasps(
     """
     if len(closed.faces) == 0 or not closed.is_watertight:
         raise AssetError("no closed mesh to grasp", expected="watertight", found=f"{len(closed.faces)} faces")
-    points = _surface_samples(closed, POINTS, rng)[0]
+    points = surface_samples(closed, POINTS, rng)[0]
     pairs = _contact_pairs(closed, rng)
     pair, rotations, depths = _reachable(pairs, points, rng)
     limit = 30 * count  # keeps the rest quick; what is left is still dense
@@ -100,7 +100,7 @@ def sample_grasps(
     return Grasps(poses[chosen], widths[chosen], frictions[chosen])
 
 
-def _surface_samples(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int_]]:
+def surface_samples(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int_]]:
     """Points (P, 3) and their faces (P,), evenly over the area."""
     area = np.cumsum(mesh.area_faces)
     faces = np.searchsorted(area, (np.arange(count) + rng.random(count)) / count * area[-1])
@@ -113,7 +113,7 @@ def _surface_samples(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator
 
 def _contact_pairs(mesh: trimesh.Trimesh, rng: np.random.Generator) -> _Pairs:
     """Shoot rays into the body; where one leaves a wall, and where it leaves the object, is the other contact."""
-    points, faces = _surface_samples(mesh, RAYS, rng)
+    points, faces = surface_samples(mesh, RAYS, rng)
     normals = np.asarray(mesh.face_normals)
     u, v = _across(normals[faces])
     radius = JITTER * np.sqrt(rng.random(RAYS)) * (rng.random(RAYS) < 0.5)

@@ -86,8 +86,9 @@ def add_body(scene: sapien.Scene, solid: Solid, pose: Array) -> physx.PhysxRigid
 
 def add_ground(scene: sapien.Scene, origin: Array) -> None:
     """Add 2 x 2 m of table, its top at a point (3,)."""
+    material = physx.PhysxMaterial(TABLE_FRICTION, TABLE_FRICTION, 0.0)
     ground = physx.PhysxRigidStaticComponent()
-    ground.attach(physx.PhysxCollisionShapeBox([1.0, 1.0, 0.05], physx.PhysxMaterial(*[TABLE_FRICTION] * 2, 0.0)))
+    ground.attach(physx.PhysxCollisionShapeBox([1.0, 1.0, 0.05], material))
     add_component(scene, ground, sapien.Pose(origin - np.array([0, 0, 0.05])))
 
 

@@ -1,0 +1,170 @@
+"""Drop an object many times: whether it comes to rest in a listed pose, without sinking in or trembling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sapien import physx
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from asset_tools.physics import (
+    TIME_STEP,
+    Solid,
+    add_body,
+    add_ground,
+    engine_settings,
+    new_scene,
+    places,
+    pose_matrix,
+)
+from robocas_ms3.assets.hulls import Hull, convex_faces, sample_surface
+
+Array = np.ndarray
+
+DROP_HEIGHT = 0.05  # m, of the lowest point
+TIME_LIMIT = 2.0  # s, to be at rest within
+WATCHED = 1.0  # s, that it is watched for afterwards
+REST_ENERGY = 2e-4  # J per kg: an even 2 cm/s
+SAME = 0.003  # m, in height and in distance from the axis: poses nearer than this are one
+SPACING, MAX_POINTS = 0.004, 800  # m; of the points that poses are compared by
+LOOK_EVERY = 5  # time steps between the poses in which a rolling object is looked at
+
+
+@dataclass(frozen=True)
+class DropReport:
+    """What became of N drops.
+
+    Attributes:
+        ends: (N, 4, 4) last pose of the object's frame, on the plane z = 0 under the place it fell from.
+        rest_times: (N,) s from letting go until it moved no more, or only rolled on; 3 s: it still moves.
+        matches: (N,) which resting pose it lies in; -1: none that is listed.
+        penetrations: (N,) m, deepest at the end: of corners below the plane, and of contacts as the engine sees them.
+        jitters: (N,) J, largest kinetic energy in the last of the 3 s.
+        rolling: (N,) bool: it hasn't stopped, but only rolls evenly.
+        good: (N,) bool: at rest in time, in a listed pose.
+    """
+
+    ends: Array
+    rest_times: Array
+    matches: Array
+    penetrations: Array
+    jitters: Array
+    rolling: NDArray[np.bool_]
+    good: NDArray[np.bool_]
+
+
+def drop_test(solid: Solid, resting_poses: Array, *, seed: int = 0, drops: int = 20) -> DropReport:
+    """Let an object fall from 5 cm above a table, turned at random, for 3 s. The same input gives the same report.
+
+    It is at rest once its kinetic energy stays below 2e-4 J/kg for good; so what trembles is never at rest.
+
+    Two poses are the same if the object fills the same heights and distances from the vertical through its centre of
+    mass in both, to 3 mm (95 % of points on its surface): this is true of poses that differ by a yaw, and of those
+    that the object's own symmetry makes alike, however it is symmetric. A ball has one pose, a can has two: standing
+    (either end up) and lying; a box has one for each pair of faces.
+
+    A table without rolling resistance, which the engine doesn't have, doesn't stop a can. What only rolls counts as at
+    rest: all through the last second it keeps to one pose in this sense, and never turns back, as what rocks does.
+
+    Args:
+        solid: the object.
+        resting_poses: (S, 4, 4) ``T_plane_object``, those listed.
+        seed: of the orientations.
+        drops: how many.
+    """
+    poses, velocities, energies, sunk = _fall(solid, seed, drops)
+    last = round(WATCHED / TIME_STEP)
+    moving = energies >= REST_ENERGY * solid.mass
+    rest_times = TIME_STEP * (len(energies) - np.argmax(moving[::-1], axis=0)) * moving.any(axis=0)
+    matches, rolling = np.full(drops, -1), np.zeros(drops, bool)
+    compare = _Comparison(solid, resting_poses)
+    for i in range(drops):
+        matches[i] = compare.find(poses[-1, i])
+        if rest_times[i] > TIME_LIMIT and matches[i] >= 0 and np.all(velocities[-last:, i] @ velocities[-1, i] > 0):
+            since = compare.since(poses[::-LOOK_EVERY, i]) * LOOK_EVERY
+            if since >= last:
+                rolling[i] = True
+                rest_times[i] = TIME_STEP * max(len(energies) - since, 0)
+    good = (rest_times <= TIME_LIMIT) & (matches >= 0)
+    return DropReport(poses[-1], rest_times, matches, sunk, energies[-last:].max(axis=0), rolling, good)
+
+
+def _fall(solid: Solid, seed: int, drops: int) -> tuple[Array, Array, Array, Array]:
+    """Poses (T, N, 4, 4), horizontal velocities (T, N, 2), kinetic energies (T, N), final penetrations (N,)."""
+    vertices = np.concatenate([np.asarray(hull, float) for hull in solid.hulls])
+    turns = Rotation.from_quat(np.random.default_rng(seed).normal(size=(drops, 4))).as_matrix()  # evenly over all
+    origins = places(drops)
+    steps = round((TIME_LIMIT + WATCHED) / TIME_STEP)
+    poses, velocities, energies = np.zeros((steps, drops, 4, 4)), np.zeros((steps, drops, 2)), np.zeros((steps, drops))
+    with engine_settings():
+        scene = new_scene()
+        bodies: list[physx.PhysxRigidDynamicComponent] = []
+        for turn, origin in zip(turns, origins, strict=True):
+            add_ground(scene, origin)
+            pose = np.eye(4)
+            pose[:3, :3] = turn
+            pose[:3, 3] = origin + [0, 0, DROP_HEIGHT - (vertices @ turn[2]).min()]
+            bodies.append(add_body(scene, solid, pose))
+        for step in range(steps):
+            scene.step()
+            for i, body in enumerate(bodies):
+                poses[step, i] = pose_matrix(body)
+                velocities[step, i] = body.linear_velocity[:2]
+                energies[step, i] = _energy(body, solid)
+        sunk = np.array([max(0.0, -(vertices @ pose[2, :3]).min() - pose[2, 3]) for pose in poses[-1]])
+        which: dict[object, int] = {body: i for i, body in enumerate(bodies)}
+        system = scene.physx_system
+        assert isinstance(system, physx.PhysxCpuSystem)
+        for contact in system.get_contacts():
+            i = next(which[body] for body in contact.bodies if body in which)
+            sunk[i] = max([sunk[i], *(-point.separation for point in contact.points)])
+    poses[..., :3, 3] -= origins
+    return poses, velocities, energies, sunk
+
+
+def _energy(body: physx.PhysxRigidDynamicComponent, solid: Solid) -> float:
+    """Kinetic energy, J."""
+    speed, spin = body.linear_velocity, body.angular_velocity
+    axes = (body.entity_pose * body.cmass_local_pose).to_transformation_matrix()[:3, :3]
+    return 0.5 * float(solid.mass * (speed @ speed) + solid.inertia @ (spin @ axes) ** 2)
+
+
+class _Comparison:
+    """Which of the listed poses (S, 4, 4) a pose is the same as; see `drop_test`."""
+
+    def __init__(self, solid: Solid, listed: Array) -> None:
+        points = sample_surface([Hull(*convex_faces(np.asarray(hull, float))) for hull in solid.hulls], SPACING)
+        self._points = points[:: len(points) // MAX_POINTS + 1]
+        self._center = solid.center_of_mass
+        self._listed = [self._profile(pose) for pose in listed]
+        self._trees = [KDTree(profile) for profile in self._listed]
+
+    def find(self, pose: Array) -> int:
+        """The listed pose that is most like a pose (4, 4), or -1."""
+        apart = [self._apart(pose, index) for index in range(len(self._listed))]
+        return int(np.argmin(apart)) if min(apart) <= SAME else -1
+
+    def since(self, poses: Array) -> int:
+        """How many of the first poses (T, 4, 4) are the same as a listed one."""
+        likely = list(range(len(self._listed)))
+        for count, pose in enumerate(poses):
+            found = next((index for index in likely if self._apart(pose, index) <= SAME), None)
+            if found is None:
+                return count
+            likely.remove(found)
+            likely.insert(0, found)  # the next one is much the same
+        return len(poses)
+
+    def _apart(self, pose: Array, index: int) -> float:
+        profile = self._profile(pose)
+        there, back = self._trees[index].query(profile)[0], KDTree(profile).query(self._listed[index])[0]
+        return float(max(np.percentile(there, 95), np.percentile(back, 95)))
+
+    def _profile(self, pose: Array) -> Array:
+        """Height above the plane and distance from the vertical through the centre of mass, (P, 2), m."""
+        placed = (self._points - self._center) @ pose[:3, :3].T
+        heights = placed[:, 2] + pose[2, :3] @ self._center + pose[2, 3]
+        return np.stack([heights, np.linalg.norm(placed[:, :2], axis=1)], axis=1)

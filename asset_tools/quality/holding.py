@@ -1,0 +1,174 @@
+"""Carry out grasps with the gripper alone: close, lift, shake; which of them hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import sapien
+from numpy.typing import NDArray
+from sapien import physx
+from scipy.spatial.transform import Rotation
+
+from asset_tools.physics import TIME_STEP, Array, Solid, add_body, engine_settings, new_scene, places, pose_matrix
+from robocas_ms3.assets.gripper import GRIPPER_BOXES
+from robocas_ms3.errors import AssetError
+
+# The fingers of robots/mobile_panda.py and robots/urdf.py: drives in N/m and N s/m, N, m, kg, kg m2
+STIFFNESS, DAMPING, FORCE_LIMIT = 1e3, 1e2, 100.0
+OPEN, CLOSED = 0.04, -0.01  # m, drive targets of a finger; beyond closed, so that thin things are pressed too
+FINGER_MASS, FINGER_INERTIA = 0.1, (6e-5, 6e-5, 6e-6)
+FINGER_FRICTION, PATCH_RADIUS = 0.99, 0.1
+PAD_HALF_WIDTH = 0.009  # m; GRIPPER_BOXES' tip is a millimetre wider, for clearance
+
+CLOSING, LIFTING, SHAKING = 0.5, 0.5, 1.5  # s
+LIFT = 0.1  # m
+SWAY, BOB, TILT_DEG = 0.03, 0.03, 20.0  # +-m sideways, +-m up and down, +-deg
+SWAY_HZ, BOB_HZ, TILT_HZ = 2.0, 2.0, 1.0
+FADE = 0.375  # s, in which the shaking swells and dies down; with it, peaks are 6 m/s2 and 25 rad/s2
+SLIPPED, TURNED_DEG = 0.02, 30.0  # m and degrees in the hand, since it closed: more is dropped
+
+_CARRIAGE_MASS, _CARRIAGE_INERTIA = 1.0, (0.01, 0.01, 0.01)
+_CARRIAGE_STIFFNESS, _CARRIAGE_DAMPING = 1e6, 1e4  # gives way by 0.1 mm under the heaviest object
+_HEIGHT = 0.5  # m above the origin of each hand's place
+_DOWN = np.diag([1.0, -1.0, -1.0, 1.0])  # the TCP's z points to the ground
+_DIAGONAL = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)  # between the closing axis and the pads' width, across both
+
+
+@dataclass(frozen=True)
+class _Hand:
+    articulation: physx.PhysxArticulation
+    carriages: list[physx.PhysxArticulationJoint]
+    fingers: list[physx.PhysxArticulationJoint]
+    palm: physx.PhysxArticulationLinkComponent  # its frame is the TCP's
+
+
+def hold_test(solid: Solid, grasps_tcp_in_object: Array, *, time_step: float = TIME_STEP) -> NDArray[np.bool_]:
+    """Say for each grasp whether the object stays in the hand. The same input gives the same answer.
+
+    The hand points down around an object that floats in the pose of the grasp. It closes, and from then on gravity
+    acts. It rises by 10 cm within 0.5 s; then for 1.5 s it sways by 3 cm across the diagonal of the pads at 2 Hz, bobs
+    by as much (up to 6 m/s2) and tilts by 20 deg at 1 Hz (up to 25 rad/s2). A grasp holds if after all
+    that the object has moved by less than 2 cm at its centre of mass and turned by less than 30 deg in the hand since
+    it closed.
+
+    Args:
+        solid: the object.
+        grasps_tcp_in_object: (G, 4, 4) poses of the TCP: z approach, y closing.
+        time_step: s.
+
+    Returns:
+        (G,).
+    """
+    if len(grasps_tcp_in_object) == 0:
+        return np.zeros(0, bool)
+    turned = np.linalg.det(np.asarray(grasps_tcp_in_object)[:, :3, :3])
+    if not np.allclose(turned, 1, atol=1e-3):
+        raise AssetError("a grasp is no rigid pose", expected="determinant 1", found=float(turned.min()))
+    with engine_settings():
+        scene = new_scene(time_step)
+        hands, objects = [], []
+        for grasp, place in zip(grasps_tcp_in_object, places(len(grasps_tcp_in_object)), strict=True):
+            tcp = _DOWN.copy()
+            tcp[:3, 3] = place + [0, 0, _HEIGHT]
+            hands.append(_add_hand(scene, tcp))
+            body = add_body(scene, solid, tcp @ _rigid_inverse(grasp))
+            body.disable_gravity = True
+            objects.append(body)
+        for _ in range(round(CLOSING / time_step)):
+            scene.step()
+        before = _in_hand(hands, objects)
+        for body in objects:
+            body.disable_gravity = False
+        for carriages in _motion(time_step):
+            for hand in hands:
+                for joint, (position, speed) in zip(hand.carriages, carriages, strict=True):
+                    joint.set_drive_target(position)
+                    joint.set_drive_velocity_target(speed)
+            scene.step()
+        after = _in_hand(hands, objects)
+    center = np.append(solid.center_of_mass, 1)
+    slipped = np.linalg.norm((after @ center - before @ center)[:, :3], axis=1)
+    cosines = (np.einsum("nij,nij->n", before[:, :3, :3], after[:, :3, :3]) - 1) / 2
+    return (slipped < SLIPPED) & (cosines > np.cos(np.radians(TURNED_DEG)))
+
+
+def _motion(time_step: float) -> NDArray[np.float64]:
+    """Positions and speeds (T, 3, 2) of the carriages: up (m), sideways (m), tilt (rad)."""
+    rise = np.arange(1, round(LIFTING / time_step) + 1) * time_step / LIFTING
+    time = np.arange(1, round(SHAKING / time_step) + 1) * time_step
+    swell = np.clip(np.minimum(time, SHAKING - time) / FADE, 0, 1)
+    swell = swell * swell * (3 - 2 * swell)
+    positions = np.zeros((len(rise) + len(time), 3))
+    positions[: len(rise), 0] = LIFT * rise * rise * (3 - 2 * rise)
+    positions[len(rise) :, 0] = LIFT + BOB * swell * np.cos(2 * np.pi * BOB_HZ * time)
+    positions[len(rise) :, 1] = SWAY * swell * np.sin(2 * np.pi * SWAY_HZ * time)
+    positions[len(rise) :, 2] = np.radians(TILT_DEG) * swell * np.sin(2 * np.pi * TILT_HZ * time)
+    speeds = np.diff(positions, axis=0, prepend=np.zeros((1, 3))) / time_step
+    return np.stack([positions, speeds], axis=2)
+
+
+def _in_hand(hands: list[_Hand], objects: list[physx.PhysxRigidDynamicComponent]) -> Array:
+    """Poses (N, 4, 4) of the objects in the TCP's frame."""
+    return np.array([_rigid_inverse(pose_matrix(h.palm)) @ pose_matrix(o) for h, o in zip(hands, objects, strict=True)])
+
+
+def _rigid_inverse(pose: Array) -> Array:
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+def _add_hand(scene: sapien.Scene, tcp_in_world: Array) -> _Hand:
+    """An open hand on carriages; all its frames are the TCP's at the start."""
+    builder = scene.create_articulation_builder()
+    builder.set_initial_pose(sapien.Pose(tcp_in_world))
+    link = builder.create_link_builder()
+    link.set_mass_and_inertia(_CARRIAGE_MASS, sapien.Pose(), _CARRIAGE_INERTIA)
+    axes = (np.array([0.0, 0.0, -1.0]), _DIAGONAL, _DIAGONAL)
+    for kind, axis in zip(("prismatic", "prismatic", "revolute"), axes, strict=True):
+        link = builder.create_link_builder(link)
+        link.set_mass_and_inertia(_CARRIAGE_MASS, sapien.Pose(), _CARRIAGE_INERTIA)
+        frame = _along(axis)
+        link.set_joint_properties(kind, [[-2.0, 2.0]], frame, frame)
+    low, high = GRIPPER_BOXES[2]
+    material = physx.PhysxMaterial(0.3, 0.3, 0.0)  # ManiSkill's default
+    palm_low, palm_high = np.array([low[0], -high[1], low[2]]), high
+    link.add_box_collision(sapien.Pose((palm_low + palm_high) / 2), (palm_high - palm_low) / 2, material)
+    palm = link
+    for side in (1.0, -1.0):
+        finger = builder.create_link_builder(palm)
+        finger.set_mass_and_inertia(FINGER_MASS, sapien.Pose(), FINGER_INERTIA)
+        frame = _along(np.array([0.0, side, 0.0]))
+        # its frame is the TCP's when it is closed, so that its boxes are those of the open hand, moved in
+        finger.set_joint_properties("prismatic", [[0.0, OPEN]], frame, frame)
+        rubber = physx.PhysxMaterial(FINGER_FRICTION, FINGER_FRICTION, 0.0)
+        for number, (low, high) in enumerate(GRIPPER_BOXES[:2]):
+            size, middle = high - low, (low + high) / 2 - [0, OPEN, 0]
+            if number == 0:
+                size[0] = 2 * PAD_HALF_WIDTH
+            finger.add_box_collision(
+                sapien.Pose(middle * [1, side, 1]),
+                size / 2,
+                rubber,
+                patch_radius=PATCH_RADIUS,
+                min_patch_radius=PATCH_RADIUS,
+            )
+    articulation = builder.build(fix_root_link=True)
+    joints = articulation.active_joints
+    for joint in joints[:3]:
+        joint.set_drive_properties(_CARRIAGE_STIFFNESS, _CARRIAGE_DAMPING)
+    for joint in joints[3:]:
+        joint.set_drive_properties(STIFFNESS, DAMPING, FORCE_LIMIT)
+        joint.set_drive_target(CLOSED)
+    articulation.qpos = np.array([0, 0, 0, OPEN, OPEN], np.float32)
+    for link in articulation.links:
+        link.disable_gravity = True
+    return _Hand(articulation, joints[:3], joints[3:], articulation.links[3])
+
+
+def _along(axis: Array) -> sapien.Pose:
+    """A joint frame whose x is along an axis (3,)."""
+    turn = Rotation.align_vectors([axis], [[1.0, 0.0, 0.0]])[0].as_quat()
+    return sapien.Pose(q=turn[[3, 0, 1, 2]])
