@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -33,6 +34,8 @@ class Verify:
     """Its name, or its folder."""
     physics: bool = False
     """Drop, grasp and shake every object, move every joint, and print the table of quality."""
+    jobs: int | None = None
+    """With --physics: processes. Default: one for each CPU core."""
     json: Path | None = None
     """With --physics: write the table here too."""
 
@@ -120,7 +123,7 @@ def verify(command: Verify) -> int:
     for loaded in pack.furniture.values():
         _ = loaded.hulls, [part.hulls for part in loaded.links.values()]
     Console(highlight=False).print(f"{pack.name}: {len(pack.manifest.assets)} assets, every file is as it should be")
-    return _verify_physics(pack, command.json) if command.physics else 0
+    return _verify_physics(pack, command.jobs or os.cpu_count() or 1, command.json) if command.physics else 0
 
 
 def sheet(command: Sheet) -> int:
@@ -137,5 +140,36 @@ def sheet(command: Sheet) -> int:
     return 0
 
 
-def _verify_physics(pack: Pack, out: Path | None) -> int:
-    raise NotImplementedError
+def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
+    from rich.console import Console
+    from rich.progress import track
+    from rich.table import Table
+
+    from asset_tools.quality.furniture import HEADER as FURNITURE_HEADER
+    from asset_tools.quality.furniture import judge_furniture
+    from asset_tools.quality.furniture import rows as furniture_rows
+    from asset_tools.quality.measure import HEADER, judge, rows
+    from asset_tools.quality.packs import remeasure_pack
+    from robocas_ms3.files import write_json
+
+    total = len(pack.manifest.assets)
+    measured = dict(track(remeasure_pack(pack, jobs), "measuring", total, console=Console(stderr=True)))
+    objects = {name: measured[name] for name in pack.objects}
+    furniture = {name: measured[name] for name in pack.furniture}
+    console = Console()
+    for header, cells in ((HEADER, rows(objects)), (FURNITURE_HEADER, furniture_rows(furniture))):
+        if cells:
+            table = Table(*header)
+            for row in cells:
+                table.add_row(*row)
+            console.print(table)
+    violations = [*judge(objects), *judge_furniture(furniture)]
+    for violation in violations:
+        where = violation.asset or "the pack"
+        console.print(f"{where}: {violation.what} is {violation.found}, expected {violation.expected}", style="red")
+    if out is not None:
+        assets = {name: quality.model_dump() for name, quality in {**objects, **furniture}.items()}
+        write_json(out, {"pack": pack.name, "assets": assets, "violations": [asdict(v) for v in violations]})
+    if not violations:
+        console.print(f"{pack.name}: {total} assets, as good as packs should be")
+    return 1 if violations else 0
