@@ -1,13 +1,13 @@
-"""Measure the assets of a whole pack anew, in parallel."""
+"""Measure the assets of a whole pack anew, in parallel; what is asked of its furniture."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 from asset_tools.quality.furniture import measure_furniture
-from asset_tools.quality.measure import remeasure
+from asset_tools.quality.measure import HULL_VERTICES, Violation, remeasure
 from robocas_ms3.assets.manifest import FurnitureQuality, ObjectQuality
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
 
@@ -23,6 +23,33 @@ def remeasure_pack(pack: Pack, processes: int = 1) -> Iterator[tuple[str, Qualit
     # physics engines don't survive a fork
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         yield from zip(assets, pool.map(_measure, assets.values()), strict=True)
+
+
+FURNITURE_HEADER = ("furniture", "hulls", "vertices", "joints that work %", "surfaces that hold %")
+
+
+def furniture_rows(qualities: Mapping[str, FurnitureQuality]) -> list[tuple[str, ...]]:
+    """The table: a row of text for each piece of furniture, as `FURNITURE_HEADER` names it."""
+
+    def share(value: float | None) -> str:
+        return "-" if value is None else f"{100 * value:.0f}"
+
+    return [
+        (name, str(q.hull_count), str(q.hull_vertices), share(q.joints_open), share(q.surfaces_hold))
+        for name, q in qualities.items()
+    ]
+
+
+def judge_furniture(qualities: Mapping[str, FurnitureQuality]) -> list[Violation]:
+    """Say which pieces of furniture have joints that stick, surfaces that don't hold, or hulls too fine for a GPU."""
+    found = []
+    for name, quality in qualities.items():
+        for what, share in (("joints that work", quality.joints_open), ("surfaces that hold", quality.surfaces_hold)):
+            if share is not None and share < 1:
+                found.append(Violation(name, what, "100%", f"{share:.0%}"))
+        if quality.hull_vertices > HULL_VERTICES:
+            found.append(Violation(name, "vertices of a hull", f"<= {HULL_VERTICES}", str(quality.hull_vertices)))
+    return found
 
 
 def _measure(asset: LoadedObject | LoadedFurniture) -> Quality:

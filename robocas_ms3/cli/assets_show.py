@@ -145,11 +145,8 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     from rich.progress import track
     from rich.table import Table
 
-    from asset_tools.quality.furniture import HEADER as FURNITURE_HEADER
-    from asset_tools.quality.furniture import judge_furniture
-    from asset_tools.quality.furniture import rows as furniture_rows
     from asset_tools.quality.measure import HEADER, judge, rows
-    from asset_tools.quality.packs import remeasure_pack
+    from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
     from robocas_ms3.files import write_json
 
     total = len(pack.manifest.assets)

