@@ -1,0 +1,106 @@
+"""GraspNet-1Billion as downloaded, as assets: ``models/NNN``, and ``grasp_label/NNN_labels.npz`` where there is one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from asset_tools.build import build_object
+from asset_tools.graspnet.catalogue import COUNT, ENTRIES, catalogue_entry
+from asset_tools.graspnet.labels import label_grasps
+from asset_tools.import_scans import estimate_mass, scan_files
+from asset_tools.pipeline import Job, content_hash
+from asset_tools.prepare import prepare
+from asset_tools.scan import find_mesh
+from asset_tools.sources import ObjectSource
+from robocas_ms3.assets.manifest import ObjectAsset
+from robocas_ms3.errors import AssetError
+
+LICENCE = "CC BY-NC-SA 4.0"
+ATTRIBUTION = "GraspNet-1Billion (H.-S. Fang, C. Wang, M. Gou, C. Lu, CVPR 2020)"
+
+
+def graspnet_jobs(root: Path, ids: Sequence[int] = ()) -> list[Job]:
+    """What is to be made of the dataset.
+
+    Args:
+        root: its folder.
+        ids: the dataset's numbers; none: the 46 that RoboCAS uses.
+
+    Raises:
+        AssetError: naming all numbers that there are none of, or whose models are missing.
+    """
+    numbers = sorted(set(ids)) or list(ENTRIES)
+    unknown = [number for number in numbers if not 0 <= number < COUNT]
+    if unknown:
+        what = "no such objects in GraspNet-1Billion"
+        raise AssetError(what, expected=f"numbers from 0 to {COUNT - 1}", found=_listed(unknown))
+    missing = [number for number in numbers if not _model(root, number).is_dir()]
+    if missing:
+        raise AssetError(
+            "models of GraspNet-1Billion are missing",
+            where=root,
+            expected=f"models/NNN for {len(numbers)} objects",
+            found=f"none for {_listed(missing)}",
+            fix="Give the folder that holds models/, or choose with --ids.",
+        )
+    return [_job(root, number) for number in numbers]
+
+
+def graspnet_source(root: Path, number: int) -> ObjectSource:
+    """An object of the dataset: its model as it is, its labelled grasps where its label file is there.
+
+    Models are in metres, z up where that can be said; their frame stays, as the labels are given in it.
+
+    Args:
+        root: the dataset's folder.
+        number: the dataset's.
+
+    Raises:
+        AssetError: the model or the label file is damaged, or the model is missing or can't be closed.
+    """
+    entry = catalogue_entry(number)
+    model = prepare(_model(root, number), up="z", unit="m")
+    labels = _labels(root, number)
+    return ObjectSource(
+        id=entry.id,
+        name=entry.name,
+        category=entry.category,
+        mesh=model.mesh,
+        closed=model.closed,
+        mass=entry.mass or estimate_mass(model.closed),
+        source="graspnet",
+        licence=LICENCE,
+        attribution=ATTRIBUTION,
+        repairs=model.repairs,
+        graspnet_id=number,
+        grasps=label_grasps(labels, model.closed) if labels.is_file() else None,
+        hollow=entry.hollow,
+    )
+
+
+def _job(root: Path, number: int) -> Job:
+    labels = _labels(root, number)
+    files = [*scan_files(find_mesh(_model(root, number))), *([labels] if labels.is_file() else [])]
+    return Job(
+        catalogue_entry(number).id,
+        partial(_make, root, number),
+        content_hash("graspnet", number, files=files, packages=["graspnet"]),
+    )
+
+
+def _make(root: Path, number: int, folder: Path) -> ObjectAsset:
+    return build_object(graspnet_source(root, number), folder)
+
+
+def _model(root: Path, number: int) -> Path:
+    return root / "models" / catalogue_entry(number).folder
+
+
+def _labels(root: Path, number: int) -> Path:
+    return root / "grasp_label" / f"{catalogue_entry(number).folder}_labels.npz"
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers))

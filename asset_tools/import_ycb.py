@@ -1,0 +1,181 @@
+"""The YCB objects that ManiSkill downloads, as assets.
+
+ManiSkill's folder holds ``info_pick_v0.json``, which maps a model's name to its scale among other things, and
+``models/<name>/textured.obj``; its ``collision.ply`` isn't used, hulls are made anew.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from asset_tools.build import build_object
+from asset_tools.graspnet.catalogue import ENTRIES, NUMBERS
+from asset_tools.import_scans import estimate_mass, scan_files
+from asset_tools.pipeline import Job, content_hash
+from asset_tools.prepare import prepare
+from asset_tools.scan import find_mesh
+from asset_tools.sources import ObjectSource
+from robocas_ms3.assets.manifest import ObjectAsset
+from robocas_ms3.errors import AssetError
+
+INFO, MODELS = "info_pick_v0.json", "models"
+DOWNLOAD = "Run `python -m mani_skill.utils.download_asset ycb`, or give the folder that holds it."
+LICENCE = "CC BY 4.0"
+ATTRIBUTION = "YCB Object and Model Set (B. Calli et al., 2015), as prepared by ManiSkill"
+
+# kg, as the set's authors list them; of those that GraspNet-1Billion has too, its catalogue says it
+MASSES = {
+    "master_chef_can": 0.414,
+    "cracker_box": 0.411,
+    "tuna_fish_can": 0.171,
+    "pudding_box": 0.187,
+    "gelatin_box": 0.097,
+    "strawberry": 0.018,
+    "pitcher_base": 0.178,
+    "bleach_cleanser": 1.131,
+    "windex_bottle": 1.022,
+    "bowl": 0.147,
+    "sponge": 0.0062,
+    "skillet_lid": 0.652,
+    "plate": 0.279,
+    "fork": 0.034,
+    "spoon": 0.030,
+    "knife": 0.031,
+    "spatula": 0.0515,
+    "wood_block": 0.729,
+    "large_marker": 0.0158,
+    "adjustable_wrench": 0.252,
+    "phillips_screwdriver": 0.097,
+    "hammer": 0.665,
+    "medium_clamp": 0.059,
+    "large_clamp": 0.125,
+    "extra_large_clamp": 0.202,
+    "mini_soccer_ball": 0.123,
+    "softball": 0.191,
+    "baseball": 0.148,
+    "tennis_ball": 0.058,
+    "golf_ball": 0.046,
+    "chain": 0.098,
+    "foam_brick": 0.028,
+    "dice": 0.0052,
+}
+HOLLOW = re.compile(r"bowl|cups|pitcher|plate|skillet|fork|spoon|knife|spatula|clamp|chain|wrench|toy_airplane")
+
+
+def default_root() -> Path:
+    """Where ManiSkill puts the YCB objects."""
+    data = Path(os.environ.get("MS_ASSET_DIR") or Path.home() / ".maniskill") / "data"
+    return data / "assets" / "mani_skill2_ycb"
+
+
+def ycb_jobs(root: Path | None = None, ids: Sequence[str] = ()) -> list[Job]:
+    """What is to be made of ManiSkill's YCB folder.
+
+    Args:
+        root: the folder; none: where ManiSkill puts it.
+        ids: names such as ``005_tomato_soup_can``; none: all.
+
+    Raises:
+        AssetError: it isn't there, or lacks objects, naming them all.
+    """
+    root = root or default_root()
+    info = _info(root)
+    unknown = sorted(set(ids) - set(info))
+    if unknown:
+        raise AssetError(
+            "no such YCB objects", where=root / INFO, expected=f"among {len(info)}", found=_listed(unknown)
+        )
+    models = sorted(set(ids) or info)
+    missing = [model for model in models if not (root / MODELS / model / "textured.obj").is_file()]
+    if missing:
+        raise AssetError("models of YCB objects are missing", where=root / MODELS, found=_listed(missing), fix=DOWNLOAD)
+    return [_job(root, model, info[model]) for model in models]
+
+
+def ycb_source(root: Path, model: str) -> ObjectSource:
+    """One of ManiSkill's YCB objects. Models are z up.
+
+    Args:
+        root: ManiSkill's YCB folder.
+        model: its name there, such as ``005_tomato_soup_can``.
+
+    Raises:
+        AssetError: it isn't there, is damaged, or can't be closed.
+    """
+    info = _info(root)
+    if model not in info:
+        raise AssetError("no such YCB object", where=root / INFO, expected=f"among {len(info)}", found=model)
+    scan = prepare(root / MODELS / model / "textured.obj", up="z", unit="m")
+    scale = _scale(root, model, info[model])
+    if scale != 1:
+        scan.mesh.apply_scale(scale)
+        scan.closed.apply_scale(scale)
+    id_ = ycb_id(model)
+    entry = ENTRIES[NUMBERS[id_]] if id_ in NUMBERS else None
+    return ObjectSource(
+        id=id_,
+        name=entry.name if entry else id_.replace("_", " "),
+        category=entry.category if entry else "ycb",
+        mesh=scan.mesh,
+        closed=scan.closed,
+        mass=(entry.mass if entry else MASSES.get(id_)) or estimate_mass(scan.closed),
+        source="ycb",
+        licence=LICENCE,
+        attribution=ATTRIBUTION,
+        repairs=scan.repairs,
+        graspnet_id=entry.number if entry else None,
+        hollow=entry.hollow if entry else HOLLOW.search(id_) is not None,
+    )
+
+
+def ycb_id(model: str) -> str:
+    """A model's name as an id, the same as GraspNet-1Billion's object has here: 072-a_toy_airplane: toy_airplane_a."""
+    found = re.fullmatch(r"\d+(?:-([a-z]))?_(\w+)", model)
+    if found is None:
+        return re.sub(r"[^a-z0-9]+", "_", model.lower()).strip("_")
+    letter, name = found.groups()
+    return f"{name}_{letter}" if letter else name
+
+
+def _job(root: Path, model: str, info: dict[str, Any]) -> Job:
+    files = scan_files(find_mesh(root / MODELS / model / "textured.obj"))
+    content = content_hash("ycb", model, _scale(root, model, info), files=files, packages=["graspnet"])
+    return Job(ycb_id(model), partial(_make, root, model), content)
+
+
+def _make(root: Path, model: str, folder: Path) -> ObjectAsset:
+    return build_object(ycb_source(root, model), folder)
+
+
+def _info(root: Path) -> dict[str, dict[str, Any]]:
+    path = root / INFO
+    if not path.is_file():
+        raise AssetError("ManiSkill's YCB objects are not there", where=root, expected=INFO, fix=DOWNLOAD)
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise AssetError("can't read the list of YCB objects", where=path, found=error, fix=DOWNLOAD) from error
+    if not isinstance(info, dict) or not info or not all(isinstance(entry, dict) for entry in info.values()):
+        raise AssetError("can't read the list of YCB objects", where=path, expected="name: facts", fix=DOWNLOAD)
+    return info
+
+
+def _scale(root: Path, model: str, info: dict[str, Any]) -> float:
+    scales = info.get("scales", [1.0])
+    try:
+        scale = float(scales[0])
+    except (TypeError, ValueError, LookupError) as error:
+        raise AssetError("no scale of a YCB object", where=root / INFO, found=f"{model}: {scales}") from error
+    if not 0 < scale < float("inf"):
+        raise AssetError("no scale of a YCB object", where=root / INFO, found=f"{model}: {scale}")
+    return scale
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names)

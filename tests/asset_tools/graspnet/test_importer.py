@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+import trimesh
+
+from asset_tools.graspnet.importer import graspnet_jobs, graspnet_source
+from asset_tools.graspnet.labels import view_directions
+from asset_tools.grasps import sample_grasps, surface_samples
+from robocas_ms3.errors import AssetError
+
+BOX = (0.04, 0.10, 0.06)
+
+
+def write_models(root, numbers):
+    for number in numbers:
+        folder = root / "models" / f"{number:03d}"
+        folder.mkdir(parents=True)
+        trimesh.creation.box(BOX).export(folder / "textured.obj")
+    return root
+
+
+def write_labels(path, poses, depth=0.02):
+    """Label some grasps, turned onto the lattice; returns their TCP poses."""
+    views = view_directions()
+    chosen = np.argmax(-poses[:, :3, 2] @ views.T, axis=1)
+    approach = -views[chosen]
+    level = np.column_stack([-approach[:, 1], approach[:, 0], 0 * approach[:, 0]])
+    level /= np.linalg.norm(level, axis=1, keepdims=True)
+    closing = poses[:, :3, 1] - np.einsum("ni,ni->n", poses[:, :3, 1], approach)[:, None] * approach
+    closing /= np.linalg.norm(closing, axis=1, keepdims=True)
+    across = np.einsum("ni,ni->n", closing, np.cross(approach, level))
+    angles = np.arctan2(across, np.einsum("ni,ni->n", closing, level))
+    count = len(poses)
+    each = np.arange(count)
+    offsets = np.zeros((count, 300, 12, 4, 3), np.float32)
+    scores = np.full((count, 300, 12, 4), -1, np.float32)
+    offsets[each, chosen, 0, 1] = np.column_stack([angles, np.full(count, depth), np.full(count, 0.06)])
+    scores[each, chosen, 0, 1] = 0.2
+    path.parent.mkdir(exist_ok=True)
+    collision = np.zeros(scores.shape, bool)
+    np.savez_compressed(
+        path, points=poses[:, :3, 3] - depth * approach, offsets=offsets, scores=scores, collision=collision
+    )
+    expected = np.tile(np.eye(4), (count, 1, 1))
+    expected[:, :3, :3] = np.stack([np.cross(closing, approach), closing, approach], axis=2)
+    expected[:, :3, 3] = poses[:, :3, 3]
+    return expected
+
+
+def test_a_model_without_labels(tmp_path):
+    source = graspnet_source(write_models(tmp_path, [2]), 2)
+    assert (source.id, source.name, source.category) == ("tomato_soup_can", "tomato soup can", "can")
+    assert source.graspnet_id == 2
+    assert source.mass == 0.349
+    assert source.mesh.extents == pytest.approx(BOX)
+    assert source.grasps is None
+    assert "GraspNet" in source.attribution
+
+
+def test_an_object_without_a_name_is_weighed_by_its_volume(tmp_path):
+    source = graspnet_source(write_models(tmp_path, [6]), 6)
+    assert source.id == "graspnet_006"
+    assert source.mass == pytest.approx(600 * np.prod(BOX))  # kg/m3
+
+
+def test_what_is_missing_is_named_at_once(tmp_path):
+    write_models(tmp_path, [1, 3])
+    with pytest.raises(AssetError, match="none for 2, 4"):
+        graspnet_jobs(tmp_path, [4, 1, 2])
+    with pytest.raises(AssetError, match="found 88, 90"):
+        graspnet_jobs(tmp_path, [1, 88, 90])
+    with pytest.raises(AssetError, match="46 objects"):
+        graspnet_jobs(tmp_path)
+    assert [job.id for job in graspnet_jobs(tmp_path, [3, 1])] == ["sugar_box", "mustard_bottle"]
+
+
+def test_jobs_follow_their_files(tmp_path):
+    write_models(tmp_path, [1])
+    first = graspnet_jobs(tmp_path, [1])[0].content
+    assert graspnet_jobs(tmp_path, [1])[0].content == first
+    box = trimesh.creation.box(BOX)
+    write_labels(
+        tmp_path / "grasp_label" / "001_labels.npz", sample_grasps(box, 0, np.random.default_rng(0)).tcp_in_object[:2]
+    )
+    assert graspnet_jobs(tmp_path, [1])[0].content != first
+
+
+def test_a_damaged_label_file_stops_the_object(tmp_path):
+    write_models(tmp_path, [1])
+    (tmp_path / "grasp_label").mkdir()
+    (tmp_path / "grasp_label" / "001_labels.npz").write_bytes(b"PK")
+    with pytest.raises(AssetError, match=r"001_labels\.npz"):
+        graspnet_source(tmp_path, 1)
+
+
+@pytest.fixture(scope="module")
+def labelled_banana(shared_dir, tmp_path_factory):
+    """The real model with labels made of sampled grasps: the source, and the poses that were labelled."""
+    root = tmp_path_factory.mktemp("graspnet")
+    (root / "models").symlink_to(shared_dir / "graspnet_sample" / "models")
+    plain = graspnet_source(root, 5)
+    grasps = sample_grasps(plain.closed, plain.closed.center_mass, np.random.default_rng(0), count=60)
+    poses = write_labels(root / "grasp_label" / "005_labels.npz", grasps.tcp_in_object)
+    return graspnet_source(root, 5), poses
+
+
+def test_a_banana_with_labels(labelled_banana):
+    source, labelled = labelled_banana
+    assert source.id == "banana"
+    assert source.closed.is_watertight
+    assert source.mesh.visual.material.image is not None
+    assert source.closed.bounds == pytest.approx(source.mesh.bounds, abs=1e-3)
+    assert source.mesh.extents == pytest.approx([0.196, 0.079, 0.038], abs=1e-3)  # a banana on its side
+    assert 10 <= len(source.grasps) <= 60
+    for pose in source.grasps.tcp_in_object:
+        assert np.abs(labelled - pose).max(axis=(1, 2)).min() < 1e-5
+    assert source.grasps.qualities == pytest.approx(np.full(len(source.grasps), 0.2), abs=1e-6)
+
+
+def test_labelled_grasps_have_the_object_between_the_fingers(labelled_banana):
+    source, _ = labelled_banana
+    points = surface_samples(source.closed, 4000, np.random.default_rng(0))[0]
+    for pose in source.grasps.tcp_in_object:
+        x, y, z = np.abs((points - pose[:3, 3]) @ pose[:3, :3]).T
+        between = (x < 0.01) & (z < 0.0085)  # m, the pads
+        assert between.sum() > 5
+        assert y[between].max() < 0.04

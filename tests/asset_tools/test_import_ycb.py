@@ -1,0 +1,113 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+
+from asset_tools.import_ycb import default_root, ycb_id, ycb_jobs, ycb_source
+from robocas_ms3.errors import AssetError
+
+SIZES = {
+    "003_cracker_box": (0.06, 0.16, 0.21),
+    "005_tomato_soup_can": (0.07, 0.07, 0.10),
+    "072-a_toy_airplane": (0.1, 0.1, 0.05),
+    "070-a_colored_wood_blocks": (0.026, 0.026, 0.026),
+}
+
+
+@pytest.fixture
+def root(tmp_path):
+    """A folder as ManiSkill lays it out, of boxes."""
+    info = {}
+    for name, size in SIZES.items():
+        folder = tmp_path / "models" / name
+        folder.mkdir(parents=True)
+        box = trimesh.creation.box(size)
+        box.export(folder / "textured.obj")
+        box.export(folder / "collision.ply")
+        half = (np.array(size) / 2).tolist()
+        bbox = {"min": [-v for v in half], "max": half}
+        info[name] = {"bbox": bbox, "scales": [1.0], "density": 1000}
+    (tmp_path / "info_pick_v0.json").write_text(json.dumps(info))
+    return tmp_path
+
+
+def test_names_become_the_ids_that_graspnets_objects_have():
+    assert ycb_id("005_tomato_soup_can") == "tomato_soup_can"
+    assert ycb_id("072-a_toy_airplane") == "toy_airplane_a"
+    assert ycb_id("065-c_cups") == "cups_c"
+
+
+def test_an_object_that_graspnet_has_too(root):
+    source = ycb_source(root, "005_tomato_soup_can")
+    assert (source.id, source.graspnet_id, source.mass) == ("tomato_soup_can", 2, 0.349)
+    assert (source.source, source.licence) == ("ycb", "CC BY 4.0")
+    assert source.closed.volume == pytest.approx(0.07 * 0.07 * 0.10)
+    assert not source.hollow
+
+
+def test_objects_that_graspnet_has_not(root):
+    box = ycb_source(root, "003_cracker_box")
+    assert (box.id, box.name, box.graspnet_id, box.mass) == ("cracker_box", "cracker box", None, 0.411)
+    block = ycb_source(root, "070-a_colored_wood_blocks")  # not listed: 600 kg/m3 would be 0.0105 kg, which is raised
+    assert block.mass == pytest.approx(0.03)
+
+
+def test_the_scale_counts(root):
+    info = json.loads((root / "info_pick_v0.json").read_text())
+    before = ycb_jobs(root, ["003_cracker_box"])[0].content
+    info["003_cracker_box"]["scales"] = [0.5]
+    (root / "info_pick_v0.json").write_text(json.dumps(info))
+    source = ycb_source(root, "003_cracker_box")
+    assert source.mesh.extents == pytest.approx([0.03, 0.08, 0.105])
+    assert source.closed.extents == pytest.approx([0.03, 0.08, 0.105])
+    assert ycb_jobs(root, ["003_cracker_box"])[0].content != before
+
+
+def test_all_or_some(root):
+    ids = ["colored_wood_blocks_a", "cracker_box", "tomato_soup_can", "toy_airplane_a"]
+    assert sorted(job.id for job in ycb_jobs(root)) == ids
+    assert [job.id for job in ycb_jobs(root, ["003_cracker_box"])] == ["cracker_box"]
+
+
+def test_what_is_not_there_is_one_error(root, tmp_path, monkeypatch):
+    with pytest.raises(AssetError, match=r"python -m mani_skill\.utils\.download_asset ycb"):
+        ycb_jobs(tmp_path / "nowhere")
+    monkeypatch.setenv("MS_ASSET_DIR", str(tmp_path / "elsewhere"))
+    with pytest.raises(AssetError, match="elsewhere/data/assets/mani_skill2_ycb"):
+        ycb_jobs()
+    with pytest.raises(AssetError, match="found 007_gun, 008_bat"):
+        ycb_jobs(root, ["008_bat", "007_gun", "003_cracker_box"])
+    shutil.rmtree(root / "models" / "003_cracker_box")
+    with pytest.raises(AssetError, match="missing.*003_cracker_box"):
+        ycb_jobs(root)
+    with pytest.raises(AssetError, match="003_cracker_box"):
+        ycb_source(root, "003_cracker_box")
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"003_cracker_box": 3}', '{"003_cracker_box": {"scales": []}}'])
+def test_a_damaged_list_is_one_error(root, text):
+    (root / "info_pick_v0.json").write_text(text)
+    with pytest.raises(AssetError, match=r"info_pick_v0\.json"):
+        ycb_jobs(root)
+
+
+def test_the_default_folder_is_maniskills():
+    import mani_skill
+    from mani_skill.utils.assets.data import DATA_SOURCES, initialize_data_sources
+
+    if not DATA_SOURCES:
+        initialize_data_sources()
+    assert default_root() == mani_skill.ASSET_DIR / DATA_SOURCES["ycb"].target_path
+
+
+def test_a_real_model(shared_dir, root):
+    folder = root / "models" / "011_banana"
+    shutil.copytree(shared_dir / "graspnet_sample" / "models" / "005", folder)
+    info = json.loads((root / "info_pick_v0.json").read_text())
+    (root / "info_pick_v0.json").write_text(json.dumps(info | {"011_banana": {"scales": [1.0]}}))
+    source = ycb_source(root, "011_banana")
+    assert (source.id, source.graspnet_id) == ("banana", 5)
+    assert source.closed.is_watertight
+    assert source.mesh.visual.material.image is not None
