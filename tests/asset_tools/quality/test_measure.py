@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+import trimesh
+
+from asset_tools.grasps import sample_grasps
+from asset_tools.quality.measure import HEADER, judge, measure_object, rows, top_grasps
+from asset_tools.resting import resting_poses
+from robocas_ms3.assets.annotations import Annotations, footprints
+from robocas_ms3.assets.manifest import ObjectQuality
+
+GOOD = ObjectQuality(
+    compact=True,
+    hull_count=4,
+    hull_vertices=48,
+    volume_iou=0.95,
+    surface_p95=0.001,
+    rest_share=1,
+    rest_time=0.5,
+    penetration=0.0005,
+    jitter=1e-6,
+    grasps_tried=20,
+    grasps_held=0.9,
+)
+
+
+def annotate(mesh, solid, count=60):
+    facts = dict(mass=solid.mass, center_of_mass=solid.center_of_mass)
+    rest = resting_poses(list(solid.hulls), **facts, inertia=solid.inertia, inertia_wxyz=solid.inertia_wxyz)
+    grasps = sample_grasps(mesh, solid.center_of_mass, np.random.default_rng(0), count=count)
+    return Annotations(
+        resting_poses=rest.poses,
+        resting_probabilities=rest.probabilities,
+        display_pose=rest.display_pose,
+        footprints=footprints(list(solid.hulls), rest.poses),
+        grasps_tcp_in_object=grasps.tcp_in_object,
+        grasp_widths=grasps.widths,
+        grasp_qualities=grasps.qualities,
+        surface_points=np.zeros((1, 3)),
+        surface_normals=np.array([[0.0, 0, 1]]),
+    )
+
+
+def test_a_block_passes_all(block):
+    mesh, solid = trimesh.creation.box((0.05, 0.08, 0.12)), block(0.05, 0.08, 0.12)
+    notes = annotate(mesh, solid)
+    quality = measure_object(mesh, solid, notes)
+    assert (quality.compact, quality.hull_count, quality.hull_vertices) == (True, 1, 8)
+    assert quality.volume_iou == 1 and quality.surface_p95 == 0
+    assert quality.rest_share == 1 and quality.grasps_tried == 20 and quality.grasps_held >= 0.95
+    assert judge({"block": quality}) == []
+    assert measure_object(mesh, solid, notes) == quality
+
+
+def test_an_object_without_grasps(block):
+    mesh, solid = trimesh.creation.box((0.12, 0.12, 0.12)), block(0.12, 0.12, 0.12)
+    quality = measure_object(mesh, solid, annotate(mesh, solid))
+    assert (quality.grasps_tried, quality.grasps_held) == (0, 0)
+    assert judge({"cube": quality, "fine": GOOD}) == []
+    assert rows({"cube": quality})[0][-1] == "-"
+
+
+def test_top_grasps_go_by_friction_then_by_order(block):
+    mesh, solid = trimesh.creation.box((0.05, 0.08, 0.12)), block(0.05, 0.08, 0.12)
+    notes = annotate(mesh, solid, count=4)
+    notes = Annotations(**{**vars(notes), "grasp_qualities": np.array([0.3, 0.1, 0.2, 0.1])})
+    np.testing.assert_array_equal(top_grasps(notes, 3), notes.grasps_tcp_in_object[[1, 3, 2]])
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (dict(volume_iou=0.79), "volume IoU"),
+        (dict(hull_vertices=65), "vertices of a hull"),
+        (dict(rest_share=0.85), "drops at rest"),
+        (dict(rest_time=2.1), "median time to rest"),
+        (dict(penetration=0.0021), "penetration"),
+        (dict(jitter=0.002), "jitter"),
+        (dict(compact=False, surface_p95=0.0041), "distance of the surfaces"),
+    ],
+)
+def test_each_limit_of_an_object(change, what):
+    pack = {"a": GOOD, "b": GOOD, "bad": GOOD.model_copy(update=change)}
+    assert [(broken.asset, broken.what) for broken in judge(pack)] == [("bad", what)]
+
+
+def test_limits_hold_for_the_right_kind():
+    assert judge({"a": GOOD.model_copy(update=dict(surface_p95=0.01))}) == []
+    assert judge({"a": GOOD.model_copy(update=dict(compact=False, volume_iou=0.3))}) == []
+
+
+def test_medians_of_the_pack():
+    weak = dict(volume_iou=0.85, hull_count=9, grasps_held=0.75)
+    one = {"a": GOOD, "b": GOOD, "c": GOOD.model_copy(update=weak)}
+    assert judge(one) == []
+    most = {"a": GOOD, "b": GOOD.model_copy(update=weak), "c": GOOD.model_copy(update=weak)}
+    found = judge(most)
+    assert [(broken.asset, broken.what, broken.expected, broken.found) for broken in found] == [
+        ("", "median volume IoU", ">= 0.90", "0.85"),
+        ("", "median hulls", "<= 8", "9"),
+        ("", "median of grasps held", ">= 80%", "75%"),
+    ]
+    assert judge({}) == []
+
+
+def test_table():
+    table = rows({"a": GOOD, "b": GOOD.model_copy(update=dict(volume_iou=0.85, compact=False))})
+    assert [len(row) for row in table] == [len(HEADER)] * 3
+    assert table[0] == ("a", "compact", "4", "0.95", "1.0", "100", "0.50", "0.50", "0.001", "90")
+    assert table[1][:4] == ("b", "thin", "4", "0.85")
+    assert table[2][:4] == ("median", "", "4", "0.90")
+    assert rows({}) == []

@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+
+from asset_tools.quality import holding
+from asset_tools.quality.holding import hold_test
+from robocas_ms3.errors import AssetError
+
+
+def grasps(*places):
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
+    return poses
+
+
+CENTRE = (0, 0, 0)
+
+
+def test_a_block_held_by_its_middle_stays(block):
+    assert hold_test(block(0.05, 0.05, 0.05), grasps(CENTRE)).tolist() == [True]
+
+
+def test_a_thin_block_stays_too(block):
+    assert hold_test(block(0.05, 0.004, 0.05, mass=0.05), grasps(CENTRE)).all()
+
+
+def test_a_grasp_beside_the_object_holds_nothing(block):
+    # 5 cm beyond its edge, and 5 cm above it, in front of the tips
+    found = hold_test(block(0.05, 0.05, 0.05), grasps((0.075, 0, 0), (0, 0, -0.075), CENTRE))
+    assert found.tolist() == [False, False, True]
+
+
+def test_a_heavy_block_slips_through(block):
+    # Fingers press with 1000 N/m * (25 + 10) mm = 35 N each, so they carry 2 * 0.99 * 35 N = 69 N: 7 kg at rest, less
+    # than 5 kg while shaken with 6 m/s2.
+    assert hold_test(block(0.05, 0.05, 0.05, mass=1.0), grasps(CENTRE)).all()
+    assert not hold_test(block(0.05, 0.05, 0.05, mass=5.0), grasps(CENTRE)).any()
+
+
+def test_a_slippery_block_slips_through(block, monkeypatch):
+    # With slippery fingers as well (the engine takes the mean of both), 2 * 0.05 * 35 N = 3.5 N carry 0.36 kg at rest.
+    assert hold_test(block(0.05, 0.05, 0.05, mass=0.5), grasps(CENTRE)).all()
+    monkeypatch.setattr(holding, "FINGER_FRICTION", 0.05)
+    assert not hold_test(block(0.05, 0.05, 0.05, mass=0.5, friction=0.05), grasps(CENTRE)).any()
+
+
+def test_a_long_bar_held_by_its_end_turns(block):
+    # 0.5 kg at 12 cm: 0.6 N m about pads that are 18 mm wide
+    bar = block(0.3, 0.03, 0.03, mass=0.5)
+    assert hold_test(bar, grasps(CENTRE, (0.12, 0, 0))).tolist() == [True, False]
+
+
+def test_the_hand_moves_as_it_says():
+    motion = holding._motion(0.002)
+    position, speed = motion[..., 0], motion[..., 1]
+    acceleration = np.gradient(speed, 0.002, axis=0)[1:-3]
+    assert len(motion) == 1000
+    assert position[249, 0] == pytest.approx(0.1)
+    np.testing.assert_allclose(position[250:].min(0), (0.07, -0.03, -np.radians(20)), atol=1e-3)
+    np.testing.assert_allclose(position[250:, :2].max(0), (0.13, 0.03), atol=1e-3)
+    np.testing.assert_allclose(position[-1], (0.1, 0, 0), atol=1e-6)
+    assert np.linalg.norm(acceleration[252:, :2], axis=1).max() == pytest.approx(6, abs=0.3)
+    assert np.abs(acceleration[252:, 2]).max() == pytest.approx(25, abs=1)
+
+
+def test_each_grasp_is_for_itself(block):
+    solid, both = block(0.06, 0.05, 0.05), grasps(CENTRE, (0.02, 0, 0.01), (0.09, 0, 0), (-0.02, 0, 0))
+    together = hold_test(solid, both)
+    assert together.tolist() == [hold_test(solid, grasp[None])[0] for grasp in both]
+    assert together.tolist() == hold_test(solid, both).tolist()
+    assert hold_test(solid, both[:0]).shape == (0,)
+
+
+def test_a_mirrored_grasp_is_refused(block):
+    with pytest.raises(AssetError, match="no rigid pose"):
+        hold_test(block(0.05, 0.05, 0.05), np.diag([1.0, 1, -1, 1])[None])
