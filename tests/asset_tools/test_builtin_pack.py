@@ -11,7 +11,7 @@ from sapien import physx
 from asset_tools.builtin.build import build_asset, builtin_jobs
 from asset_tools.builtin.furniture import MAKERS
 from asset_tools.builtin.objects import SPECS
-from asset_tools.graspnet.catalogue import CATALOGUE
+from asset_tools.graspnet.catalogue import ENTRIES
 from asset_tools.quality.measure import judge
 from asset_tools.quality.packs import judge_furniture
 from robocas_ms3.assets.pack import load_pack
@@ -34,7 +34,7 @@ def test_ships_with_everything(pack):
 def test_stands_in_for_the_objects_of_upstream(pack):
     """Same number, same id: a configuration runs on either pack."""
     ours = {loaded.asset.graspnet_id: id_ for id_, loaded in pack.objects.items()}
-    assert ours == {number: entry.id for number, entry in CATALOGUE.items()} and len(ours) == 46
+    assert ours == {number: entry.id for number, entry in ENTRIES.items()} and len(ours) == 46
     names = [loaded.asset.name for loaded in pack.objects.values()]
     assert len(set(names)) == 46
 
