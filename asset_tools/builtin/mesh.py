@@ -114,6 +114,25 @@ def fitted(parts: list[list[Patch]], size: Size, *, pieces: Sequence[np.ndarray]
     return replace(build_shape(stretched), pieces=tuple((piece - middle) * factor for piece in pieces))
 
 
+def creased_shape(
+    vertices: np.ndarray,
+    uv: np.ndarray,
+    faces: np.ndarray,
+    texture_size: int,
+    pieces: tuple[np.ndarray, ...] = (),
+    *,
+    crease_deg: float = CREASE_DEG,
+) -> Shape:
+    """A shape of any closed surface that is unwrapped already; it has no regions.
+
+    Args:
+        vertices: (n, 3) m, split where the UVs jump. uv: (n, 2). faces: (f, 3).
+        texture_size: pixels. pieces: see ``Shape``.
+        crease_deg: faces that meet more sharply get an edge, not a smooth normal.
+    """
+    return replace(_with_normals(vertices, uv, faces, {}, texture_size, crease_deg), pieces=pieces)
+
+
 def weld(vertices: np.ndarray, tolerance: float = WELD) -> tuple[np.ndarray, np.ndarray]:
     """Distinct positions (k, 3) and, for each of the (n, 3) vertices, its position's index (n,)."""
     _, first, index = np.unique(

@@ -1,0 +1,195 @@
+"""Models: coloured parts blended into one closed body, unwrapped, and painted in space, so that no seam shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import trimesh
+import xatlas
+from PIL import Image
+from scipy.ndimage import distance_transform_edt
+
+from asset_tools.builtin.blends import Field, Point, mesh_of, smooth_min
+from asset_tools.builtin.mesh import Shape, Size, creased_shape
+from asset_tools.builtin.textures import Colour, as_jpeg
+from asset_tools.decompose import few_vertices
+
+MM = 1e-3
+CREASE_DEG = 55.0  # simplified roundings are coarse
+OVERSAMPLING = 2
+SHADE = 0.3  # how much darker the deepest creases are
+
+# points (n, 3) mm, unit normals (n, 3), colours (n, 3) to change in place
+Decorate = Callable[[np.ndarray, np.ndarray, np.ndarray, np.random.Generator], None]
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of a model.
+
+    Args:
+        field: its body. colour: of its surface.
+        soft: how far its creases with the parts before it are filled, mm.
+    """
+
+    field: Field
+    colour: Colour
+    soft: float = 0.0
+
+
+@dataclass(frozen=True)
+class Model:
+    """A body made of parts; lengths in mm, see ``blends``.
+
+    Args:
+        parts: united in this order; each point of the surface has the colour of the nearest.
+        low, high: box that holds the body.
+        decorate: paints details over the parts' colours.
+        floor: level below which everything is cut off, so that it stands.
+        step, triangles: of the mesh, see ``mesh_of``.
+        texture_size: pixels.
+        hulls: boxes (low, high); what the body has in each makes one convex collision piece.
+        grain: how much the brightness varies, as a fraction.
+    """
+
+    parts: tuple[Part, ...]
+    low: Point
+    high: Point
+    decorate: Decorate | None = None
+    floor: float | None = None
+    step: float = 1.0
+    triangles: int = 2000
+    texture_size: int = 512
+    hulls: tuple[tuple[Point, Point], ...] = ()
+    grain: float = 0.02
+
+    def field(self, points: np.ndarray) -> np.ndarray:
+        """The distance to the whole."""
+        distance = self.parts[0].field(points)
+        for part in self.parts[1:]:
+            distance = smooth_min(distance, part.field(points), part.soft)
+        return distance if self.floor is None else np.maximum(distance, self.floor - points[:, 2])
+
+    @cached_property
+    def body(self) -> trimesh.Trimesh:
+        """The closed surface, mm."""
+        body = mesh_of(self.field, self.low, self.high, step=self.step, triangles=self.triangles)
+        if self.floor is not None:  # simplifying moves the rim a little
+            low = body.vertices[:, 2] < self.floor + 0.3
+            body.vertices[low, 2] = self.floor
+        return body
+
+    def shape(self, size: Size) -> Shape:
+        """The body, centred and stretched to its exact size.
+
+        Raises:
+            ValueError: it would have to be stretched by more than a fifth.
+        """
+        factor = np.asarray(size) / (self.body.extents * MM)
+        if np.abs(factor - 1).max() > 0.2:
+            raise ValueError(f"the parts give {self.body.extents} mm for a shape of {size} m")
+        points = (self.body.vertices - self.body.bounds.mean(0)) * MM * factor
+        pieces = tuple((piece - self.body.bounds.mean(0)) * MM * factor for piece in self._pieces())
+        return unwrapped(np.asarray(points), np.asarray(self.body.faces), self.texture_size, pieces)
+
+    def paint(self, shape: Shape, rng: np.random.Generator) -> Image.Image:
+        """The texture of a shape that this model made."""
+        extents = np.ptp(shape.vertices, axis=0)
+        back, middle = self.body.extents / extents, self.body.bounds.mean(0)
+        palette = np.array([part.colour for part in self.parts], np.float32)
+
+        def colours(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+            points = (points * back + middle).astype(np.float32)
+            nearest = np.argmin([part.field(points) for part in self.parts], axis=0)
+            result = palette[nearest]
+            if self.decorate is not None:
+                self.decorate(points, normals, result, rng)
+            reach = 0.03 * float(self.body.extents.max())
+            open_ = np.clip(self.field((points + reach * normals).astype(np.float32)) / reach, 0, 1)
+            shade = 1 - SHADE * (1 - open_) ** 1.5
+            if self.grain:
+                shade *= 1 + self.grain * _grain(points, rng)
+            return result * shade[:, None]
+
+        return paint_in_space(shape, colours)
+
+    def _pieces(self) -> list[np.ndarray]:
+        """Hulls (k, 3) of what lies in each box, mm."""
+        import manifold3d
+
+        solid = manifold3d.Manifold(
+            manifold3d.Mesh(np.asarray(self.body.vertices, np.float32), np.asarray(self.body.faces, np.uint32))
+        )
+        pieces = []
+        for low, high in self.hulls:
+            tool = manifold3d.Manifold.cube(tuple(np.subtract(high, low).tolist())).translate(low)
+            inside = (solid ^ tool).to_mesh()
+            pieces.append(few_vertices(np.asarray(inside.vert_properties[:, :3], float)))
+        return pieces
+
+
+def unwrapped(vertices: np.ndarray, faces: np.ndarray, texture_size: int, pieces: tuple[np.ndarray, ...] = ()) -> Shape:
+    """A closed surface as a shape with one texture atlas that covers each of its triangles once."""
+    low, reach = vertices.min(0), float(np.ptp(vertices, axis=0).max())
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(((vertices - low) / reach).astype(np.float32), faces.astype(np.uint32))
+    options = xatlas.PackOptions()
+    options.resolution, options.padding, options.bilinear = texture_size, 3, True
+    atlas.generate(pack_options=options)
+    origin, corners, uv = atlas[0]
+    uv, corners = uv.astype(float), corners.astype(np.int64)
+    return creased_shape(vertices[origin], uv, corners, texture_size, pieces, crease_deg=CREASE_DEG)
+
+
+def paint_in_space(shape: Shape, colours: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Image.Image:
+    """The texture of a shape, given the colours (n, 3) in 0..255 of points (n, 3) m with normals (n, 3).
+
+    The shape's triangles must not overlap in the texture.
+    """
+    size = OVERSAMPLING * shape.texture_size
+    row, column, face, weights = _texels(shape.uv[shape.faces], size)
+    corners = shape.faces[face]
+    points = np.einsum("nc,ncd->nd", weights, shape.vertices[corners])
+    normals = np.einsum("nc,ncd->nd", weights, shape.normals[corners])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    picture = np.zeros((size, size, 3), np.uint8)
+    empty = np.ones((size, size), bool)
+    picture[row, column] = np.clip(np.rint(colours(points, normals)), 0, 255)
+    empty[row, column] = False
+    near = distance_transform_edt(empty, return_distances=False, return_indices=True)
+    return as_jpeg(Image.fromarray(picture[near[0], near[1]]).reduce(OVERSAMPLING), 85)  # type: ignore[index]
+
+
+def _texels(uv: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Row, column, face and (n, 3) corner weights of each texel whose centre a face (f, 3, 2) covers."""
+    corners = uv * (size, -size) + (-0.5, size - 0.5)  # column, row; whole numbers are centres
+    low = np.clip(np.ceil(corners.min(1)), 0, size - 1).astype(int)
+    count = np.maximum(np.clip(np.floor(corners.max(1)), 0, size - 1).astype(int) - low + 1, 0)
+    many = count.prod(1)
+    face = np.repeat(np.arange(len(uv)), many)
+    step = np.arange(len(face)) - np.repeat(np.cumsum(many) - many, many)
+    wide = np.maximum(count[face, 0], 1)
+    column, row = low[face, 0] + step % wide, low[face, 1] + step // wide
+    a, b, c = corners[face].transpose(1, 0, 2)
+    texel = np.column_stack([column, row])
+    area = _cross(b - a, c - a)
+    area = np.where(np.abs(area) < 1e-12, np.inf, area)
+    weights = np.column_stack(
+        [_cross(b - texel, c - texel), _cross(c - texel, a - texel), _cross(a - texel, b - texel)]
+    )
+    weights = weights / area[:, None]
+    keep = (weights >= -1e-6).all(1) & np.isfinite(area)
+    return row[keep], column[keep], face[keep], weights[keep]
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _grain(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Smooth variation in about [-1, 1], a few cm wide."""
+    waves = rng.normal(size=(6, 3)) * 0.12
+    return np.cos(points @ waves.T + rng.uniform(0, 2 * np.pi, 6)).sum(1) / np.sqrt(6)
