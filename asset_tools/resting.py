@@ -24,7 +24,8 @@ ROUNDS = 6  # seconds an object may roll until it stays
 MOVED, TURNED_DEG = 0.001, 2.0  # in one second, afresh: less is at rest
 YAWS = tuple(np.arange(8) * 0.8)  # rad: it must stay however it is turned, for the engine's contacts depend on it
 DROP = 0.0005  # m above the plane at the start: scenes leave a gap as well
-MIN_TOPPLING_DEG = 3.0  # a pose that gives way to less is no pose to put things down in
+MIN_TOPPLING_DEG = 3.0  # a pose that gives way to less is no pose to put things down in,
+ROCKING_DEG = tuple(range(1, 11))  # unless it only rocks: tilted by any of these it is no lower than before
 STEPS = 100  # of TIME_STEP
 
 LIFT = np.zeros((4, 4))
@@ -255,8 +256,22 @@ def _firm(body: _Body, directions: Array, which: list[int]) -> tuple[Array, list
     if len(directions) == 0:
         return directions, which
     margins = np.array([toppling_angle(body.cooked, body.center_of_mass, up) for up in directions])
-    firm = np.flatnonzero(margins >= min(MIN_TOPPLING_DEG, margins.max()))
+    rocks = np.array([_only_rocks(body.cooked - body.center_of_mass, up) for up in directions])
+    firm = np.flatnonzero((margins >= min(MIN_TOPPLING_DEG, margins.max())) | rocks)
     return directions[firm], [which[i] for i in firm]
+
+
+def _only_rocks(points: Array, up: Array) -> bool:
+    """Whether a body of corners (V, 3) about its centre of mass stays near a pose even if it leaves it.
+
+    The sides of an oval bottle are a few facets, and on each of them it stands by a hair.
+    """
+    across = np.linalg.svd(up[None])[2][1:]
+    turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    around = np.cos(turns)[:, None] * across[0] + np.sin(turns)[:, None] * across[1]
+    tilts = np.radians(ROCKING_DEG)[:, None, None]
+    ups = np.cos(tilts) * up + np.sin(tilts) * around
+    return bool((-(ups @ points.T).min(axis=-1)).min() >= -(points @ up).min() - SAME_HEIGHT)
 
 
 def toppling_angle(points: Array, center_of_mass: Array, up: Array) -> float:

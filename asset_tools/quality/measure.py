@@ -26,7 +26,7 @@ HULL_VERTICES = 64  # more don't go into a GPU's hull
 REST_SHARE = 0.90  # of drops
 REST_TIME = 2.0  # s
 PENETRATION = 0.002  # m
-JITTER = 1e-3  # J; a drop counts as at rest below 2e-4 J per kg anyway
+JITTER = 1e-3  # J; a drop counts as at rest below 4.5e-4 J per kg anyway
 # Of the median over the pack:
 MEDIAN_OVERLAP = 0.90
 MEDIAN_HULLS = 8

@@ -199,3 +199,32 @@ def test_toppling_angle_of_a_box_is_known():
     assert toppling_angle(corners, np.zeros(3), up) == pytest.approx(np.degrees(np.arctan2(1, 3)))
     assert toppling_angle(corners, np.array([0.9, 0, 0]), up) == pytest.approx(np.degrees(np.arctan2(0.1, 3)))
     assert toppling_angle(corners, np.zeros(3), np.array([1, 0, 1]) / np.sqrt(2)) == 0  # on an edge
+
+
+def test_a_body_that_only_rocks_is_put_down_on_its_blunt_edges_too() -> None:
+    """A bar 70 mm wide whose broad sides are roofs 1.1 mm high: each half is 1.8 deg off, and lets go at 1.8 deg."""
+    outline = [(0.035, 0.0229), (0, 0.024), (-0.035, 0.0229), (-0.035, -0.0229), (0, -0.024), (0.035, -0.0229)]
+    points = np.array([(x, y, z) for x, z in outline for y in (-0.085, 0.085)])
+    result = resting_poses(
+        [points], mass=0.3, center_of_mass=(0, 0, 0), inertia=box_inertia(0.3, 0.07, 0.17, 0.047), inertia_wxyz=IDENTITY
+    )
+    ups = result.poses[:, 2, :3]
+    slant = np.arctan(0.0011 / 0.035)
+    broad = ups[np.abs(ups[:, 2]) > 0.9]
+    np.testing.assert_allclose(np.abs(broad), [(np.sin(slant), 0, np.cos(slant))] * 2, atol=1e-3)  # halves are merged
+    assert broad[:, 2].min() < 0 < broad[:, 2].max()
+    assert result.probabilities[np.abs(ups[:, 2]) > 0.9].sum() > 0.5
+
+
+def test_a_pen_is_not_put_down_on_its_end() -> None:
+    """4 mm across and 15 cm long it lets go at 1.5 deg, and then it falls."""
+    points = box_points(0.004, 0.004, 0.15)
+    result = resting_poses(
+        [points],
+        mass=0.01,
+        center_of_mass=(0, 0, 0),
+        inertia=box_inertia(0.01, 0.004, 0.004, 0.15),
+        inertia_wxyz=IDENTITY,
+        minimum_probability=0.0,
+    )
+    assert np.abs(result.poses[:, 2, 2]).max() < 0.1
