@@ -1,189 +1,177 @@
-"""Parametric bottles and tubes, see ``shapes``."""
+"""Parametric bottles and tubes, see ``shapes``. Those with a lid have the regions side, shoulder, cap, lid, bottom.
+
+Rings are (half_x, half_y, z, exponent, corner cut) in metres, see ``surfaces``.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.optimize import root_scalar
 
-from asset_tools.builtin.mesh import Shape, Size, fitted
+from asset_tools.builtin.mesh import Patch, Shape, Size, fitted
 from asset_tools.builtin.surfaces import Section, chained_pieces, loft, oval_rings, round_rings, stacked_pieces, sweep
+
+Ring = tuple[float, float, float, float, float]
 
 
 def squeeze_bottle(size: Size) -> Shape:
     """A flat oval bottle with a conical nozzle. Regions: side, shoulder, cap, bottom."""
-    a, b, h = size[0] / 2, size[1] / 2, size[2]
-    top = h * 0.70
-    side = [
-        (a * 0.88, b * 0.86, 0, 2.6, 0),
-        (a, b, 0, 2.6, 0.008),
-        (a * 0.97, b * 0.97, h * 0.3, 2.6, 0.05),
-        (a, b, top, 2.6, 0),
-    ]
-    shoulder = [(a, b, top, 2.6, 0), (a * 0.98, b * 0.98, h * 0.76, 2.5, 0.02), (0.019, 0.019, h * 0.835, 2.0, 0)]
-    cap = [
-        (0.019, 0.019, h * 0.835, 2, 0),
-        (0.021, 0.021, h * 0.835, 2, 0),
-        (0.021, 0.021, h * 0.88, 2, 0.002),
-        (0.0105, 0.0105, h * 0.9, 2, 0.006),
-    ]
-    cap += [(0.0055, 0.0055, h * 0.992, 2, 0.002), (0.004, 0.004, h, 2, 0.002), (0, 0, h, 2, 0)]
-    sections = [
-        Section(
-            "bottom",
-            oval_rings([(0, 0, 0.003, 2.6, 0), (a * 0.7, b * 0.66, 0.003, 2.6, 0.004), side[0]]),
-            flat=True,
-            detail=0.4,
-        ),
-        Section("side", oval_rings(side)),
-        Section("shoulder", oval_rings(shoulder, steps=4), detail=0.4),
-        Section("cap", oval_rings(cap), detail=0.6),
-    ]
-    part = loft(sections)
-    return fitted([part], size, pieces=stacked_pieces(part, [h * 0.835, h * 0.9]))
+    a, b, h = _halves(size)
+    side = [*_foot(a, b, 2.6), (a * 0.97, b * 0.97, h * 0.3, 2.6, 0.05), (a, b, h * 0.70, 2.6, 0)]
+    shoulder = [(a * 0.98, b * 0.98, h * 0.76, 2.5, 0.02), _neck(0.019, h * 0.835)]
+    cap = [_neck(0.021, h * 0.835), _neck(0.021, h * 0.88, 0.002), _neck(0.0105, h * 0.9, 0.006)]
+    cap += [_neck(0.0055, h * 0.992, 0.002), _neck(0.004, h, 0.002), _neck(0, h)]
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.835, h * 0.9])
 
 
-def flip_top_bottle(size: Size, *, exponent: float = 2.4, cap_height: float = 0.2, taper: float = 0.82) -> Shape:
-    """An oval bottle with a wide cap as its shoulders' continuation. Regions: side, shoulder, cap, lid, bottom."""
-    a, b, h = size[0] / 2, size[1] / 2, size[2]
-    cap_z, shoulder_z = h * (1 - cap_height), h * (0.88 - cap_height)
-    ca, cb = a * taper * 0.7, b * taper
-    side = [(a * 0.88, b * 0.86, 0, exponent, 0), (a, b, 0, exponent, 0.006), (a, b, shoulder_z, exponent, 0)]
-    shoulder = [
-        (a, b, shoulder_z, exponent, 0),
-        (a, b, shoulder_z + 0.3 * (cap_z - shoulder_z), exponent, 0.02),
-        (ca, cb * 0.96, cap_z, 2.2, 0),
-    ]
-    cap = [
-        (ca, cb * 0.96, cap_z, 2.2, 0),
-        (ca + 0.0012, cb, cap_z, 2.2, 0),
-        (ca * 0.96, cb * 0.96, h, 2.2, 0.003),
-        (ca * 0.8, cb * 0.8, h, 2.2, 0),
-    ]
-    sections = [
-        Section(
-            "bottom",
-            oval_rings([(0, 0, 0.002, exponent, 0), (a * 0.7, b * 0.66, 0.002, exponent, 0.004), side[0]]),
-            flat=True,
-            detail=0.4,
-        ),
-        Section("side", oval_rings(side)),
-        Section("shoulder", oval_rings(shoulder, steps=4), detail=0.4),
-        Section("cap", oval_rings(cap), detail=0.6),
-        Section("lid", oval_rings([cap[-1], (0, 0, h, 2.2, 0)]), flat=True, detail=0.6),
-    ]
-    part = loft(sections)
-    return fitted([part], size, pieces=stacked_pieces(part, [cap_z]))
+def flip_top_bottle(
+    size: Size, *, exponent: float = 2.4, cap_height: float = 0.2, taper: float = 0.6, waist: float = 0.0
+) -> Shape:
+    """An oval bottle whose shoulders go on into a wide oval cap.
+
+    Args:
+        size: see ``shapes``. exponent: of its section.
+        cap_height: as a fraction of the height. taper: width of the cap as a fraction of the body's.
+        waist: how much narrower the middle of the body is, as a fraction of the width.
+    """
+    a, b, h = _halves(size)
+    cap_z, top = h * (1 - cap_height), h * (0.88 - cap_height)
+    ca, cb = a * taper, min(b * 0.84, a * taper)
+    side = [*_foot(a, b, exponent), (a, b, top, exponent, 0)]
+    cuts = [cap_z]
+    if waist:
+        middle = top * 0.52
+        narrow = a * (1 - waist), b * (1 - waist / 2)
+        side[2:2] = [(a, b, top * 0.14, exponent, 0.03), (*narrow, middle, exponent, 0.05)]
+        side[-1:] = [(a, b, top * 0.94, exponent, 0.03), (a, b, top, exponent, 0)]
+        cuts = [middle, cap_z]
+    shoulder = [(a, b, top + 0.35 * (cap_z - top), exponent, 0.02), (ca * 0.97, cb * 0.97, cap_z, 2.2, 0)]
+    cap = [(ca, cb, cap_z, 2.2, 0), (ca * 0.97, cb * 0.97, h, 2.2, 0.004), (ca * 0.8, cb * 0.8, h, 2.2, 0)]
+    return _bottle(size, side, shoulder, cap, cuts=cuts)
 
 
-def drink_bottle(size: Size) -> Shape:
-    """A round bottle with waist, long shoulders and a screw cap. Regions: side, shoulder, cap, lid, bottom."""
-    r, h = size[0] / 2, size[2]
-    side = [
-        (r * 0.8, 0, 0),
-        (r, 0, 0.008),
-        (r, h * 0.16, 0.004),
-        (r * 0.93, h * 0.2, 0.006),
-        (r * 0.93, h * 0.24, 0.006),
-        (r, h * 0.28, 0.004),
-        (r, h * 0.62, 0),
-    ]
-    shoulder = [(r, h * 0.62, 0), (r, h * 0.72, 0.04), (0.0135, h * 0.88, 0.01), (0.0135, h * 0.905, 0)]
-    cap = [(0.0135, h * 0.905, 0), (0.0155, h * 0.905, 0), (0.0155, h, 0.0015), (0.012, h, 0)]
-    sections = [
-        Section(
-            "bottom", round_rings([(0, 0.005, 0), (r * 0.6, 0.003, 0.008), (r * 0.8, 0, 0)]), flat=True, detail=0.4
-        ),
-        Section("side", round_rings(side)),
-        Section("shoulder", round_rings(shoulder, steps=4), detail=0.4),
-        Section("cap", round_rings(cap), detail=0.6),
-        Section("lid", round_rings([(0.012, h, 0), (0, h, 0)]), flat=True, detail=0.6),
-    ]
-    part = loft(sections)
-    return fitted([part], size, pieces=stacked_pieces(part, [h * 0.22, h * 0.87, h * 0.905]))
+def teardrop_bottle(size: Size) -> Shape:
+    """A flat bottle, broad low down, that narrows without shoulders into a flip-top cap."""
+    a, b, h = _halves(size)
+    side = [*_foot(a * 0.90, b * 0.94, 2.3), (a, b, h * 0.26, 2.3, 0.05), (a * 0.80, b * 0.93, h * 0.66, 2.3, 0)]
+    shoulder = [(a * 0.60, b * 0.80, h * 0.82, 2.3, 0)]
+    cap = [(a * 0.62, b * 0.83, h * 0.82, 2.3, 0), (a * 0.52, b * 0.72, h, 2.3, 0.006), (a * 0.4, b * 0.5, h, 2.3, 0)]
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.82])
+
+
+def disc_top_bottle(size: Size) -> Shape:
+    """A slender flat bottle with round shoulders and a small low cap."""
+    a, b, h = _halves(size)
+    side = [*_foot(a, b, 2.2), (a, b, h * 0.66, 2.2, 0)]
+    shoulder = [(a * 0.98, b * 0.98, h * 0.77, 2.2, 0.018), (a * 0.55, b * 0.7, h * 0.85, 2.1, 0.008)]
+    shoulder += [_neck(0.0100, h * 0.865, 0.002), _neck(0.0095, h * 0.885)]
+    cap = [_neck(0.0130, h * 0.885), _neck(0.0125, h, 0.002), _neck(0.0100, h)]
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.857, h * 0.885])
+
+
+def tapered_bottle(size: Size) -> Shape:
+    """Broad at the shoulders and narrow at the foot, nearly rectangular, with a slim tall cap."""
+    a, b, h = _halves(size)
+    side = [*_foot(a * 0.72, b * 0.78, 4), (a, b, h * 0.62, 4, 0)]
+    shoulder = [(a * 0.985, b * 0.985, h * 0.695, 3.5, 0.014), (0.014, 0.014, h * 0.75, 2.2, 0.006)]
+    shoulder += [_neck(0.0115, h * 0.765)]
+    cap = [_neck(0.0135, h * 0.765), _neck(0.0165, h, 0.002), _neck(0.0120, h)]
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.75])
 
 
 def screw_cap_bottle(size: Size) -> Shape:
-    """A nearly rectangular bottle with a tall screw cap. Regions: side, shoulder, cap, lid, bottom."""
-    a, b, h = size[0] / 2, size[1] / 2, size[2]
-    side = [(a * 0.86, b * 0.84, 0, 4, 0), (a, b, 0, 4, 0.006), (a, b, h * 0.6, 4, 0)]
-    shoulder = [
-        (a, b, h * 0.6, 4, 0),
-        (a, b, h * 0.7, 4, 0.022),
-        (0.016, 0.016, h * 0.77, 2, 0.004),
-        (0.0155, 0.0155, h * 0.80, 2, 0),
-    ]
-    cap = [
-        (0.0155, 0.0155, h * 0.8, 2, 0),
-        (0.0195, 0.0195, h * 0.8, 2, 0),
-        (0.018, 0.018, h, 2, 0.002),
-        (0.014, 0.014, h, 2, 0),
-    ]
-    sections = [
-        Section(
-            "bottom",
-            oval_rings([(0, 0, 0.003, 4, 0), (a * 0.66, b * 0.6, 0.003, 4, 0.004), side[0]]),
-            flat=True,
-            detail=0.4,
-        ),
-        Section("side", oval_rings(side)),
-        Section("shoulder", oval_rings(shoulder, steps=4), detail=0.4),
-        Section("cap", oval_rings(cap), detail=0.6),
-        Section("lid", oval_rings([cap[-1], (0, 0, h, 2, 0)]), flat=True, detail=0.6),
-    ]
-    part = loft(sections)
-    return fitted([part], size, pieces=stacked_pieces(part, [h * 0.77, h * 0.8]))
+    """A nearly rectangular bottle with a tall screw cap."""
+    a, b, h = _halves(size)
+    side = [*_foot(a, b, 4), (a, b, h * 0.6, 4, 0)]
+    shoulder = [(a, b, h * 0.7, 4, 0.022), _neck(0.016, h * 0.77, 0.004), _neck(0.0155, h * 0.80)]
+    cap = [_neck(0.0195, h * 0.8), _neck(0.018, h, 0.002), _neck(0.014, h)]
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.77, h * 0.8])
 
 
-def pump_bottle(size: Size) -> Shape:
-    """A rounded bottle with a pump, its spout towards +x. Regions: side, shoulder, cap, spout, bottom."""
-    a, b, h = size[0] / 2, size[1] / 2, size[2]
-    body = h * 0.66
-    side = [(a * 0.86, b * 0.84, 0, 3, 0), (a, b, 0, 3, 0.006), (a, b, body, 3, 0)]
-    shoulder = [
-        (a, b, body, 3, 0),
-        (a, b, h * 0.73, 3, 0.02),
-        (0.0145, 0.0145, h * 0.765, 2, 0.002),
-        (0.0135, 0.0135, h * 0.77, 2, 0),
-    ]
-    cap = [
-        (0.0135, 0.0135, h * 0.77, 2, 0),
-        (0.016, 0.016, h * 0.77, 2, 0),
-        (0.0155, 0.0155, h * 0.85, 2, 0.002),
-        (0.006, 0.006, h * 0.855, 2, 0.001),
-    ]
-    cap += [
-        (0.005, 0.005, h * 0.93, 2, 0.001),
-        (0.0135, 0.0115, h * 0.935, 2.4, 0.002),
-        (0.0145, 0.0125, h, 2.4, 0.004),
-        (0, 0, h, 2.2, 0),
-    ]
-    sections = [
-        Section(
-            "bottom",
-            oval_rings([(0, 0, 0.002, 3, 0), (a * 0.66, b * 0.6, 0.002, 3, 0.004), side[0]]),
-            flat=True,
-            detail=0.4,
-        ),
-        Section("side", oval_rings(side)),
-        Section("shoulder", oval_rings(shoulder, steps=4), detail=0.4),
-        Section("cap", oval_rings(cap, steps=3), detail=0.5),
-    ]
+def flask(size: Size) -> Shape:
+    """A square flask with a long sloping neck and a measuring cup for a cap."""
+    a, b, h = _halves(size)
+    side = [*_foot(a, b, 5), (a, b, h * 0.46, 5, 0)]
+    shoulder = [(a, b, h * 0.51, 4.5, 0.012), _neck(0.0105, h * 0.735, 0.008), _neck(0.0105, h * 0.77)]
+    cap = [_neck(0.0130, h * 0.77), _neck(0.0180, h, 0.001), _neck(0.0150, h)]
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.735, h * 0.77])
+
+
+def foamer(size: Size) -> Shape:
+    """An oval bottle under a tall dome, which covers the foam pump."""
+    a, b, h = _halves(size)
+    side = [*_foot(a, b, 2.3), (a, b, h * 0.53, 2.3, 0)]
+    shoulder = [(a * 0.98, b * 0.98, h * 0.61, 2.3, 0.014), _neck(0.0170, h * 0.65)]
+    cap = [_neck(0.0185, h * 0.65), _neck(0.0182, h * 0.90, 0.02), _neck(0.0145, h * 0.985, 0.012), _neck(0, h)]
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.65])
+
+
+def drink_bottle(size: Size) -> Shape:
+    """A round bottle with waist, long shoulders and a screw cap."""
+    r, _, h = _halves(size)
+    side = [_neck(r * 0.8, 0), _neck(r, 0, 0.008), _neck(r, h * 0.16, 0.004)]
+    side += [_neck(r * 0.93, h * 0.2, 0.006), _neck(r * 0.93, h * 0.24, 0.006), _neck(r, h * 0.28, 0.004)]
+    side += [_neck(r, h * 0.62)]
+    shoulder = [_neck(r, h * 0.72, 0.04), _neck(0.0135, h * 0.88, 0.01), _neck(0.0135, h * 0.905)]
+    cap = [_neck(0.0155, h * 0.905), _neck(0.0155, h, 0.0015), _neck(0.012, h)]
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.22, h * 0.87, h * 0.905])
+
+
+def pump_bottle(size: Size, *, exponent: float = 3.0, body: float = 0.66, reach: float = 1.0) -> Shape:
+    """A bottle with a pump, its spout towards +x. Regions: side, shoulder, cap, spout, bottom.
+
+    Args:
+        size: see ``shapes``. exponent: of its section.
+        body: height of its straight part, as a fraction of the height.
+        reach: of the spout, as a fraction of half the width.
+    """
+    a, b, h = _halves(size)
+    side = [*_foot(a, b, exponent), (a, b, h * body, exponent, 0)]
+    neck = body + 0.105
+    shoulder = [(a, b, h * (body + 0.07), exponent, 0.02), _neck(0.0145, h * neck, 0.002), _neck(0.0135, h * neck)]
+    cap = [_neck(0.016, h * neck), _neck(0.0155, h * (neck + 0.08), 0.002), _neck(0.006, h * (neck + 0.085), 0.001)]
+    cap += [_neck(0.005, h * 0.93, 0.001), (0.0135, 0.0115, h * 0.935, 2.4, 0.002)]
+    cap += [(0.0145, 0.0125, h, 2.4, 0.004), _neck(0, h)]
     t = np.linspace(0, 1, 7)
-    path = np.stack([0.004 + (a - 0.006) * t, 0 * t, h * 0.972 - 0.009 * t**3], axis=-1)
+    path = np.stack([0.004 + (a * reach - 0.006) * t, 0 * t, h * 0.972 - 0.009 * t**3], axis=-1)
     radii = np.stack([0.0048 - 0.0014 * t, 0.0062 - 0.0024 * t], axis=-1)
     path, radii = np.concatenate([path[:1], path, path[-1:]]), np.concatenate([[[0, 0]], radii, [[0, 0]]])
     path[0, 0] -= 1e-4
     path[-1, 0] += 1e-4
     spout = sweep("spout", path, radii, normal=(0, 1, 0), segments=10, detail=0.5)
-    part = loft(sections)
-    pieces = stacked_pieces(part, [h * 0.765, h * 0.855, h * 0.93]) + chained_pieces(spout[0], 2)
-    return fitted([part, spout], size, pieces=pieces)
+    return _bottle(size, side, shoulder, cap, cuts=[h * neck, h * (neck + 0.085), h * 0.93], spout=spout)
 
 
-def tube(size: Size, *, cap_radius: float, cap_height: float) -> Shape:
+def upended_bottle(size: Size) -> Shape:
+    """A bottle standing on its wide flat cap, broadest near its domed top. Regions: side, shoulder, cap, lid."""
+    a, b, h = _halves(size)
+    ca, cb, z = a * 0.74, b * 0.86, h * 0.15
+    cap = [(ca * 0.94, cb * 0.94, 0, 2.6, 0), (ca, cb, 0, 2.6, 0.002), (ca, cb, z, 2.6, 0.001)]
+    cap += [(ca * 0.96, cb * 0.95, z, 2.6, 0)]
+    side = [cap[-1], (a * 0.80, b * 0.94, h * 0.3, 2.6, 0.05), (a, b, h * 0.74, 2.6, 0.04), (a, b, h * 0.88, 2.6, 0)]
+    dome = [side[-1], (a * 0.97, b * 0.96, h * 0.985, 2.6, 0.018), (a * 0.55, b * 0.5, h, 2.4, 0.015), _neck(0, h)]
+    part = loft(
+        [
+            Section("lid", oval_rings([_neck(0, 0), cap[0]]), flat=True, detail=0.5),
+            Section("cap", oval_rings(cap), detail=0.5),
+            Section("side", oval_rings(side, steps=3)),
+            Section("shoulder", oval_rings(dome, steps=4), flat=False, detail=0.4),
+        ]
+    )
+    return fitted([part], size, pieces=stacked_pieces(part, [z, h * 0.34]))
+
+
+def tube(size: Size, *, cap_radius: float, cap_height: float, flare: float = 1.0) -> Shape:
     """A squeeze tube standing on its cap: round there, blending into a flat crimp on top. Regions: side, cap, lid.
 
     Its circumference is the same all along, as of a real tube: the crimp is pi / 2 times as wide as the round end.
+
+    Args:
+        size: see ``shapes``; the depth is the diameter of the round end.
+        cap_radius: of the cap where it meets the tube, m. cap_height: m.
+        flare: how much wider the cap is where the tube stands on it.
     """
     r, h, thick = size[1] / 2, size[2], 0.0008
     perimeter = 2 * np.pi * r
@@ -192,26 +180,70 @@ def tube(size: Size, *, cap_radius: float, cap_height: float) -> Shape:
         return root_scalar(lambda x: _ellipse_perimeter(x, half_y) - perimeter, bracket=(half_y * 0.99, np.pi * r)).root
 
     start, crimp = cap_height + 0.007, h - 0.008
-    body = [(cap_radius, cap_radius, cap_height, 2.0), (r * 0.96, r * 0.96, start - 0.001, 2.0)]
+    body = [(cap_radius * 0.97, cap_radius * 0.97, cap_height, 2.0), (cap_radius, cap_radius, cap_height, 2.0)]
+    body.append((r * 0.96, r * 0.96, start - 0.001, 2.0))
     for fraction in np.linspace(0, 1, 11):
         half_y = r + (thick - r) * fraction**1.25
         body.append((half_x(half_y), half_y, start + (crimp - start) * fraction, 2.0))
     flat = body[-1][0]
     body += [(flat, thick, h - 0.0005, 2.0), (flat, 0.0, h, 2.0)]
-    cap = [
-        (cap_radius * 0.9, 0, 0),
-        (cap_radius, 0, 0.002),
-        (cap_radius, cap_height, 0.001),
-        (cap_radius * 0.97, cap_height, 0),
-    ]
-    body.insert(0, (cap_radius * 0.97, cap_radius * 0.97, cap_height, 2.0))
+    foot = cap_radius * flare
+    cap = [(foot * 0.9, 0, 0), (foot, 0, 0.002), (cap_radius, cap_height, 0.001), (cap_radius * 0.97, cap_height, 0)]
     sections = [
-        Section("lid", round_rings([(0, 0, 0), (cap_radius * 0.9, 0, 0)]), flat=True, detail=0.5),
+        Section("lid", round_rings([(0, 0, 0), (foot * 0.9, 0, 0)]), flat=True, detail=0.5),
         Section("cap", round_rings(cap), detail=0.6),
         Section("side", np.array(body)),
     ]
     part = loft(sections)
     return fitted([part], size, pieces=stacked_pieces(part, [cap_height, start]))
+
+
+def _bottle(
+    size: Size,
+    side: Sequence[Ring],
+    shoulder: Sequence[Ring],
+    cap: Sequence[Ring],
+    *,
+    cuts: Sequence[float],
+    spout: list[Patch] | None = None,
+) -> Shape:
+    """Body, shoulder and cap, each beginning where the one before ends; a flat lid, unless the cap closes itself.
+
+    Args:
+        size: see ``shapes``. side, shoulder, cap: rings, upwards. cuts: see ``stacked_pieces``.
+        spout: a part of its own.
+    """
+    a, b, _, n, _ = side[0]
+    shoulder, cap = [(*side[-1][:4], 0), *shoulder], [(*shoulder[-1][:4], 0), *cap]
+    bottom = [(0, 0, 0.003, n, 0), (a * 0.78, b * 0.74, 0.003, n, 0.004), side[0]]
+    sections = [
+        Section("bottom", oval_rings(bottom), flat=True, detail=0.4),
+        Section("side", oval_rings(list(side), steps=3)),
+        Section("shoulder", oval_rings(shoulder, steps=4), detail=0.4),
+        Section("cap", oval_rings(cap, steps=3), detail=0.5),
+    ]
+    if cap[-1][0] > 0:
+        lid = [cap[-1], (0, 0, *cap[-1][2:])]
+        sections.append(Section("lid", oval_rings(lid), flat=True, detail=0.6))
+    part = loft(sections)
+    pieces = stacked_pieces(part, cuts)
+    if spout is None:
+        return fitted([part], size, pieces=pieces)
+    return fitted([part, spout], size, pieces=pieces + chained_pieces(spout[0], 2))
+
+
+def _halves(size: Size) -> tuple[float, float, float]:
+    return size[0] / 2, size[1] / 2, size[2]
+
+
+def _foot(a: float, b: float, exponent: float) -> list[Ring]:
+    """The rounded lower edge of a body of half sizes a and b."""
+    return [(a * 0.88, b * 0.86, 0, exponent, 0), (a, b, 0, exponent, 0.007)]
+
+
+def _neck(radius: float, z: float, cut: float = 0.0) -> Ring:
+    """A round ring."""
+    return radius, radius, z, 2.0, cut
 
 
 def _ellipse_perimeter(a: float, b: float) -> float:

@@ -13,6 +13,7 @@ from asset_tools.builtin.motifs import MOTIFS
 from asset_tools.builtin.textures import Box, Canvas, Colour, Painter
 
 METAL = (186, 190, 194)
+PLATED = ("stripes", "diagonal", "dots")  # styles too busy to print on: words stand on a plate of the base colour
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Label:
         amount_ink: of the amount, where the ground there differs.
         style: how the accent colour is laid out.
         motif: a picture of ``MOTIFS``.
-        cap: colour of lids, caps and nozzles.
+        cap: colour of lids, caps and nozzles. ridged: with grooves to turn it by; otherwise it flips open.
         turn: degrees by which the front is turned (tubes: 90).
         rows: of the table on the back.
     """
@@ -37,10 +38,11 @@ class Label:
     accent: Colour
     ink: Colour
     motif: str
-    style: Literal["bands", "half", "wave", "stripes", "diagonal", "panel", "dots"] = "bands"
+    style: Literal["bands", "half", "wave", "stripes", "diagonal", "panel", "dots", "plain"] = "bands"
     outline: Colour | None = None
     amount_ink: Colour | None = None
     cap: Colour = (240, 240, 238)
+    ridged: bool = True
     turn: int = 0
     rows: tuple[tuple[str, str], ...] = (
         ("Energy", "420 kJ"),
@@ -53,10 +55,10 @@ class Label:
 
 CARE_ROWS = (
     ("Use", "daily"),
-    ("Skin", "all types"),
+    ("Skin", "all"),
     ("Water", "70 %"),
-    ("Keep", "below 30 C"),
-    ("Opened", "12 months"),
+    ("Keep", "cool"),
+    ("Open", "1 year"),
 )
 
 
@@ -110,15 +112,17 @@ def paint_wrapped(shape: Shape, rng: np.random.Generator, label: Label, *, metal
             canvas.rectangle((0.5 - half - 0.035, 0.1, 0.5 + half + 0.035, 0.93), label.accent, corner=0.12)
         top, bottom = (0.14, 0.86) if label.style == "bands" else (0.12, 0.91)
         _front(canvas, (0.5 - half, top, 0.5 + half, bottom), label)
-        canvas.facts((0.79, 0.22, 0.97, 0.8), "Contents", list(label.rows))
-        if label.style == "panel":
-            canvas.rectangle((0.02, 0.22, 0.22, 0.84), label.accent, corner=0.12)
-        canvas.barcode((0.05, 0.62, 0.19, 0.8))
-        canvas.text(label.title, (0.035, 0.26, 0.205, 0.54), label.ink, bold=0.04, outline=label.outline)
+        heading = "Directions" if label.rows == CARE_ROWS else "Contents"
+        canvas.facts((0.825, 0.22, 0.99, 0.8), heading, list(label.rows))
+        if label.style in ("panel", *PLATED):
+            ground = label.accent if label.style == "panel" else label.base
+            canvas.rectangle((0.01, 0.22, 0.175, 0.84), ground, corner=0.12)
+        canvas.barcode((0.025, 0.62, 0.155, 0.8))
+        canvas.text(label.title, (0.015, 0.26, 0.17, 0.54), label.ink, bold=0.04, outline=label.outline)
     for name in ("rim", "bottom", "lid", "cap", "spout"):
         painter.fill(name, METAL if metal else label.cap)
     painter.fill("bottom", METAL if metal else label.accent if label.style in ("bands", "half", "wave") else label.base)
-    _ridges(painter, "cap", label.cap)
+    _cap(painter, label)
     if metal:
         for name in ("lid", "bottom"):
             _rings(painter, name, METAL)
@@ -135,11 +139,13 @@ def paint_tube(shape: Shape, rng: np.random.Generator, label: Label) -> Image.Im
     with painter.region("side") as canvas:
         _background(canvas, label)
         canvas.rectangle((0, 0, 1, 0.055), label.accent)
-        _front(canvas, (0.33, 0.15, 0.67, 0.85), label)
-        canvas.facts((0.8, 0.28, 0.95, 0.66), "Directions", list(label.rows))
+        _front(canvas, (0.30, 0.14, 0.70, 0.86), label)
+        canvas.facts((0.8, 0.28, 0.97, 0.66), "Directions", list(label.rows))
+        if label.style in PLATED:
+            canvas.rectangle((0.04, 0.12, 0.21, 0.68), label.base, corner=0.12)
         canvas.barcode((0.05, 0.5, 0.2, 0.66))
         canvas.text(label.title, (0.05, 0.15, 0.2, 0.46), label.ink, bold=0.04, turn=90, outline=label.outline)
-    _ridges(painter, "cap", label.cap)
+    _cap(painter, label)
     painter.fill("lid", label.cap)
     return painter.image()
 
@@ -201,8 +207,8 @@ def _front(canvas: Canvas, box: Box, label: Label) -> None:
     inner = Canvas((area.width, area.height), 1, label.base, canvas.rng)
     inner.image.paste(area)
     wide, high = area.width, area.height
-    plate = label.style in ("stripes", "diagonal", "dots")
-    if wide > 1.9 * high:
+    plate = label.style in PLATED
+    if wide > 1.6 * high:
         if plate:
             inner.rectangle((0.0, 0.12, 1, 0.88), label.base, corner=0.3)
         radius = 0.3 * high
@@ -222,14 +228,13 @@ def _front(canvas: Canvas, box: Box, label: Label) -> None:
     canvas.image.paste(inner.image.rotate(label.turn, expand=True), (left, top))
 
 
-def _ridges(painter: Painter, name: str, colour: Colour) -> None:
-    """Fine vertical grooves, as on screw caps."""
-    if name in painter.shape.regions:
-        angle, level = painter.grid(name)
-        shade = 1 - 0.13 * (np.cos(angle * 40) > 0.3)
-        painter.put(
-            name, (np.ones_like(level)[:, None, None] * shade[None, :, None] * np.asarray(colour)).astype(np.uint8)
-        )
+def _cap(painter: Painter, label: Label) -> None:
+    """Fine vertical grooves, as on screw caps, or the seam under a lid that flips open."""
+    if "cap" in painter.shape.regions:
+        angle, level = painter.grid("cap")
+        groove = np.cos(angle * 40)[None, :] > 0.3 if label.ridged else np.abs(level - 0.42)[:, None] < 0.025
+        shade = 1 - (0.13 if label.ridged else 0.3) * np.broadcast_to(groove, (len(level), len(angle)))
+        painter.put("cap", (shade[..., None] * np.asarray(label.cap)).astype(np.uint8))
 
 
 def _rings(painter: Painter, name: str, colour: Colour) -> None:

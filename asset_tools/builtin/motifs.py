@@ -149,6 +149,65 @@ def olive(pen: Pen, x: float, y: float, r: float) -> None:
         _disc(pen, x + (dx - 0.1) * r, y + 0.22 * r, 0.1 * r, (186, 200, 120))
 
 
+def lily(pen: Pen, x: float, y: float, r: float) -> None:
+    """A water lily."""
+    for angle, length in ((0.25, 0.9), (2.89, 0.9), (0.72, 1.05), (2.42, 1.05), (1.17, 1.2), (1.97, 1.2), (1.57, 1.3)):
+        _leaf(pen, x, y + 0.55 * r, length * r, angle, (236, 150, 186) if angle != 1.57 else (246, 186, 210))
+    pen.pieslice((x - 0.95 * r, y + 0.36 * r, x + 0.95 * r, y + 0.84 * r), 0, 180, fill=GREEN)
+
+
+def crown(pen: Pen, x: float, y: float, r: float) -> None:
+    """A crown."""
+    gold, dark = (252, 224, 130), (84, 44, 20)
+    spikes = [(-0.9, -0.45), (-0.45, 0.05), (0, -0.7), (0.45, 0.05), (0.9, -0.45), (0.7, 0.6), (-0.7, 0.6)]
+    pen.polygon([(x + dx * r, y + dy * r) for dx, dy in spikes], fill=gold, outline=dark)
+    for dx, dy in ((-0.88, -0.47), (0, -0.74), (0.88, -0.47)):
+        _disc(pen, x + dx * r, y + dy * r, 0.11 * r, gold)
+    pen.rectangle((x - 0.68 * r, y + 0.32 * r, x + 0.68 * r, y + 0.44 * r), fill=dark)
+
+
+def coconut(pen: Pen, x: float, y: float, r: float) -> None:
+    """Half a coconut and a leaf."""
+    _leaf(pen, x + 0.1 * r, y - 0.2 * r, 0.85 * r, 0.8)
+    _disc(pen, x, y + 0.1 * r, 0.86 * r, (106, 66, 36), 1.05)
+    _disc(pen, x, y + 0.08 * r, 0.74 * r, WHITE, 1.05)
+    _disc(pen, x, y + 0.12 * r, 0.46 * r, (222, 226, 220), 1.1)
+
+
+def bamboo(pen: Pen, x: float, y: float, r: float) -> None:
+    """Two canes of bamboo and leaves."""
+    for dx, low in ((-0.3, 0.9), (0.18, 0.6)):
+        for i in range(3):
+            top = y + (low - 0.55 * (i + 1)) * r
+            box = (x + (dx - 0.15) * r, top, x + (dx + 0.15) * r, top + 0.5 * r)
+            pen.rounded_rectangle(box, 0.06 * r, fill=(112, 158, 70))
+    _leaf(pen, x + 0.2 * r, y - 0.4 * r, 0.72 * r, 0.5)
+    _leaf(pen, x - 0.3 * r, y - 0.3 * r, 0.62 * r, 2.7)
+
+
+def shield(pen: Pen, x: float, y: float, r: float) -> None:
+    """A shield with a drop of oil on it."""
+    t = np.linspace(0, 1, 12)
+    half, level = 0.78 * np.sqrt(1 - t**2.2), -0.45 + 1.4 * t
+    right = list(zip((x + half * r).tolist(), (y + level * r).tolist(), strict=True))
+    left = [(2 * x - px, py) for px, py in right[::-1]]
+    pen.polygon([(x, y - 0.8 * r), *right, *left], fill=(226, 230, 236))
+    pen.polygon([(x, y - 0.5 * r), (x - 0.3 * r, y + 0.1 * r), (x + 0.3 * r, y + 0.1 * r)], fill=(240, 168, 30))
+    _disc(pen, x, y + 0.2 * r, 0.33 * r, (240, 168, 30))
+
+
+def snowflake(pen: Pen, x: float, y: float, r: float) -> None:
+    """A snowflake."""
+    width = max(1, round(0.11 * r))
+    for angle in np.arange(6) * np.pi / 3 + np.pi / 6:
+        cos, sin = float(np.cos(angle)), float(np.sin(angle))
+        pen.line([(x, y), (x + 0.92 * r * cos, y + 0.92 * r * sin)], fill=WHITE, width=width)
+        for turn in (-0.8, 0.8):
+            tip = 0.34 * float(np.cos(angle + turn)), 0.34 * float(np.sin(angle + turn))
+            start = x + 0.5 * r * cos, y + 0.5 * r * sin
+            pen.line([start, (start[0] + tip[0] * r, start[1] + tip[1] * r)], fill=WHITE, width=width)
+
+
 MOTIFS: dict[str, Callable[[Pen, float, float, float], None]] = {
     function.__name__: function
     for function in (
@@ -167,5 +226,11 @@ MOTIFS: dict[str, Callable[[Pen, float, float, float], None]] = {
         sparkle,
         bubbles,
         olive,
+        lily,
+        crown,
+        coconut,
+        bamboo,
+        shield,
+        snowflake,
     )
 }

@@ -148,9 +148,9 @@ def mug(size: Size, *, wall: float = 0.004) -> Shape:
     path[0, 0] -= 2e-4
     path[-1, 0] -= 2e-4
     handle = sweep("handle", path, radii, normal=(0, 1, 0), segments=12, detail=0.5)
-    pieces = _ring_pieces(inner, r, (0.0, h), count=14)
-    pieces.append(ring_points(np.array([[inner, inner, z, 2.0] for z in (0.0, floor)]), 24).reshape(-1, 3))
-    pieces += chained_pieces(handle[0], 6)
+    pieces = _ring_pieces(inner, r, (0.0, h), count=8)
+    pieces.append(ring_points(np.array([[inner, inner, z, 2.0] for z in (0.0, floor)]), 24)[:, :-1].reshape(-1, 3))
+    pieces += chained_pieces(handle[0], 4)
     return fitted([loft(sections), handle], size, pieces=pieces)
 
 

@@ -18,8 +18,11 @@ def paint_fruit(
     blush_amount: float = 0.5,
     streaks: float = 0.0,
     poles: Colour | None = None,
+    crown: Colour | None = None,
     speckle: Colour | None = None,
     pores: float = 0.0,
+    bloom: Colour | None = None,
+    groove: float = 0.0,
     stem: Colour = (92, 62, 34),
 ) -> Image.Image:
     """Skin and stem of a round fruit.
@@ -31,8 +34,11 @@ def paint_fruit(
         blush_amount: how much of the surface is blushed, 0 to 1.
         streaks: how strongly the blush runs in lines from stem to bottom.
         poles: colour around the stem and the bottom.
+        crown: colour of a wider, ragged patch around the stem.
         speckle: colour of small dots.
         pores: depth of fine dimples, as a fraction of the brightness.
+        bloom: colour of a patchy film of wax or fuzz.
+        groove: how much darker the groove along the front is, as a fraction of the brightness.
         stem: its colour.
     """
     painter = Painter(shape, rng, base)
@@ -50,6 +56,15 @@ def paint_fruit(
     if poles:
         cap = np.exp(-(((1 - np.abs(points[..., 2])) / 0.09) ** 2))
         colours = blend(cap * (0.8 + 0.2 * noise(points, rng, frequency=2.0)), colours, poles)
+    if crown:
+        ragged = 0.22 * noise(points, rng, frequency=1.2)
+        colours = blend(0.9 / (1 + np.exp(-9 * (points[..., 2] - 0.72 + ragged))), colours, crown)
+    if bloom:
+        film = 0.55 + 0.6 * noise(points, rng, frequency=1.1) + 0.25 * noise(points, rng, frequency=9.0, octaves=2)
+        colours = blend(np.clip(0.42 * film, 0, 0.6), colours, bloom)
+    if groove:
+        off_front = np.angle(np.exp(1j * (angle - np.pi)))[None, :]
+        colours = colours * (1 - groove * np.exp(-((off_front / 0.09) ** 2)) * np.sin(polar))[..., None]
     if speckle:
         spots = noise(points, rng, frequency=9.0, octaves=1, waves=40)
         colours = blend(np.clip(6 * (spots - 0.72), 0, 0.75), colours, speckle)
