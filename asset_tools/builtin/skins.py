@@ -60,7 +60,11 @@ def paint_fruit(
         ragged = 0.22 * noise(points, rng, frequency=1.2)
         colours = blend(0.9 / (1 + np.exp(-9 * (points[..., 2] - 0.72 + ragged))), colours, crown)
     if bloom:
-        film = 0.55 + 0.6 * noise(points, rng, frequency=1.1) + 0.25 * noise(points, rng, frequency=9.0, octaves=2)
+        film = (
+            0.55
+            + 0.6 * noise(points, rng, frequency=1.1)
+            + 0.25 * noise(points, rng, frequency=8.0, octaves=1, waves=30)
+        )
         colours = blend(np.clip(0.42 * film, 0, 0.6), colours, bloom)
     if groove:
         off_front = np.angle(np.exp(1j * (angle - np.pi)))[None, :]
@@ -87,7 +91,7 @@ def paint_banana(shape: Shape, rng: np.random.Generator) -> Image.Image:
     ridge = np.clip(np.cos(5 * angle) - 0.93, 0, 1) / 0.07
     colours = blend(ridge * (0.28 + 0.2 * noise(points, rng, frequency=0.6)), colours, (150, 112, 40))
     freckles = noise(points, rng, frequency=1.6, octaves=2, waves=40)
-    colours = blend(np.clip(5 * (freckles - 0.62), 0, 0.8), colours, (112, 74, 32))
+    colours = blend(np.clip(5 * (freckles - 0.70), 0, 0.8), colours, (112, 74, 32))
     stem = np.clip((0.035 - from_stem) / 0.02, 0, 1) * 0.9 + np.clip((0.13 - from_stem) / 0.1, 0, 1) * 0.25
     colours = blend(stem, colours, (104, 84, 40))
     colours = blend(np.clip((from_stem - 0.95) / 0.03, 0, 1), colours, (62, 48, 34))
