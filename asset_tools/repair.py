@@ -10,11 +10,11 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from asset_tools.clean import clean
 from robocas_ms3.errors import AssetError, MissingExtraError
 
 Array = NDArray[np.float64]
 
-LOOSE = 0.02  # share of the surface below which a separate piece is scanner dirt
 FILLED = 0.35  # share of the surface that may be filled in
 HOPELESS = 0.4  # share of the edges that are open: no surface, but confetti
 LEAST_VOLUME = 0.01  # of the convex hull's: less is a sheet, not a body
@@ -31,15 +31,17 @@ class Closed:
 
     Attributes:
         mesh: watertight, faces outwards, in the scan's frame and unit.
+        scan: to look at: without dirt and inner shells, faces outwards.
         repairs: what had to be mended, in words.
     """
 
     mesh: trimesh.Trimesh
+    scan: trimesh.Trimesh
     repairs: tuple[str, ...]
 
 
 def close(scan: trimesh.Trimesh) -> Closed:
-    """Make a watertight solid of a scan: weld, drop dirt, fill holes; what still isn't closed is meshed anew.
+    """Make a watertight solid of a scan: weld, drop dirt, turn faces outwards, fill holes; else mesh it anew.
 
     A shell inside of the outer surface (an empty can scanned through) is dropped: things are solid.
 
@@ -50,18 +52,15 @@ def close(scan: trimesh.Trimesh) -> Closed:
         AssetError: it encloses nothing (a sheet), or can't be closed.
     """
     repairs: list[str] = []
-    mesh = _welded(scan, repairs)
-    mesh = _outer_pieces(mesh, repairs)
-    if not mesh.is_winding_consistent:
-        trimesh.repair.fix_winding(mesh)
-        repairs.append("turned faces the same way round")
+    cleaned = clean(scan, repairs)
+    mesh = cleaned.welded
     if not mesh.is_watertight:
         mesh = _filled(mesh, repairs)
     solid = _as_solid(mesh)
     if solid is None and _open_edges(mesh) <= HOPELESS * len(mesh.edges_unique):
         solid = _as_solid(_remeshed(mesh))
         repairs.append("meshed anew around the scan")
-    hull_volume = float(scan.convex_hull.volume) if np.ptp(scan.vertices, axis=0).min() > 0 else 0.0
+    hull_volume = float(mesh.convex_hull.volume) if np.ptp(mesh.vertices, axis=0).min() > 0 else 0.0
     if solid is None or solid.volume() < LEAST_VOLUME * hull_volume or hull_volume <= 0:
         raise AssetError(
             "the mesh can't be closed to a solid",
@@ -69,45 +68,7 @@ def close(scan: trimesh.Trimesh) -> Closed:
             found=f"{_open_edges(mesh)} open edges of {len(mesh.edges_unique)}",
             fix="Repair the scan, or leave it out.",
         )
-    return Closed(_light(solid, float(np.linalg.norm(scan.extents))), tuple(repairs))
-
-
-def _welded(scan: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
-    mesh = trimesh.Trimesh(np.array(scan.vertices), np.array(scan.faces), process=False)
-    # scans are written with 5 or 6 digits, so that corners of one point may differ in the last
-    tolerance = 1e-6 * float(np.linalg.norm(mesh.extents))
-    mesh.vertices = mesh.vertices / tolerance
-    mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=0)
-    mesh.vertices = mesh.vertices * tolerance
-    count = len(mesh.faces)
-    a, b, c = mesh.faces.T
-    mesh.update_faces(mesh.unique_faces() & (a != b) & (b != c) & (c != a))
-    mesh.remove_unreferenced_vertices()
-    if len(mesh.faces) == 0:
-        raise AssetError("the mesh has no faces of any size", expected="triangles", found=f"{count} slivers")
-    if len(mesh.faces) < count:
-        repairs.append(f"dropped {count - len(mesh.faces)} double or degenerate faces")
-    return mesh
-
-
-def _outer_pieces(mesh: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
-    """Drop dirt and shells inside of others."""
-    pieces = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1)
-    if len(pieces) < 2:
-        return mesh
-    areas = np.array([mesh.area_faces[piece].sum() for piece in pieces])
-    pieces = [pieces[i] for i in np.argsort(-areas) if areas[i] >= LOOSE * areas.sum()]
-    kept: list = []
-    for piece in pieces:
-        corners = mesh.vertices[np.unique(mesh.faces[piece])]
-        outer = [trimesh.Trimesh(mesh.vertices, mesh.faces[other], process=False) for other in kept]
-        if not any(shell.is_watertight and shell.contains(corners[:: len(corners) // 50 + 1]).all() for shell in outer):
-            kept.append(piece)
-    if len(kept) < len(areas):
-        repairs.append(f"dropped {len(areas) - len(kept)} loose or inner pieces")
-    mesh.update_faces(np.sort(np.concatenate(kept)))
-    mesh.remove_unreferenced_vertices()
-    return mesh
+    return Closed(_light(solid, float(np.linalg.norm(cleaned.scan.extents))), cleaned.scan, tuple(repairs))
 
 
 def _filled(mesh: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:

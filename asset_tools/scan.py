@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Sequence
+import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, get_args
-from urllib.parse import unquote
+from typing import Any, Literal, get_args
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 from shapely import MultiPoint
+from trimesh.visual.material import PBRMaterial
 
+from asset_tools.scan_files import ScanFiles, decode, large_images, scan_files, sound_image
 from robocas_ms3.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -26,9 +26,9 @@ UPS: tuple[str, ...] = get_args(Up)
 FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off", ".dae", ".3mf")  # the better first
 PLAUSIBLE = (0.005, 1.5)  # m, longest side of a thing that a hand can pick up, generously
 TYPICAL = 0.15  # m, longest side of a household object
+FAR = np.log(20)  # from the typical size, where a scan no longer tells what unit the others have
 STANDS = 0.27  # thickness over height down to which people put a box on its end
 BOX_FILL = 0.93  # share of its rectangle that a box's outline fills; an ellipse fills 0.785
-COLOUR_MAPS = ("map_kd", "map_ka")  # others are not used
 
 
 def find_mesh(path: Path) -> Path:
@@ -49,19 +49,31 @@ def find_mesh(path: Path) -> Path:
     return min(found, key=lambda file: (_plain(file), FORMATS.index(file.suffix.lower()), file.name))
 
 
-def load_scan(path: Path) -> trimesh.Trimesh:
+def load_scan(path: Path, repairs: list[str] | None = None) -> trimesh.Trimesh:
     """Load a scan with its colours, as it is: unit and axes are the file's.
+
+    Args:
+        path: of the mesh, or of a folder with one.
+        repairs: gets a line for each thing that had to be mended: files not where they should be, huge textures.
 
     Raises:
         AssetError: the file is missing, damaged, empty, of no size or not finite, or a texture it names is missing.
     """
-    path = find_mesh(path)
-    textures = _textures(path)
+    path, repairs = find_mesh(path), [] if repairs is None else repairs
+    files = scan_files(path, repairs)
     try:
-        loaded = trimesh.load_scene(path, process=False)
-        mesh = loaded.to_mesh() if loaded.geometry else trimesh.Trimesh()
+        data = path.read_bytes()
+        if path.suffix.lower() == ".obj":
+            data = decode(data).encode()  # as the names of the materials were read
+        with large_images():
+            loaded = trimesh.load_scene(io.BytesIO(data), path.suffix.lower()[1:], resolver=files, process=False)
+            _mend_textures(loaded, path, files, repairs)
+            mesh = _as_one(loaded)
+    except AssetError:
+        raise
     except Exception as error:  # the loaders raise whatever their parsing runs into
-        raise AssetError("can't read this mesh", where=path, found=f"{type(error).__name__}: {error}") from error
+        found = " ".join(f"{type(error).__name__}: {error}".split())
+        raise AssetError("can't read this mesh", where=path, found=found) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or len(mesh.vertices) == 0:
         raise AssetError("the mesh is empty", where=path, expected="triangles", found="none")
     if not np.isfinite(mesh.vertices).all():
@@ -71,10 +83,25 @@ def load_scan(path: Path) -> trimesh.Trimesh:
         )
     if np.ptp(mesh.vertices[mesh.faces].reshape(-1, 3), axis=0).max() <= 0:
         raise AssetError("the mesh has no size", where=path, found="all vertices in one point")
-    material = getattr(mesh.visual, "material", None)
-    if len(textures) == 1 and material is not None and getattr(material, "image", textures) is None:
-        material.image = textures[0]  # the loader stumbles over options and spaces in names
     return mesh
+
+
+def longest_side(path: Path) -> float:
+    """Longest side of a scan, in its unit; textures are not looked at.
+
+    Raises:
+        AssetError: as `load_scan`.
+    """
+    if path.suffix.lower() != ".obj":
+        return float(load_scan(path).extents.max())
+    words = [line.split(maxsplit=4)[1:4] for line in path.read_bytes().splitlines() if line.startswith(b"v ")]
+    try:
+        points = np.array(words, dtype=float).reshape(-1, 3)
+    except ValueError as error:
+        raise AssetError("can't read this mesh", where=path, found=error) from error
+    if len(points) == 0:
+        raise AssetError("the mesh is empty", where=path, expected="triangles", found="none")
+    return float(np.ptp(points, axis=0).max())
 
 
 def guess_unit(longest: Sequence[float]) -> Unit:
@@ -98,6 +125,32 @@ def guess_unit(longest: Sequence[float]) -> Unit:
             fix="Pass --units.",
         )
     return best  # pyright: ignore[reportReturnType]
+
+
+def guess_units(longest: Mapping[str, float]) -> dict[str, Unit]:
+    """The unit of each scan of a folder: that of most of them, save for those that it makes giants or crumbs.
+
+    Args:
+        longest: longest side of each scan, in its unit, by its name.
+
+    Raises:
+        AssetError: a scan is in no unit of a size that can be picked up.
+    """
+    cost = {
+        unit: sum(min(abs(np.log(side * METRES[unit] / TYPICAL)), FAR) for side in longest.values())
+        for unit in ("m", "cm", "mm")
+    }
+    usual: Any = min(cost, key=lambda unit: cost[unit])
+    units: dict[str, Unit] = {}
+    for name, side in longest.items():
+        fits = PLAUSIBLE[0] <= side * METRES[usual] <= PLAUSIBLE[1]
+        try:
+            units[name] = usual if fits else guess_unit([side])
+        except AssetError as error:
+            raise AssetError(
+                error.what, where=name, expected=error.expected, found=error.found, fix=error.fix
+            ) from error
+    return units
 
 
 def guess_up(mesh: trimesh.Trimesh, suffix: str = "") -> Up:
@@ -126,7 +179,7 @@ def guess_up(mesh: trimesh.Trimesh, suffix: str = "") -> Up:
 
 def upright(mesh: trimesh.Trimesh, up: Up) -> trimesh.Trimesh:
     """A copy with an axis of the file turned to +z."""
-    turned = mesh.copy()
+    turned = mesh.copy(include_cache=True)  # with its normals
     axis = np.zeros(3)
     axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     transform = np.diag([1.0, -1.0, -1.0, 1.0]) if up == "-z" else np.eye(4)
@@ -148,40 +201,35 @@ def _plain(file: Path) -> bool:
     return "nontextured" in file.stem.lower() or file.suffix.lower() in (".stl", ".off")
 
 
-def _textures(path: Path) -> list[Image.Image]:
-    """The textures of an OBJ; loaders leave out those they can't find without a word, here that is an error."""
-    found: list[Image.Image] = []
-    if path.suffix.lower() == ".obj":
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            if line.startswith("mtllib "):
-                found += _textures_of_mtl(path.parent / line[7:].strip())
-    elif path.suffix.lower() == ".gltf":
-        try:
-            tree = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise AssetError("can't read this mesh", where=path, found=f"no JSON: {error}") from error
-        for entry in [*tree.get("images", []), *tree.get("buffers", [])]:
-            uri = entry.get("uri", "data:")
-            if not uri.startswith("data:") and not (path.parent / unquote(uri)).is_file():
-                raise AssetError("a file this mesh names is missing", where=path.parent / unquote(uri))
-    return found
+def _as_one(loaded: trimesh.Scene) -> Any:
+    """A scene's mesh; one alone keeps its normals, which joining would drop."""
+    if len(loaded.geometry) == 0:
+        return trimesh.Trimesh()
+    nodes = loaded.graph.nodes_geometry
+    if len(nodes) == 1:
+        transform, name = loaded.graph[nodes[0]]
+        if np.array_equal(transform, np.eye(4)):
+            return loaded.geometry[name]
+    return loaded.to_mesh()
 
 
-def _textures_of_mtl(path: Path) -> list[Image.Image]:
-    if not path.is_file():
-        raise AssetError("the material file that the mesh names is missing", where=path)
-    found: dict[Path, Image.Image] = {}
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        words = line.strip().split(maxsplit=1)
-        if len(words) < 2 or words[0].lower() not in COLOUR_MAPS:
-            continue
-        # options (-s 1 1 1, -clamp on) may stand before the name, and the name may hold spaces
-        file = path.parent / re.sub(r"^(-\w+(\s+(on|off|-?[\d.]+))*\s+)+", "", words[1])
-        if not file.is_file():
-            raise AssetError("the texture file that the material names is missing", where=file, found=path.name)
-        try:
-            found[file] = Image.open(file)
-            found[file].load()
-        except (OSError, SyntaxError) as error:
-            raise AssetError("can't read the texture", where=file, found=error) from error
-    return list(found.values())
+def _mend_textures(loaded: trimesh.Scene, path: Path, files: ScanFiles, repairs: list[str]) -> None:
+    """Textures of a loaded scene read, of a useful size, and where the file meant them to be."""
+    done: dict[int, Image.Image] = {}
+    parts: list[Any] = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh)]
+    for part in parts:
+        material: Any = getattr(part.visual, "material", None)
+        name = "baseColorTexture" if isinstance(material, PBRMaterial) else "image"
+        image = getattr(material, name, None)
+        if image is not None:
+            if id(image) not in done:
+                done[id(image)] = sound_image(image, files.paths.get(image.info.get("file_path", ""), path), repairs)
+            setattr(material, name, done[id(image)])
+        elif material is not None and len(files.paths) == 1 and material.name not in files.materials:
+            only = next(iter(files.paths))
+            with Image.open(files.paths[only]) as opened:
+                done[id(material)] = sound_image(opened, files.paths[only], repairs)
+            setattr(material, name, done[id(material)])
+            repairs.append(f"took the only texture, {files.paths[only].name}, for faces without a material")
+    if parts and files.textured and not done:
+        raise AssetError("can't read the texture", where=path, expected="an image, and vertices with UV coordinates")

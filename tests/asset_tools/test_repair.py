@@ -27,14 +27,14 @@ def test_a_closed_mesh_stays_as_it_is(can):
 def test_inside_out_is_turned(can):
     volume = can.volume
     can.invert()
-    assert closed_volume(can, "") == pytest.approx(volume, rel=1e-6)
+    assert closed_volume(can, "turned inside out") == pytest.approx(volume, rel=1e-6)
 
 
 def test_faces_turned_at_random_are_made_consistent(can):
     turned = np.random.default_rng(0).random(len(can.faces)) < 0.3
     faces = np.where(turned[:, None], can.faces[:, ::-1], can.faces)
     mixed = trimesh.Trimesh(can.vertices, faces, process=False)
-    assert closed_volume(mixed, "same way round") == pytest.approx(can.volume, rel=1e-6)
+    assert closed_volume(mixed, f"turned {turned.sum()} faces outwards") == pytest.approx(can.volume, rel=1e-6)
 
 
 def test_a_can_without_lid_and_bottom_is_filled(can):
@@ -65,7 +65,7 @@ def test_bodies_that_overlap_count_once(can):
 def test_seams_of_the_texture_are_no_holes(can):
     split = trimesh.Trimesh(can.triangles.reshape(-1, 3), np.arange(3 * len(can.faces)).reshape(-1, 3), process=False)
     assert not split.is_watertight
-    assert closed_volume(split, "") == pytest.approx(can.volume, rel=1e-4)
+    assert closed_volume(split, "duplicate vertices") == pytest.approx(can.volume, rel=1e-4)
 
 
 @pytest.mark.slow
