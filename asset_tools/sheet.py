@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from asset_tools.studio import PAPER, Body, Colour, Studio, box_faces
+from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import Hull
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import FurnitureAsset, Handle, ObjectAsset
@@ -23,13 +24,13 @@ Array = NDArray[np.float64]
 Picture = tuple[str, Image.Image]
 
 CELLS = 5  # pictures of an asset, side by side
-LARGE, SMALL = 220, 160  # px, a picture's side: of packs with few and with many assets
+LARGE, SMALL = 220, 154  # px, a picture's side: of packs with few and with many assets
 FEW = 16
-GAP, CAPTION = 10, 36  # px between assets, of the text above the pictures
+GAP, CAPTION, LABEL = 6, 33, 14  # px between assets, of the text above the pictures, of that below
 POSES, GRASPS = 4, 20
 GROUND, GREY, RED = (0.80, 0.80, 0.78), (0.55, 0.55, 0.55), (0.9, 0.1, 0.1)
 INK, FAINT = (25, 25, 25), (120, 120, 120)
-FINGER = 0.004  # m, thickness of drawn grippers
+FINGER = 0.003  # m, thickness of drawn grippers
 
 
 def contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None) -> None:
@@ -51,7 +52,7 @@ def contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None) -> N
     size, columns = (LARGE, 2) if len(chosen) <= FEW else (SMALL, 3)
     columns = min(columns, len(chosen))
     studio = Studio(size)
-    width, height = CELLS * size, CAPTION + size
+    width, height = CELLS * size, CAPTION + size + LABEL
     rows = -(-len(chosen) // columns)
     sheet = Image.new("RGB", (columns * (width + GAP) + GAP, rows * (height + GAP) + GAP), "white")
     for i, asset in enumerate(chosen):
@@ -69,13 +70,13 @@ def _strip(studio: Studio, asset: LoadedObject | LoadedFurniture) -> Image.Image
     else:
         title, line, pictures = asset.asset.id, _furniture_line(asset), _furniture_pictures(studio, asset)
     size = studio.size
-    strip = Image.new("RGB", (CELLS * size, CAPTION + size), PAPER)
+    strip = Image.new("RGB", (CELLS * size, CAPTION + size + LABEL), PAPER)
     draw = ImageDraw.Draw(strip)
     draw.text((4, 0), title, INK, _font(15))
-    draw.text((4, 19), line, INK, _font(12))
+    draw.text((4, 17), line, INK, _font(12))
     for i, (label, picture) in enumerate(pictures):
         strip.paste(picture, (i * size, CAPTION))
-        draw.text((i * size + 4, CAPTION + size - 15), label, FAINT, _font(11))
+        draw.text((i * size + 4, CAPTION + size), label, FAINT, _font(11))
     return strip
 
 
@@ -105,7 +106,7 @@ def _object_pictures(studio: Studio, asset: LoadedObject) -> list[Picture]:
     fast = Body(points, file=asset.visual("fast"))
     grasps = zip(notes.grasps_tcp_in_object, notes.grasp_widths, notes.grasp_qualities, strict=True)
     grippers = [_solid(gripper_faces(width), _tone(quality), pose) for pose, width, quality in islice(grasps, GRASPS)]
-    best = np.argsort(-notes.resting_probabilities, kind="stable")[:POSES]
+    best = _shown_poses(notes)
     chances = " ".join(f"{notes.resting_probabilities[i]:.0%}" for i in best)
     return [
         ("fast", studio.picture([fast], -60, 25)),
@@ -114,6 +115,14 @@ def _object_pictures(studio: Studio, asset: LoadedObject) -> list[Picture]:
         (f"rests {chances}", studio.picture(standing(fast, notes.resting_poses[best]), -60, 30)),
         (f"{len(grippers)} of {len(notes.grasp_widths)} grasps", studio.picture([fast, *grippers], -60, 30)),
     ]
+
+
+def _shown_poses(notes: Annotations) -> list[int]:
+    """The likeliest resting poses, the upright one first, however rare it is."""
+    order = [int(i) for i in np.argsort(-notes.resting_probabilities, kind="stable")]
+    if notes.display_pose >= 0:
+        order = [notes.display_pose, *(i for i in order if i != notes.display_pose)]
+    return order[:POSES]
 
 
 def _furniture_pictures(studio: Studio, furniture: LoadedFurniture) -> list[Picture]:

@@ -8,6 +8,7 @@ from asset_tools.sheet import (
     CAPTION,
     CELLS,
     GAP,
+    LABEL,
     LARGE,
     contact_sheet,
     frame_faces,
@@ -138,7 +139,7 @@ def share(picture, channel):
 def test_a_sheet_shows_every_asset(pack, tmp_path, studio):
     contact_sheet(pack, tmp_path / "new" / "sheet.png")
     sheet = Image.open(tmp_path / "new" / "sheet.png")
-    width, height = CELLS * LARGE, CAPTION + LARGE
+    width, height = CELLS * LARGE, CAPTION + LARGE + LABEL
     assert sheet.size == (2 * width + 3 * GAP, height + 2 * GAP)
 
     def cell(asset, i):
@@ -160,7 +161,7 @@ def test_a_sheet_shows_every_asset(pack, tmp_path, studio):
 @pytest.mark.slow
 def test_some_assets_only(pack, tmp_path, studio):
     contact_sheet(pack, tmp_path / "sheet.png", ids=["red_box"])
-    assert Image.open(tmp_path / "sheet.png").size == (CELLS * LARGE + 2 * GAP, CAPTION + LARGE + 2 * GAP)
+    assert Image.open(tmp_path / "sheet.png").size == (CELLS * LARGE + 2 * GAP, CAPTION + LARGE + LABEL + 2 * GAP)
     with pytest.raises(AssetError, match="found blue_box"):
         contact_sheet(pack, tmp_path / "sheet.png", ids=["blue_box"])
 
