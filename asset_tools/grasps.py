@@ -96,7 +96,7 @@ def sample_grasps(
     scores = 0.5 * shares - 2.0 * (frictions - MIN_FRICTION) - lever / 0.15 - distance / 0.3
     left = np.flatnonzero(shares >= MIN_PAD_SHARE)
     left = left[_not_dominated(poses[left], frictions[left])]
-    chosen = left[_spread(poses[left], scores[left], count)]
+    chosen = left[spread_out(poses[left], scores[left], count)]
     return Grasps(poses[chosen], widths[chosen], frictions[chosen])
 
 
@@ -160,7 +160,7 @@ def _reachable(pairs: _Pairs, points: Array, rng: np.random.Generator) -> tuple[
     clear = np.zeros((len(pair), len(DEPTHS)), dtype=bool)
     for start in range(0, len(pair), CHUNK):
         chunk = slice(start, start + CHUNK)
-        x, y, z = _local(points, rotations[chunk], pairs.middles[pair[chunk]])
+        x, y, z = local_points(points, rotations[chunk], pairs.middles[pair[chunk]])
         x, y = np.abs(x), np.abs(y)
         free = np.ones((len(x), len(DEPTHS)), dtype=bool)
         for low, high in GRIPPER_BOXES:
@@ -184,7 +184,7 @@ def _touched(
     expected = max(len(points) / area * 4 * PAD_HALF_SIZE[0] * PAD_HALF_SIZE[1], 2.0)
     for start in range(0, len(pair), CHUNK):
         chunk = slice(start, start + CHUNK)
-        x, y, z = _local(points, rotations[chunk], pairs.middles[pair[chunk]])
+        x, y, z = local_points(points, rotations[chunk], pairs.middles[pair[chunk]])
         half = 0.5 * pairs.widths[pair[chunk]].astype(np.float32)
         depth = depths[chunk, None].astype(np.float32)
         x = np.abs(x)
@@ -212,7 +212,7 @@ def _not_dominated(poses: Array, frictions: Array) -> NDArray[np.int_]:
     return np.flatnonzero(keep)
 
 
-def _spread(poses: Array, scores: Array, count: int) -> NDArray[np.int_]:
+def spread_out(poses: Array, scores: Array, count: int) -> NDArray[np.int_]:
     """Pick greedily: the best score plus the distance (in approach, closing axis, place) from what was picked."""
     closing = poses[:, :3, 1]
     both_ways = np.einsum("ni,nj->nij", closing, closing).reshape(-1, 9)  # the same for either sign of the axis
@@ -229,7 +229,7 @@ def _spread(poses: Array, scores: Array, count: int) -> NDArray[np.int_]:
     return np.array(picked, dtype=int)
 
 
-def _local(points: Array, rotations: Array, origins: Array) -> tuple[NDArray[np.float32], ...]:
+def local_points(points: Array, rotations: Array, origins: Array) -> tuple[NDArray[np.float32], ...]:
     """Coordinates x, y, z, each (C, P), of points (P, 3) in frames (C, 3, 3) at (C, 3); single precision, for speed."""
     axes = rotations.transpose(2, 0, 1).astype(np.float32)  # (3, C, 3)
     offset = np.einsum("aci,ci->ac", axes, origins.astype(np.float32))

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 import trimesh
-from scipy.spatial import QhullError
 
 from asset_tools.build import build_object
 from asset_tools.pipeline import Job, content_hash
@@ -105,20 +104,17 @@ def estimate_mass(closed: trimesh.Trimesh) -> float:
 
 
 def _make(id_: str, path: Path, unit: Unit, settings: ImportSettings, folder: Path) -> ObjectAsset:
-    try:
-        scan = prepare(path, up=settings.up, unit=unit)
-        source = ObjectSource(
-            id=id_,
-            name=id_.replace("_", " "),
-            category="scan",
-            mesh=scan.mesh,
-            closed=scan.closed,
-            mass=settings.masses.get(id_) or estimate_mass(scan.closed),
-            source="scan",
-            licence=settings.licence,
-            attribution=settings.attribution,
-            repairs=scan.repairs,
-        )
-        return build_object(source, folder)
-    except QhullError as error:
-        raise AssetError("the scan is flat or has too few points", where=path, expected="a closed body") from error
+    scan = prepare(path, up=settings.up, unit=unit)
+    source = ObjectSource(
+        id=id_,
+        name=id_.replace("_", " "),
+        category="scan",
+        mesh=scan.mesh,
+        closed=scan.closed,
+        mass=settings.masses.get(id_) or estimate_mass(scan.closed),
+        source="scan",
+        licence=settings.licence,
+        attribution=settings.attribution,
+        repairs=scan.repairs,
+    )
+    return build_object(source, folder)

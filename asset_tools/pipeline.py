@@ -15,6 +15,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
+from scipy.spatial import QhullError
 
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, Asset, FurnitureAsset, ObjectAsset, PackManifest
 from robocas_ms3.assets.pack import MANIFEST, sha256
@@ -25,6 +26,7 @@ MADE_FROM = "made_from.json"  # of a pack: asset id -> hash of what it was made 
 ENTRY = "asset.json"  # what the manifest says of a kept asset; written last
 KEPT_DAYS = 60  # an asset that wasn't asked for in this time is made again
 TOOLS = ("coacd", "trimesh", "manifold3d", "numpy", "scipy", "sapien", "xatlas", "fast-simplification", "embreex")
+NOT_INVOLVED = ("pipeline", "sheet", "studio", "import_")  # files that say what is made or show it, not how it is made
 
 _ASSET: TypeAdapter[ObjectAsset | FurnitureAsset] = TypeAdapter(Asset)
 
@@ -112,7 +114,7 @@ def _code(package: str) -> str:
     here = Path(__file__).parent
     digest = hashlib.sha256()
     for path in sorted((here / package).glob("*.py")):
-        if path.name != Path(__file__).name:
+        if package or not path.name.startswith(NOT_INVOLVED):
             digest.update(path.read_bytes())
     if not package:
         for path in sorted((here.parent / "robocas_ms3" / "assets").glob("*.py")):
@@ -141,8 +143,8 @@ def _make(job: Job, place: Path) -> Made:
         with replacing_folder(place) as tmp:
             asset = job.make(tmp)
             (tmp / ENTRY).write_text(asset.model_dump_json(), encoding="utf-8")
-    except RobocasError as error:
-        message = str(error)
+    except (RobocasError, QhullError) as error:
+        message = "it is flat, or has too few points" if isinstance(error, QhullError) else str(error)
         return Made(job.id, None, message if job.id in message else f"{job.id}: {message}")
     return Made(job.id, asset, seconds=time.perf_counter() - start)
 

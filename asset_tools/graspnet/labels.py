@@ -19,7 +19,7 @@ import trimesh
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from asset_tools.grasps import Grasps, _local, _spread, surface_samples  # pyright: ignore[reportPrivateUsage]
+from asset_tools.grasps import Grasps, local_points, spread_out, surface_samples
 from robocas_ms3.assets.gripper import GRIPPER_BOXES
 from robocas_ms3.errors import AssetError
 
@@ -108,7 +108,7 @@ def label_grasps(path: Path, closed: trimesh.Trimesh, *, count: int = 800, seed:
     # Weight far off the approach line twists the object in the pads; along that line it does little harm.
     lever = np.linalg.norm(np.cross(to_center, poses[:, :3, 2]), axis=1)
     scores = -2.0 * frictions - lever / 0.15 - np.linalg.norm(to_center, axis=1) / 0.3
-    chosen = _spread(poses, scores, count)
+    chosen = spread_out(poses, scores, count)
     return Grasps(poses[chosen], labels.widths[clear][chosen], frictions[chosen])
 
 
@@ -186,7 +186,7 @@ def _clear(poses: Array, points: Array) -> NDArray[np.bool_]:
     free = np.ones(len(poses), dtype=bool)
     for start in range(0, len(poses), CHUNK):
         chunk = slice(start, start + CHUNK)
-        x, y, z = _local(points, poses[chunk, :3, :3], poses[chunk, :3, 3])
+        x, y, z = local_points(points, poses[chunk, :3, :3], poses[chunk, :3, 3])
         x, y = np.abs(x), np.abs(y)
         for low, high in GRIPPER_BOXES:
             # whatever lies behind the front of a box is hit on the way in

@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 from manifold3d import Manifold, OpType
 from scipy.spatial import KDTree
+from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from asset_tools.decompose import volume_iou
 from asset_tools.grasps import surface_samples
@@ -20,6 +21,7 @@ THIN = 0.010
 SAMPLES = 4000  # points from which distances are taken, on each surface
 TARGETS = 20000  # points on the other surface, to find the triangles near by
 NEAREST = 4
+SLIT = 0.001  # m, narrower is no gap: a decomposition cuts along planes and leaves both sides
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,10 @@ def hull_quality(closed: trimesh.Trimesh, hulls: list[Array], *, hollow: bool = 
         hull_count=len(hulls),
         hull_vertices=max(len(hull) for hull in hulls),
         volume_iou=overlap,
-        surface_p95=max(_distance_p95(closed, surface), _distance_p95(surface, closed)),
+        surface_p95=max(
+            _distance_p95(_samples(closed, SAMPLES)[0], surface),
+            _distance_p95(_outside_of_slits(surface, _samples(surface, SAMPLES)), closed),
+        ),
     )
 
 
@@ -69,10 +74,26 @@ def mean_thickness(closed: trimesh.Trimesh) -> float:
     return float(2 * closed.volume / closed.area)
 
 
-def _distance_p95(source: trimesh.Trimesh, target: trimesh.Trimesh) -> float:
-    """95th percentile of the distances from one surface to the other: to the triangles of the nearest samples."""
-    points = surface_samples(source, SAMPLES, np.random.default_rng(0))[0]
-    samples, faces = surface_samples(target, TARGETS, np.random.default_rng(0))
+def _samples(mesh: trimesh.Trimesh, count: int) -> tuple[Array, Array]:
+    """Points (P, 3) on a surface and the faces (P,) they lie on."""
+    return surface_samples(mesh, count, np.random.default_rng(0))
+
+
+def _outside_of_slits(union: trimesh.Trimesh, samples: tuple[Array, Array]) -> Array:
+    """The points of samples on hulls that one could touch: not those in a slit between two hulls side by side."""
+    points, faces = samples
+    normals = np.asarray(union.face_normals)[faces]
+    caster = RayMeshIntersector(union)
+    _, rays, hits = caster.intersects_id(points + 1e-5 * normals, normals, multiple_hits=False, return_locations=True)
+    near = np.linalg.norm(hits - points[rays], axis=1) < SLIT
+    touched = np.ones(len(points), dtype=bool)
+    touched[rays[near]] = False
+    return points[touched]
+
+
+def _distance_p95(points: Array, target: trimesh.Trimesh) -> float:
+    """95th percentile of the distances of points (P, 3) from a surface: from the triangles of the nearest samples."""
+    samples, faces = _samples(target, TARGETS)
     nearest = faces[KDTree(samples).query(points, k=NEAREST)[1]]
     starts = np.repeat(points, NEAREST, axis=0)
     ends = trimesh.triangles.closest_point(target.triangles[nearest.ravel()], starts)
