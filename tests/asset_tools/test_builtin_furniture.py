@@ -1,73 +1,360 @@
+import json
+from functools import cache
+
 import numpy as np
 import pytest
+import sapien
 import trimesh
+from sapien import physx
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
-from asset_tools.builtin.furniture import basket, room, table
+from asset_tools.builtin.finishes import FLOORS, TILE, WALLS
+from asset_tools.builtin.furniture import MAKERS
+from asset_tools.builtin.furniture.base import block
+from asset_tools.builtin.furniture.room import room
+from asset_tools.builtin.materials import Grid
+from asset_tools.inertia import piece_inertia
+from asset_tools.quality.furniture import examine_furniture
+from asset_tools.quality.surfaces import clearances
+from asset_tools.visual import write_glb
+from robocas_ms3.assets.gripper import GRIPPER_BOXES
+from robocas_ms3.assets.hulls import write_hulls
+from robocas_ms3.assets.kinematics import joint_frame
 
-
-@pytest.mark.parametrize("piece", [table(), basket(), room()], ids=lambda piece: piece.id)
-def test_pieces_are_convex_and_few(piece):
-    assert 5 <= len(piece.pieces) <= 8
-    for points in piece.pieces:
-        hull = trimesh.convex.convex_hull(points)
-        assert len(hull.vertices) == len(points) == 8 and hull.volume > 0
-    assert piece.shape.uv.min() >= 0 and piece.shape.uv.max() <= 1
-    assert len(piece.shape.faces) < 500 and piece.shape.texture_size <= 1024
-    corners = piece.shape.vertices[piece.shape.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert (np.einsum("fi,fci->fc", normals, piece.shape.normals[piece.shape.faces]) > 0).all()
-
-
-def test_table_frame():
-    piece = table()
-    surface = piece.shape.closed()
-    assert surface.is_watertight and surface.body_count == 1
-    np.testing.assert_allclose(surface.bounds, [[-0.38, -0.68, 0], [0.38, 0.68, 0.61]], atol=1e-6)
-    top = piece.surfaces["top"]
-    assert (top.min_xy, top.max_xy, top.z) == ((-0.38, -0.68), (0.38, 0.68), 0.61)
-    assert max(points[:, 2].max() for points in piece.pieces) == pytest.approx(0.61)
-    assert min(points[:, 2].min() for points in piece.pieces) == 0
-    assert not surface.contains([[0, 0, 0.3]])[0]  # room for legs: it is no block
-    assert piece.mass is None
+JOINTS = [("cabinet", f"{part}_{side}") for part in ("door", "drawer") for side in ("left", "right")]
+JOINTS += [("container", "door"), ("refrigerator", "door"), ("refrigerator", "freezer_door")]
 
 
-def test_basket_is_a_container():
-    piece = basket()
-    surface = piece.shape.closed()
-    assert surface.is_watertight and surface.volume > 0
-    np.testing.assert_allclose(surface.bounds, [[-0.15, -0.15, -0.096], [0.15, 0.15, 0.094]], atol=1e-6)
-    inner = piece.inner
-    assert inner is not None
-    hulls = [trimesh.convex.convex_hull(points) for points in piece.pieces]
-    probes = np.random.default_rng(0).uniform(np.add(inner.min, 1e-4), np.subtract(inner.max, 1e-4), (200, 3))
-    assert not any(hull.contains(probes).any() for hull in hulls)
-    assert not surface.contains(probes).any()
-    wall = [[0.1445, 0, 0.05], [0, -0.1445, 0.05], [-0.1445, 0, 0.05], [0, 0.1445, 0.05], [0, 0, -0.092]]
-    assert np.any([hull.contains(wall) for hull in hulls], axis=0).all()
+@cache
+def made(name):
+    return room(64) if name == "room" else MAKERS[name]()
+
+
+def bodies(source):
+    return {"": source.pieces} | {link.name: link.pieces for link in source.links}
+
+
+def pose(handle):
+    result = np.eye(4)
+    w, x, y, z = handle.wxyz
+    result[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    result[:3, 3] = handle.position
+    return result
+
+
+def within(pieces, points):
+    """Which of the points (n, 3) lie in one of the convex pieces."""
+    planes = [ConvexHull(piece).equations for piece in pieces]
+    return np.any([(points @ p[:, :3].T + p[:, 3] <= 0).all(axis=1) for p in planes], axis=0)
+
+
+def test_what_there_is():
+    assert set(MAKERS) == {
+        *("table", "dining_table", "side_table", "shelf", "cabinet"),
+        *("container", "refrigerator", "basket", "plate", "room"),
+    }
+    assert {name for name in MAKERS if made(name).mass is not None} == {"basket", "plate"}
+    assert {(name, link.name) for name in MAKERS for link in made(name).links} == set(JOINTS)
+    assert {(name, handle) for name in MAKERS for handle in made(name).handles} == set(JOINTS)
+    assert all(name == made(name).id for name in MAKERS)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_meshes_and_pieces(name):
+    source = made(name)
+    meshes = [source.mesh, *(link.mesh for link in source.links)]
+    assert sum(len(mesh.faces) for mesh in meshes) <= 1500
+    for mesh in meshes:
+        assert mesh.visual.uv.min() >= 0 and mesh.visual.uv.max() <= 1
+        assert max(mesh.visual.material.baseColorTexture.size) <= 1024
+        corners = mesh.vertices[mesh.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        large = np.linalg.norm(normals, axis=1) > 1e-9
+        assert (np.einsum("fi,fci->fc", normals, mesh.vertex_normals[mesh.faces])[large] > 0).all()
+    for pieces in bodies(source).values():
+        for piece in pieces:
+            hull = trimesh.convex.convex_hull(piece)
+            assert len(hull.vertices) == len(piece) <= 64 and hull.volume > 0
+
+
+@pytest.mark.parametrize(
+    "name, surface, low, high, z",
+    [
+        ("table", "top", (-0.25, -0.35), (0.3, 0.35), 0.61),
+        ("table", "top", (0, -0.45), (0.3, 0.25), 0.61),
+        ("table", "top", (-0.05, -0.25), (0.25, 0.15), 0.61),
+        *[("shelf", f"layer_{i}", (-0.35, -0.5), (-0.05, 0.5), z) for i, z in enumerate((0.085, 0.514, 0.942, 1.371))],
+        *[("container", f"layer_{i}", (0, 0.2), (0.21, 0.6), z) for i, z in enumerate((0.055, 0.6))],
+    ],
+)
+def test_surfaces_hold_the_rectangles_of_the_tasks(name, surface, low, high, z):
+    found = made(name).surfaces[surface]
+    assert found.z == z
+    assert np.all(np.array(found.min_xy) <= low) and np.all(np.array(found.max_xy) >= high)
+    assert found.headroom is None or found.headroom > 0.35
+
+
+@pytest.mark.parametrize(
+    "name, low, high",
+    [
+        ("table", (-0.38, -0.68, 0), (0.38, 0.68, 0.61)),
+        ("dining_table", (-0.42, -0.8, 0), (0.42, 0.8, 0.75)),
+        ("side_table", (-0.457, -0.457, 0), (0.457, 0.457, 0.5)),  # a polygon of 28 sides: 0.46 cos(pi / 28)
+        ("shelf", (-0.42, -0.58, 0), (0.006, 0.58, 1.8)),
+        ("cabinet", (-0.25, -0.6, 0), (0.248, 0.6, 0.92)),
+        ("container", (-0.3, -0.8, 0), (0.335, 0.74, 1.13)),
+        ("refrigerator", (-0.362, -0.35, 0), (0.3, 0.35, 1.75)),
+        ("basket", (-0.15, -0.15, -0.096), (0.15, 0.15, 0.094)),
+        ("plate", (-0.2, -0.2, 0), (0.2, 0.2, 0.1)),
+        ("room", (-3, -3, 0), (3, 3, 4)),
+    ],
+)
+def test_sizes(name, low, high):
+    np.testing.assert_allclose(made(name).mesh.bounds, [low, high], atol=6e-4)
+
+
+@pytest.mark.parametrize("name", [name for name in MAKERS if name != "room"])
+def test_pieces_are_where_the_mesh_is(name):
+    """Every corner of the collision pieces lies on or in the mesh's bounding box, and the other way round."""
+    source = made(name)
+    for mesh, pieces in [(source.mesh, source.pieces), *((link.mesh, link.pieces) for link in source.links)]:
+        points = np.concatenate(pieces)
+        np.testing.assert_allclose([points.min(0), points.max(0)], mesh.bounds, atol=0.0125)
+
+
+@pytest.mark.parametrize("name", ["cabinet", "container", "refrigerator"])
+def test_parts_keep_clear_of_each_other(name):
+    """All pieces are boxes along the axes; two of different bodies are 2 mm apart along one of them."""
+    boxes = [(body, p.min(axis=0), p.max(axis=0), len(p)) for body, ps in bodies(made(name)).items() for p in ps]
+    assert all(count == 8 for *_, count in boxes)
+    pairs = 0
+    for i, (body, low, high, _) in enumerate(boxes):
+        for other, other_low, other_high, _ in boxes[:i]:
+            if body != other:
+                pairs += 1
+                assert np.maximum(low - other_high, other_low - high).max() >= 0.002 - 1e-9, (body, other, low, high)
+    assert pairs > 30
+
+
+@pytest.mark.parametrize("name", [name for name in MAKERS if name not in ("basket", "room")])
+def test_joints_work_and_surfaces_hold(name):
+    report = examine_furniture(made(name))
+    assert [key for key, joint in report.joints.items() if not joint.works] == []
+    assert [key for key, surface in report.surfaces.items() if not surface.holds] == []
+    assert len(report.surfaces) >= 1
+
+
+def articulation(source, folder):
+    """The furniture in a scene of its own, its joints by name."""
+    scene = sapien.Scene([physx.PhysxCpuSystem()])
+    builder = scene.create_articulation_builder()
+    parts = {"": builder.create_link_builder()}
+    parts[""].set_joint_properties("fixed", [], sapien.Pose(), sapien.Pose())
+    for link in source.links:
+        part = parts[link.name] = builder.create_link_builder(parts[link.parent])
+        part.set_name(link.name)
+        part.set_joint_name(link.name)
+        frame = sapien.Pose(joint_frame(link.joint))
+        part.set_joint_properties(link.joint.kind, [link.joint.limits], frame, frame, 0.0, link.joint.damping)
+        center, inertia, axes = piece_inertia(link.pieces, link.mass)
+        part.set_mass_and_inertia(link.mass, sapien.Pose(center, axes), inertia)
+    for key, pieces in bodies(source).items():
+        write_hulls(folder / f"{key}.obj", pieces)
+        parts[key].add_multiple_convex_collisions_from_file(str(folder / f"{key}.obj"))
+    built = builder.build()
+    joints = {joint.name: joint for joint in built.active_joints}
+    for link in source.links:
+        joints[link.name].set_friction(link.joint.friction)
+    return scene, built, [joint.name for joint in built.active_joints]
+
+
+@pytest.mark.parametrize("name, part", JOINTS)
+def test_ten_newtons_open_it_and_nothing_keeps_it_there(name, part, tmp_path):
+    source = made(name)
+    link = next(link for link in source.links if link.name == part)
+    handle = source.handles[part]
+    scene, built, order = articulation(source, tmp_path)
+    body = next(candidate for candidate in built.links if candidate.name == part)
+    index, limit = order.index(part), link.joint.limits[1]
+
+    def pull(force, seconds):
+        for _ in range(round(seconds / scene.timestep)):
+            frame = body.entity.pose.to_transformation_matrix()
+            moved = frame @ pose(handle)
+            way = -moved[:3, 2]
+            if link.joint.kind == "prismatic":
+                way = np.array(link.joint.axis)
+            body.add_force_at_point((force * way).astype(np.float32), moved[:3, 3].astype(np.float32))
+            scene.step()
+        return built.qpos[index]
+
+    for _ in range(50):
+        scene.step()
+    np.testing.assert_allclose(built.qpos, 0, atol=1e-5)  # nothing pushes anything
+    assert pull(1.0, 0.5) < 0.02 * limit  # a touch does not move it
+    half = pull(10.0, 1.0)
+    assert 0.05 * limit < half < 0.95 * limit
+    pull(0.0, 0.5)
+    left = built.qpos[index]
+    pull(0.0, 1.0)
+    assert abs(built.qpos[index] - left) < 1e-3 * limit
+    assert pull(10.0, 4.0) == pytest.approx(limit, rel=0.01)
+    assert pull(-10.0, 6.0) == pytest.approx(0, abs=0.01 * limit)
+    others = np.delete(built.qpos, index)
+    np.testing.assert_allclose(others, 0, atol=1e-3)
+
+
+@pytest.mark.parametrize("name, part", JOINTS)
+def test_the_open_gripper_reaches_around_the_handle(name, part):
+    source = made(name)
+    handle = source.handles[part]
+    tcp = pose(handle)
+    everything = [piece for pieces in bodies(source).values() for piece in pieces]
+    for low, high in GRIPPER_BOXES:
+        for side in (1, -1):
+            box = block(np.array(low) * (1, side, 1), np.array(high) * (1, side, 1))
+            axes = [np.arange(a, b + 0.003, 0.003).clip(a, b) for a, b in zip(box.min(0), box.max(0), strict=True)]
+            points = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3) @ tcp[:3, :3].T + tcp[:3, 3]
+            assert not within(everything, points).any()
+    # between the fingers is the bar, as thick as it says, and all along the pads
+    own = bodies(source)[part]
+    across = handle.width / 2 * np.array([0, 0.98, -0.98, 1.02, -1.02])
+    for along in (-0.01, 0, 0.01):
+        points = np.stack([np.full(5, along), across, np.zeros(5)], axis=1) @ tcp[:3, :3].T + tcp[:3, 3]
+        assert within(own, points).tolist() == [True, True, True, False, False]
+    # 35 mm of room behind it, as high as the fingers are wide
+    behind = np.array(
+        [[x, y, handle.width / 2 + d] for x in (-0.01, 0.01) for y in (-0.046, 0, 0.046) for d in (0.001, 0.035)]
+    )
+    assert not within(everything, behind @ tcp[:3, :3].T + tcp[:3, 3]).any()
+
+
+@pytest.mark.parametrize("name, part", JOINTS)
+def test_handles_open_what_they_belong_to(name, part):
+    """Pulling back along the approach, or along the slide, opens."""
+    source = made(name)
+    link = next(link for link in source.links if link.name == part)
+    handle = source.handles[part]
+    back = -pose(handle)[:3, 2]
+    np.testing.assert_allclose(back, (1, 0, 0), atol=1e-9)
+    assert handle.link == part
+    if link.joint.kind == "revolute":
+        motion = np.cross(link.joint.axis, np.subtract(handle.position, link.joint.origin))
+        assert motion @ back > 0.4  # m of way per rad: far from the hinge
+    elif name == "cabinet":
+        assert link.joint.axis == (1, 0, 0)
+    else:
+        assert link.joint.axis == (0, -1, 0)
+
+
+def test_container_is_upstreams():
+    source = made("container")
+    assert source.handles["door"].position == (0.378, 0.672, 0.557)
+    assert source.links[0].joint.limits[1] >= 0.5
+
+
+@pytest.mark.parametrize("name", ["cabinet", "container", "refrigerator"])
+def test_open_doors_lay_the_surfaces_bare(name):
+    """With everything shut, each surface inside has a wall in front of it; without the moving parts, none."""
+    source = made(name)
+    for key, surface in source.surfaces.items():
+        if key == "top" or surface.link:
+            continue
+        center = np.add(surface.min_xy, surface.max_xy) / 2
+        ray = np.array([[x, center[1], surface.z + 0.03] for x in np.arange(surface.max_xy[0], 0.5, 0.005)])
+        assert not within(source.pieces, ray).any(), key
+        assert within([piece for link in source.links for piece in link.pieces], ray).any(), key
+
+
+def test_drawers_are_hollow():
+    source = made("cabinet")
+    for part in ("drawer_left", "drawer_right"):
+        surface = source.surfaces[part]
+        pieces = bodies(source)[part]
+        x, y = (np.linspace(surface.min_xy[i], surface.max_xy[i], 9) for i in (0, 1))
+        spots = np.stack([*(grid.ravel() for grid in np.meshgrid(x, y)), np.full(81, surface.z + 0.05)], axis=1)
+        below, above = clearances(pieces, spots)
+        np.testing.assert_allclose(below, 0.05, atol=1e-9)
+        assert np.isinf(above).all()
+        assert max(np.ptp(x), np.ptp(y)) > 0.4 and min(np.ptp(x), np.ptp(y)) > 0.35
+
+
+def test_basket_and_plate_are_hollow():
+    for name in ("basket", "plate"):
+        source = made(name)
+        inner = source.inner
+        assert inner is not None
+        probes = np.random.default_rng(0).uniform(np.add(inner.min, 1e-4), np.subtract(inner.max, 1e-4), (200, 3))
+        assert not within(source.pieces, probes).any()
+        below = probes * (1, 1, 0) + (0, 0, inner.min[2] - 0.003)
+        assert within(source.pieces, below).all()
+    walls = [[0.1445, 0, 0.05], [0, -0.1445, 0.05], [-0.1445, 0, 0.05], [0, 0.1445, 0.05], [0, 0, -0.092]]
+    assert within(made("basket").pieces, np.array(walls)).all()
 
 
 def test_basket_mass():
-    piece = basket()
-    center, moments = piece.mass_properties()
-    assert piece.mass == 0.8
+    source = made("basket")
+    center, moments, _ = piece_inertia(source.pieces, source.mass)
+    assert source.mass == 0.8 and source.origin_height == 0.096
     np.testing.assert_allclose(center[:2], 0, atol=1e-9)
     assert -0.06 < center[2] < 0  # the bottom plate pulls it down
-    # Between a solid cube's and a thin shell's of that size.
+    # between a solid cube's and a thin shell's of that size
     assert 0.8 * (0.28**2 + 0.19**2) / 12 < moments[0] < 0.8 * (0.3**2 + 0.19**2) / 4
     assert moments[0] == pytest.approx(moments[1]) and moments[2] > moments[0]
-    with pytest.raises(ValueError, match="no mass"):
-        table().mass_properties()
 
 
 def test_room_faces_inwards():
-    piece = room()
-    shape = piece.shape
-    np.testing.assert_allclose([shape.vertices.min(0), shape.vertices.max(0)], [[-3, -3, 0], [3, 3, 4]], atol=1e-9)
-    to_center = np.array([0, 0, 2]) - shape.vertices
-    assert (np.einsum("ij,ij->i", to_center, shape.normals) > 0).all()
-    assert shape.closed().volume == pytest.approx(-6 * 6 * 4)  # inside out, seen from outside
+    source = made("room")
+    assert len(source.finishes["wall"]) >= 6 and len(source.finishes["floor"]) >= 6
+    meshes = [source.mesh, *source.finishes["wall"].values(), *source.finishes["floor"].values()]
+    for mesh in meshes:
+        to_center = np.array([0, 0, 2]) - mesh.triangles_center
+        assert (np.einsum("ij,ij->i", to_center, mesh.face_normals) > 0).all()
+    wall, floor = source.finishes["wall"]["brick"], source.finishes["floor"]["checker"]
+    assert wall.area == pytest.approx(4 * 6 * 4) and floor.area == pytest.approx(6 * 6)
     inside = np.array([[0, 0, 0.001], [2.99, 0, 1], [0, -2.99, 1], [2.99, 2.99, 3.9]])
     outside = np.array([[0, 0, -0.001], [3.01, 0, 1], [0, -3.01, 1], [-3.01, 0, 1], [0, 3.01, 1]])
-    hulls = [trimesh.convex.convex_hull(points) for points in piece.pieces]
-    assert not any(hull.contains(inside).any() for hull in hulls)
-    assert np.any([hull.contains(outside) for hull in hulls], axis=0).all()
+    assert not within(source.pieces, inside).any()
+    assert within(source.pieces, outside).all()
+
+
+@pytest.mark.parametrize("name", [*WALLS, *FLOORS])
+def test_finishes_tile_and_differ(name):
+    grid = Grid.of((TILE, TILE), (256, 256))
+    picture = (WALLS | FLOORS)[name](grid, np.random.default_rng(11))
+    assert picture.shape == (256, 256, 3) and 20 < picture.mean() < 250
+    for axis in (0, 1):
+        steps = np.abs(np.diff(picture, axis=axis)).mean(axis=(1 - axis, 2))
+        seam = np.abs(picture.take(0, axis) - picture.take(-1, axis)).mean()
+        assert seam <= steps.max() * 1.02 + 0.5
+
+
+def test_finishes_look_different():
+    colours = [
+        np.asarray(mesh.visual.material.baseColorTexture, float) for mesh in made("room").finishes["floor"].values()
+    ]
+    for i, one in enumerate(colours):
+        for other in colours[:i]:
+            assert np.abs(one - other).mean() > 10
+
+
+@pytest.mark.parametrize("name", ["side_table", "container", "plate"])
+def test_same_bytes_twice(name, tmp_path):
+    def data(source):
+        result = []
+        for mesh in (source.mesh, *(link.mesh for link in source.links)):
+            write_glb(mesh, tmp_path / "mesh.glb")
+            result.append((tmp_path / "mesh.glb").read_bytes())
+        facts = [model.model_dump_json() for model in [*source.surfaces.values(), *source.handles.values()]]
+        return result, json.dumps(facts), [piece.tobytes() for pieces in bodies(source).values() for piece in pieces]
+
+    assert data(MAKERS[name]()) == data(MAKERS[name]())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["wall", "floor"])
+def test_pictures_of_the_room_are_small(part, tmp_path):
+    for mesh in MAKERS["room"]().finishes[part].values():
+        write_glb(mesh, tmp_path / "mesh.glb")
+        assert (tmp_path / "mesh.glb").stat().st_size < 205_000

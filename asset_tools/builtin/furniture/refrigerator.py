@@ -1,0 +1,109 @@
+"""A white refrigerator over a freezer, each behind a door."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from asset_tools.builtin.furniture.base import BAR_GAP, Body, bar_grip, hinge, surface
+from asset_tools.builtin.materials import DARK, STEEL, coat
+from asset_tools.sources import FurnitureSource, LinkSource
+
+BACK, FRONT, HALF, HEIGHT = -0.36, 0.30, 0.35, 1.75
+WALL = 0.045
+DOOR, DOOR_GAP = 0.055, 0.004
+BAR = 0.014
+FREEZER = (0.10, 0.60)  # m, heights of the doors
+FRIDGE = (0.606, 1.745)
+FLOORS = {"freezer": (0.145, 0.58), "shelf_0": (0.66, 0.968), "shelf_1": (0.98, 1.298), "shelf_2": (1.31, 1.70)}
+
+ENAMEL = coat((238, 240, 240))
+LINER = coat((246, 247, 247))
+GLASS = coat((196, 218, 216))
+
+
+def refrigerator() -> FurnitureSource:
+    """Both doors hang on the left edge; origin on the floor under its middle."""
+    body = Body({"enamel": ENAMEL, "liner": LINER, "glass": GLASS, "dark": DARK}, seed=9, texture=256, roughness=0.35)
+    inner = HALF - WALL
+    bottom = 0.10
+    for side in (-1, 1):  # the liner shows from inside, the enamel from outside
+        body.board(
+            (BACK, side * HALF, bottom), (FRONT, side * (inner + 0.01), HEIGHT), "enamel", bevel=0.003, collide=False
+        )
+        body.board(
+            (BACK + 0.02, side * (HALF - 0.02), bottom + 0.01),
+            (FRONT - 0.001, side * inner, HEIGHT - 0.02),
+            "liner",
+            collide=False,
+        )
+        body.pieces.append(
+            np.array(np.meshgrid((BACK, FRONT), (side * HALF, side * inner), (bottom, HEIGHT))).reshape(3, -1).T
+        )
+    body.board((BACK, -inner, bottom), (BACK + 0.05, inner, HEIGHT), "liner")
+    body.board((BACK - 0.002, -HALF + 0.01, bottom + 0.01), (BACK, HALF - 0.01, HEIGHT - 0.01), "enamel", collide=False)
+    body.board((BACK, -inner, bottom), (FRONT, inner, 0.145), "liner")
+    body.board((BACK, -inner, 0.58), (FRONT, inner, 0.66), "liner")
+    body.board((BACK, -inner, 1.70), (FRONT, inner, HEIGHT - 0.008), "liner")
+    body.board((BACK, -HALF, HEIGHT - 0.01), (FRONT, HALF, HEIGHT), "enamel", bevel=0.003)
+    for z in (0.98, 1.31):
+        body.board((BACK + 0.05, -inner, z - 0.012), (0.18, inner, z), "glass")
+        body.board((0.18, -inner, z - 0.014), (0.19, inner, z + 0.002), "liner", collide=False)
+    body.board((BACK + 0.05, -HALF + 0.03, 0), (FRONT - 0.03, HALF - 0.03, bottom), "dark")
+
+    links, handles = [], {}
+    for name, (low, high), bar, mass in (
+        ("freezer_door", FREEZER, (0.34, 0.56), 5.0),
+        ("door", FRIDGE, (0.70, 1.12), 9.0),
+    ):
+        link, grip = _door(name, low, high, bar, mass, bins=(0.72, 1.05, 1.38) if name == "door" else ())
+        links.append(link)
+        handles[name] = bar_grip(name, grip, along="z", bar=BAR)
+    room = 0.175  # m: bins in the door reach in so far
+    surfaces = {
+        name: surface(
+            (BACK + 0.055, -inner + 0.003), (room if name != "freezer" else FRONT - 0.01, inner - 0.003), z, top - z
+        )
+        for name, (z, top) in FLOORS.items()
+    }
+    surfaces["top"] = surface((BACK, -HALF), (FRONT, HALF), HEIGHT)
+    return FurnitureSource(
+        "refrigerator",
+        "refrigerator",
+        "refrigerator",
+        body.mesh(),
+        body.pieces,
+        surfaces=surfaces,
+        links=tuple(links),
+        handles=handles,
+    )
+
+
+def _door(
+    name: str, low: float, high: float, bar: tuple[float, float], mass: float, *, bins: tuple[float, ...]
+) -> tuple[LinkSource, tuple[float, float, float]]:
+    """A door and the middle of its handle; ``bins`` are the heights of racks on its inside."""
+    body = Body(
+        {"enamel": ENAMEL, "liner": LINER, "steel": STEEL, "glass": GLASS, "dark": DARK},
+        seed=10,
+        texture=256,
+        roughness=0.35,
+    )
+    face = FRONT + DOOR_GAP
+    out = face + DOOR
+    body.board((face, -HALF, low), (out, HALF, high), "enamel", bevel=0.006)
+    body.board(
+        (face - 0.003, -HALF + 0.02, low + 0.02), (face + 0.001, HALF - 0.02, high - 0.02), "dark", collide=False
+    )  # seal
+    body.board(
+        (face - 0.004, -HALF + 0.035, low + 0.035), (face + 0.001, HALF - 0.035, high - 0.035), "liner", collide=False
+    )
+    for z in bins:
+        y = HALF - 0.10
+        body.board((face - 0.10, -y, z), (face, y, z + 0.008), "liner")
+        body.board((face - 0.10, -y, z + 0.008), (face - 0.094, y, z + 0.07), "glass")
+        for side in (-1, 1):
+            body.board((face - 0.10, side * y, z), (face, side * (y - 0.006), z + 0.07), "liner")
+    grip = (out + BAR_GAP + BAR / 2, HALF - 0.055, round(sum(bar) / 2, 6))
+    body.bar_handle(np.array(grip), bar[1] - bar[0], "steel", along="z", bar=BAR)
+    joint = hinge(f"{name}_hinge", (face, -HALF, 0.0), -1)
+    return LinkSource(name, joint, body.mesh(), body.pieces, mass), grip

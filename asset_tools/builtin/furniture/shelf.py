@@ -1,0 +1,40 @@
+"""A shop's shelf of four layers: oak boards between black steel posts, a white back, price rails along the front."""
+
+from __future__ import annotations
+
+from asset_tools.builtin.furniture.base import Body, surface
+from asset_tools.builtin.materials import BLACK_STEEL, OAK, WHITE, coat, wooden
+from asset_tools.sources import FurnitureSource
+
+LAYERS = (0.085, 0.514, 0.942, 1.371)  # m, upstream's
+TOP = 1.80
+DEPTH, HALF_WIDTH = 0.42, 0.58  # m; the front is at x = 0, as upstream's numbers have it
+POST = 0.04
+BOARD = 0.022
+
+
+def shelf() -> FurnitureSource:
+    """A shelf that is open to its front at x = 0; origin on the floor in the middle of its front."""
+    body = Body(
+        {"oak": wooden(OAK, (1.2, 0.45)), "steel": BLACK_STEEL, "back": WHITE, "rail": coat((222, 226, 228))},
+        seed=3,
+        roughness=0.55,
+    )
+    y, back = HALF_WIDTH, -DEPTH
+    for side in (-1, 1):
+        for x in (0.0, back + POST):
+            body.board((x - POST, side * y, 0), (x, side * (y - POST), TOP), "steel", bevel=0.003)
+        for z in (*LAYERS, TOP):  # bars that carry the boards
+            body.board((back + POST, side * y, z - 0.05), (-POST, side * (y - POST), z), "steel")
+    inner = y - POST
+    for z in (*LAYERS, TOP):
+        body.board((back, -inner, z - BOARD), (0.0, inner, z), "oak", bevel=0.002)
+        if z < TOP:
+            body.board((-0.004, -inner, z - 0.05), (0.006, inner, z - 0.004), "rail", collide=False)
+    body.board((back, -inner, LAYERS[0]), (back + 0.008, inner, TOP - BOARD), "back")
+    ceilings = (*LAYERS[1:], TOP)
+    surfaces = {
+        f"layer_{i}": surface((back + 0.02, -0.53), (-0.01, 0.53), z, ceilings[i] - BOARD - z)
+        for i, z in enumerate(LAYERS)
+    }
+    return FurnitureSource("shelf", "shelf", "shelf", body.mesh(), body.pieces, surfaces=surfaces)

@@ -1,0 +1,109 @@
+"""Three tables: a plain one of oak, a dining table with painted legs, a round one of marble and steel."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from asset_tools.builtin.furniture.base import Body, disc, surface
+from asset_tools.builtin.materials import BLACK_STEEL, OAK, WALNUT, WHITE, Material, marble, wooden
+from asset_tools.sources import FurnitureSource
+
+TABLE_HEIGHT = 0.61  # m, upstream's
+TABLE_HALF = (0.38, 0.68)
+DINING_HEIGHT = 0.75
+DINING_HALF = (0.42, 0.80)
+SIDE_HEIGHT = 0.50
+SIDE_RADIUS = 0.46
+
+
+def table() -> FurnitureSource:
+    """A table of oak with square legs: origin on the floor under its centre, top at 0.61 m."""
+    (x, y), z, thickness, leg = TABLE_HALF, TABLE_HEIGHT, 0.03, 0.06
+    body = Body({"top": wooden(OAK, (1.37, 0.77), plank=0.1283), "oak": wooden(OAK, (1.25, 0.16))}, roughness=0.55)
+    body.board((-x, -y, z - thickness), (x, y, z), "top", bevel=0.003)
+    _legs(body, "oak", x - 0.03, y - 0.03, leg, z - thickness)
+    _apron(body, "oak", x - 0.045, y - 0.045, leg, z - thickness, 0.07)
+    return FurnitureSource(
+        "table", "table", "table", body.mesh(), body.pieces, surfaces={"top": surface((-x, -y), (x, y), z)}
+    )
+
+
+def dining_table() -> FurnitureSource:
+    """A table with a walnut top on white tapered legs, top at 0.75 m."""
+    (x, y), z, thickness = DINING_HALF, DINING_HEIGHT, 0.035
+    body = Body({"top": wooden(WALNUT, (1.62, 0.86), plank=0.1433), "white": WHITE}, seed=1, roughness=0.5)
+    body.board((-x, -y, z - thickness), (x, y, z), "top", bevel=0.006)
+    below = z - thickness
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            inner = np.array([sx * (x - 0.10), sy * (y - 0.10), 0.0])
+            outer = inner + (sx * 0.07, sy * 0.07, 0)
+            knee = np.array([0, 0, below - 0.13])
+            body.board(inner + knee, outer + (0, 0, below), "white", bevel=0.002)
+            foot = outer - (sx * 0.035, sy * 0.035, 0)
+            body.solid(np.concatenate([_square(inner + knee, outer + knee), _square(foot, outer)]), "white")
+    _apron(body, "white", x - 0.04, y - 0.04, 0.06, below, 0.09)
+    return FurnitureSource(
+        "dining_table",
+        "dining table",
+        "table",
+        body.mesh(),
+        body.pieces,
+        surfaces={"top": surface((-x, -y), (x, y), z)},
+    )
+
+
+def side_table() -> FurnitureSource:
+    """A low round table: a marble top 0.5 m high on black steel legs. Its surface is the square within the circle."""
+    z, radius, thickness = SIDE_HEIGHT, SIDE_RADIUS, 0.025
+    body = Body({"top": Material((0.94, 0.94), marble), "steel": BLACK_STEEL}, seed=2, roughness=0.35)
+    body.solid(disc((0, 0, z - thickness), radius, thickness, bevel=0.003), "top", collide=False)
+    body.solid(disc((0, 0, z - thickness), radius, thickness), "top", show=False)
+    bar, reach = 0.022, 0.30
+    for sx in (-1, 1):
+        for sy in (-1, 1):  # leaning outwards
+            head, foot = np.array([sx * 0.19, sy * 0.19, z - thickness]), np.array([sx * reach, sy * reach, 0.0])
+            half = np.array([bar / 2, bar / 2, 0])
+            body.solid(np.concatenate([_square(end - half, end + half) for end in (head, foot)]), "steel")
+    level = 0.12
+    spread = 0.19 + (reach - 0.19) * (1 - level / (z - thickness))
+    for side in (-1, 1):  # a frame near the floor, and one below the top
+        for height, half in ((level, spread), (z - thickness - bar / 2, 0.19)):
+            body.board(
+                (-half, side * half - bar / 2, height - bar / 2),
+                (half, side * half + bar / 2, height + bar / 2),
+                "steel",
+            )
+            body.board(
+                (side * half - bar / 2, -half, height - bar / 2),
+                (side * half + bar / 2, half, height + bar / 2),
+                "steel",
+            )
+    half = 0.32
+    return FurnitureSource(
+        "side_table",
+        "side table",
+        "table",
+        body.mesh(),
+        body.pieces,
+        surfaces={"top": surface((-half, -half), (half, half), z)},
+    )
+
+
+def _square(corner: np.ndarray, opposite: np.ndarray) -> np.ndarray:
+    """Corners (4, 3) of a level rectangle."""
+    return np.array([(x, y, corner[2]) for x in (corner[0], opposite[0]) for y in (corner[1], opposite[1])])
+
+
+def _legs(body: Body, material: str, x: float, y: float, width: float, height: float) -> None:
+    for sx in (-1, 1):
+        for sy in (-1, 1):
+            body.board((sx * x, sy * y, 0), (sx * (x - width), sy * (y - width), height), material, bevel=0.002)
+
+
+def _apron(body: Body, material: str, x: float, y: float, leg: float, top: float, depth: float) -> None:
+    """Boards on edge below the top, between the legs; ``x`` and ``y`` are their outer faces."""
+    board = 0.02
+    for side in (-1, 1):
+        body.board((side * x, -y + leg / 2, top - depth), (side * (x - board), y - leg / 2, top), material)
+        body.board((-x + leg / 2, side * y, top - depth), (x - leg / 2, side * (y - board), top), material)
