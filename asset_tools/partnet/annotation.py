@@ -1,0 +1,100 @@
+"""What a PartNet-Mobility model doesn't say of itself: a YAML file beside it, ``<id>.yaml``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import yaml
+from pydantic import Field, ValidationError
+
+from robocas_ms3.assets.manifest import Name, NotNegative, Positive, Quaternion, StrictModel, Surface, Vec3
+from robocas_ms3.errors import AssetError
+
+SHIPPED = Path(__file__).parent / "annotations"
+
+TEMPLATE = """\
+name: kitchen cabinet         # for language
+category: cabinet
+origin_lift: 0.5              # height of the model's origin above its lowest point, m
+surfaces:                     # where objects may stand; m, x out of the front, z up, joints closed
+  top: {min_xy: [-0.2, -0.4], max_xy: [0.2, 0.4], z: 0.5}
+  drawer: {link: link_0, min_xy: [-0.2, -0.4], max_xy: [0.2, 0.4], z: 0.1, headroom: 0.1}
+handles:                      # pose of the gripper's TCP (z approach, y closing) in the same frame
+  drawer: {joint: joint_0, position: [0.3, 0, 0.2], wxyz: [0.5, 0.5, -0.5, -0.5], width: 0.012}
+joints:                       # all optional
+  joint_0: {mass: 2.0, friction: 0.05, damping: 5.0, limits: [0, 0.3]}
+"""
+
+
+class HandleNote(StrictModel):
+    """Where to take hold of what a joint moves: pose of the TCP in the furniture's frame, joints closed."""
+
+    joint: str
+    position: Vec3
+    wxyz: Quaternion
+    width: Positive
+
+
+class JointNote(StrictModel):
+    """What to change about a joint."""
+
+    mass: Positive | None = Field(default=None, description="of what it moves, kg; none: by volume")
+    friction: NotNegative | None = None
+    damping: NotNegative | None = None
+    closed: float | None = Field(default=None, description="position at which it is closed, as the URDF counts")
+    limits: tuple[float, float] | None = Field(default=None, description="counted from where it is closed")
+    fixed: bool = Field(default=False, description="hold it closed")
+
+
+class Annotation(StrictModel):
+    """The file. Surfaces name the URDF's links; those of the fixed body leave ``link`` out."""
+
+    name: Annotated[str, Field(min_length=1)]
+    category: Annotated[str, Field(min_length=1)]
+    origin_lift: float
+    mass: Positive | None = Field(default=None, description="kg; none: it can't be moved")
+    surfaces: dict[Name, Surface] = {}
+    handles: dict[Name, HandleNote] = {}
+    joints: dict[str, JointNote] = {}
+
+
+def find_annotation(model_id: str, folder: Path | None = None) -> Annotation:
+    """The annotation of a model: the user's, or else the one that comes with this package.
+
+    Args:
+        model_id: name of the model's folder.
+        folder: the user's annotations.
+
+    Raises:
+        AssetError: there is none, or it is wrong.
+    """
+    places = [home / f"{model_id}.yaml" for home in (folder, SHIPPED) if home is not None]
+    for path in places:
+        if path.is_file():
+            return load_annotation(path)
+    shipped = ", ".join(sorted(path.stem for path in SHIPPED.glob("*.yaml")))
+    raise AssetError(
+        "no annotation of this model",
+        where=model_id,
+        expected=f"{model_id}.yaml in the folder given by --annotations, or one of those shipped ({shipped})",
+        fix=f"Write one like this:\n{TEMPLATE}",
+    )
+
+
+def load_annotation(path: Path) -> Annotation:
+    """Read an annotation file.
+
+    Raises:
+        AssetError: it can't be read, or a key is unknown, missing or wrong: naming the first.
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise AssetError("the annotation can't be read", where=path, found=" ".join(str(error).split())) from error
+    try:
+        return Annotation.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"])) or "the top"
+        raise AssetError("the annotation is wrong", where=path, expected=first["msg"], found=f"at {key}") from error

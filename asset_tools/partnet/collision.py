@@ -1,0 +1,267 @@
+"""Convex pieces of furniture, part by part, so that drawers stay hollow and what is open stays open."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull, KDTree, QhullError
+from shapely import unary_union
+from shapely.geometry import MultiPolygon, Polygon
+
+from asset_tools.decompose import few_vertices
+from asset_tools.repair import close
+from robocas_ms3.errors import AssetError
+
+Array = np.ndarray
+
+TOLERANCE, FINE = 0.02, 0.005  # m between hull and surface, nine tenths of it; fine: what fingers reach behind
+FARTHEST = 2.25  # times that, anywhere
+BOARD = 0.08  # m: thinner parts are their hull, unless there is a hole right through
+SMALL = 0.08  # m: smaller parts are their hull
+TINY = 0.015  # m: smaller parts are left out
+SHEET = 0.01  # m: what has no thickness gets this: downward, so that things stand where it is seen, or else inward
+FLAT = 0.0005  # m
+LEVEL = 0.9  # of a normal's z
+FILLED = 0.1  # share of the surface that closing may add; more is a lid on something open
+LARGEST_FACETS = 40  # of an open shell
+MOST = 40  # pieces of a link
+SAMPLES = 300
+DENSE = 1000  # triangles: of carved work; distances from more are measured to points on it
+CUTS, STEPS, DEPTH = 6, 5, 4  # planes tried across each axis at faces and evenly, cuts one after the other
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the furniture, as PartNet names it.
+
+    Attributes:
+        name: ``drawer_side-23``.
+        meshes: (F, 3, 3) triangles of each of its meshes, m.
+    """
+
+    name: str
+    meshes: list[Array]
+
+
+def pieces_of(parts: Sequence[Part], middle: Array) -> list[Array]:
+    """Corners (V, 3) of the convex pieces of a link's parts, at most 40.
+
+    A part that nearly fills its hull is one piece. Others are split: into their meshes, these into loose components,
+    open shells into their walls, and what remains by the planes that save most hull volume. Furniture being made of
+    boards, such planes are exact where a general decomposition would leave slopes, and are found much sooner.
+
+    Args:
+        parts: of the link.
+        middle: (3,) of the furniture: upright sheets without thickness grow towards it.
+
+    Raises:
+        AssetError: there is nothing to make a hull of.
+    """
+    found: list[Array] = []
+    for part in parts:
+        fine = "handle" in part.name or "knob" in part.name
+        # of what else than handles is that slender nothing leans on
+        found += [piece for piece in _split(part.meshes, fine, middle) if _size(piece, 0 if fine else 1) >= TINY]
+    hulls = [few_vertices(piece) for piece in found]
+    hulls = _without_hidden(hulls)
+    if not hulls:
+        raise AssetError("nothing to touch", found=f"{len(parts)} parts", expected="a body")
+    if len(hulls) > MOST:
+        order = np.argsort([-np.ptp(hull, axis=0).max() for hull in hulls], kind="stable")[:MOST]
+        hulls = [hulls[index] for index in sorted(order)]
+    return hulls
+
+
+def _size(points: Array, rank: int) -> float:
+    """Longest (0), middle (1) or shortest (2) extent, m."""
+    return float(np.sort(np.ptp(points, axis=0))[2 - rank])
+
+
+def _split(meshes: Sequence[Array], fine: bool, middle: Array) -> list[Array]:
+    points = np.concatenate(meshes).reshape(-1, 3)
+    flat = _flat_hull(points, middle)
+    if flat is not None:
+        return [flat]
+    if _fits(np.concatenate(meshes), fine):
+        return [points]
+    if len(meshes) > 1:
+        return [piece for mesh in meshes for piece in _split([mesh], fine, middle)]
+    body = _welded(meshes[0])
+    components = trimesh.graph.connected_components(body.face_adjacency, nodes=np.arange(len(body.faces)), min_len=1)
+    if len(components) > 1:
+        return [piece for one in components for piece in _split([body.triangles[np.sort(one)]], fine, middle)]
+    return _walls(body) if _is_shell(body) else _cut(body.triangles, fine, DEPTH)
+
+
+def _is_shell(body: trimesh.Trimesh) -> bool:
+    """Whether it takes a lid to close it."""
+    if body.is_watertight:
+        return False
+    try:
+        return close(body).mesh.area > (1 + FILLED) * body.area
+    except AssetError:
+        return True
+
+
+def _cut(triangles: Array, fine: bool, depth: int) -> list[Array]:
+    """Points of nearly convex pieces of a closed mesh, cut by planes across x, y or z."""
+    points = triangles.reshape(-1, 3)
+    size = np.ptp(points, axis=0)
+    if depth == 0 or size.max() <= TINY or _fits(triangles, True, TINY if fine else SMALL):
+        return [points]
+    best, halves = np.inf, []
+    for axis in range(3):
+        for place in _places(triangles, axis):
+            found = [_half(triangles, axis, place, side) for side in (1.0, -1.0)]
+            volume = sum(_hull_volume(half) for half in found)
+            if min(map(len, found)) and volume < best:
+                best, halves = volume, found
+    if not halves:
+        return [points]
+    pieces = []
+    for half in halves:
+        body = _welded(half)
+        for one in trimesh.graph.connected_components(body.face_adjacency, nodes=np.arange(len(body.faces)), min_len=1):
+            part = body.triangles[np.sort(one)]
+            if np.ptp(part.reshape(-1, 3), axis=0).min() > FLAT:
+                pieces += _cut(part, fine, depth - 1)
+    return pieces
+
+
+def _places(triangles: Array, axis: int) -> Array:
+    """Where to try cuts across an axis: at the largest faces across it, where a notch ends, and at even steps."""
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    areas = np.abs(cross[:, axis]) * (np.abs(cross[:, axis]) > 0.99 * np.linalg.norm(cross, axis=1))
+    low, high = triangles[..., axis].min(), triangles[..., axis].max()
+    places, which = np.unique(np.round(triangles[:, :, axis].mean(axis=1), 4), return_inverse=True)
+    largest = places[np.argsort(-np.bincount(which, areas), kind="stable")]
+    largest = largest[(largest > low + FLAT) & (largest < high - FLAT)][:CUTS]
+    return np.append(largest, np.linspace(low, high, STEPS + 2)[1:-1])
+
+
+def _half(triangles: Array, axis: int, place: float, side: float) -> Array:
+    points, faces = triangles.reshape(-1, 3), np.arange(len(triangles) * 3).reshape(-1, 3)
+    points, faces = trimesh.intersections.slice_faces_plane(
+        points, faces, side * np.eye(3)[axis], place * np.eye(3)[axis]
+    )[:2]
+    return np.asarray(points)[np.asarray(faces)].reshape(-1, 3, 3)
+
+
+def _hull_volume(triangles: Array) -> float:
+    try:
+        return float(ConvexHull(triangles.reshape(-1, 3)).volume)
+    except (QhullError, ValueError):
+        return 0.0
+
+
+def _welded(triangles: Array) -> trimesh.Trimesh:
+    body = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(len(triangles) * 3).reshape(-1, 3), process=False)
+    body.merge_vertices(digits_vertex=5)
+    body.update_faces(body.nondegenerate_faces() & body.unique_faces())
+    body.remove_unreferenced_vertices()
+    return body
+
+
+def _flat_hull(points: Array, middle: Array) -> Array | None:
+    """The hull of points in a plane, given some thickness; none: they aren't in a plane."""
+    center = points.mean(axis=0)
+    spread = np.linalg.svd(points - center, full_matrices=False)
+    normal = spread[2][-1]
+    if np.ptp(points @ normal) > FLAT:
+        return None
+    return np.concatenate([points, points + _thickness(normal, middle - center)])
+
+
+def _thickness(normal: Array, inward: Array) -> Array:
+    """The way in which a sheet of a normal grows, m."""
+    level = abs(normal[2]) > LEVEL
+    return normal * (SHEET if (-normal[2] if level else normal @ inward) > 0 else -SHEET)
+
+
+def _fits(triangles: Array, fine: bool, small: float = SMALL) -> bool:
+    """Whether a part's convex hull stands for it well enough."""
+    points = triangles.reshape(-1, 3)
+    if np.ptp(points, axis=0).max() <= small:
+        return True
+    hull = ConvexHull(points)
+    body = _welded(triangles)
+    outside = trimesh.Trimesh(points, hull.simplices, process=False)
+    spots = trimesh.sample.sample_surface(outside, SAMPLES, seed=0)[0]
+    gaps = _distances(body, spots)
+    tolerance = FINE if fine else TOLERANCE
+    if np.percentile(gaps, 90) <= tolerance and gaps.max() <= FARTHEST * tolerance:
+        return True
+    if fine:
+        return False
+    thickness = float(min(trimesh.bounds.oriented_bounds(outside)[1]))
+    return thickness <= BOARD and bool(gaps.max() <= 1.05 * thickness)
+
+
+def _distances(body: trimesh.Trimesh, points: Array) -> Array:
+    if len(body.faces) <= DENSE:
+        return trimesh.proximity.closest_point(body, points)[1]
+    places = trimesh.sample.sample_surface(body, 20_000, seed=0)[0]
+    return KDTree(np.concatenate([places, body.vertices])).query(points)[0]
+
+
+def _walls(body: trimesh.Trimesh) -> list[Array]:
+    """A slab for each flat face of an open shell, its thickness inward."""
+    groups = [np.asarray(group) for group in body.facets]
+    single = np.setdiff1d(np.arange(len(body.faces)), np.concatenate(groups) if groups else [])
+    groups += [np.array([face]) for face in single]
+    groups.sort(key=lambda group: -body.area_faces[group].sum())
+    middle = body.bounds.mean(axis=0)
+    slabs = []
+    for group in groups[:LARGEST_FACETS]:
+        normal = body.face_normals[group[0]]
+        across = np.linalg.svd(normal[None])[2][1:]
+        origin = body.triangles[group[0], 0]
+        grown = _thickness(normal, middle - origin)
+        for outline in _convex_outlines((body.triangles[group] - origin) @ across.T):
+            face = origin + outline @ across
+            slabs.append(np.concatenate([face, face + grown]))
+    return slabs
+
+
+def _convex_outlines(triangles: Array) -> list[Array]:
+    """Convex polygons (V, 2) that cover triangles (F, 3, 2) of a plane, joined where the sum is convex."""
+    shapes = [Polygon(triangle) for triangle in triangles]
+    union = unary_union(shapes)
+    whole = [one for one in (union.geoms if isinstance(union, MultiPolygon) else [union]) if isinstance(one, Polygon)]
+    if all(one.area >= 0.97 * one.convex_hull.area for one in whole):
+        shapes = whole
+    joined = True
+    while joined:
+        joined = False
+        for i in range(len(shapes)):
+            for j in range(i + 1, len(shapes)):
+                both = shapes[i].union(shapes[j])
+                if isinstance(both, Polygon) and both.area >= 0.99 * both.convex_hull.area:
+                    shapes[i] = both
+                    del shapes[j]
+                    joined = True
+                    break
+            if joined:
+                break
+    hulls = [shape.convex_hull for shape in shapes if shape.area > TINY**2]
+    return [np.array(hull.exterior.coords)[:-1] for hull in hulls if isinstance(hull, Polygon)]
+
+
+def _without_hidden(hulls: list[Array]) -> list[Array]:
+    """Leave out pieces that lie inside of another."""
+    planes = [ConvexHull(hull).equations for hull in hulls]
+    sizes = [ConvexHull(hull).volume for hull in hulls]
+    kept = []
+    for index, hull in enumerate(hulls):
+        inside = any(
+            other != index
+            and (sizes[other], other) > (sizes[index], index)
+            and (hull @ planes[other][:, :3].T + planes[other][:, 3]).max() < 1e-6
+            for other in range(len(hulls))
+        )
+        if not inside:
+            kept.append(hull)
+    return kept
