@@ -19,11 +19,11 @@ Ring = tuple[float, float, float, float, float]
 def squeeze_bottle(size: Size) -> Shape:
     """A flat oval bottle with a conical nozzle. Regions: side, shoulder, cap, bottom."""
     a, b, h = _halves(size)
-    side = [*_foot(a, b, 2.6), (a * 0.97, b * 0.97, h * 0.3, 2.6, 0.05), (a, b, h * 0.70, 2.6, 0)]
-    shoulder = [(a * 0.98, b * 0.98, h * 0.76, 2.5, 0.02), _neck(0.019, h * 0.835)]
+    side = [*_foot(a, b, 3.0), (a * 0.97, b * 0.97, h * 0.3, 3.0, 0.05), (a, b, h * 0.70, 3.0, 0)]
+    shoulder = [(a * 0.98, b * 0.98, h * 0.76, 2.8, 0.02), _neck(0.019, h * 0.835)]
     cap = [_neck(0.021, h * 0.835), _neck(0.021, h * 0.88, 0.002), _neck(0.0105, h * 0.9, 0.006)]
     cap += [_neck(0.0055, h * 0.992, 0.002), _neck(0.004, h, 0.002), _neck(0, h)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.835, h * 0.9])
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.70, h * 0.835, h * 0.9])
 
 
 def flip_top_bottle(
@@ -78,7 +78,7 @@ def tapered_bottle(size: Size) -> Shape:
     shoulder = [(a * 0.985, b * 0.985, h * 0.695, 3.5, 0.014), (0.014, 0.014, h * 0.75, 2.2, 0.006)]
     shoulder += [_neck(0.0115, h * 0.765)]
     cap = [_neck(0.0135, h * 0.765), _neck(0.0165, h, 0.002), _neck(0.0120, h)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.75])
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.62, h * 0.75])
 
 
 def screw_cap_bottle(size: Size) -> Shape:
@@ -87,7 +87,7 @@ def screw_cap_bottle(size: Size) -> Shape:
     side = [*_foot(a, b, 4), (a, b, h * 0.6, 4, 0)]
     shoulder = [(a, b, h * 0.7, 4, 0.022), _neck(0.016, h * 0.77, 0.004), _neck(0.0155, h * 0.80)]
     cap = [_neck(0.0195, h * 0.8), _neck(0.018, h, 0.002), _neck(0.014, h)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.77, h * 0.8])
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.6, h * 0.77, h * 0.8])
 
 
 def flask(size: Size) -> Shape:
@@ -141,7 +141,7 @@ def pump_bottle(size: Size, *, exponent: float = 3.0, body: float = 0.66, reach:
     path[0, 0] -= 1e-4
     path[-1, 0] += 1e-4
     spout = sweep("spout", path, radii, normal=(0, 1, 0), segments=10, detail=0.5)
-    return _bottle(size, side, shoulder, cap, cuts=[h * neck, h * (neck + 0.085), h * 0.93], spout=spout)
+    return _bottle(size, side, shoulder, cap, cuts=[h * body, h * neck, h * (neck + 0.085), h * 0.93], spout=spout)
 
 
 def upended_bottle(size: Size) -> Shape:

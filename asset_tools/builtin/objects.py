@@ -72,7 +72,7 @@ toothpaste_tube = partial(bottles.tube, cap_radius=0.0105, cap_height=0.020)
 oil_control_tube = partial(bottles.tube, cap_radius=0.0115, cap_height=0.022, flare=1.5)
 face_wash_tube = partial(bottles.tube, cap_radius=0.0195, cap_height=0.026)
 waisted_bottle = partial(bottles.flip_top_bottle, exponent=2.3, cap_height=0.13, taper=0.46, waist=0.16)
-round_pump_bottle = partial(bottles.pump_bottle, exponent=2.0, body=0.58, reach=1.15)
+round_pump_bottle = partial(bottles.pump_bottle, exponent=2.0, body=0.58, reach=1.0)
 
 APPLE_SKIN = {
     "base": (206, 178, 70),

@@ -93,7 +93,7 @@ def canister(size: Size) -> Shape:
         ),
     ]
     part = loft(sections)
-    return fitted([part], size, pieces=stacked_pieces(part))
+    return fitted([part], size, pieces=stacked_pieces(part, [h - lid]))
 
 
 def jar(size: Size) -> Shape:
