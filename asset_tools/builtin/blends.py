@@ -1,7 +1,7 @@
 """Solids as signed distance fields: primitives, smooth unions, and a closed mesh of a field.
 
-A field maps points (n, 3) to distances (n,), negative inside; it needs to be right near the surface only. Lengths are in
-millimetres, the unit that such things are drawn in. Turns are degrees about x, then y, then z.
+A field maps points (n, 3) to distances (n,), negative inside; it needs to be right near the surface only. Lengths are
+in millimetres, the unit that such things are drawn in. Turns are degrees about x, then y, then z.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ def mesh_of(field: Field, low: Point, high: Point, *, step: float, triangles: in
     vertices, faces = marching_cubes(values, 0.0, spacing=(step, step, step), gradient_direction="ascent")[:2]
     for aggression in (3, 5, 7):
         points, corners = fast_simplification.simplify(
-            vertices.astype(np.float64), faces.astype(np.int32), target_count=triangles, agg=aggression
+            vertices.astype(np.float64), faces.astype(np.int32), target_count=min(triangles, len(faces)), agg=aggression
         )[:2]
         mesh = trimesh.Trimesh(points + corner, corners, process=False)
         if mesh.is_watertight and mesh.is_winding_consistent and len(mesh.faces) < 1.3 * triangles:

@@ -22,6 +22,7 @@ CREASE_DEG = 55.0  # simplified roundings are coarse
 OVERSAMPLING = 2
 SHADE = 0.3  # how much darker the deepest creases are
 
+Box = tuple[Point, Point]
 # points (n, 3) mm, unit normals (n, 3), colours (n, 3) to change in place
 Decorate = Callable[[np.ndarray, np.ndarray, np.ndarray, np.random.Generator], None]
 
@@ -63,7 +64,7 @@ class Model:
     step: float = 1.0
     triangles: int = 2000
     texture_size: int = 512
-    hulls: tuple[tuple[Point, Point], ...] = ()
+    hulls: tuple[Box, ...] = ()
     grain: float = 0.02
 
     def field(self, points: np.ndarray) -> np.ndarray:
@@ -131,6 +132,11 @@ class Model:
         return pieces
 
 
+def pair(low: Point, high: Point) -> tuple[Box, Box]:
+    """A box, and its mirror image at the other side of y = 0."""
+    return (low, high), ((low[0], -high[1], low[2]), (high[0], -low[1], high[2]))
+
+
 def unwrapped(vertices: np.ndarray, faces: np.ndarray, texture_size: int, pieces: tuple[np.ndarray, ...] = ()) -> Shape:
     """A closed surface as a shape with one texture atlas that covers each of its triangles once."""
     low, reach = vertices.min(0), float(np.ptp(vertices, axis=0).max())
@@ -138,6 +144,7 @@ def unwrapped(vertices: np.ndarray, faces: np.ndarray, texture_size: int, pieces
     atlas.add_mesh(((vertices - low) / reach).astype(np.float32), faces.astype(np.uint32))
     options = xatlas.PackOptions()
     options.resolution, options.padding, options.bilinear = texture_size, 3, True
+    options.rotate_charts = False  # it would mirror them
     atlas.generate(pack_options=options)
     origin, corners, uv = atlas[0]
     uv, corners = uv.astype(float), corners.astype(np.int64)

@@ -19,7 +19,7 @@ from asset_tools.builtin.blends import (
     plate,
     turned,
 )
-from asset_tools.builtin.models import Model, Part
+from asset_tools.builtin.models import Model, Part, pair
 from asset_tools.builtin.textures import Colour
 
 BLACK: Colour = (30, 30, 32)
@@ -63,7 +63,7 @@ def power_drill() -> Model:
         grip = (z > 62) & (z < 122) & (x < -28)
         colours[grip & ((z + 0.4 * x) % 6 < 1.8)] = (64, 64, 68)
         colours[side & (np.abs(z - 27) < 1.0) & (x < 50)] = (84, 84, 88)
-        battery = side & lettering("LI-ION", (x + 24) * flip, z - 14, 8)
+        battery = side & lettering("LITHIUM", (x + 24) * flip, z - 14, 8)
         colours[battery & (z < 26)] = orange
 
     return Model(
@@ -77,6 +77,15 @@ def power_drill() -> Model:
             Part(box((-16, 0, 117), (16, 14, 24), 5, (0, -10, 0)), (196, 30, 24)),
             Part(box((-30, 0, 36), (100, 50, 20), 8), orange, 8),
             Part(box((-30, 0, 13), (110, 56, 28), 6), BLACK),
+        ),
+        hulls=(
+            ((-96, -36, 132), (47, 36, 196)),
+            ((47, -36, 126), (84, 36, 190)),
+            ((84, -20, 140), (106, 20, 180)),
+            ((-70, -30, 103), (26, 30, 134)),
+            ((-76, -30, 49), (-10, 30, 104)),
+            ((-96, -36, 26), (36, 36, 50)),
+            ((-96, -36, -6), (36, 36, 26.5)),
         ),
         low=(-96, -36, -6),
         high=(106, 36, 196),
@@ -113,7 +122,6 @@ def scissors() -> Model:
         screw = (np.hypot(x, y) < 5.2) & (np.abs(normals[:, 2]) > 0.5)
         colours[screw] = (120, 122, 128)
         colours[screw & (np.abs(y - 0.5 * x) < 0.9)] = (44, 44, 48)
-        colours[metal & ~screw] *= (1 + 0.03 * np.cos(2.2 * x + 0.4 * y))[metal & ~screw, None]
 
     return Model(
         parts=(
@@ -124,6 +132,17 @@ def scissors() -> Model:
             Part(first[2], red, 3),
             Part(second[2], red, 3),
             Part(cylinder("z", (0, 0, 0), 9.5, 5, 1.2), SILVER),
+        ),
+        hulls=(
+            *pair((-112, 0, -12), (-86, 50, 12)),
+            *pair((-86, 25, -12), (-68, 56, 12)),
+            *pair((-86, 0, -12), (-68, 25, 12)),
+            *pair((-68, 25, -12), (-50, 56, 12)),
+            *pair((-68, 0, -12), (-50, 25, 12)),
+            *pair((-50, 0, -12), (-38, 56, 12)),
+            ((-38, -56, -12), (-10, 56, 12)),
+            ((-10, -20, -12), (30, 20, 12)),
+            *pair((30, 0, -12), (102, 20, 12)),
         ),
         low=(-112, -56, -12),
         high=(102, 56, 12),
@@ -161,6 +180,12 @@ def screwdriver() -> Model:
 
     return Model(
         parts=(Part(cut(handle, *flutes), yellow), Part(blade, SILVER)),
+        hulls=(
+            ((-114, -22, -22), (-30, 22, 22)),
+            ((-30, -22, -22), (2, 22, 22)),
+            ((2, -22, -22), (86, 22, 22)),
+            ((86, -22, -22), (114, 22, 22)),
+        ),
         low=(-114, -22, -22),
         high=(114, 22, 22),
         decorate=decorate,
@@ -197,6 +222,15 @@ def padlock() -> Model:
             Part(box((0, 0, 23), (47, 27, 46), 3.5), brass),
             Part(both_sides_x(chain((14, 0, 36, 4.2), (14, 0, 57, 4.2))), STEEL),
             Part(_arch(14, 57, 4.2), STEEL),
+        ),
+        hulls=(
+            ((-30, -20, -6), (30, 20, 46)),
+            ((-22, -8, 46), (-8, 8, 60)),
+            ((8, -8, 46), (22, 8, 60)),
+            ((-22, -8, 60), (-7, 8, 82)),
+            ((-7, -8, 60), (0, 8, 82)),
+            ((0, -8, 60), (7, 8, 82)),
+            ((7, -8, 60), (22, 8, 82)),
         ),
         low=(-30, -20, -6),
         high=(30, 20, 82),
@@ -257,6 +291,7 @@ def computer_mouse() -> Model:
 
     return Model(
         parts=(Part(shell, white), Part(cylinder("y", (27, 0, 23.5), 6.0, 9.6, 1.5), BLACK)),
+        hulls=(((-62, -38, -5), (62, 38, 46)),),
         low=(-62, -38, -5),
         high=(62, 38, 46),
         decorate=decorate,
