@@ -17,13 +17,13 @@ Ring = tuple[float, float, float, float, float]
 
 
 def squeeze_bottle(size: Size) -> Shape:
-    """A flat oval bottle with a conical nozzle. Regions: side, shoulder, cap, bottom."""
+    """A flat bottle that narrows upwards, with a conical nozzle. Regions: side, shoulder, cap, bottom."""
     a, b, h = _halves(size)
-    side = [*_foot(a, b, 3.0), (a * 0.97, b * 0.97, h * 0.3, 3.0, 0.05), (a, b, h * 0.70, 3.0, 0)]
-    shoulder = [(a * 0.98, b * 0.98, h * 0.76, 2.8, 0.02), _neck(0.019, h * 0.835)]
+    side = [*_foot(a * 0.97, b, 4), (a, b, h * 0.2, 4, 0.04), (a * 0.72, b, h * 0.68, 4, 0)]
+    shoulder = [(a * 0.68, b * 0.9, h * 0.765, 2.8, 0.016), _neck(0.019, h * 0.835)]
     cap = [_neck(0.021, h * 0.835), _neck(0.021, h * 0.88, 0.002), _neck(0.0105, h * 0.9, 0.006)]
     cap += [_neck(0.0055, h * 0.992, 0.002), _neck(0.004, h, 0.002), _neck(0, h)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.70, h * 0.835, h * 0.9])
+    return _bottle(size, side, shoulder, cap, cuts=[h * 0.68, h * 0.835, h * 0.9])
 
 
 def flip_top_bottle(
