@@ -14,6 +14,7 @@ from asset_tools.builtin.mesh import Shape, Size
 from asset_tools.builtin.products import LABELS
 from asset_tools.builtin.skins import paint_banana, paint_fruit
 from asset_tools.builtin.spec import ObjectSpec
+from asset_tools.builtin.toys import TOYS
 
 
 def _product(
@@ -292,4 +293,4 @@ HOUSEHOLD: tuple[ObjectSpec, ...] = (
         spoken="purple shampoo bottle",
     ),
 )
-SPECS: tuple[ObjectSpec, ...] = HOUSEHOLD
+SPECS: tuple[ObjectSpec, ...] = (*HOUSEHOLD, *TOYS)

@@ -32,9 +32,9 @@ def test_ships_with_everything(pack):
 
 
 def test_stands_in_for_the_objects_of_upstream(pack):
-    """Same number, same id: a configuration runs on either pack."""
-    ours = {loaded.asset.graspnet_id: id_ for id_, loaded in pack.objects.items()}
-    assert ours == {number: entry.id for number, entry in ENTRIES.items()} and len(ours) == 46
+    """Same number, same id, same kind: a configuration runs on either pack."""
+    ours = {loaded.asset.graspnet_id: (id_, loaded.asset.category) for id_, loaded in pack.objects.items()}
+    assert ours == {number: (entry.id, entry.category) for number, entry in ENTRIES.items()} and len(ours) == 46
     names = [loaded.asset.name for loaded in pack.objects.values()]
     assert len(set(names)) == 46
 
