@@ -1,4 +1,7 @@
-"""What walls and floors are covered with: pictures of 2 x 2 m that tile."""
+"""What walls and floors are covered with: pictures of 2 x 2 m that tile.
+
+Joints are soft: cameras see them from afar, and renderers without mip maps would tear sharp ones into dashes.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ def brick(grid: Grid, rng: np.random.Generator) -> Array:
     clay = shade(clay, 0.13 * tone + 0.008 * grit + 0.04 * blot)
     mortar = shade(_even(grid, (184, 174, 160)), 0.02 * grit)
     edge = cells.edge + 0.0007 * grit
-    return blend(joint(edge, 0.005, 0.003), clay, mortar)
+    return blend(joint(edge, 0.004, 0.005), clay, mortar)
 
 
 def boards(grid: Grid, rng: np.random.Generator) -> Array:
@@ -37,7 +40,7 @@ def boards(grid: Grid, rng: np.random.Generator) -> Array:
     lying = Grid.of(grid.size, (grid.x.shape[0], grid.x.shape[1]))
     cells = lying.cells((TILE, 0.125))
     amount = shade(cells.shuffled(wood(lying, rng, tones=OAK, ring=0.04), rng), 0.07 * cells.random(rng))
-    return np.rot90(shade(amount, -0.45 * joint(cells.edge, 0.002, 0.003)))
+    return np.rot90(shade(amount, -0.40 * joint(cells.edge, 0.002, 0.006)))
 
 
 def glazed(grid: Grid, rng: np.random.Generator) -> Array:
@@ -45,13 +48,13 @@ def glazed(grid: Grid, rng: np.random.Generator) -> Array:
     cells = grid.cells((0.2, 0.1), shift=0.5)
     sheen = grid.noise(rng, (0.15, 0.08), slope=2.5)
     colours = shade(_even(grid, (222, 232, 230)), 0.025 * cells.random(rng) + 0.012 * sheen)
-    colours = shade(colours, -0.07 * joint(cells.edge, 0.003, 0.006))
-    return blend(joint(cells.edge, 0.0015), colours, (160, 164, 162))
+    colours = shade(colours, -0.06 * joint(cells.edge, 0.003, 0.008))
+    return blend(joint(cells.edge, 0.001, 0.004), colours, (172, 178, 176))
 
 
 def wallpaper(grid: Grid, rng: np.random.Generator) -> Array:
     """Stripes with sprigs of leaves."""
-    pitch = TILE / 10
+    pitch = TILE / 8
     stripe = 0.5 + 0.5 * np.tanh(6 * np.cos(2 * np.pi * grid.x / pitch))
     colours = blend(stripe, (222, 210, 184), (236, 228, 208))
     u = grid.x % pitch / pitch - 0.5
@@ -65,7 +68,7 @@ def wallpaper(grid: Grid, rng: np.random.Generator) -> Array:
             ink = np.maximum(ink, along**2 + across**2 < 1)
     ink = np.maximum(ink, (u / 0.035) ** 2 + ((v - 0.27) / 0.055) ** 2 < 1)
     paper = 1 + 0.008 * grid.noise(rng, (0.01, 0.01))
-    return blend(0.62 * ink, colours, (104, 132, 104)) * paper[..., None]
+    return blend(0.5 * ink, colours, (104, 132, 104)) * paper[..., None]
 
 
 def parquet(grid: Grid, rng: np.random.Generator, *, tones: Pair = OAK) -> Array:
@@ -73,7 +76,7 @@ def parquet(grid: Grid, rng: np.random.Generator, *, tones: Pair = OAK) -> Array
     cells = grid.cells((0.5, 0.1), shift=0.35)
     plain = wood(grid, rng, tones=tones)
     colours = shade(cells.shuffled(plain, rng), 0.09 * cells.random(rng))
-    return shade(colours, -0.5 * joint(cells.edge, 0.0008))
+    return shade(colours, -0.35 * joint(cells.edge, 0.0005, 0.003))
 
 
 def stone(grid: Grid, rng: np.random.Generator) -> Array:
@@ -81,7 +84,7 @@ def stone(grid: Grid, rng: np.random.Generator) -> Array:
     cells = grid.cells((0.5, 0.5))
     cloud = cells.shuffled(grid.noise(rng, (0.25, 0.25), slope=1.8), rng)
     colours = blend(0.5 + 0.17 * cloud + 0.18 * cells.random(rng), (216, 209, 197), (182, 173, 160))
-    return blend(joint(cells.edge, 0.002, 0.002), colours, (138, 132, 124))
+    return blend(joint(cells.edge, 0.002, 0.004), colours, (146, 140, 132))
 
 
 def terracotta(grid: Grid, rng: np.random.Generator) -> Array:
@@ -90,7 +93,7 @@ def terracotta(grid: Grid, rng: np.random.Generator) -> Array:
     blot = cells.shuffled(grid.noise(rng, (0.12, 0.12), slope=1.7), rng)
     clay = blend(0.5 + 0.45 * cells.random(rng), (206, 124, 84), (170, 90, 60))
     worn = 1 - 0.06 * joint(cells.edge, 0.006, 0.02)
-    return blend(joint(cells.edge, 0.004, 0.002), shade(clay, 0.05 * blot) * worn[..., None], (176, 164, 150))
+    return blend(joint(cells.edge, 0.003, 0.004), shade(clay, 0.05 * blot) * worn[..., None], (176, 164, 150))
 
 
 def concrete(grid: Grid, rng: np.random.Generator) -> Array:
@@ -115,7 +118,7 @@ def checker(grid: Grid, rng: np.random.Generator) -> Array:
     cloud = cells.shuffled(grid.noise(rng, (0.2, 0.2), slope=2.0), rng)
     dark = ((cells.row + cells.column) % 2).astype(float)
     colours = shade(blend(dark, (232, 229, 222), (58, 60, 64)), 0.03 * cloud + 0.02 * cells.random(rng))
-    return blend(joint(cells.edge, 0.001, 0.0015), colours, (128, 126, 122))
+    return blend(joint(cells.edge, 0.001, 0.003), colours, (128, 126, 122))
 
 
 def _even(grid: Grid, colour: Colour) -> Array:

@@ -145,7 +145,7 @@ def wood(grid: Grid, rng: np.random.Generator, *, tones: Pair = OAK, plank: floa
     return blend(amount, *tones)
 
 
-def painted(grid: Grid, rng: np.random.Generator, *, colour: Colour, rough: float = 0.004) -> Array:
+def painted(grid: Grid, rng: np.random.Generator, *, colour: Colour, rough: float = 0.0015) -> Array:
     """Paint or enamel: nearly even."""
     return shade(np.broadcast_to(np.asarray(colour, float), (*grid.x.shape, 3)), rough * grid.noise(rng, (0.05, 0.05)))
 
@@ -193,7 +193,7 @@ def wooden(tones: Pair, size: tuple[float, float] = (1.3, 0.42), **options: floa
     return Material(size, partial(wood, tones=tones, **options))
 
 
-def coat(colour: Colour, size: tuple[float, float] = (0.3, 0.15), *, rough: float = 0.004) -> Material:
+def coat(colour: Colour, size: tuple[float, float] = (0.3, 0.15), *, rough: float = 0.0015) -> Material:
     """A sample of paint, enamel or plastic; large things stretch it, which nobody sees."""
     return Material(size, partial(painted, colour=colour, rough=rough))
 

@@ -146,7 +146,7 @@ def test_joints_work_and_surfaces_hold(name):
 
 
 def articulation(source, folder):
-    """The furniture in a scene of its own, its joints by name."""
+    """The furniture in a scene of its own, and the names of its joints in the engine's order."""
     scene = sapien.Scene([physx.PhysxCpuSystem()])
     builder = scene.create_articulation_builder()
     parts = {"": builder.create_link_builder()}

@@ -103,6 +103,8 @@ def _door(
         body.board((face - 0.10, -y, z + 0.008), (face - 0.094, y, z + 0.07), "glass")
         for side in (-1, 1):
             body.board((face - 0.10, side * y, z), (face, side * (y - 0.006), z + 0.07), "liner")
+    if bins:  # the temperature's display
+        body.board((out - 0.001, -0.06, high - 0.20), (out + 0.001, 0.06, high - 0.16), "dark", collide=False)
     grip = (out + BAR_GAP + BAR / 2, HALF - 0.055, round(sum(bar) / 2, 6))
     body.bar_handle(np.array(grip), bar[1] - bar[0], "steel", along="z", bar=BAR)
     joint = hinge(f"{name}_hinge", (face, -HALF, 0.0), -1)

@@ -15,7 +15,7 @@ from asset_tools.sources import FurnitureSource
 
 HALF, HEIGHT = 3.0, 4.0
 SLAB = 0.1  # m, thickness of floor and walls, outside of the room
-PIXELS = 1024
+PIXELS = 800
 SKIRTING = (0.09, 0.014)  # m, height and thickness; only for the eye
 
 Quad = tuple[np.ndarray, np.ndarray, np.ndarray]  # a lower left corner, the way right, the way up
