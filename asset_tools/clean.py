@@ -144,8 +144,7 @@ def _runs_along(faces: Ints, edges: Ints) -> NDArray[np.bool_]:
 
 def _shown(scan: trimesh.Trimesh, kept: Ints, turned: NDArray[np.bool_], repairs: list[str]) -> trimesh.Trimesh:
     """The scan with some of its faces, some of them turned; its normals dropped where they don't fit the faces."""
-    shown = scan.copy(include_cache=True)
-    normals: Any = shown._cache.cache.get("vertex_normals")
+    shown, normals = scan.copy(), scan._cache.cache.get("vertex_normals")
     shown.update_faces(kept)
     if turned.any():
         faces = np.array(shown.faces)

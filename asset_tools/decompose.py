@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from manifold3d import Manifold, OpType
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.errors import AssetError, MissingExtraError
 from robocas_ms3.files import replacing
 
@@ -20,9 +22,11 @@ MAX_VERTICES = 48  # a hull; PhysX takes up to 64 on a GPU, but thins hulls of m
 MAX_HULLS = 32
 WANTED_OVERLAP = 0.9  # the fewest hulls that reach it are taken
 THRESHOLDS = (0.2, 0.12, 0.08, 0.05)  # CoACD's concavity, coarse first
+FINE = (0.05, 0.03)  # for hollow things, whose walls coarse cuts fill the inside with
 SMOOTHED = 0.002  # of the diagonal: detail that CoACD is spared
 HOLLOW = 0.5  # volume over that of the convex hull, below which a thing is hollow or thin
 WANTED_DISTANCE = 0.0025  # m, 95th percentile between the surfaces of a hollow thing and of its hulls
+TRIES = 4  # mergers in a row that are too much
 LOST_OVERLAP = 0.05  # that merging the hulls of a hollow thing may cost
 _VERSION = 2
 
@@ -75,11 +79,9 @@ def volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
     Raises:
         AssetError: the mesh is no solid.
     """
-    from manifold3d import Error, Manifold, Mesh, OpType
-
-    solid = Manifold(Mesh(np.asarray(closed.vertices, np.float32), np.asarray(closed.faces, np.uint32)))
-    if solid.status() != Error.NoError:
-        raise AssetError("the mesh is no solid", found=str(solid.status()), fix="Close it first.")
+    solid = to_solid(closed)
+    if solid is None:
+        raise AssetError("the mesh is no solid", expected="watertight", fix="Close it first.")
     union = Manifold.batch_boolean([Manifold.hull_points(hull) for hull in hulls], OpType.Add)
     shared = (solid ^ union).volume()
     return float(shared / (solid.volume() + union.volume() - shared))
@@ -120,7 +122,7 @@ def _decompose(closed: trimesh.Trimesh) -> Decomposition:
         if best.volume_iou >= WANTED_OVERLAP:
             return best
     hollow, smooth = is_hollow(closed), _smoothed(closed)
-    for threshold in THRESHOLDS:
+    for threshold in FINE if hollow else THRESHOLDS:
         hulls = _run_coacd(smooth, threshold)
         if not hulls:
             continue
@@ -151,27 +153,28 @@ def _merged(closed: trimesh.Trimesh, found: Decomposition, hollow: bool) -> Deco
         return ConvexHull(np.concatenate([hulls[i], hulls[j]])).volume - volumes[i] - volumes[j]
 
     costs = {(i, j): added(i, j) for i in hulls for j in hulls if i < j}
-    while costs:
+    tries = 0
+    while costs and tries < TRIES:
         i, j = min(costs, key=lambda pair: (costs[pair], pair))
         kept = {k: hull for k, hull in hulls.items() if k not in (i, j)}
-        new = max(hulls) + 1
+        new = max(volumes) + 1
         kept[new] = few_vertices(np.concatenate([hulls[i], hulls[j]]))
         fewer = Decomposition(list(kept.values()), volume_iou(closed, list(kept.values())))
         if not _good_enough(closed, fewer, hollow, least):
-            break
-        found, hulls, volumes[new] = fewer, kept, float(ConvexHull(kept[new]).volume)
+            tries += 1
+            del costs[i, j]
+            continue
+        found, hulls, volumes[new], tries = fewer, kept, float(ConvexHull(kept[new]).volume), 0
         costs = {pair: cost for pair, cost in costs.items() if not {i, j} & set(pair)}
         costs |= {(k, new): added(k, new) for k in kept if k != new}
     return found
 
 
 def _smoothed(closed: trimesh.Trimesh) -> trimesh.Trimesh:
-    from manifold3d import Manifold, Mesh64
-
-    solid = Manifold(Mesh64(np.asarray(closed.vertices, np.float64), np.asarray(closed.faces, np.uint64)))
-    mesh = solid.simplify(SMOOTHED * float(np.linalg.norm(closed.extents))).to_mesh64()
-    smooth = trimesh.Trimesh(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts, np.int64))
-    return smooth if smooth.is_watertight else closed
+    solid = to_solid(closed)
+    if solid is None:
+        return closed
+    return to_mesh(solid.simplify(SMOOTHED * float(np.linalg.norm(closed.extents))))
 
 
 def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
@@ -199,7 +202,7 @@ def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
 def _content_hash(mesh: trimesh.Trimesh) -> str:
     from importlib.metadata import version
 
-    digest = hashlib.sha256(f"{_VERSION} {version('coacd')} {THRESHOLDS} {MAX_HULLS} {SMOOTHED}".encode())
+    digest = hashlib.sha256(f"{_VERSION} {version('coacd')} {THRESHOLDS} {FINE} {MAX_HULLS} {SMOOTHED}".encode())
     digest.update(np.round(np.asarray(mesh.vertices), 7).tobytes())
     digest.update(np.asarray(mesh.faces, dtype=np.int64).tobytes())
     return digest.hexdigest()[:32]

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
+
+from asset_tools.solids import to_mesh, to_solid
 
 Array = NDArray[np.float64]
 
@@ -43,7 +47,8 @@ def level_base(
             pressed = mesh.copy()
             pressed.vertices = vertices
             repairs.append(f"pressed the base flat by {1e3 * depth:.2g} mm")
-            return pressed, _cut(closed, low + depth)
+            solid: Any = to_solid(closed)  # what is watertight is one
+            return pressed, to_mesh(solid.trim_by_plane((0.0, 0.0, 1.0), low + depth))
     return mesh, closed
 
 
@@ -59,11 +64,3 @@ def _edge_distance(flat: Array, center: Array) -> float:
         return float((-(ConvexHull(flat).equations @ [*center[:2], 1.0])).min())
     except (QhullError, ValueError):
         return 0.0
-
-
-def _cut(closed: trimesh.Trimesh, height: float) -> trimesh.Trimesh:
-    from manifold3d import Manifold, Mesh64
-
-    solid = Manifold(Mesh64(np.asarray(closed.vertices, np.float64), np.asarray(closed.faces, np.uint64)))
-    cut = solid.trim_by_plane((0.0, 0.0, 1.0), height).to_mesh64()
-    return trimesh.Trimesh(np.asarray(cut.vert_properties)[:, :3], np.asarray(cut.tri_verts, np.int64), process=False)

@@ -7,13 +7,18 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from manifold3d import Manifold, OpType
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from trimesh.visual.color import ColorVisuals
+from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.clean import clean
+from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.errors import AssetError, MissingExtraError
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 FILLED = 0.35  # share of the surface that may be filled in
 HOPELESS = 0.4  # share of the edges that are open: no surface, but confetti
@@ -53,9 +58,9 @@ def close(scan: trimesh.Trimesh) -> Closed:
     """
     repairs: list[str] = []
     cleaned = clean(scan, repairs)
-    mesh = cleaned.welded
+    mesh, shown = cleaned.welded, cleaned.scan
     if not mesh.is_watertight:
-        mesh = _filled(mesh, repairs)
+        mesh, shown = _filled(mesh, shown, repairs)
     solid = _as_solid(mesh)
     if solid is None and _open_edges(mesh) <= HOPELESS * len(mesh.edges_unique):
         solid = _as_solid(_remeshed(mesh))
@@ -68,15 +73,19 @@ def close(scan: trimesh.Trimesh) -> Closed:
             found=f"{_open_edges(mesh)} open edges of {len(mesh.edges_unique)}",
             fix="Repair the scan, or leave it out.",
         )
-    return Closed(_light(solid, float(np.linalg.norm(cleaned.scan.extents))), cleaned.scan, tuple(repairs))
+    return Closed(_light(solid, float(np.linalg.norm(shown.extents))), shown, tuple(repairs))
 
 
-def _filled(mesh: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
-    """Close each hole by a fan around its middle, if its rim is a simple loop."""
-    edges = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+def _filled(
+    mesh: trimesh.Trimesh, shown: trimesh.Trimesh, repairs: list[str]
+) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
+    """Close each hole by a fan around its middle, if its rim is a simple loop; the same in the mesh to look at."""
+    rim_edges = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
+    edges = mesh.edges[rim_edges]
     following = {int(a): int(b) for b, a in edges}  # the fill runs along the rim the other way
     if len(following) < len(edges):
-        return mesh  # two holes meet in a vertex: left to re-meshing
+        return mesh, shown  # two holes meet in a vertex: left to re-meshing
+    middles: dict[int, Any] = {}
     vertices, faces = [np.asarray(mesh.vertices)], [np.asarray(mesh.faces)]
     count, holes, area = len(mesh.vertices), 0, 0.0
     while following:
@@ -85,10 +94,11 @@ def _filled(mesh: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
         while end != start:
             loop.append(end)
             if end not in following:
-                return mesh
+                return mesh, shown
             end = following.pop(end)
         rim = mesh.vertices[loop]
-        middle = rim.mean(axis=0)
+        middle = np.asarray(rim).mean(axis=0)
+        middles |= dict.fromkeys(loop, middle)
         area += float(np.linalg.norm(np.cross(rim - middle, np.roll(rim, -1, axis=0) - middle), axis=1).sum() / 2)
         vertices.append(middle[None])
         faces.append(np.column_stack([loop, np.roll(loop, -1), np.full(len(loop), count + holes)]))
@@ -101,20 +111,47 @@ def _filled(mesh: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
             fix="Scan it from all sides, or leave it out.",
         )
     repairs.append(f"filled {holes} hole{'s' if holes > 1 else ''}")
-    return trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
+    filled = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
+    face, corner = np.asarray(mesh.edges_face)[rim_edges], np.asarray(rim_edges, np.int64) % 3
+    return filled, _patched(shown, face, corner, np.array([middles[int(a)] for a in edges[:, 0]]))
 
 
-def _as_solid(mesh: trimesh.Trimesh):
-    """The mesh as a manifold3d solid with outward faces; none if it isn't closed or encloses nothing."""
-    try:
-        from manifold3d import Error, Manifold, Mesh64, OpType
-    except ImportError as error:
-        raise MissingExtraError("manifold3d is not installed", fix="pip install 'robocas-ms3[assets]'") from error
+def _patched(shown: trimesh.Trimesh, face: Ints, corner: Ints, middles: Array) -> trimesh.Trimesh:
+    """A mesh with a triangle from each edge at a hole's rim to the hole's middle, in the colours of the edge.
+
+    Args:
+        shown: textured or coloured.
+        face: (E,) that each edge belongs to.
+        corner: (E,) of the face, at which the edge begins.
+        middles: (E, 3) of the hole that each is at.
+    """
+    old = np.asarray(shown.faces)
+    first, second = old[face, corner], old[face, (corner + 1) % 3]
+    tips = len(shown.vertices) + np.arange(len(face))
+    vertices = np.concatenate([shown.vertices, middles])
+    faces = np.concatenate([old, np.column_stack([second, first, tips])])
+    visual: Any = shown.visual
+    uv = getattr(visual, "uv", None)
+    if uv is not None:
+        uv = np.concatenate([uv, (uv[first] + uv[second]) / 2])
+        visual = TextureVisuals(uv=uv, material=visual.material)
+    elif visual.kind == "face":
+        visual = ColorVisuals(face_colors=np.concatenate([visual.face_colors, visual.face_colors[face]]))
+    elif visual.kind == "vertex":
+        visual = ColorVisuals(vertex_colors=np.concatenate([visual.vertex_colors, visual.vertex_colors[first]]))
+    else:
+        return trimesh.Trimesh(vertices, faces, process=False)
+    return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
+
+
+def _as_solid(mesh: trimesh.Trimesh) -> Manifold | None:
+    """The mesh as a solid with outward faces; none if it isn't closed or encloses nothing."""
     if not mesh.is_watertight:
         return None
-    faces = mesh.faces if mesh.volume >= 0 else mesh.faces[:, ::-1]
-    solid = Manifold(Mesh64(np.asarray(mesh.vertices, np.float64), np.asarray(faces, np.uint64)))
-    if solid.status() != Error.NoError or solid.volume() <= 0:
+    if mesh.volume < 0:
+        mesh.invert()
+    solid = to_solid(mesh)
+    if solid is None or solid.volume() <= 0:
         return None
     bodies = solid.decompose()
     if len(bodies) > 1 and all(body.volume() > 0 for body in bodies):
@@ -185,14 +222,13 @@ def winding_number(points: Array, samples: Array, normals: Array, area: float) -
     return result * area / (4 * np.pi * len(samples))
 
 
-def _light(solid, diagonal: float) -> trimesh.Trimesh:
+def _light(solid: Manifold, diagonal: float) -> trimesh.Trimesh:
     """The solid with few faces; it stays closed, within a thousandth or so of its size."""
     for tolerance in TOLERANCES:
         if solid.num_tri() <= FACES:
             break
         solid = solid.simplify(tolerance * diagonal)
-    mesh = solid.to_mesh64()
-    return trimesh.Trimesh(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts, np.int64), process=False)
+    return to_mesh(solid)
 
 
 def _open_edges(mesh: trimesh.Trimesh) -> int:

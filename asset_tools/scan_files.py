@@ -110,6 +110,7 @@ def sound_image(image: Image.Image, where: Path, repairs: list[str]) -> Image.Im
             image.load()
             return image
         image.draft(image.mode, (USEFUL, USEFUL))  # JPEG can be read at a part of its size
+        image = image if image.mode in ("L", "RGB", "RGBA") else image.convert("RGB")  # palettes don't mix
         scale = -(-max(image.size) // USEFUL)
         small = image.reduce(scale) if scale > 1 else image.copy()
     except (OSError, SyntaxError) as error:

@@ -1,0 +1,360 @@
+"""What scanners and exporters do to a scan: each is mended and said, or is one error that says what is wrong.
+
+The scan is a bottle of revolution: four quarters in four colours, its neck at the top.
+"""
+
+# trimesh types a visual as None or either of two kinds; the tests know which one they have
+# pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+import unicodedata
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
+
+from asset_tools.prepare import prepare
+from asset_tools.visual import to_display
+from robocas_ms3.errors import AssetError
+
+PROFILE = np.array([[0.03, 0.0], [0.03, 0.05], [0.03, 0.1], [0.012, 0.13], [0.012, 0.16]])  # radius, height in m
+COLORS = np.array([[220, 30, 30], [30, 200, 40], [30, 40, 220], [230, 220, 40]])
+ROUND = 48
+
+
+def bottle(sections=ROUND, rows=1):
+    """The bottle, in metres, z up, as vertices (V, 3), UVs (V, 2) and faces (F, 3); a seam at azimuth 0."""
+    at = np.linspace(0, len(PROFILE) - 1, (len(PROFILE) - 1) * rows + 1)
+    radius, height = (np.interp(at, np.arange(len(PROFILE)), column) for column in PROFILE.T)
+    angle = np.linspace(0, 2 * np.pi, sections + 1)
+    x, y = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
+    wall = np.stack([x, y, np.broadcast_to(height[:, None], x.shape)], axis=-1).reshape(-1, 3)
+    wall_uv = np.stack(np.broadcast_arrays(angle / (2 * np.pi), height[:, None] / height[-1]), axis=-1).reshape(-1, 2)
+    row, column = (grid.reshape(-1) for grid in np.meshgrid(np.arange(len(at) - 1), np.arange(sections), indexing="ij"))
+    a = row * (sections + 1) + column
+    b, c, d = a + 1, a + sections + 2, a + sections + 1
+    top = (len(at) - 1) * (sections + 1)
+    tips = len(wall) + np.arange(2 * sections)  # a middle of its own for each cap triangle, for its colour
+    k = np.arange(sections)
+    faces = [
+        np.column_stack([a, b, c]),
+        np.column_stack([a, c, d]),
+        np.column_stack([k + 1, k, tips[:sections]]),
+        np.column_stack([top + k, top + k + 1, tips[sections:]]),
+    ]
+    middles = np.repeat([[0, 0, 0], [0, 0, height[-1]]], sections, axis=0)
+    middle_uv = np.column_stack([np.tile((k + 0.5) / sections, 2), np.repeat([0.0, 1.0], sections)])
+    return np.concatenate([wall, middles]), np.concatenate([wall_uv, middle_uv]), np.concatenate(faces)
+
+
+VOLUME = trimesh.Trimesh(bottle()[0], bottle()[2]).volume
+
+
+def picture(size=(64, 64)):
+    """Four columns of colour; a palette image, which is small even if huge."""
+    image = Image.fromarray(np.repeat(np.arange(4, dtype=np.uint8)[None], 4, axis=0)).resize(size, Image.Resampling.BOX)
+    image = Image.frombytes("P", size, image.tobytes())
+    image.putpalette(COLORS.astype(np.uint8).tobytes())
+    return image
+
+
+def write_obj(folder, model=None, *, scale=1.0, y_up=False, normals="", texture="skin.png", named=None, name="scan",
+              encoding="utf-8", image=None, mtl=None):  # fmt: skip
+    """Write a scan of the bottle: OBJ, materials and texture, which the materials may call by another name."""
+    vertices, uv, faces = bottle() if model is None else model
+    vertices = vertices * scale
+    if y_up:
+        vertices = vertices[:, [1, 2, 0]]
+    folder.mkdir(parents=True, exist_ok=True)
+    mtl = mtl or name
+    lines = [f"mtllib {mtl}.mtl", f"usemtl {name}"]
+    lines += [f"v {x:.8f} {y:.8f} {z:.8f}" for x, y, z in vertices]
+    lines += [f"vt {u:.6f} {v:.6f}" for u, v in uv]
+    if normals:
+        surface = trimesh.Trimesh(vertices, faces, process=False)
+        out = surface.vertex_normals * (-1 if normals == "inwards" else 1)
+        lines += [f"vn {x:.5f} {y:.5f} {z:.5f}" for x, y, z in out]
+    corner = "{0}/{0}/{0}" if normals else "{0}/{0}"
+    lines += ["f " + " ".join(corner.format(i + 1) for i in face) for face in faces]
+    (folder / f"{name}.obj").write_bytes(("\n".join(lines) + "\n").encode(encoding))
+    (folder / f"{mtl}.mtl").write_bytes(f"newmtl {name}\nKd 1 1 1\nmap_Kd {named or texture}\n".encode(encoding))
+    if texture:
+        path = folder / texture
+        path.parent.mkdir(exist_ok=True)
+        (image or picture()).save(path)
+    return folder / f"{name}.obj"
+
+
+def quarter_of(points):
+    return (np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi) // (np.pi / 2)).astype(int)
+
+
+def check_bottle(scan, *, colors=True, volume=0.005):
+    """It is the bottle: its size and volume, its neck up, each quarter in its colour, all faces outwards."""
+    assert scan.closed.is_watertight
+    assert scan.closed.volume == pytest.approx(VOLUME, rel=volume)
+    for mesh in (scan.mesh, scan.closed):
+        np.testing.assert_allclose(mesh.bounds, [[-0.03, -0.03, 0], [0.03, 0.03, 0.16]], atol=5e-4)
+        assert np.linalg.norm(mesh.vertices[mesh.vertices[:, 2] > 0.14][:, :2], axis=1).max() < 0.013
+    middles, out = scan.mesh.triangles_center, scan.mesh.face_normals
+    side = np.abs(out[:, 2]) < 0.8
+    assert (np.einsum("fi,fi->f", middles, out * [1, 1, 0])[side] > 0).all()
+    if not colors:
+        return
+    light = to_display(scan.mesh, triangles=1000, texture_size=256)
+    # so that each face counts that is seen from outside, and only from there
+    points, faces = trimesh.sample.sample_surface(light, 4000, seed=1)[:2]
+    weights = trimesh.triangles.points_to_barycentric(light.triangles[faces], points)
+    uv = np.einsum("nc,ncd->nd", weights, light.visual.uv[light.faces[faces]])
+    pixels = np.asarray(light.visual.material.baseColorTexture.convert("RGB"), dtype=int)
+    row = np.clip(((1 - uv[:, 1]) * len(pixels)).astype(int), 0, len(pixels) - 1)
+    seen = pixels[row, np.clip((uv[:, 0] * pixels.shape[1]).astype(int), 0, pixels.shape[1] - 1)]
+    angle = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 90
+    inner = (np.minimum(angle, 90 - angle) > 12) & (np.abs(light.face_normals[faces, 2]) < 0.8)
+    assert inner.sum() > 1500
+    wrong = np.abs(seen - COLORS[quarter_of(points)]).max(axis=1) > 40
+    assert wrong[inner].mean() < 0.01
+    shading = np.einsum("nc,nci->ni", weights, light.vertex_normals[light.faces[faces]])
+    assert (np.einsum("ni,ni->n", shading, light.face_normals[faces]) > 0).all()
+
+
+def test_a_good_scan_has_nothing_to_mend(tmp_path):
+    scan = prepare(write_obj(tmp_path))
+    assert (scan.up, scan.unit, scan.repairs) == ("z", "m", ())
+    check_bottle(scan)
+
+
+@pytest.mark.parametrize(("scale", "unit", "words"), [(100, "cm", "centimetres"), (1000, "mm", "millimetres")])
+def test_other_units_and_y_up(tmp_path, scale, unit, words):
+    scan = prepare(write_obj(tmp_path, scale=scale, y_up=True))
+    assert (scan.up, scan.unit) == ("y", unit)
+    assert scan.repairs == ("turned y up", f"scaled from {words}")
+    turned = scan.mesh.copy(include_cache=True), scan.closed.copy()
+    # y up by [1, 2, 0] and back by a quarter turn about x leaves a quarter turn about z
+    for mesh in turned:
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1]))
+    check_bottle(type(scan)(*turned, scan.up, scan.unit, scan.repairs))
+
+
+def test_a_wrong_unit_is_an_error(tmp_path):
+    path = write_obj(tmp_path, scale=1000)
+    with pytest.raises(AssetError, match=r"no size that can be picked up.*160 m, taking its 160 for metres.*--units"):
+        prepare(path, unit="m")
+
+
+def test_faces_inwards(tmp_path):
+    vertices, uv, faces = bottle()
+    scan = prepare(write_obj(tmp_path, (vertices, uv, faces[:, ::-1])))
+    assert scan.repairs == ("turned inside out",)
+    check_bottle(scan)
+
+
+def test_faces_turned_at_random(tmp_path):
+    vertices, uv, faces = bottle()
+    turned = np.random.default_rng(0).random(len(faces)) < 0.3
+    scan = prepare(write_obj(tmp_path, (vertices, uv, np.where(turned[:, None], faces[:, ::-1], faces))))
+    assert scan.repairs == (f"turned {turned.sum()} faces outwards",)
+    check_bottle(scan)
+
+
+def test_normals_inwards(tmp_path):
+    scan = prepare(write_obj(tmp_path, normals="inwards"))
+    assert scan.repairs == ("dropped normals that look inwards",)
+    check_bottle(scan)
+    assert prepare(write_obj(tmp_path / "good", normals="outwards")).repairs == ()
+
+
+def test_holes(tmp_path):
+    vertices, uv, faces = bottle(rows=8)
+    kept = np.ones(len(faces), bool)
+    middles = vertices[faces].mean(axis=1)
+    for hole in ([0.03, 0, 0.05], [-0.03, 0, 0.05]):
+        kept &= np.linalg.norm(middles - hole, axis=1) > 0.006
+    scan = prepare(write_obj(tmp_path, (vertices, uv, faces[kept])))
+    assert scan.repairs == ("filled 2 holes",)
+    check_bottle(scan)
+    # what is looked at has no holes either
+    ray = [[0.1, 0.0, 0.05]], [[-1.0, 0.0, 0.0]]
+    assert scan.mesh.ray.intersects_location(*ray)[0][:, 0].max() == pytest.approx(0.03, abs=1e-3)
+
+
+def test_a_hole_too_large_is_an_error(tmp_path):
+    vertices, uv, faces = bottle()
+    half = vertices[faces].mean(axis=1)[:, 0] > 0
+    with pytest.raises(AssetError, match=r"can't be closed to a solid.*holes of at most 35%"):
+        prepare(write_obj(tmp_path, (vertices, uv, faces[half])))
+
+
+def test_thousands_of_loose_bits(tmp_path):
+    vertices, uv, faces = bottle()
+    rng = np.random.default_rng(0)
+    corners = rng.uniform(-0.2, 0.2, (5000, 1, 3)) + rng.normal(0, 1e-4, (5000, 3, 3))
+    dust = len(vertices) + np.arange(15000).reshape(-1, 3)
+    model = (np.concatenate([vertices, corners.reshape(-1, 3)]), np.concatenate([uv, np.zeros((15000, 2))]),
+             np.concatenate([faces, dust]))  # fmt: skip
+    path = write_obj(tmp_path, model)
+    start = time.process_time()
+    scan = prepare(path)
+    assert time.process_time() - start < 20
+    assert scan.repairs == ("dropped 5000 loose or inner pieces",)
+    check_bottle(scan)
+
+
+def test_double_vertices_and_faces(tmp_path):
+    vertices, uv, faces = bottle()
+    soup = np.arange(3 * len(faces)).reshape(-1, 3)
+    model = (vertices[faces].reshape(-1, 3), uv[faces].reshape(-1, 2), np.concatenate([soup, soup[:10]]))
+    scan = prepare(write_obj(tmp_path, model))
+    assert scan.repairs[1:] == ("dropped 10 double or degenerate faces",)
+    assert scan.repairs[0] == f"merged {3 * len(faces) - len(vertices)} duplicate vertices"
+    check_bottle(scan)
+
+
+def test_a_missing_texture_is_an_error_that_names_it(tmp_path):
+    with pytest.raises(AssetError, match=r"textures/lost\.png: the texture file that the material names is missing"):
+        prepare(write_obj(tmp_path, named="textures\\lost.png"))
+
+
+@pytest.mark.parametrize("size", [(8192, 8192), (16384, 12288)], ids=str)
+def test_a_huge_texture_is_shrunk(tmp_path, size):
+    scan = prepare(write_obj(tmp_path, image=picture(size)))
+    assert scan.repairs == (f"shrank the texture from {size[0]} x {size[1]} to 4096 x {size[1] // (size[0] // 4096)}",)
+    check_bottle(scan)
+
+
+def test_a_texture_beyond_all_bounds_is_an_error(tmp_path):
+    path = write_obj(tmp_path)
+    image = tmp_path / "skin.png"
+    head = bytearray(image.read_bytes())
+    head[16:24] = (60000).to_bytes(4, "big") * 2  # width and height in the first chunk
+    import zlib
+
+    head[29:33] = zlib.crc32(head[12:29]).to_bytes(4, "big")
+    image.write_bytes(head)
+    with pytest.raises(AssetError, match=r"skin\.png: the texture is too large"):
+        prepare(path)
+
+
+def test_colours_of_vertices_only(tmp_path):
+    vertices, _, faces = bottle(sections=96)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    colors = COLORS[quarter_of(np.asarray(mesh.vertices) @ np.array([[1, 0.001, 0], [-0.001, 1, 0], [0, 0, 1]]))]
+    mesh.visual.vertex_colors = np.column_stack([colors, np.full(len(colors), 255)]).astype(np.uint8)
+    mesh.export(tmp_path / "scan.ply")
+    scan = prepare(tmp_path / "scan.ply", up="z")
+    assert "baked the vertices' colours into a texture" in scan.repairs
+    check_bottle(scan, volume=0.01)
+
+
+def test_no_colours(tmp_path):
+    vertices, _, faces = bottle()
+    trimesh.Trimesh(vertices, faces).export(tmp_path / "scan.stl")
+    scan = prepare(tmp_path / "scan.stl")
+    assert "has no colours" in scan.repairs
+    check_bottle(scan, colors=False)
+
+
+@pytest.mark.parametrize(
+    ("named", "texture", "repair"),
+    [
+        ("textures/skin.png", "textures/skin.png", ()),
+        ("textures\\skin.png", "textures/skin.png", ("read textures\\skin.png as textures/skin.png",)),
+        ("textures\\skin.png", "skin.png", ("took skin.png for textures\\skin.png",)),
+        ("C:\\Users\\me\\my scan\\skin.png", "skin.png", ("took skin.png for C:\\Users\\me\\my scan\\skin.png",)),
+        ("/home/me/skin.png", "maps/skin.png", ("took maps/skin.png for /home/me/skin.png",)),
+        ("SKIN.PNG", "skin.png", ("took skin.png for SKIN.PNG",)),
+        ("-clamp on -o 0 0 0 my skin.png", "my skin.png", ()),
+    ],
+)
+def test_paths_of_textures(tmp_path, named, texture, repair):
+    scan = prepare(write_obj(tmp_path, named=named, texture=texture))
+    assert scan.repairs == repair
+    check_bottle(scan)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_names_with_accents(tmp_path, encoding):
+    path = write_obj(
+        tmp_path / "Öl", name="Flasche für Öl", mtl="matériau", texture="étiquette n° 1.png", encoding=encoding
+    )
+    scan = prepare(path)
+    assert scan.repairs == ()
+    check_bottle(scan)
+
+
+def test_names_in_other_scripts_and_accents_written_apart(tmp_path):
+    check_bottle(prepare(write_obj(tmp_path / "瓶", name="瓶子", mtl="材质", texture="标签.png")))
+    apart = unicodedata.normalize("NFD", "étiquette.png")
+    scan = prepare(write_obj(tmp_path / "b", texture=apart, named=unicodedata.normalize("NFC", apart)))
+    assert len(scan.repairs) == 1 and scan.repairs[0].startswith("took ")
+    check_bottle(scan)
+
+
+def test_several_materials(tmp_path):
+    """Each quarter has a texture of its own."""
+    vertices, uv, faces = bottle()
+    path = write_obj(tmp_path, texture="")
+    lines = [line for line in path.read_text().splitlines() if not line.startswith(("f ", "usemtl"))]
+    quarter = quarter_of(vertices[faces].mean(axis=1))
+    mtl = ""
+    for k, color in enumerate(COLORS):
+        lines += [f"usemtl part {k}"]
+        lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in faces[quarter == k]]
+        mtl += f"newmtl part {k}\nmap_Kd part{k}.png\n"
+        Image.new("RGB", (16, 16), tuple(color.tolist())).save(tmp_path / f"part{k}.png")
+    path.write_text("\n".join(lines))
+    (tmp_path / "scan.mtl").write_text(mtl)
+    check_bottle(prepare(path, up="z"))
+
+
+def test_glb_has_y_up_and_its_huge_texture_is_shrunk(tmp_path):
+    vertices, uv, faces = bottle()
+    material = PBRMaterial(baseColorTexture=picture((8192, 64)).convert("RGB"))
+    mesh = trimesh.Trimesh(
+        vertices[:, [1, 2, 0]], faces, visual=TextureVisuals(uv=uv, material=material), process=False
+    )
+    mesh.export(tmp_path / "scan.glb")
+    scan = prepare(tmp_path / "scan.glb")
+    assert scan.up == "y"
+    assert "shrank the texture from 8192 x 64 to 4096 x 32" in scan.repairs
+    assert scan.closed.volume == pytest.approx(VOLUME, rel=0.005)
+
+
+def test_glb_compressed_is_an_error(tmp_path):
+    path = tmp_path / "scan.gltf"
+    path.write_text('{"extensionsRequired": ["KHR_draco_mesh_compression"]}')
+    with pytest.raises(AssetError, match=r"compressed in a way.*KHR_draco_mesh_compression.*without compression"):
+        prepare(path)
+
+
+@pytest.mark.slow
+def test_half_a_million_faces(tmp_path):
+    model = bottle(sections=500, rows=125)
+    assert len(model[2]) > 500_000
+    path = write_obj(tmp_path, model, scale=100)
+    code = f"""
+import pickle, resource, time
+from asset_tools.prepare import prepare
+from asset_tools.visual import to_display
+from pathlib import Path
+start = time.process_time()
+scan = prepare(Path({str(path)!r}))
+to_display(scan.mesh, triangles=1000)
+to_display(scan.mesh, triangles=12000, texture_size=1024)
+print(time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2)
+pickle.dump(scan, open({str(tmp_path / "scan.pickle")!r}, "wb"))
+"""
+    seconds, gibibytes = map(float, subprocess.check_output([sys.executable, "-c", code]).split())
+    assert seconds < 60
+    assert gibibytes < 2
+    import pickle
+
+    with (tmp_path / "scan.pickle").open("rb") as file:
+        check_bottle(pickle.load(file), volume=0.01)

@@ -1,0 +1,106 @@
+"""Hulls: few, near to the body, and hollow things stay hollow."""
+
+import numpy as np
+import pytest
+import sapien
+import trimesh
+from sapien import physx
+
+from asset_tools.decompose import MAX_VERTICES, decompose, is_hollow
+from asset_tools.prepare import prepare
+from asset_tools.quality.hulls import hull_quality
+from asset_tools.repair import close
+
+BALL = 0.012  # m
+
+
+def cup(radius=0.04, height=0.1, wall=0.004, sections=64):
+    """An open cup of revolution, solid walls and floor, its bottom at z = 0."""
+    profile = [[0, 0], [radius, 0], [radius, height], [radius - wall, height], [radius - wall, wall], [0, wall]]
+    return trimesh.creation.revolve(np.array(profile), sections=sections)
+
+
+def basket(size=(0.24, 0.18, 0.1), wall=0.005):
+    """An open box, its bottom at z = 0."""
+    outer = trimesh.creation.box(size)
+    inner = trimesh.creation.box([size[0] - 2 * wall, size[1] - 2 * wall, size[2]])
+    inner.apply_translation([0, 0, wall])
+    hollow = outer.difference(inner)
+    hollow.apply_translation([0, 0, size[2] / 2])
+    return hollow
+
+
+def ball_dropped_into(hulls, start):
+    """Where a ball comes to rest that is let go above a container held in place."""
+    scene = sapien.Scene([physx.PhysxCpuSystem()])
+    container = physx.PhysxRigidStaticComponent()
+    for hull in hulls:
+        shape = physx.PhysxCollisionShapeConvexMesh(
+            np.asarray(hull, np.float32), [1, 1, 1], physx.PhysxMaterial(0.5, 0.5, 0)
+        )
+        container.attach(shape)
+    entity = sapien.Entity()
+    entity.add_component(container)
+    scene.add_entity(entity)
+    builder = scene.create_actor_builder()
+    builder.add_sphere_collision(radius=BALL)
+    builder.initial_pose = sapien.Pose(start)
+    ball = builder.build("ball")
+    for _ in range(200):
+        scene.step()
+    return ball.pose.p
+
+
+def test_hollow_is_what_fills_less_than_half_of_its_hull():
+    assert is_hollow(cup()) and is_hollow(basket())
+    assert not is_hollow(trimesh.creation.box([0.1, 0.1, 0.1]))
+    assert not is_hollow(trimesh.creation.icosphere())
+
+
+def test_a_scanned_cup_stays_hollow(tmp_path):
+    mesh = cup()
+    mesh.visual.vertex_colors = [200, 60, 40, 255]
+    mesh.export(tmp_path / "cup.ply")
+    closed = prepare(tmp_path / "cup.ply", up="z").closed
+    assert closed.volume == pytest.approx(mesh.volume, rel=0.02)
+    found = decompose(closed)
+    quality = hull_quality(closed, found.hulls, hollow=True)
+    assert quality.surface_p95 <= 0.004
+    assert quality.hull_count <= 32 and quality.hull_vertices <= MAX_VERTICES
+    for x, y in ((0, 0), (0.02, 0), (-0.012, 0.012)):
+        end = ball_dropped_into(found.hulls, [x, y, 0.13])
+        assert end[2] == pytest.approx(0.004 + BALL, abs=2e-3)
+        assert np.hypot(*end[:2]) < 0.04 - BALL
+
+
+def test_a_basket_stays_hollow():
+    closed = close(basket()).mesh
+    found = decompose(closed)
+    assert hull_quality(closed, found.hulls, hollow=True).surface_p95 <= 0.004
+    for x, y in ((0, 0), (0.09, -0.06), (-0.1, 0.05)):
+        end = ball_dropped_into(found.hulls, [x, y, 0.15])
+        assert end[2] == pytest.approx(0.005 + BALL, abs=2e-3)
+
+
+def test_a_can_with_rims_takes_few_hulls():
+    """Recessed lids leave 0.86 to one hull; CoACD alone takes some 20 to reach 0.9."""
+    rim, inner, half, deep = 0.033, 0.030, 0.04, 0.007
+    profile = [[0, deep], [inner, deep], [inner, 0], [rim, 0], [rim, 2 * half], [inner, 2 * half]]
+    profile += [[inner, 2 * half - deep], [0, 2 * half - deep]]
+    can = trimesh.creation.revolve(np.array(profile), sections=64)
+    found = decompose(can)
+    assert can.volume / can.convex_hull.volume == pytest.approx(1 - 0.014 * 0.03**2 / (0.08 * 0.033**2), abs=1e-6)
+    assert found.volume_iou >= 0.9
+    assert 2 <= len(found.hulls) <= 10
+    assert max(map(len, found.hulls)) <= MAX_VERTICES
+
+
+def test_the_same_mesh_gives_the_same_hulls_and_a_cache_keeps_them(tmp_path):
+    bodies = [trimesh.creation.box([0.1, 0.02, 0.02]), trimesh.creation.box([0.02, 0.02, 0.1])]
+    cross = trimesh.boolean.union(bodies)
+    first, second = decompose(cross, cache=tmp_path), decompose(cross)
+    assert len(list(tmp_path.iterdir())) == 1
+    for again in (second, decompose(cross, cache=tmp_path)):
+        assert again.volume_iou == first.volume_iou
+        assert all(np.array_equal(a, b) for a, b in zip(first.hulls, again.hulls, strict=True))
+    assert first.volume_iou > 0.9 and len(first.hulls) <= 3
