@@ -138,13 +138,15 @@ def pair(low: Point, high: Point) -> tuple[Box, Box]:
 
 
 def unwrapped(vertices: np.ndarray, faces: np.ndarray, texture_size: int, pieces: tuple[np.ndarray, ...] = ()) -> Shape:
-    """A closed surface as a shape with one texture atlas that covers each of its triangles once."""
+    """A closed surface as a shape with one texture atlas that shows each of its triangles once.
+
+    Some charts are mirrored, which is all the same to what is painted in space.
+    """
     low, reach = vertices.min(0), float(np.ptp(vertices, axis=0).max())
     atlas = xatlas.Atlas()
     atlas.add_mesh(((vertices - low) / reach).astype(np.float32), faces.astype(np.uint32))
     options = xatlas.PackOptions()
     options.resolution, options.padding, options.bilinear = texture_size, 3, True
-    options.rotate_charts = False  # it would mirror them
     atlas.generate(pack_options=options)
     origin, corners, uv = atlas[0]
     uv, corners = uv.astype(float), corners.astype(np.int64)

@@ -89,7 +89,7 @@ def red_airplane() -> Model:
         high=(78, 82, 68),
         decorate=decorate,
         step=1.0,
-        triangles=1700,
+        triangles=1600,
         texture_size=400,
     )
 
@@ -253,7 +253,7 @@ def biplane() -> Model:
         high=(60, 66, 70),
         decorate=decorate,
         step=0.85,
-        triangles=1900,
-        texture_size=400,
+        triangles=1600,
+        texture_size=352,
         grain=0.0,
     )
