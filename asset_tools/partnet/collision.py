@@ -113,12 +113,12 @@ def _cut(triangles: Array, fine: bool, depth: int) -> list[Array]:
     if depth == 0 or size.max() <= TINY or _fits(triangles, True, TINY if fine else SMALL):
         return [points]
     best, halves = np.inf, []
-    for axis in range(3):
-        for place in _places(triangles, axis):
-            found = [_half(triangles, axis, place, side) for side in (1.0, -1.0)]
-            volume = sum(_hull_volume(half) for half in found)
-            if min(map(len, found)) and volume < best:
-                best, halves = volume, found
+    for axis, place in _places(triangles, size > (0 if fine else BOARD / 2)):
+        found = [_half(triangles, axis, place, side) for side in (1.0, -1.0)]
+        volume = sum(_hull_volume(half) for half in found)
+        # beside an opening the first cut saves nothing yet: among equals the first is best
+        if min(map(len, found)) and volume < 0.98 * best:
+            best, halves = volume, found
     if not halves:
         return [points]
     pieces = []
@@ -131,15 +131,25 @@ def _cut(triangles: Array, fine: bool, depth: int) -> list[Array]:
     return pieces
 
 
-def _places(triangles: Array, axis: int) -> Array:
-    """Where to try cuts across an axis: at the largest faces across it, where a notch ends, and at even steps."""
+def _places(triangles: Array, across: Array) -> list[tuple[int, float]]:
+    """Where to try cuts: axis and place of the largest faces across x, y and z, where notches end; then even steps.
+
+    Args:
+        triangles: (F, 3, 3).
+        across: (3,) which axes to cut across: boards are not split into thinner ones.
+    """
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    areas = np.abs(cross[:, axis]) * (np.abs(cross[:, axis]) > 0.99 * np.linalg.norm(cross, axis=1))
-    low, high = triangles[..., axis].min(), triangles[..., axis].max()
-    places, which = np.unique(np.round(triangles[:, :, axis].mean(axis=1), 4), return_inverse=True)
-    largest = places[np.argsort(-np.bincount(which, areas), kind="stable")]
-    largest = largest[(largest > low + FLAT) & (largest < high - FLAT)][:CUTS]
-    return np.append(largest, np.linspace(low, high, STEPS + 2)[1:-1])
+    level = np.abs(cross) > 0.99 * np.linalg.norm(cross, axis=1, keepdims=True)
+    faces, steps = [], []
+    for axis in np.flatnonzero(across).tolist():
+        low, high = triangles[..., axis].min(), triangles[..., axis].max()
+        places, which = np.unique(np.round(triangles[:, :, axis].mean(axis=1), 4), return_inverse=True)
+        areas = np.bincount(which, np.abs(cross[:, axis]) * level[:, axis])
+        inside = np.flatnonzero((places > low + FLAT) & (places < high - FLAT) & (areas > 0))
+        order = inside[np.argsort(-np.round(areas[inside], 9), kind="stable")][:CUTS]
+        faces += [(-round(float(areas[one]), 9), axis, float(places[one])) for one in order]
+        steps += [(axis, float(place)) for place in np.linspace(low, high, STEPS + 2)[1:-1]]
+    return [(axis, place) for _, axis, place in sorted(faces)] + steps
 
 
 def _half(triangles: Array, axis: int, place: float, side: float) -> Array:

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from asset_tools.partnet.annotation import Annotation, JointNote
+from asset_tools.build import build_furniture
+from asset_tools.import_scans import object_id
+from asset_tools.partnet.annotation import Annotation, JointNote, find_annotation
 from asset_tools.partnet.clearance import trimmed
 from asset_tools.partnet.collision import Part, pieces_of
 from asset_tools.partnet.looks import merged
 from asset_tools.partnet.obj import Faces, read_obj
-from asset_tools.partnet.urdf import Mobility, MovingLink, Visual, read_urdf
+from asset_tools.partnet.urdf import URDF, Mobility, MovingLink, Visual, read_urdf
+from asset_tools.pipeline import Job, content_hash
 from asset_tools.sources import FurnitureSource, LinkSource
-from robocas_ms3.assets.manifest import Handle, Joint, Surface
+from robocas_ms3.assets.manifest import FurnitureAsset, Handle, Joint, Surface
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray
@@ -64,7 +68,7 @@ def read_partnet(folder: Path, annotation: Annotation) -> FurnitureSource:
         links.append(LinkSource(link.name, joints[link.name], mesh, pieces[link.name], mass, link.parent))
     names = {link.joint: link.name for link in model.links}
     return FurnitureSource(
-        id=folder.name,
+        id=object_id(folder.name),
         name=annotation.name,
         category=annotation.category,
         mesh=merged([faces for _, _, faces in looks[""]]),
@@ -81,6 +85,39 @@ def read_partnet(folder: Path, annotation: Annotation) -> FurnitureSource:
         licence=LICENCE,
         attribution=ATTRIBUTION,
     )
+
+
+def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> list[Job]:
+    """What is to be made of models.
+
+    Args:
+        folders: of the models, each with a ``mobility.urdf``; their names are the ids.
+        annotations: folder of the user's ``<id>.yaml``; they go before those shipped.
+
+    Raises:
+        AssetError: a folder is no model, an annotation is missing or wrong, or two models have one id.
+    """
+    jobs: dict[str, Job] = {}
+    for folder in (folder.resolve() for folder in folders):
+        name = object_id(folder.name)
+        if name in jobs:
+            raise AssetError("two models would get the same id", where=folder, found=name, fix="Rename one.")
+        annotation = find_annotation(folder.name, annotations)
+        model = read_urdf(folder)  # says what is missing before anything is made
+        meshes = {
+            visual.path.parent for group in (model.body, *(link.visuals for link in model.links)) for visual in group
+        }
+        files = [
+            folder / URDF,
+            *(path for home in sorted(meshes | {folder / "images"}) for path in sorted(home.glob("*.*"))),
+        ]
+        content = content_hash(name, annotation, files=files, packages=("partnet",))
+        jobs[name] = Job(name, partial(_make, folder, annotation), content)
+    return list(jobs.values())
+
+
+def _make(folder: Path, annotation: Annotation, out: Path) -> FurnitureAsset:
+    return build_furniture(read_partnet(folder, annotation), out)
 
 
 def _looks(visuals: Sequence[Visual]) -> list[tuple[str, Path, Faces]]:
