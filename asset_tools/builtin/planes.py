@@ -254,6 +254,6 @@ def biplane() -> Model:
         decorate=decorate,
         step=0.85,
         triangles=1600,
-        texture_size=352,
+        texture_size=304,
         grain=0.0,
     )
