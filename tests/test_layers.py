@@ -67,6 +67,8 @@ def imports(module: str, path: Path) -> tuple[tuple[str, bool], ...]:
                 found.append((name if name in MODULES else base, id(node) in local))
     return tuple(found)
 
+    assert users <= {("robocas_ms3.cli.assets_make", True), ("robocas_ms3.cli.assets_show", True)}
+
 
 def layer(module: str) -> str:
     """`robocas_ms3.tasks.pick` is in `tasks`; the package itself in none."""

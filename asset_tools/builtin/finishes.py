@@ -136,9 +136,9 @@ WALLS: dict[str, Paint] = {
     "wallpaper": wallpaper,
 }
 FLOORS: dict[str, Paint] = {
+    "stone_tiles": stone,  # the default: tables of wood stand out from it
     "oak_parquet": parquet,
     "walnut_parquet": partial(parquet, tones=WALNUT),
-    "stone_tiles": stone,
     "terracotta": terracotta,
     "concrete": concrete,
     "carpet": carpet,

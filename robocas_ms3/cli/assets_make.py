@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
-if TYPE_CHECKING:
-    from asset_tools.pipeline import Job
+# `asset_tools.pipeline.Job`, which only loads when a command runs
+Job = Any
 
 
 @dataclass(kw_only=True)

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from robocas_ms3.assets.pack import Pack
 
 
@@ -54,34 +56,41 @@ class Sheet:
 
 def list_packs(command: ListPacks) -> int:
     """Run ``list``; a pack that can't be read is listed with the reason."""
-    from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from robocas_ms3.assets.pack import load_pack, pack_folders
     from robocas_ms3.errors import AssetError
 
-    table = Table("pack", "objects", "furniture", "folder")
+    table = Table(Column("pack", no_wrap=True), "objects", "furniture", "folder")
     for name, folder in pack_folders().items():
         try:
             pack = load_pack(name)
             table.add_row(name, str(len(pack.objects)), str(len(pack.furniture)), str(folder))
         except AssetError as error:
             table.add_row(name, "-", "-", f"[red]{error}[/red]")
-    Console().print(table)
+    _console().print(table)
     return 0
 
 
 def info(command: Info) -> int:
     """Run ``info``."""
-    from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from robocas_ms3.assets.pack import load_pack
 
     pack = load_pack(command.pack)
-    console = Console()
+    console = _console()
     if pack.objects:
-        table = Table("object", "size (mm)", "mass (g)", "hulls", "overlap", "resting poses", "grasps", "repairs")
+        table = Table(
+            Column("object", no_wrap=True),
+            "size (mm)",
+            "mass (g)",
+            "hulls",
+            "overlap",
+            "resting poses",
+            "grasps",
+            "repairs",
+        )
         for loaded in pack.objects.values():
             asset = loaded.asset
             table.add_row(
@@ -96,7 +105,7 @@ def info(command: Info) -> int:
             )
         console.print(table)
     if pack.furniture:
-        table = Table("furniture", "size (mm)", "surfaces", "joints", "handles", "finishes")
+        table = Table(Column("furniture", no_wrap=True), "size (mm)", "surfaces", "joints", "handles", "finishes")
         for loaded in pack.furniture.values():
             asset = loaded.asset
             table.add_row(
@@ -128,9 +137,9 @@ def verify(command: Verify) -> int:
 
 def sheet(command: Sheet) -> int:
     """Run ``sheet``."""
-    from asset_tools.sheet import contact_sheet
     from rich.console import Console
 
+    from asset_tools.sheet import contact_sheet
     from robocas_ms3.assets.pack import load_pack
 
     pack = load_pack(command.pack)
@@ -138,6 +147,14 @@ def sheet(command: Sheet) -> int:
     contact_sheet(pack, out, ids=command.ids or None)
     Console(highlight=False, soft_wrap=True).print(f"wrote {out}")
     return 0
+
+
+def _console() -> Console:
+    """Tables in a file or a pipe are not squeezed into the 80 columns of a terminal that isn't there."""
+    from rich.console import Console
+
+    console = Console()
+    return console if console.is_terminal else Console(width=180)
 
 
 def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
@@ -153,7 +170,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     measured = dict(track(remeasure_pack(pack, jobs), "measuring", total, console=Console(stderr=True)))
     objects = {name: measured[name] for name in pack.objects}
     furniture = {name: measured[name] for name in pack.furniture}
-    console = Console()
+    console = _console()
     for header, cells in ((HEADER, rows(objects)), (FURNITURE_HEADER, furniture_rows(furniture))):
         if cells:
             table = Table(*header)
