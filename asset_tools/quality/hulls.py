@@ -84,7 +84,8 @@ def _outside_of_slits(union: trimesh.Trimesh, samples: tuple[Array, Array]) -> A
     points, faces = samples
     normals = np.asarray(union.face_normals)[faces]
     caster = RayMeshIntersector(union)
-    _, rays, hits = caster.intersects_id(points + 1e-5 * normals, normals, multiple_hits=False, return_locations=True)
+    found = caster.intersects_id(points + 1e-5 * normals, normals, multiple_hits=False, return_locations=True)
+    rays, hits = found[1], found[-1]
     near = np.linalg.norm(hits - points[rays], axis=1) < SLIT
     touched = np.ones(len(points), dtype=bool)
     touched[rays[near]] = False

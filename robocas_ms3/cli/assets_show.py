@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -81,16 +81,8 @@ def info(command: Info) -> int:
     pack = load_pack(command.pack)
     console = _console()
     if pack.objects:
-        table = Table(
-            Column("object", no_wrap=True),
-            "size (mm)",
-            "mass (g)",
-            "hulls",
-            "overlap",
-            "resting poses",
-            "grasps",
-            "repairs",
-        )
+        names = ("size (mm)", "mass (g)", "hulls", "overlap", "resting poses", "grasps", "repairs")
+        table = Table(Column("object", no_wrap=True), *names)
         for loaded in pack.objects.values():
             asset = loaded.asset
             table.add_row(
@@ -167,7 +159,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     from robocas_ms3.files import write_json
 
     total = len(pack.manifest.assets)
-    measured = dict(track(remeasure_pack(pack, jobs), "measuring", total, console=Console(stderr=True)))
+    measured: dict[str, Any] = dict(track(remeasure_pack(pack, jobs), "measuring", total, console=Console(stderr=True)))
     objects = {name: measured[name] for name in pack.objects}
     furniture = {name: measured[name] for name in pack.furniture}
     console = _console()
