@@ -1,0 +1,93 @@
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+import yaml
+from mani_skill.utils.structs import Articulation
+
+import robocas_ms3  # noqa: F401
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config import TaskConfig
+from robocas_ms3.errors import ConfigError
+from robocas_ms3.paths import task_configs_dir
+from robocas_ms3.scenes.build import find_objects, furniture_pose
+
+
+def pick_config(**changes):
+    data = yaml.safe_load((task_configs_dir() / "pick_table_scattered.yaml").read_text(encoding="utf-8"))
+    return {**data, **changes}
+
+
+def objects_of(ids):
+    return find_objects(load_pack("builtin"), TaskConfig.model_validate(pick_config(objects={"ids": ids, "count": 2})))
+
+
+def test_objects_by_id_or_by_graspnet_number():
+    assert objects_of([5, "apple", 31]) == ["banana", "apple", "toy_airplane_k"]
+    assert len(objects_of("all")) == 46
+
+
+def test_unknown_objects_are_named_with_what_there_is():
+    with pytest.raises(ConfigError, match=r"no such object.*GraspNet number of \[1, 2, 3.*found 6, spam"):
+        objects_of([6, "spam", 12])
+
+
+def test_furniture_stands_on_its_lowest_point():
+    pack = load_pack("builtin")
+    config = TaskConfig.model_validate(pick_config())
+    pose = furniture_pose(config.basket, pack.furniture["basket"])
+    np.testing.assert_allclose(pose[:3, 3], [1.3, 0.9, 0.61 + 0.096])
+
+
+CABINET = {"asset": "cabinet", "pose": {"position": [-1.5, -1.0, 0.0], "yaw_deg": 0.0}}
+
+
+def test_articulated_furniture_is_closed_again_after_a_reset():
+    data = pick_config()
+    data["furniture"]["cabinet"] = CABINET
+    env = gym.make("RoboCASPick-v1", config=data, render_backend="none", reconfiguration_freq=0)
+    try:
+        env.reset(seed=0)
+        cabinet = env.unwrapped.fixtures.furniture["cabinet"]
+        assert isinstance(cabinet, Articulation)
+        cabinet.set_qpos(torch.full((1, cabinet.max_dof), 0.2))
+        for _ in range(3):
+            env.step(env.action_space.sample() * 0)
+        assert (cabinet.qpos > 0.1).all()
+        env.reset(seed=1)
+        assert cabinet.qpos.abs().max() < 1e-6
+        for _ in range(20):
+            env.step(env.action_space.sample() * 0)
+        assert cabinet.qpos.abs().max() < 1e-3
+    finally:
+        env.close()
+
+
+def test_an_unknown_finish_is_an_error():
+    data = pick_config(room={"asset": "room", "finishes": {"floor": "lava"}})
+    env = gym.make(
+        "RoboCASPick-v1",
+        config=pick_config(room={"asset": "room", "finishes": {"floor": "carpet"}}),
+        render_backend="none",
+    )
+    env.close()
+    with pytest.raises(
+        ConfigError, match=r"room.finishes.floor: no such finish \(expected one of .*carpet.*found lava"
+    ):
+        gym.make("RoboCASPick-v1", config=data, render_backend="none")
+
+
+@pytest.mark.slow
+def test_finishes_and_levels_are_seen(needs_renderer):
+    """The floor's colour is that of the finish; both levels of detail render nearly the same picture."""
+    pictures = {}
+    for name, floor, level in (("oak", "oak_parquet", "fast"), ("blue", "carpet", "fast"), ("full", "carpet", "full")):
+        data = pick_config(room={"asset": "room", "finishes": {"floor": floor}})
+        env = gym.make("RoboCASPick-v1", config=data, visual_level=level, render_mode="rgb_array")
+        env.reset(seed=0)
+        pictures[name] = env.render()[0].cpu().numpy().astype(float)
+        env.close()
+    corner = np.s_[380:, :120]  # floor beside the robot
+    oak, blue = pictures["oak"][corner].mean(axis=(0, 1)), pictures["blue"][corner].mean(axis=(0, 1))
+    assert oak[0] > oak[2] + 20 and blue[2] > blue[0] + 10
+    assert 0 < np.abs(pictures["full"] - pictures["blue"]).mean() < 3
