@@ -25,9 +25,9 @@ THRESHOLDS = (0.2, 0.12, 0.08, 0.05)  # CoACD's concavity, coarse first
 FINE = (0.05, 0.03)  # for hollow things, whose walls coarse cuts fill the inside with
 SMOOTHED = 0.002  # of the diagonal: detail that CoACD is spared
 HOLLOW = 0.5  # volume over that of the convex hull, below which a thing is hollow or thin
-WANTED_DISTANCE = 0.0025  # m, 95th percentile between the surfaces of a hollow thing and of its hulls
+WANTED_DISTANCE = 0.002  # m, 95th percentile between the surfaces of a hollow thing and of its hulls
 TRIES = 4  # mergers in a row that are too much
-LOST_OVERLAP = 0.05  # that merging the hulls of a hollow thing may cost
+LOST_OVERLAP = 0.02  # that merging the hulls of a hollow thing may cost
 _VERSION = 2
 
 

@@ -194,7 +194,7 @@ def _simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     body.merge_vertices(digits_vertex=None)
     center, size = body.bounds.mean(axis=0), float(np.linalg.norm(body.extents))
     vertices, faces = (np.asarray(body.vertices) - center) / size, np.asarray(body.faces)
-    for aggression in (5, 7, 9, 12):  # gentle first: it may stop above the limit
+    for aggression in (5, 7, 9, 12, 16, 20):  # gentle first: it may stop above the limit
         if len(faces) <= triangles:
             break
         vertices, faces = fast_simplification.simplify(

@@ -222,7 +222,7 @@ def test_a_missing_texture_is_an_error_that_names_it(tmp_path):
         prepare(write_obj(tmp_path, named="textures\\lost.png"))
 
 
-@pytest.mark.parametrize("size", [(8192, 8192), (16384, 12288)], ids=str)
+@pytest.mark.parametrize("size", [(8192, 8192), pytest.param((16384, 12288), marks=pytest.mark.slow)], ids=str)
 def test_a_huge_texture_is_shrunk(tmp_path, size):
     scan = prepare(write_obj(tmp_path, image=picture(size)))
     assert scan.repairs == (f"shrank the texture from {size[0]} x {size[1]} to 4096 x {size[1] // (size[0] // 4096)}",)

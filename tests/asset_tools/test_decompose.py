@@ -73,6 +73,7 @@ def test_a_scanned_cup_stays_hollow(tmp_path):
         assert np.hypot(*end[:2]) < 0.04 - BALL
 
 
+@pytest.mark.slow
 def test_a_basket_stays_hollow():
     closed = close(basket()).mesh
     found = decompose(closed)

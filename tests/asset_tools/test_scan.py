@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from asset_tools.scan import find_mesh, guess_unit, guess_up, load_scan, upright
+from asset_tools.scan import find_mesh, guess_unit, guess_units, guess_up, load_scan, longest_side, upright
 from robocas_ms3.errors import AssetError
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
@@ -89,6 +89,30 @@ def test_units_are_guessed_from_sizes(longest, unit):
 def test_sizes_of_no_unit():
     with pytest.raises(AssetError, match=r"found 1e\+06 units\)\. Pass --units"):
         guess_unit([1e6])
+
+
+@pytest.mark.parametrize(
+    ("longest", "units"),
+    [
+        ({"a": 0.15, "b": 0.2, "c": 0.08, "odd": 190.0}, {"a": "m", "b": "m", "c": "m", "odd": "mm"}),
+        ({"a": 8.0, "b": 15.0, "odd": 0.12}, {"a": "cm", "b": "cm", "odd": "m"}),
+        ({"a": 8.0, "b": 15.0, "odd": 210.0}, {"a": "cm", "b": "cm", "odd": "mm"}),
+        ({"a": 0.03, "b": 0.4}, {"a": "m", "b": "m"}),
+    ],
+)
+def test_a_scan_in_another_unit_than_its_neighbours(longest, units):
+    assert guess_units(longest) == units
+
+
+def test_a_scan_of_no_unit_is_named():
+    with pytest.raises(AssetError, match=r"^odd: can't guess the unit"):
+        guess_units({"a": 0.1, "b": 0.2, "odd": 1e6})
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply"])
+def test_longest_side(tmp_path, suffix):
+    trimesh.creation.box([1, 7, 3]).export(tmp_path / f"box.{suffix}")
+    assert longest_side(tmp_path / f"box.{suffix}") == pytest.approx(7)
 
 
 def shape(kind, along):

@@ -1,0 +1,90 @@
+"""Bases that bulge are pressed flat, and only those; real scans stand as they do in life."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from asset_tools.decompose import decompose
+from asset_tools.inertia import principal_inertia
+from asset_tools.level import level_base
+from asset_tools.prepare import prepare
+from asset_tools.resting import resting_poses
+from robocas_ms3.errors import AssetError
+
+
+QUARTER = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
+HOPE = ["alphabet_soup", "bbq_sauce", "butter", "chocolate_pudding", "cream_cheese", "ketchup", "orange_juice"]
+
+
+def carton(bulge, size=0.07, height=0.19):
+    """A box whose base is a dome that is deepest in the middle, by ``bulge`` m; its edges at z = 0."""
+    mesh = trimesh.creation.box([size, size, height])
+    for _ in range(4):
+        mesh = mesh.subdivide()
+    mesh.apply_translation([0, 0, height / 2])
+    x, y, z = mesh.vertices.T
+    dome = bulge * (1 - (2 * x / size) ** 2) * (1 - (2 * y / size) ** 2)
+    mesh.vertices = np.column_stack([x, y, np.where(z < 1e-9, -dome, z)])
+    return mesh
+
+
+def poses_of(closed):
+    inertia, axes = principal_inertia(closed, 0.3)
+    hulls = decompose(closed).hulls
+    return resting_poses(hulls, mass=0.3, center_of_mass=closed.center_mass, inertia=inertia, inertia_wxyz=axes)
+
+
+def test_a_bulging_base_is_pressed_flat():
+    scan, repairs = carton(0.0015), []
+    mesh, closed = level_base(scan.copy(), scan, repairs)
+    assert len(repairs) == 1 and repairs[0].startswith("pressed the base flat by ")
+    depth = float(repairs[0].split()[-2]) / 1e3
+    assert depth < 0.0015
+    for leveled in (mesh, closed):
+        assert leveled.bounds[0, 2] == pytest.approx(-0.0015 + depth, abs=1e-4)
+        np.testing.assert_allclose(leveled.bounds[1], scan.bounds[1])
+    assert closed.is_watertight
+    assert scan.volume > closed.volume > 0.99 * scan.volume
+    assert poses_of(closed).display_pose >= 0
+    again: list[str] = []
+    level_base(mesh, closed, again)
+    assert again == []
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        carton(0.0),
+        carton(-0.003),  # hollowed: it stands on its edges
+        trimesh.creation.icosphere(4, 0.04),
+        trimesh.creation.capsule(0.1, 0.02),
+        trimesh.creation.cylinder(0.03, 0.1, sections=64, transform=QUARTER),
+    ],
+    ids=["flat", "hollow", "ball", "capsule", "lying"],
+)
+def test_other_bases_stay(body):
+    repairs: list[str] = []
+    mesh, closed = level_base(body.copy(), body, repairs)
+    assert repairs == []
+    assert closed is body and mesh.volume == pytest.approx(body.volume)
+
+
+def test_axis_and_unit_can_be_given(tmp_path):
+    trimesh.creation.box([1.0, 2.0, 5.0]).export(tmp_path / "box.ply")
+    scan = prepare(tmp_path / "box.ply", up="x", unit="inch")
+    assert (scan.up, scan.unit) == ("x", "inch")
+    np.testing.assert_allclose(sorted(scan.closed.extents), [0.0254, 0.0508, 0.127])
+    assert scan.closed.extents[2] == pytest.approx(0.0254)
+    assert {"turned x up", "scaled from inches"} <= set(scan.repairs)
+    with pytest.raises(AssetError, match="no such mesh"):
+        prepare(tmp_path / "lost.ply")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*HOPE, "salad_dressing"])
+def test_what_stands_in_life_stands_here(shared_dir, name):
+    scan = prepare(shared_dir / "scans" / "hope" / name, unit="cm")
+    found = decompose(scan.closed)
+    assert found.volume_iou >= 0.9
+    assert len(found.hulls) <= 8
+    assert poses_of(scan.closed).display_pose >= 0
