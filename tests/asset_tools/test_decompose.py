@@ -1,5 +1,8 @@
 """Hulls: few, near to the body, and hollow things stay hollow."""
 
+# trimesh types a visual as None or either of two kinds; the tests know which one they have
+# pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
+
 import numpy as np
 import pytest
 import sapien

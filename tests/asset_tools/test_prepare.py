@@ -11,7 +11,6 @@ from asset_tools.prepare import prepare
 from asset_tools.resting import resting_poses
 from robocas_ms3.errors import AssetError
 
-
 QUARTER = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
 HOPE = ["alphabet_soup", "bbq_sauce", "butter", "chocolate_pudding", "cream_cheese", "ketchup", "orange_juice"]
 

@@ -1,3 +1,6 @@
+# trimesh types a visual as None or either of two kinds; the tests know which one they have
+# pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
+
 import json
 
 import numpy as np
