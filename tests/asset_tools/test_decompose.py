@@ -3,13 +3,15 @@
 # trimesh types a visual as None or either of two kinds; the tests know which one they have
 # pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
 
+import time
+
 import numpy as np
 import pytest
 import sapien
 import trimesh
 from sapien import physx
 
-from asset_tools.decompose import MAX_VERTICES, decompose, is_hollow
+from asset_tools.decompose import MAX_VERTICES, decompose, few_vertices, is_hollow, volume_iou
 from asset_tools.prepare import prepare
 from asset_tools.quality.hulls import hull_quality
 from asset_tools.repair import close
@@ -108,3 +110,41 @@ def test_the_same_mesh_gives_the_same_hulls_and_a_cache_keeps_them(tmp_path):
         assert again.volume_iou == first.volume_iou
         assert all(np.array_equal(a, b) for a, b in zip(first.hulls, again.hulls, strict=True))
     assert first.volume_iou > 0.9 and len(first.hulls) <= 3
+
+
+def test_overlap_of_shifted_boxes_is_known():
+    box = trimesh.creation.box([2.0, 1.0, 1.0])
+    half_out = np.asarray(box.vertices) + [1.0, 0, 0]
+    assert volume_iou(box, [np.asarray(box.vertices)]) == pytest.approx(1.0, abs=1e-6)
+    assert volume_iou(box, [half_out]) == pytest.approx(1 / 3, abs=1e-6)
+
+
+def test_few_vertices_keep_volume():
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    kept = few_vertices(np.asarray(ball.vertices), 48)
+    assert len(kept) == 48
+    assert trimesh.convex.convex_hull(kept).volume == pytest.approx(ball.volume, rel=1e-6)
+
+
+def test_a_box_is_one_hull_and_a_u_is_several():
+    assert len(decompose(trimesh.creation.box([0.1, 0.05, 0.03])).hulls) == 1
+    parts = [
+        ([0.1, 0.02, 0.02], [0, 0, 0]),
+        ([0.02, 0.02, 0.08], [-0.04, 0, 0.03]),
+        ([0.02, 0.02, 0.08], [0.04, 0, 0.03]),
+    ]
+    boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in parts]
+    found = decompose(trimesh.boolean.union(boxes))
+    assert len(found.hulls) >= 3
+    assert found.volume_iou > 0.9
+
+
+@pytest.mark.slow
+def test_the_can_of_the_reference_material(shared_dir):
+    """A round can whose scan is a thin shell: naively 85 s and 16 hulls."""
+    start = time.process_time()
+    can = prepare(shared_dir / "scans" / "hope" / "alphabet_soup", up="y", unit="cm")
+    found = decompose(can.closed)
+    assert time.process_time() - start < 15
+    assert can.closed.volume > 0.8 * can.mesh.convex_hull.volume  # a solid, not a shell
+    assert found.volume_iou >= 0.9 and len(found.hulls) <= 16

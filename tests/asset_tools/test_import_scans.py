@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.decompose import decompose, few_vertices, volume_iou
-from asset_tools.import_scans import ImportSettings, estimate_mass, find_scans, import_scans, object_id
-from asset_tools.repair import close
-from asset_tools.scan import load_scan, upright
+from asset_tools.import_scans import ImportSettings, estimate_mass, find_scans, object_id, scan_jobs
+from asset_tools.pipeline import up_to_date, write_pack
+from asset_tools.scan import load_scan
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.errors import AssetError
 
@@ -18,6 +17,7 @@ def write_box(folder, name, size=(4.0, 6.0, 10.0)):
 def test_names_become_ids():
     assert object_id("Alphabet Soup (v2)") == "alphabet_soup_v2"
     assert object_id("Käse") == "kase"
+    assert object_id("可乐") != object_id("牛奶") and object_id("可乐").startswith("object_")
 
 
 def test_mass_is_estimated_from_volume_within_limits():
@@ -26,48 +26,28 @@ def test_mass_is_estimated_from_volume_within_limits():
     assert estimate_mass(trimesh.creation.box([0.2] * 3)) == 0.8
 
 
-def test_overlap_of_shifted_boxes_is_known():
-    box = trimesh.creation.box([2.0, 1.0, 1.0])
-    half_out = np.asarray(box.vertices) + [1.0, 0, 0]
-    assert volume_iou(box, [np.asarray(box.vertices)]) == pytest.approx(1.0, abs=1e-6)
-    assert volume_iou(box, [half_out]) == pytest.approx(1 / 3, abs=1e-6)
-
-
-def test_few_vertices_keep_volume():
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    kept = few_vertices(np.asarray(ball.vertices), 48)
-    assert len(kept) == 48
-    assert trimesh.convex.convex_hull(kept).volume == pytest.approx(ball.volume, rel=1e-6)
-
-
-def test_a_box_is_one_hull_and_a_u_is_several():
-    assert len(decompose(trimesh.creation.box([0.1, 0.05, 0.03])).hulls) == 1
-    parts = [
-        ([0.1, 0.02, 0.02], [0, 0, 0]),
-        ([0.02, 0.02, 0.08], [-0.04, 0, 0.03]),
-        ([0.02, 0.02, 0.08], [0.04, 0, 0.03]),
-    ]
-    boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in parts]
-    letter = trimesh.boolean.union(boxes)
-    found = decompose(letter)
-    assert len(found.hulls) >= 3
-    assert found.volume_iou > 0.9
-
-
 def test_a_folder_of_scans_in_centimetres_becomes_a_pack(tmp_path):
     write_box(tmp_path / "scans" / "Blue Box", "textured")
     write_box(tmp_path / "scans", "small", (3.0, 3.0, 8.0))
+    jobs = scan_jobs(tmp_path / "scans", ImportSettings(masses={"small": 0.2}))
     done = []
-    import_scans(tmp_path / "scans", tmp_path / "mine", ImportSettings(), jobs=1, on_result=done.append)
+    write_pack(jobs, tmp_path / "mine", tmp_path / "kept", on_made=done.append)
     pack = load_pack(tmp_path / "mine")
     assert pack.name == "mine"
     assert [result.id for result in done] == ["blue_box", "small"]
     box = pack.objects["blue_box"]
     assert sorted(box.asset.extents) == pytest.approx([0.04, 0.06, 0.1], abs=1e-6)
     assert box.asset.name == "blue box"
-    assert box.asset.volume_iou == pytest.approx(1.0, abs=1e-3)
+    assert box.asset.quality.volume_iou == pytest.approx(1.0, abs=1e-3)
+    assert box.asset.quality.rest_share >= 0.9 and box.asset.quality.grasps_held >= 0.8
+    assert pack.objects["small"].asset.mass == 0.2
     assert len(box.annotations.resting_poses) == 6
     assert box.asset.grasp_count >= 50
+    # nothing to do a second time, until a scan or what is said of it changes
+    assert up_to_date(scan_jobs(tmp_path / "scans", ImportSettings(masses={"small": 0.2})), tmp_path / "mine")
+    assert not up_to_date(scan_jobs(tmp_path / "scans", ImportSettings()), tmp_path / "mine")
+    with pytest.raises(AssetError, match="scans that are not there.*found smal"):
+        scan_jobs(tmp_path / "scans", ImportSettings(masses={"smal": 0.2}))
 
 
 @pytest.mark.parametrize(
@@ -90,16 +70,18 @@ def test_a_bad_scan_is_one_line_that_names_it_and_leaves_nothing(tmp_path, conte
     (tmp_path / "scans" / "bad.ply").write_bytes(content)
     settings = ImportSettings(units="cm")
     with pytest.raises(AssetError) as error:
-        import_scans(tmp_path / "scans", tmp_path / "pack", settings, jobs=1)
+        write_pack(scan_jobs(tmp_path / "scans", settings), tmp_path / "pack", tmp_path / "kept")
     assert words in str(error.value)
     assert "\n" not in str(error.value)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["scans"]
+    assert not (tmp_path / "pack").exists()
+    assert not [path for path in tmp_path.rglob("*.tmp")]
 
 
 def test_bad_scans_can_be_left_out(tmp_path):
     write_box(tmp_path / "scans", "good")
     (tmp_path / "scans" / "bad.ply").write_bytes(b"nonsense")
-    results = import_scans(tmp_path / "scans", tmp_path / "pack", ImportSettings(units="cm"), jobs=1, skip_bad=True)
+    jobs = scan_jobs(tmp_path / "scans", ImportSettings(units="cm"))
+    results = write_pack(jobs, tmp_path / "pack", tmp_path / "kept", skip_bad=True)
     assert {result.id: result.asset is not None for result in results} == {"good": True, "bad": False}
     assert list(load_pack(tmp_path / "pack").objects) == ["good"]
 
@@ -115,19 +97,3 @@ def test_missing_folder_texture_and_mesh(tmp_path):
     (tmp_path / "thing" / "a.obj").write_text("mtllib a.mtl\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with pytest.raises(AssetError, match=r"lost\.png"):
         load_scan(tmp_path / "thing" / "a.obj")
-
-
-@pytest.mark.slow
-def test_the_can_of_the_reference_material(shared_dir):
-    """A round can whose scan is a thin shell: naively 85 s and 16 hulls."""
-    import time
-
-    scan = load_scan(shared_dir / "scans" / "hope" / "alphabet_soup")
-    body = upright(scan, "y")
-    body.apply_scale(0.01)
-    start = time.process_time()
-    solid = close(body).mesh
-    found = decompose(solid)
-    assert time.process_time() - start < 15
-    assert solid.volume > 0.8 * body.convex_hull.volume  # a solid, not a shell
-    assert found.volume_iou >= 0.9
