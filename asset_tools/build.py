@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from asset_tools.decompose import Decomposition, decompose, volume_iou
+from asset_tools.decompose import Decomposition, decompose, is_hollow, volume_iou
 from asset_tools.grasps import sample_grasps
 from asset_tools.inertia import piece_inertia, principal_inertia
 from asset_tools.physics import Solid
@@ -117,7 +117,7 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
         inertia_wxyz=axes,
         grasp_count=len(grasps),
         no_grasps_because=reason,
-        quality=measure_object(closed, solid, notes, hollow=source.hollow),
+        quality=measure_object(closed, solid, notes, hollow=source.hollow or is_hollow(closed)),
     )
 
 
