@@ -66,8 +66,10 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
     # what the simulator will load: a round thing rests differently on a facet that was rounded away
     hulls = [hull.vertices for hull in read_hulls(folder / HULLS)]
 
-    center = np.asarray(closed.center_mass)
-    inertia, axes = principal_inertia(closed, source.mass)
+    # as the manifest has them, so that whoever measures the pack again finds the same
+    center = np.array(_triple(closed.center_mass))
+    moments, axes = principal_inertia(closed, source.mass)
+    inertia = np.array(_triple(moments))
     solid = Solid(hulls, source.mass, center, inertia, np.array(axes), source.friction)
     rest = resting_poses(
         hulls,
@@ -99,6 +101,7 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
         surface_normals=_light(closed.face_normals[faces]),
     )
     notes.save(folder / ANNOTATIONS)
+    notes = Annotations.load(folder / ANNOTATIONS)
     return ObjectAsset(
         id=source.id,
         name=source.name,

@@ -64,8 +64,8 @@ def teardrop_bottle(size: Size) -> Shape:
 def disc_top_bottle(size: Size) -> Shape:
     """A slender flat bottle with round shoulders and a small low cap."""
     a, b, h = _halves(size)
-    side = [*_foot(a, b, 2.2), (a, b, h * 0.66, 2.2, 0)]
-    shoulder = [(a * 0.98, b * 0.98, h * 0.77, 2.2, 0.018), (a * 0.55, b * 0.7, h * 0.85, 2.1, 0.008)]
+    side = [*_foot(a, b, 3), (a, b, h * 0.66, 3, 0)]
+    shoulder = [(a * 0.98, b * 0.98, h * 0.77, 3, 0.018), (a * 0.55, b * 0.7, h * 0.85, 2.4, 0.008)]
     shoulder += [_neck(0.0100, h * 0.865, 0.002), _neck(0.0095, h * 0.885)]
     cap = [_neck(0.0130, h * 0.885), _neck(0.0125, h, 0.002), _neck(0.0100, h)]
     return _bottle(size, side, shoulder, cap, cuts=[h * 0.857, h * 0.885])
