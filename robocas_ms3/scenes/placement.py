@@ -13,6 +13,7 @@ from robocas_ms3.errors import LayoutError
 
 Array = NDArray[np.float64]
 
+_TIGHT = 0.3  # share of the tries after which objects are packed rather than strewn
 _TRIES_AT_ONCE = 40  # positions of one object before the layout starts over
 
 
@@ -78,7 +79,8 @@ def sample_scattered(
     while tries < max_tries:
         poses = np.zeros((len(placeables), 4, 4))
         # Where it gets tight, objects rather stand than lie: of several poses drawn, the one covering least is taken.
-        draws = 1 + int(4 * tries / max_tries)
+        tightness = tries / max_tries
+        draws = 1 + int(8 * tightness)
         choices = [_choose_pose(rng, placeable, draws) for placeable in placeables]
         areas = [shapely.Polygon(p.footprints[c]).area for p, c in zip(placeables, choices, strict=True)]
         placed: list[shapely.Polygon] = []
@@ -91,9 +93,11 @@ def sample_scattered(
                 yaws, positions, outlines = (values[gaps >= min_gap] for values in (yaws, positions, outlines))
             if not len(yaws):
                 break  # no room for this one: start over
-            placed.append(outlines[0])
-            x, y = positions[0]
-            poses[index] = planar_pose(x, y, region.z, yaws[0]) @ placeable.resting_poses[choice]
+            # and they rather stand in a corner or close to each other than anywhere, so that room is left for the rest
+            best = 0 if tightness < _TIGHT else _snuggest(outlines, placed, region)
+            placed.append(outlines[best])
+            x, y = positions[best]
+            poses[index] = planar_pose(x, y, region.z, yaws[best]) @ placeable.resting_poses[choice]
         if len(placed) == len(placeables):
             return poses
     size = np.subtract(region.max_xy, region.min_xy)
@@ -103,6 +107,15 @@ def sample_scattered(
         found=f"{max_tries} tries used up",
         fix="Lower objects.count or layout.min_gap, enlarge the surface, or raise layout.max_tries.",
     )
+
+
+def _snuggest(outlines: NDArray, placed: list[shapely.Polygon], region: Region) -> int:
+    """The outline that is nearest to its two nearest neighbours, the region's edges being neighbours too."""
+    low, high = shapely.bounds(outlines)[:, :2], shapely.bounds(outlines)[:, 2:]
+    gaps = [low - region.min_xy, np.subtract(region.max_xy, high)]
+    if placed:
+        gaps.append(shapely.distance(outlines[:, None], np.array(placed)[None]))
+    return int(np.sort(np.concatenate(gaps, axis=1), axis=1)[:, :2].sum(axis=1).argmin())
 
 
 def _candidates(rng: np.random.Generator, footprint: Array, region: Region) -> tuple[Array, Array, NDArray]:
