@@ -1,0 +1,80 @@
+"""Seconds that each step of making an asset takes, over builtin objects; prints JSON.
+
+python benchmarks/assets.py --ids banana drink large_elephant
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import tyro
+
+from asset_tools.build import write_visuals
+from asset_tools.builtin.objects import SPECS
+from asset_tools.decompose import decompose
+from asset_tools.grasps import sample_grasps
+from asset_tools.inertia import principal_inertia
+from asset_tools.physics import Solid
+from asset_tools.quality.drops import drop_test
+from asset_tools.quality.holding import hold_test
+from asset_tools.quality.hulls import hull_quality
+from asset_tools.resting import resting_poses
+
+
+@dataclass
+class Benchmark:
+    """Time the steps of making builtin objects."""
+
+    ids: tuple[str, ...] = ()
+    """Which objects. Default: all 46."""
+
+
+def main(cfg: Benchmark) -> None:
+    """Run it."""
+    seconds: dict[str, dict[str, float]] = defaultdict(dict)
+    for spec in SPECS:
+        if cfg.ids and spec.id not in cfg.ids:
+            continue
+
+        @contextmanager
+        def timed(step: str, id_: str = spec.id) -> Iterator[None]:
+            start = time.perf_counter()
+            yield
+            seconds[step][id_] = time.perf_counter() - start
+
+        with timed("shape and texture"):
+            shape, mesh = spec.build()
+        closed = shape.closed()
+        with timed("display meshes"), TemporaryDirectory() as folder:
+            write_visuals(mesh, Path(folder))
+        with timed("hulls"):
+            hulls = list(shape.pieces) or decompose(closed).hulls
+        center = np.asarray(closed.center_mass)
+        inertia, axes = principal_inertia(closed, spec.mass)
+        facts = {"mass": spec.mass, "center_of_mass": center, "inertia": inertia, "inertia_wxyz": np.array(axes)}
+        with timed("resting poses"):
+            rest = resting_poses(hulls, **facts)
+        with timed("grasps"):
+            grasps = sample_grasps(closed, center, np.random.default_rng(0), count=800)
+        solid = Solid(hulls, **facts)
+        with timed("quality"):
+            hull_quality(closed, hulls, hollow=spec.hollow)
+            drop_test(solid, rest.poses)
+            hold_test(solid, grasps.tcp_in_object[:20])
+    steps = {
+        step: {"median_s": round(float(np.median(list(v.values()))), 2), "max_s": round(max(v.values()), 2)}
+        for step, v in seconds.items()
+    }
+    print(json.dumps({"objects": len(seconds["grasps"]), "steps": steps}, indent=2))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Benchmark))
