@@ -24,7 +24,6 @@ from robocas_ms3.assets.hulls import read_hulls, write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, Link, ObjectAsset
 from robocas_ms3.assets.pack import ANNOTATIONS, FINISHES, HULLS, LINKS, VISUALS, sha256
 from robocas_ms3.errors import AssetError
-from robocas_ms3.paths import cache_dir
 
 SURFACE_POINTS = 1024
 GRASPS = 800  # many, since of an object on a table most are from below or blocked by neighbours
@@ -33,7 +32,7 @@ FAST, FAST_ENOUGH = 1000, 1500  # triangles: what `fast` is decimated to, and wh
 FULL, FULL_TEXTURE = 12_000, 1024
 
 
-def build_object(source: ObjectSource, folder: Path, *, hull_cache: Path | None = None) -> ObjectAsset:
+def build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
     """Make an object's files in a folder and say what the manifest says of it. The same source gives the same files.
 
     The frame's origin becomes the centre of the mesh's bounding box.
@@ -42,14 +41,14 @@ def build_object(source: ObjectSource, folder: Path, *, hull_cache: Path | None 
         AssetError: naming the object and what can't be done with it.
     """
     try:
-        return _build_object(source, folder, hull_cache or cache_dir() / "hulls")
+        return _build_object(source, folder)
     except AssetError as error:
         raise AssetError(
             error.what, where=source.id, expected=error.expected, found=error.found, fix=error.fix
         ) from error
 
 
-def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> ObjectAsset:
+def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
     folder.mkdir(parents=True, exist_ok=True)
     shift = -source.mesh.bounds.mean(axis=0)
     mesh, closed = source.mesh.copy(include_cache=True), source.closed.copy()
@@ -58,7 +57,7 @@ def _build_object(source: ObjectSource, folder: Path, hull_cache: Path) -> Objec
     write_visuals(mesh, folder)
 
     if source.pieces is None:
-        parts = decompose(closed, cache=hull_cache)
+        parts = decompose(closed)
     else:
         pieces = [piece + shift for piece in source.pieces]
         parts = Decomposition(pieces, volume_iou(closed, pieces))

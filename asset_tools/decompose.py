@@ -1,10 +1,8 @@
-"""Convex hulls of a closed mesh: one where that is close enough, else CoACD's, merged to few; cached by content."""
+"""Convex hulls of a closed mesh: one where that is close enough, else CoACD's, merged to few."""
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -14,7 +12,6 @@ from scipy.spatial import ConvexHull
 
 from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.errors import AssetError, MissingExtraError
-from robocas_ms3.files import replacing
 
 Array = NDArray[np.float64]
 
@@ -28,7 +25,6 @@ HOLLOW = 0.5  # volume over that of the convex hull, below which a thing is holl
 WANTED_DISTANCE = 0.002  # m, 95th percentile between the surfaces of a hollow thing and of its hulls
 TRIES = 4  # mergers in a row that are too much
 LOST_OVERLAP = 0.02  # that merging the hulls of a hollow thing may cost
-_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -44,12 +40,11 @@ class Decomposition:
     volume_iou: float
 
 
-def decompose(closed: trimesh.Trimesh, *, cache: Path | None = None) -> Decomposition:
+def decompose(closed: trimesh.Trimesh) -> Decomposition:
     """Decompose a closed mesh; the same mesh gives the same hulls.
 
     Args:
         closed: watertight, metres.
-        cache: folder that results are kept in, by the mesh's content; none: no cache.
 
     Raises:
         AssetError: the mesh isn't closed, or CoACD makes nothing of it.
@@ -57,16 +52,25 @@ def decompose(closed: trimesh.Trimesh, *, cache: Path | None = None) -> Decompos
     """
     if not closed.is_watertight or closed.volume <= 0:
         raise AssetError("can't decompose a mesh that isn't closed", expected="watertight, volume > 0")
-    path = None if cache is None else cache / f"{_content_hash(closed)}.npz"
-    if path is not None and path.is_file():
-        with np.load(path, allow_pickle=False) as file:
-            return Decomposition([file[f"hull_{i}"] for i in range(int(file["count"]))], float(file["volume_iou"]))
-    result = _decompose(closed)
-    if path is not None:
-        arrays = {f"hull_{i}": hull for i, hull in enumerate(result.hulls)}
-        with replacing(path) as tmp:
-            np.savez(tmp, count=len(result.hulls), volume_iou=result.volume_iou, **arrays)
-    return result
+    best: Decomposition | None = None
+    if closed.volume / closed.convex_hull.volume >= WANTED_OVERLAP - 0.02:
+        hulls = [few_vertices(np.asarray(closed.vertices))]
+        best = Decomposition(hulls, volume_iou(closed, hulls))
+        if best.volume_iou >= WANTED_OVERLAP:
+            return best
+    hollow, smooth = is_hollow(closed), _smoothed(closed)
+    for threshold in FINE if hollow else THRESHOLDS:
+        hulls = _run_coacd(smooth, threshold)
+        if not hulls:
+            continue
+        found = Decomposition(hulls, volume_iou(closed, hulls))
+        if _good_enough(closed, found, hollow):
+            return _merged(closed, found, hollow)
+        if best is None or found.volume_iou > best.volume_iou + 0.01:
+            best = found
+    if best is None:
+        raise AssetError("the convex decomposition found no hulls", fix="Check the mesh for slivers or zero volume.")
+    return best
 
 
 def volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
@@ -112,28 +116,6 @@ def few_vertices(points: Array, limit: int = MAX_VERTICES) -> Array:
 def is_hollow(closed: trimesh.Trimesh) -> bool:
     """Whether a body is a container, or thin and bent: it fills less than half of its convex hull."""
     return bool(closed.volume < HOLLOW * closed.convex_hull.volume)
-
-
-def _decompose(closed: trimesh.Trimesh) -> Decomposition:
-    best: Decomposition | None = None
-    if closed.volume / closed.convex_hull.volume >= WANTED_OVERLAP - 0.02:
-        hulls = [few_vertices(np.asarray(closed.vertices))]
-        best = Decomposition(hulls, volume_iou(closed, hulls))
-        if best.volume_iou >= WANTED_OVERLAP:
-            return best
-    hollow, smooth = is_hollow(closed), _smoothed(closed)
-    for threshold in FINE if hollow else THRESHOLDS:
-        hulls = _run_coacd(smooth, threshold)
-        if not hulls:
-            continue
-        found = Decomposition(hulls, volume_iou(closed, hulls))
-        if _good_enough(closed, found, hollow):
-            return _merged(closed, found, hollow)
-        if best is None or found.volume_iou > best.volume_iou + 0.01:
-            best = found
-    if best is None:
-        raise AssetError("the convex decomposition found no hulls", fix="Check the mesh for slivers or zero volume.")
-    return best
 
 
 def _good_enough(closed: trimesh.Trimesh, found: Decomposition, hollow: bool, least: float = 0.0) -> bool:
@@ -197,12 +179,3 @@ def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
         seed=0,
     )
     return [few_vertices(np.asarray(vertices, dtype=float)) for vertices, _ in parts if len(vertices) >= 4]
-
-
-def _content_hash(mesh: trimesh.Trimesh) -> str:
-    from importlib.metadata import version
-
-    digest = hashlib.sha256(f"{_VERSION} {version('coacd')} {THRESHOLDS} {FINE} {MAX_HULLS} {SMOOTHED}".encode())
-    digest.update(np.round(np.asarray(mesh.vertices), 7).tobytes())
-    digest.update(np.asarray(mesh.faces, dtype=np.int64).tobytes())
-    return digest.hexdigest()[:32]
