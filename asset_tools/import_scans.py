@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,8 @@ import trimesh
 from asset_tools.build import build_object
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.prepare import prepare
-from asset_tools.scan import FORMATS, Unit, Up, find_mesh, guess_units, longest_side
+from asset_tools.scan import FORMATS, Unit, Up, find_mesh, guess_unit, guess_units, longest_side
+from asset_tools.scan_files import scan_files as resolved_files
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
 from robocas_ms3.errors import AssetError
@@ -22,6 +24,7 @@ from robocas_ms3.errors import AssetError
 # Filled packages weigh about what water does, half-empty ones and boxes of cereal far less.
 DENSITY = 600.0  # kg/m3 of the whole body
 MASS_RANGE = (0.03, 0.8)  # kg
+BESIDE = {".mtl", ".bin", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp"}
 
 
 @dataclass(frozen=True)
@@ -44,29 +47,45 @@ class ImportSettings:
 
 
 def scan_jobs(source: Path, settings: ImportSettings) -> list[Job]:
-    """What is to be made of a folder of scans.
+    """What is to be made of a folder of scans. One that can't be read is a job that fails when it is its turn.
 
     Raises:
-        AssetError: there are none, or their unit can't be guessed.
+        AssetError: there are none, or masses are given for others.
     """
     scans = find_scans(source)
-    units: dict[str, Unit] = dict.fromkeys(scans, settings.units) if settings.units else {}
-    units = units or guess_units({id_: longest_side(path) for id_, path in scans.items()})
     unknown = sorted(set(settings.masses) - set(scans))
     if unknown:
         expected = f"ids among {', '.join(scans)}"
         raise AssetError("masses are given for scans that are not there", expected=expected, found=", ".join(unknown))
-    jobs = []
+    bad: dict[str, AssetError] = {}
+    meshes, sides = {}, {}
     for id_, path in scans.items():
-        job = partial(_make, id_, path, units[id_], settings)
-        mass = settings.masses.get(id_)
-        facts = (id_, units[id_], settings.up, mass, settings.licence, settings.attribution)
-        jobs.append(Job(id_, job, content_hash(*facts, files=scan_files(path))))
+        try:
+            meshes[id_] = find_mesh(path)
+            sides[id_] = longest_side(meshes[id_])
+        except AssetError as error:
+            bad[id_] = error
+    units: dict[str, Unit] = {}
+    for id_, side in sides.items():
+        try:
+            # the others say which unit is usual; one that fits none is bad by itself
+            others = {name: length for name, length in sides.items() if _in_some_unit(length)}
+            units[id_] = settings.units or guess_units({**others, id_: side})[id_]
+        except AssetError as error:
+            bad[id_] = error
+    jobs = []
+    for id_ in scans:
+        if id_ in bad:
+            jobs.append(Job(id_, partial(_fail, bad[id_]), content_hash(str(bad[id_]))))
+            continue
+        job = partial(_make, id_, meshes[id_], units[id_], settings)
+        facts = (id_, units[id_], settings.up, settings.masses.get(id_), settings.licence, settings.attribution)
+        jobs.append(Job(id_, job, content_hash(*facts, files=scan_files(meshes[id_]))))
     return jobs
 
 
 def find_scans(source: Path) -> dict[str, Path]:
-    """Object id -> mesh file, of every subfolder with a mesh and every mesh file in a folder.
+    """Object id -> mesh file or folder: every subfolder and every mesh file in a folder.
 
     Raises:
         AssetError: no such folder, nothing in it, or two scans with one name.
@@ -80,15 +99,17 @@ def find_scans(source: Path) -> dict[str, Path]:
         name = object_id(path.stem if path.is_file() else path.name)
         if name in scans:
             raise AssetError("two scans would get the same id", where=path, found=name, fix="Rename one.")
-        scans[name] = find_mesh(path)
+        scans[name] = path
     if not scans:
         raise AssetError("no scans in this folder", where=source, expected="a mesh file or a subfolder per object")
     return scans
 
 
 def scan_files(mesh: Path) -> list[Path]:
-    """The files that a scan may be made of: the mesh, and what lies beside it that is no other mesh."""
-    beside = (path for path in mesh.parent.rglob("*") if path.is_file() and path.suffix.lower() not in FORMATS)
+    """The files that a scan may be made of: the mesh, materials and pictures below its folder, textures elsewhere."""
+    beside = {path for path in mesh.parent.rglob("*") if path.suffix.lower() in BESIDE and path.is_file()}
+    with suppress(AssetError):  # a missing one: said when the scan is read
+        beside.update(path.resolve() for path in resolved_files(mesh, []).paths.values())
     return [mesh, *sorted(beside)]
 
 
@@ -103,6 +124,18 @@ def estimate_mass(closed: trimesh.Trimesh) -> float:
     return round(min(max(DENSITY * float(closed.volume), MASS_RANGE[0]), MASS_RANGE[1]), 4)
 
 
+def _in_some_unit(side: float) -> bool:
+    try:
+        guess_unit([side])
+    except AssetError:
+        return False
+    return True
+
+
+def _fail(error: AssetError, folder: Path) -> ObjectAsset:
+    raise error
+
+
 def _make(id_: str, path: Path, unit: Unit, settings: ImportSettings, folder: Path) -> ObjectAsset:
     scan = prepare(path, up=settings.up, unit=unit)
     source = ObjectSource(
@@ -111,7 +144,7 @@ def _make(id_: str, path: Path, unit: Unit, settings: ImportSettings, folder: Pa
         category="scan",
         mesh=scan.mesh,
         closed=scan.closed,
-        mass=settings.masses.get(id_) or estimate_mass(scan.closed),
+        mass=settings.masses[id_] if id_ in settings.masses else estimate_mass(scan.closed),
         source="scan",
         licence=settings.licence,
         attribution=settings.attribution,

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
+import os
+import re
 import shutil
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -19,14 +24,21 @@ from scipy.spatial import QhullError
 
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, Asset, FurnitureAsset, ObjectAsset, PackManifest
 from robocas_ms3.assets.pack import MANIFEST, sha256
-from robocas_ms3.errors import AssetError, RobocasError
+from robocas_ms3.errors import AssetError, OutputExistsError, RobocasError
 from robocas_ms3.files import replacing_folder, write_json
 
 MADE_FROM = "made_from.json"  # of a pack: asset id -> hash of what it was made from
 ENTRY = "asset.json"  # what the manifest says of a kept asset; written last
 KEPT_DAYS = 60  # an asset that wasn't asked for in this time is made again
-TOOLS = ("coacd", "trimesh", "manifold3d", "numpy", "scipy", "sapien", "xatlas", "fast-simplification", "embreex")
-NOT_INVOLVED = ("pipeline", "sheet", "studio", "import_")  # files that say what is made or show it, not how it is made
+TOOLS = ("coacd", "trimesh", "manifold3d", "numpy", "scipy", "sapien", "xatlas", "fast-simplification", "embreex") + (
+    "pillow",
+    "scikit-image",
+    "shapely",
+)
+PACK_NAME = r"[a-z0-9_\-]+"
+NOT_INVOLVED = ("pipeline", "sheet", "studio")  # files that say what is made or show it, not how it is made
+
+log = logging.getLogger(__name__)
 
 _ASSET: TypeAdapter[ObjectAsset | FurnitureAsset] = TypeAdapter(Asset)
 
@@ -80,17 +92,17 @@ def make_assets(jobs: Sequence[Job], out: Path, kept: Path, *, processes: int = 
     todo = []
     for job in jobs:
         place = kept / f"{job.id}-{job.content[:20]}"
-        asset = _kept_asset(place)
+        asset = _copied(place, out / job.id)
         if asset is None:
             todo.append((job, place))
         else:
-            place.touch()
-            shutil.copytree(place, out / job.id, ignore=shutil.ignore_patterns(ENTRY))
             yield Made(job.id, asset, reused=True)
     for made, place in _run(todo, processes):
-        if made.asset is not None:
-            shutil.copytree(place, out / made.id, ignore=shutil.ignore_patterns(ENTRY))
-        yield made
+        # another run may be replacing it by the same just now
+        if made.asset is None or _copied(place, out / made.id) or _copied(place, out / made.id):
+            yield made
+        else:
+            yield Made(made.id, None, f"{made.id}: what was made is gone from {place.parent}")
 
 
 def content_hash(*parts: object, files: Iterable[Path] = (), packages: Sequence[str] = ()) -> str:
@@ -127,14 +139,41 @@ def _run(todo: list[tuple[Job, Path]], processes: int) -> Iterator[tuple[Made, P
     if processes <= 1 or len(todo) <= 1:
         yield from ((_make(job, place), place) for job, place in todo)
         return
-    # physics and rendering libraries don't survive a fork
-    with ProcessPoolExecutor(min(processes, len(todo)), mp_context=get_context("spawn")) as pool:
+    left = {job.id: (job, place) for job, place in todo}
+    with _pool(min(processes, len(todo))) as pool:
         futures: dict[Future[Made], Path] = {pool.submit(_make, job, place): place for job, place in todo}
         try:
             for future in as_completed(futures):
-                yield future.result(), futures[future]
+                made = future.result()
+                del left[made.id]
+                yield made, futures[future]
+        except BrokenProcessPool:
+            pass  # one of them took its process down; which one will show
         finally:
             pool.shutdown(cancel_futures=True)
+    for job, place in left.values():
+        with _pool(1) as pool:
+            try:
+                made = pool.submit(_make, job, place).result()
+            except BrokenProcessPool:
+                made = Made(job.id, None, f"{job.id}: the process that made it was killed; is there memory enough?")
+        yield made, place
+
+
+def _pool(processes: int) -> ProcessPoolExecutor:
+    # physics and rendering libraries don't survive a fork
+    return ProcessPoolExecutor(processes, get_context("spawn"), _die_with_parent, (os.getpid(),))
+
+
+def _die_with_parent(parent: int) -> None:
+    """A worker whose parent was killed would go on to the end of the queue."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _make(job: Job, place: Path) -> Made:
@@ -143,20 +182,32 @@ def _make(job: Job, place: Path) -> Made:
         with replacing_folder(place) as tmp:
             asset = job.make(tmp)
             (tmp / ENTRY).write_text(asset.model_dump_json(), encoding="utf-8")
-    except (RobocasError, QhullError) as error:
-        message = "it is flat, or has too few points" if isinstance(error, QhullError) else str(error)
-        return Made(job.id, None, message if job.id in message else f"{job.id}: {message}")
+    except RobocasError as error:
+        return _failed(job, str(error))
+    except QhullError:
+        return _failed(job, "it is flat, or has too few points")
+    except Exception as error:  # whatever a mesh library trips over: one asset fails, with its name, not the run
+        log.exception("%s failed", job.id)
+        return _failed(job, f"{type(error).__name__}: {' '.join(str(error).split())}")
     return Made(job.id, asset, seconds=time.perf_counter() - start)
 
 
-def _kept_asset(place: Path) -> ObjectAsset | FurnitureAsset | None:
-    """What was kept, unless there is nothing or it was damaged since."""
+def _failed(job: Job, message: str) -> Made:
+    return Made(job.id, None, message if job.id in message else f"{job.id}: {message}")
+
+
+def _copied(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset | None:
+    """Copy an asset that was kept; none if there is none, or it was damaged since."""
     try:
         asset = _ASSET.validate_json((place / ENTRY).read_bytes())
-    except (OSError, ValidationError):
-        return None
-    whole = all((place / name).is_file() and sha256(place / name) == found for name, found in asset.files.items())
-    return asset if whole else None
+        place.touch()
+        shutil.copytree(place, folder, ignore=shutil.ignore_patterns(ENTRY))
+        if all(sha256(folder / name) == found for name, found in asset.files.items()):
+            return asset
+    except (OSError, shutil.Error, ValidationError):
+        pass
+    shutil.rmtree(folder, ignore_errors=True)
+    return None
 
 
 def _forget_old(kept: Path) -> None:
@@ -192,6 +243,7 @@ def write_pack(
     Raises:
         AssetError: an asset can't be made, naming it and why; or none can.
     """
+    check_target(folder)
     results = []
     with replacing_folder(folder) as tmp:
         for made in make_assets(jobs, tmp, kept, processes=processes):
@@ -201,18 +253,33 @@ def write_pack(
             on_made(made)
         assets = sorted((made.asset for made in results if made.asset), key=lambda asset: (asset.kind, asset.id))
         if not assets:
-            raise AssetError("none of the assets could be made", where=folder)
+            raise AssetError("none of the assets could be made", where=folder, found=results[0].error)
         manifest = PackManifest(name=folder.name, description=description, assets=assets)
         (tmp / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n", encoding="utf-8")
         if record:
-            write_json(tmp / MADE_FROM, {job.id: job.content for job in jobs})
+            bad = sorted(made.id for made in results if made.asset is None)
+            write_json(tmp / MADE_FROM, {"content": {job.id: job.content for job in jobs}, "left_out": bad})
     return results
 
 
-def up_to_date(jobs: Sequence[Job], folder: Path) -> bool:
-    """Whether a pack was made of just these assets, by this code."""
+def check_target(folder: Path) -> None:
+    """See that a pack may be written to a folder.
+
+    Raises:
+        AssetError: its name is no name for a pack.
+        OutputExistsError: there is something there that is no pack.
+    """
+    if not re.fullmatch(PACK_NAME, folder.name):
+        expected = "small letters, digits, _ and -"
+        raise AssetError("this is no name for a pack", where=folder, expected=expected, found=folder.name)
+    if folder.exists() and not (folder / MANIFEST).is_file() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputExistsError("there is something there that is no asset pack", where=folder, fix="Choose another.")
+
+
+def made_of(jobs: Sequence[Job], folder: Path, *, skip_bad: bool = False) -> bool:
+    """Whether a pack was made of just these assets, by this code; with ``skip_bad``, some may have been left out."""
     try:
         found = json.loads((folder / MADE_FROM).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return found["content"] == {job.id: job.content for job in jobs} and (skip_bad or not found["left_out"])
+    except (OSError, ValueError, TypeError, KeyError):
         return False
-    return found == {job.id: job.content for job in jobs}

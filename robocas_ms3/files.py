@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import json
 import os
@@ -9,7 +10,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -42,22 +43,45 @@ def replacing_folder(path: Path | str) -> Iterator[Path]:
     """Yield a fresh folder beside ``path``; on success it becomes ``path`` (an older one goes), else it is removed."""
     path = Path(path)
     make_folder(path.parent)
-    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
-        if time.time() - leftover.stat().st_mtime > ABANDONED:
-            shutil.rmtree(leftover, ignore_errors=True)
+    _sweep(path)
     tmp = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
     tmp.chmod(0o755)
     try:
         yield tmp
-        if path.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
-            os.replace(path, old / "old")
-            os.replace(tmp, path)
-            shutil.rmtree(old, ignore_errors=True)
-        else:
-            os.replace(tmp, path)
+        _move_in(tmp, path)
     finally:
         shutil.rmtree(tmp, ignore_errors=True)
+
+
+def _move_in(tmp: Path, path: Path, tries: int = 5) -> None:
+    """Rename a folder onto another, which may be there, or come between."""
+    for left in reversed(range(tries)):
+        old = None
+        if path.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
+            with suppress(FileNotFoundError):
+                os.replace(path, old / "old")
+        try:
+            os.replace(tmp, path)
+            return
+        except OSError as error:  # another run has moved its own in
+            if not left or error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+        finally:
+            if old is not None:
+                shutil.rmtree(old, ignore_errors=True)
+
+
+def _sweep(path: Path) -> None:
+    """Mend what killed runs left beside a folder: one killed between its two renames gets the old folder back."""
+    name = glob.escape(path.name)
+    with suppress(OSError):  # another run may be at it too
+        for old in path.parent.glob(f".{name}.*.old/old"):
+            if not path.exists():
+                os.replace(old, path)
+        for leftover in [*path.parent.glob(f".{name}.*.tmp"), *path.parent.glob(f".{name}.*.old")]:
+            if time.time() - leftover.stat().st_mtime > ABANDONED:
+                shutil.rmtree(leftover, ignore_errors=True)
 
 
 def make_folder(path: Path | str) -> Path:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
+
+from robocas_ms3.cli.assets_show import mesh_tools
 
 # `asset_tools.pipeline.Job`, which only loads when a command runs
 Job = Any
@@ -83,6 +83,8 @@ class ImportPartNet(_Making):
 
     models: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of models, each with a mobility.urdf."""
+    template: bool = False
+    """Import nothing; print an annotation to start from, with the joints of the first model."""
     pack: str = "partnet"
     """Name of the new pack."""
     annotations: Path | None = None
@@ -96,14 +98,14 @@ class Build:
     out: Path | None = None
     """Its folder. Default: where the package has it."""
     ids: tuple[str, ...] = ()
-    """Only these assets. Default: all."""
+    """Only these assets; needs --out. Default: all."""
     jobs: int | None = None
     """Processes. Default: one for each CPU core."""
 
 
 def import_scans(command: ImportScans) -> int:
     """Run ``import-scans``."""
-    with _tools():
+    with mesh_tools():
         from asset_tools.import_scans import ImportSettings, scan_jobs
     masses = _masses(command.masses)
     settings = ImportSettings(command.units, command.up, masses, command.licence, command.attribution)
@@ -112,31 +114,38 @@ def import_scans(command: ImportScans) -> int:
 
 def import_graspnet(command: ImportGraspNet) -> int:
     """Run ``import-graspnet``."""
-    with _tools():
+    with mesh_tools():
         from asset_tools.graspnet.importer import graspnet_jobs
     return _make(graspnet_jobs(command.root, command.ids), command, command.pack, "GraspNet objects")
 
 
 def import_ycb(command: ImportYCB) -> int:
     """Run ``import-ycb``."""
-    with _tools():
+    with mesh_tools():
         from asset_tools.import_ycb import ycb_jobs
     return _make(ycb_jobs(command.root, command.ids), command, command.pack, "YCB objects")
 
 
 def import_partnet(command: ImportPartNet) -> int:
     """Run ``import-partnet``."""
-    with _tools():
+    with mesh_tools():
+        from asset_tools.partnet.annotation import template
         from asset_tools.partnet.importer import partnet_jobs
+    if command.template:
+        print(template(command.models[0]))  # noqa: T201
+        return 0
     return _make(partnet_jobs(command.models, command.annotations), command, command.pack, "PartNet models")
 
 
 def build(command: Build) -> int:
     """Run ``build``."""
-    with _tools():
+    with mesh_tools():
         from asset_tools.builtin.build import DESCRIPTION, NAME, builtin_jobs
+    from robocas_ms3.errors import AssetError
     from robocas_ms3.paths import builtin_packs_dir
 
+    if command.ids and command.out is None:
+        raise AssetError("the shipped pack is made as a whole", found="--ids without --out", fix="Pass --out FOLDER.")
     out = command.out or builtin_packs_dir() / NAME
     making = _Making(jobs=command.jobs, overwrite=True)
     return _write(builtin_jobs(command.ids), making, out, DESCRIPTION, record=False)
@@ -145,15 +154,25 @@ def build(command: Build) -> int:
 def _make(jobs: list[Job], command: _Making, name: str, what: str) -> int:
     from rich.console import Console
 
-    from asset_tools.pipeline import up_to_date
-    from robocas_ms3.errors import OutputExistsError
-    from robocas_ms3.paths import data_dir
+    from asset_tools.pipeline import check_target, made_of
+    from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.errors import AssetError, OutputExistsError
+    from robocas_ms3.paths import builtin_packs_dir, data_dir
 
+    console = Console(highlight=False, soft_wrap=True)
+    if (builtin_packs_dir() / name).exists() or Path(name).name != name:
+        raise AssetError("this can't be the name of an imported pack", found=name, fix="Choose another with --pack.")
     out = data_dir() / "packs" / name
-    if out.exists() and up_to_date(jobs, out):
-        Console(highlight=False, soft_wrap=True).print(f"{out} is made of just this already")
-        return 0
-    if out.exists() and not command.overwrite:
+    check_target(out)
+    if made_of(jobs, out, skip_bad=command.skip_bad):
+        try:
+            load_pack(out)
+        except AssetError as error:
+            console.print(f"making it again: {error}")
+        else:
+            console.print(f"{out} is made of just this already")
+            return 0
+    elif out.exists() and not command.overwrite:
         fix = "Pass --overwrite to replace it, or choose another name with --pack."
         raise OutputExistsError("there is such a pack already, made from something else", where=out, fix=fix)
     return _write(jobs, command, out, f"{len(jobs)} {what}")
@@ -201,18 +220,11 @@ def _masses(path: Path | None) -> dict[str, float]:
         return {}
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return {str(key): float(value) for key, value in data.items()}
+        masses = {str(key): float(value) for key, value in data.items()}
+        if not all(0 < mass < 1000 for mass in masses.values()):
+            raise ValueError("masses must be positive")
+        return masses
     except (OSError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
-        raise AssetError("can't read the masses", where=path, expected="a YAML mapping: object id: kg") from error
-
-
-@contextmanager
-def _tools() -> Iterator[None]:
-    """Say which extra to install where the mesh tools are missing."""
-    from robocas_ms3.errors import MissingExtraError
-
-    try:
-        yield
-    except ImportError as error:
-        what, fix = "mesh tools are not installed", "pip install 'robocas-ms3[assets]'"
-        raise MissingExtraError(what, found=error.name or error, fix=fix) from error
+        raise AssetError(
+            "can't read the masses", where=path, expected="a YAML mapping: object id: kg", found=error
+        ) from error

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -131,12 +133,17 @@ def sheet(command: Sheet) -> int:
     """Run ``sheet``."""
     from rich.console import Console
 
-    from asset_tools.sheet import contact_sheet
+    with mesh_tools():
+        from asset_tools.sheet import contact_sheet
     from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.errors import AssetError
 
     pack = load_pack(command.pack)
     out = command.out or Path(f"{pack.name}.png")
-    contact_sheet(pack, out, ids=command.ids or None)
+    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise AssetError("a sheet is a PNG or JPEG", where=out, expected=".png, .jpg", found=out.suffix or "no suffix")
+    with Console(stderr=True).status(f"drawing {len(command.ids) or len(pack.manifest.assets)} assets"):
+        contact_sheet(pack, out, ids=command.ids or None)
     Console(highlight=False, soft_wrap=True).print(f"wrote {out}")
     return 0
 
@@ -154,8 +161,9 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     from rich.progress import track
     from rich.table import Table
 
-    from asset_tools.quality.measure import HEADER, judge, rows
-    from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
+    with mesh_tools():
+        from asset_tools.quality.measure import HEADER, judge, rows
+        from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
     from robocas_ms3.files import write_json
 
     total = len(pack.manifest.assets)
@@ -179,3 +187,15 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     if not violations:
         console.print(f"{pack.name}: {total} assets, as good as packs should be")
     return 1 if violations else 0
+
+
+@contextmanager
+def mesh_tools() -> Iterator[None]:
+    """Say which extra to install where the mesh tools are missing."""
+    from robocas_ms3.errors import MissingExtraError
+
+    try:
+        yield
+    except ImportError as error:
+        what, fix = "mesh tools are not installed", "pip install 'robocas-ms3[assets]'"
+        raise MissingExtraError(what, found=error.name or error, fix=fix) from error

@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from asset_tools.import_scans import ImportSettings, estimate_mass, find_scans, object_id, scan_jobs
-from asset_tools.pipeline import up_to_date, write_pack
+from asset_tools.pipeline import made_of, write_pack
 from asset_tools.scan import load_scan
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.errors import AssetError
@@ -44,8 +44,8 @@ def test_a_folder_of_scans_in_centimetres_becomes_a_pack(tmp_path):
     assert len(box.annotations.resting_poses) == 6
     assert box.asset.grasp_count >= 50
     # nothing to do a second time, until a scan or what is said of it changes
-    assert up_to_date(scan_jobs(tmp_path / "scans", ImportSettings(masses={"small": 0.2})), tmp_path / "mine")
-    assert not up_to_date(scan_jobs(tmp_path / "scans", ImportSettings()), tmp_path / "mine")
+    assert made_of(scan_jobs(tmp_path / "scans", ImportSettings(masses={"small": 0.2})), tmp_path / "mine")
+    assert not made_of(scan_jobs(tmp_path / "scans", ImportSettings()), tmp_path / "mine")
     with pytest.raises(AssetError, match="scans that are not there.*found smal"):
         scan_jobs(tmp_path / "scans", ImportSettings(masses={"smal": 0.2}))
 

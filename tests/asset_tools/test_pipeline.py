@@ -1,17 +1,18 @@
+import contextlib
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
 from functools import partial
+from pathlib import Path
 
 import pytest
 
-from asset_tools.pipeline import Job, content_hash, make_assets, up_to_date, write_pack
+from asset_tools.pipeline import Job, content_hash, made_of, make_assets, write_pack
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality
 from robocas_ms3.assets.pack import HULLS, VISUALS, load_pack, sha256
-from robocas_ms3.errors import AssetError
+from robocas_ms3.errors import AssetError, OutputExistsError
 
 
 def make(id_, folder, log, fail="", seconds=0.0):
@@ -66,13 +67,13 @@ def test_a_kept_asset_that_was_damaged_is_made_again(tmp_path):
     load_pack(tmp_path / "pack")
 
 
-def test_up_to_date_knows_what_a_pack_was_made_from(tmp_path):
+def test_a_pack_knows_what_a_pack_was_made_from(tmp_path):
     log = tmp_path / "log"
-    assert not up_to_date(jobs(log, a="1" * 64), tmp_path / "pack")
+    assert not made_of(jobs(log, a="1" * 64), tmp_path / "pack")
     write_pack(jobs(log, a="1" * 64), tmp_path / "pack", tmp_path / "kept")
-    assert up_to_date(jobs(log, a="1" * 64), tmp_path / "pack")
-    assert not up_to_date(jobs(log, a="2" * 64), tmp_path / "pack")
-    assert not up_to_date(jobs(log, a="1" * 64, b="1" * 64), tmp_path / "pack")
+    assert made_of(jobs(log, a="1" * 64), tmp_path / "pack")
+    assert not made_of(jobs(log, a="2" * 64), tmp_path / "pack")
+    assert not made_of(jobs(log, a="1" * 64, b="1" * 64), tmp_path / "pack")
 
 
 def test_a_failure_names_the_asset_leaves_no_pack_and_loses_nothing(tmp_path):
@@ -86,6 +87,7 @@ def test_a_failure_names_the_asset_leaves_no_pack_and_loses_nothing(tmp_path):
     results = write_pack(todo, tmp_path / "pack", kept, skip_bad=True)
     assert [result.id for result in results if result.asset is None] == ["bad"]
     assert made_in(log) == ["a", "bad", "bad"]
+    assert made_of(todo, tmp_path / "pack", skip_bad=True) and not made_of(todo, tmp_path / "pack")
     with pytest.raises(AssetError, match="none of the assets could be made"):
         write_pack([bad], tmp_path / "none", kept, skip_bad=True)
 
@@ -111,6 +113,35 @@ def test_assets_not_asked_for_in_months_are_forgotten(tmp_path):
     assert not place.exists()
 
 
+def trip(folder):
+    raise IndexError("list index out of range")
+
+
+def die(folder):
+    os._exit(9)
+
+
+def test_whatever_goes_wrong_is_said_of_the_asset_and_costs_no_other(tmp_path):
+    log = tmp_path / "log"
+    todo = [Job("odd", trip, "7" * 64), Job("deadly", die, "8" * 64), *jobs(log, a="1" * 64, b="2" * 64)]
+    results = write_pack(todo, tmp_path / "pack", tmp_path / "kept", skip_bad=True, processes=2)
+    errors = {made.id: made.error for made in results}
+    assert errors["odd"] == "odd: IndexError: list index out of range"
+    assert errors["deadly"].startswith("deadly: the process that made it was killed")
+    assert load_pack(tmp_path / "pack").furniture.keys() == {"a", "b"}
+
+
+def test_what_is_no_pack_is_not_replaced(tmp_path):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter").write_text("1")
+    todo = jobs(tmp_path / "log", a="1" * 64)
+    with pytest.raises(OutputExistsError, match="no asset pack"):
+        write_pack(todo, tmp_path / "thesis", tmp_path / "kept")
+    with pytest.raises(AssetError, match="no name for a pack"):
+        write_pack(todo, tmp_path / "My.Pack", tmp_path / "kept")
+    assert made_in(tmp_path / "log") == []
+
+
 SCRIPT = """
 import sys
 from functools import partial
@@ -126,20 +157,33 @@ if __name__ == "__main__":
 """
 
 
+def workers_of(script):
+    """Processes of the session that the script began, by /proc."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):
+            found += [path] if f"ROBOCAS_TEST_RUN={script}".encode() in path.read_bytes() else []
+    return found
+
+
 def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
     script = tmp_path / "run.py"
     script.write_text(SCRIPT.format(tests=os.path.dirname(__file__), root=str(tmp_path)))
-    quick = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}
+    quick = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1", "ROBOCAS_TEST_RUN": str(script)}
     run = subprocess.Popen([sys.executable, script], start_new_session=True, env=quick)
     while len(list((tmp_path / "kept").glob("asset_*/asset.json"))) < 3:
         time.sleep(0.02)
         assert run.poll() is None
-    os.killpg(run.pid, signal.SIGKILL)
+    run.kill()  # the parent alone: its workers must not go on without it
     run.wait()
+    deadline = time.monotonic() + 5
+    while workers_of(script) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not workers_of(script)
     assert not (tmp_path / "pack").exists()
     finished = len(list((tmp_path / "kept").glob("asset_*/asset.json")))
     before = len(made_in(tmp_path / "log"))
     assert subprocess.run([sys.executable, script], check=False, env=quick).returncode == 0
     assert len(load_pack(tmp_path / "pack").furniture) == 8
     assert len(made_in(tmp_path / "log")) - before == 8 - finished
-    assert len(json.loads((tmp_path / "pack" / "made_from.json").read_text())) == 8
+    assert len(json.loads((tmp_path / "pack" / "made_from.json").read_text())["content"]) == 8
