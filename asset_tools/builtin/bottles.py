@@ -11,7 +11,16 @@ import numpy as np
 from scipy.optimize import root_scalar
 
 from asset_tools.builtin.mesh import Patch, Shape, Size, fitted
-from asset_tools.builtin.surfaces import Section, chained_pieces, loft, oval_rings, round_rings, stacked_pieces, sweep
+from asset_tools.builtin.surfaces import (
+    Section,
+    chained_pieces,
+    loft,
+    oval_rings,
+    prism_piece,
+    round_rings,
+    stacked_pieces,
+    sweep,
+)
 
 Ring = tuple[float, float, float, float, float]
 
@@ -116,7 +125,14 @@ def drink_bottle(size: Size) -> Shape:
     side += [_neck(r, h * 0.62)]
     shoulder = [_neck(r, h * 0.72, 0.04), _neck(0.0135, h * 0.88, 0.01), _neck(0.0135, h * 0.905)]
     cap = [_neck(0.0155, h * 0.905), _neck(0.0155, h, 0.0015), _neck(0.012, h)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.22, h * 0.87, h * 0.905])
+    # straight through the waist, which is 2 mm deep; lying, it rests on one facet
+    pieces = [
+        prism_piece([(r * 0.86, 0), (r, 0.005), (r, h * 0.65)]),
+        prism_piece([(r, h * 0.65), (r * 0.9, h * 0.73), (0.0135, h * 0.87)]),
+        prism_piece([(0.0135, h * 0.87), (0.0135, h * 0.905)]),
+        prism_piece([(0.0155, h * 0.905), (0.0155, h)]),
+    ]
+    return _bottle(size, side, shoulder, cap, pieces=pieces)
 
 
 def pump_bottle(size: Size, *, exponent: float = 3.0, body: float = 0.66, reach: float = 1.0) -> Shape:
@@ -204,13 +220,15 @@ def _bottle(
     shoulder: Sequence[Ring],
     cap: Sequence[Ring],
     *,
-    cuts: Sequence[float],
+    cuts: Sequence[float] = (),
+    pieces: list[np.ndarray] | None = None,
     spout: list[Patch] | None = None,
 ) -> Shape:
     """Body, shoulder and cap, each beginning where the one before ends; a flat lid, unless the cap closes itself.
 
     Args:
-        size: see ``shapes``. side, shoulder, cap: rings, upwards. cuts: see ``stacked_pieces``.
+        size: see ``shapes``. side, shoulder, cap: rings, upwards.
+        cuts: see ``stacked_pieces``. pieces: convex ones, instead of those cut there.
         spout: a part of its own.
     """
     a, b, _, n, _ = side[0]
@@ -226,7 +244,7 @@ def _bottle(
         lid = [cap[-1], (0, 0, *cap[-1][2:])]
         sections.append(Section("lid", oval_rings(lid), flat=True, detail=0.6))
     part = loft(sections)
-    pieces = stacked_pieces(part, cuts)
+    pieces = stacked_pieces(part, cuts) if pieces is None else pieces
     if spout is None:
         return fitted([part], size, pieces=pieces)
     return fitted([part, spout], size, pieces=pieces + chained_pieces(spout[0], 2))

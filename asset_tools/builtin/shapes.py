@@ -14,6 +14,7 @@ from asset_tools.builtin.surfaces import (
     chained_pieces,
     loft,
     oval_rings,
+    prism_piece,
     ring_points,
     round_rings,
     rounded_box,
@@ -68,7 +69,8 @@ def can(size: Size, *, exponent: float = 2.0) -> Shape:
         ),
     ]
     part = loft(sections, segments=segments)
-    return fitted([part], size, pieces=stacked_pieces(part))
+    pieces = [prism_piece([(a, 0), (a, h)])] if exponent == 2.0 else stacked_pieces(part)
+    return fitted([part], size, pieces=pieces)
 
 
 def canister(size: Size) -> Shape:
@@ -93,7 +95,7 @@ def canister(size: Size) -> Shape:
         ),
     ]
     part = loft(sections)
-    return fitted([part], size, pieces=stacked_pieces(part, [h - lid]))
+    return fitted([part], size, pieces=[prism_piece([(body, 0), (body, h - lid)]), prism_piece([(r, h - lid), (r, h)])])
 
 
 def jar(size: Size) -> Shape:
@@ -116,7 +118,9 @@ def jar(size: Size) -> Shape:
         ),
     ]
     part = loft(sections)
-    return fitted([part], size, pieces=stacked_pieces(part, [h - lid]))
+    low = [(r * 0.88, 0), (r, 0.005), (r, h - lid - 0.003)]
+    high = [(neck, h - lid - 0.003), (neck, h)]
+    return fitted([part], size, pieces=[prism_piece(low), prism_piece(high)])
 
 
 def mug(size: Size, *, wall: float = 0.004) -> Shape:
