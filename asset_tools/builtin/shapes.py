@@ -69,7 +69,7 @@ def can(size: Size, *, exponent: float = 2.0) -> Shape:
         ),
     ]
     part = loft(sections, segments=segments)
-    pieces = [prism_piece([(a, 0), (a, h)])] if exponent == 2.0 else stacked_pieces(part)
+    pieces = [prism_piece([(a, 0), (a, h)], 20)] if exponent == 2.0 else stacked_pieces(part)
     return fitted([part], size, pieces=pieces)
 
 
