@@ -17,24 +17,62 @@ frames of all links of a piece of furniture coincide with its own when every joi
 
 from __future__ import annotations
 
+from pathlib import PurePosixPath
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 SCHEMA_VERSION = 2
 
+# What the fixed body of articulated furniture is called in the simulator, and the joint that fixes it
+BODY = "body"
+
+
+def _unit(wxyz: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if abs(sum(x * x for x in wxyz) ** 0.5 - 1) > 1e-3:
+        raise ValueError(f"{wxyz} is no unit quaternion")
+    return wxyz
+
+
+def _of_a_body(moments: tuple[float, float, float]) -> tuple[float, float, float]:
+    a, b, c = sorted(moments)
+    if a + b < 0.99 * c:  # within what rounding does to a flat body, whose moments just add up
+        raise ValueError(f"no body has the moments of inertia {moments}: the largest is more than the others' sum")
+    return moments
+
+
+def _inside(path: str) -> str:
+    parts = PurePosixPath(path)
+    if parts.is_absolute() or ".." in parts.parts or str(parts) != path:
+        raise ValueError(f"{path!r} is no plain path inside the asset's folder")
+    return path
+
+
+def _whole(version: object) -> object:
+    if type(version) is not int:  # a literal 2 lets 2.0 pass
+        raise ValueError("a whole number")
+    return version
+
+
 Vec3 = tuple[float, float, float]
-Quaternion = Annotated[tuple[float, float, float, float], Field(description="wxyz")]
+Quaternion = Annotated[
+    tuple[float, float, float, float], Field(description="wxyz, of length 1 within 1e-3"), AfterValidator(_unit)
+]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Moments = Annotated[
+    tuple[Positive, Positive, Positive], Field(description="principal moments, kg m2"), AfterValidator(_of_a_body)
+]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
+FilePath = Annotated[str, Field(pattern=r"^[a-z0-9_./-]+$"), AfterValidator(_inside)]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class StrictModel(BaseModel):
-    """Unknown keys are errors; nothing changes after loading."""
+    """Unknown keys and numbers that aren't finite are errors; nothing changes after loading."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Surface(StrictModel):
@@ -45,6 +83,12 @@ class Surface(StrictModel):
     max_xy: tuple[float, float]
     z: float
     headroom: Positive | None = Field(default=None, description="free height above it, m; none: open to the sky")
+
+    @model_validator(mode="after")
+    def _sound(self) -> Surface:
+        if not all(low < high for low, high in zip(self.min_xy, self.max_xy, strict=True)):
+            raise ValueError(f"min_xy {self.min_xy} must lie below max_xy {self.max_xy}")
+        return self
 
 
 class InnerBox(StrictModel):
@@ -82,7 +126,7 @@ class Link(StrictModel):
     joint: Joint
     mass: Positive
     center_of_mass: Vec3
-    inertia: tuple[Positive, Positive, Positive] = Field(description="principal moments, kg m2")
+    inertia: Moments
     inertia_wxyz: Quaternion = (1, 0, 0, 0)
 
 
@@ -130,10 +174,12 @@ class AssetBase(StrictModel):
     licence: str
     attribution: str
     units: Literal["m"] = "m"
-    extents: Vec3 = Field(description="size of the visual mesh's bounding box, m")
+    extents: tuple[NotNegative, NotNegative, NotNegative] = Field(
+        description="size of the visual mesh's bounding box, m"
+    )
     friction: Positive = 0.99
     repairs: tuple[str, ...] = Field(default=(), description="what the importer had to mend in the source mesh")
-    files: dict[str, str] = Field(description="path inside the asset's folder -> sha256")
+    files: dict[FilePath, Sha256] = Field(description="path inside the asset's folder -> sha256; there are no others")
 
 
 class ObjectAsset(AssetBase):
@@ -145,7 +191,7 @@ class ObjectAsset(AssetBase):
     )
     mass: Positive = Field(description="kg")
     center_of_mass: Vec3 = Field(description="m, in the asset's frame")
-    inertia: tuple[Positive, Positive, Positive] = Field(description="principal moments, kg m2")
+    inertia: Moments
     inertia_wxyz: Quaternion = (1, 0, 0, 0)
     grasp_count: int = Field(ge=0)
     no_grasps_because: str = Field(default="", description="why there are fewer grasps than usual, if so")
@@ -158,23 +204,32 @@ class FurnitureAsset(AssetBase):
     kind: Literal["furniture"] = "furniture"
     mass: Positive | None = Field(default=None, description="kg; none: its body can't move")
     center_of_mass: Vec3 = (0, 0, 0)
-    inertia: tuple[Positive, Positive, Positive] | None = None
+    inertia: Moments | None = Field(default=None, description="given if the mass is")
     inertia_wxyz: Quaternion = (1, 0, 0, 0)
     origin_height: float = Field(default=0.0, description="height of the frame's origin above the lowest point, m")
     surfaces: dict[Name, Surface] = {}
     inner: InnerBox | None = Field(default=None, description="containers only")
     links: tuple[Link, ...] = Field(default=(), description="moving parts, parents first")
     handles: dict[Name, Handle] = {}
-    finishes: dict[Name, tuple[Name, ...]] = Field(default={}, description="part -> its finishes, the default first")
+    finishes: dict[Name, Annotated[tuple[Name, ...], Field(min_length=1)]] = Field(
+        default={}, description="part -> its finishes, the default first"
+    )
     quality: FurnitureQuality
 
     @model_validator(mode="after")
-    def _parts_exist(self) -> FurnitureAsset:
-        known = {""}
+    def _sound(self) -> FurnitureAsset:
+        if self.mass is not None and self.inertia is None:
+            raise ValueError("a body with a mass needs its inertia too")
+        known, joints = {""}, {BODY}
         for link in self.links:
             if link.parent not in known:
                 raise ValueError(f"link {link.name!r} hangs on {link.parent!r}, which does not come before it")
+            if link.name in {BODY, *known}:
+                raise ValueError(f"two links are called {link.name!r}; {BODY!r} is the fixed one")
+            if link.joint.name in joints:
+                raise ValueError(f"two joints are called {link.joint.name!r}; {BODY!r} is the fixed one")
             known.add(link.name)
+            joints.add(link.joint.name)
         named = {name: part.link for name, part in [*self.surfaces.items(), *self.handles.items()]}
         for name, link_name in named.items():
             if link_name not in known:
@@ -188,7 +243,8 @@ Asset = Annotated[ObjectAsset | FurnitureAsset, Field(discriminator="kind")]
 class PackManifest(StrictModel):
     """``manifest.json``."""
 
-    schema_version: Literal[2] = SCHEMA_VERSION
+    # the default is for writing; `load_pack` insists that the file says it
+    schema_version: Annotated[Literal[2], BeforeValidator(_whole)] = SCHEMA_VERSION
     name: str = Field(pattern=r"^[a-z0-9_\-]+$")
     description: str = ""
     assets: list[Asset]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -169,7 +170,7 @@ def load_pack(name_or_path: str | Path) -> Pack:
         name_or_path: name of a shipped or imported pack, or the folder of one.
 
     Raises:
-        AssetError: there is no such pack, or a file of it is missing, changed or damaged.
+        AssetError: there is no such pack, or a file of it is missing, changed, damaged or not listed.
     """
     folder = pack_folders().get(str(name_or_path))
     if folder is None:
@@ -192,12 +193,19 @@ def load_pack(name_or_path: str | Path) -> Pack:
 
 
 def verify(pack: Pack) -> None:
-    """Check that every file the manifest lists is there and unchanged. A file is read once per process and change.
+    """Check that the files of all assets are those the manifest lists. A file is read once per process and change.
 
     Raises:
-        AssetError: naming the file, and whether it is missing, cut short or changed.
+        AssetError: naming the file, and whether it is missing, cut short, changed or not listed.
     """
     for asset in pack.manifest.assets:
+        for name in _files(str(pack.root / asset.id)):
+            if name not in asset.files:
+                raise AssetError(
+                    "the manifest of the asset pack doesn't list this file",
+                    where=pack.root / asset.id / name,
+                    fix="Remove it, or make the pack again.",
+                )
         for name, expected in asset.files.items():
             path = pack.root / asset.id / name
             fix = f"Restore the file, or make the pack {pack.name!r} again."
@@ -229,11 +237,27 @@ def sha256(path: Path) -> str:
     return _hashes[key]
 
 
+def _files(folder: str, prefix: str = "") -> Iterator[str]:
+    """Paths of the files in a folder, relative to it; not of hidden ones, which systems and editors leave."""
+    if not os.path.isdir(folder):
+        return
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name.startswith("."):
+                continue
+            if entry.is_dir(follow_symlinks=False):
+                yield from _files(entry.path, f"{prefix}{entry.name}/")
+            else:
+                yield prefix + entry.name
+
+
 def _read(folder: Path, path: Path) -> Pack:
     try:
-        manifest = PackManifest.model_validate_json(path.read_bytes())
+        manifest = PackManifest.model_validate_json(path.read_bytes(), strict=True)
     except ValidationError as error:
         raise _damaged(path, error) from error
+    if "schema_version" not in manifest.model_fields_set:
+        raise _other_format(path, "none")
     objects: dict[str, LoadedObject] = {}
     furniture: dict[str, LoadedFurniture] = {}
     for asset in manifest.assets:
@@ -264,13 +288,15 @@ def required_files(asset: ObjectAsset | FurnitureAsset) -> list[str]:
 def _damaged(path: Path, error: ValidationError) -> AssetError:
     for entry in error.errors():
         if entry["loc"] == ("schema_version",):
-            fix = "Make the pack again: run the import or build that made it."
-            expected = f"pack format {SCHEMA_VERSION}"
-            return AssetError(
-                "this pack has another format", where=path, expected=expected, found=entry["input"], fix=fix
-            )
+            return _other_format(path, repr(entry["input"])[:40])
     first = error.errors()[0]
-    found = f"at {'.'.join(map(str, first['loc'])) or 'the top'}"
-    return AssetError(
-        "the manifest is damaged", where=path, expected=first["msg"], found=found, fix="Make the pack again."
-    )
+    place = ".".join(map(str, first["loc"])) or "the top"
+    # keys and values of the file may hold line breaks
+    found, expected = (" ".join(text.split()) for text in (f"at {place}", first["msg"].removeprefix("Value error, ")))
+    return AssetError("the manifest is damaged", where=path, expected=expected, found=found, fix="Make the pack again.")
+
+
+def _other_format(path: Path, found: str) -> AssetError:
+    fix = "Make the pack again: run the import or build that made it."
+    expected = f"pack format {SCHEMA_VERSION}"
+    return AssetError("this pack has another format", where=path, expected=expected, found=found, fix=fix)

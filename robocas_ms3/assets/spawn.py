@@ -11,7 +11,7 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Articulation
 
 from robocas_ms3.assets.kinematics import joint_frame
-from robocas_ms3.assets.manifest import FurnitureAsset, Link, ObjectAsset
+from robocas_ms3.assets.manifest import BODY, FurnitureAsset, Link, ObjectAsset
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Part, VisualLevel
 from robocas_ms3.errors import AssetError
 
@@ -70,7 +70,6 @@ def spawn_articulation(
     name: str,
     pose: sapien.Pose,
     level: VisualLevel = "fast",
-    scene_idxs: Sequence[int] | None = None,
 ) -> Articulation:
     """Build furniture with moving parts, its body fixed in the world, its joints at 0. Arguments as in `spawn`.
 
@@ -80,8 +79,8 @@ def spawn_articulation(
     builder: Any = scene.create_articulation_builder()
     facts = asset.asset
     root = builder.create_link_builder()
-    root.set_name("body")
-    root.set_joint_name("body")
+    root.set_name(BODY)
+    root.set_joint_name(BODY)
     root.set_joint_properties("fixed", [], sapien.Pose(), sapien.Pose())
     _add_shapes(root, asset, facts.friction, level, render=scene.can_render())
     made = {"": root}
@@ -96,13 +95,11 @@ def spawn_articulation(
         _set_mass(part, link)
         made[link.name] = part
     builder.initial_pose = pose
-    if scene_idxs is not None:
-        builder.set_scene_idxs(list(scene_idxs))
     articulation = builder.build(name)
     frictions = {link.joint.name: link.joint.friction for link in facts.links}
     for joint in articulation.active_joints:  # the builder drops what it is told of friction
         joint.set_friction(frictions[joint.name])
-    parts: dict[str, Part] = {"body": asset, **asset.links}
+    parts: dict[str, Part] = {BODY: asset, **asset.links}
     for link in articulation.links:
         for body in link._bodies:
             _check_shapes(body, parts[link.name])

@@ -15,7 +15,6 @@ from robocas_ms3.assets.manifest import (
     ObjectAsset,
     ObjectQuality,
     PackManifest,
-    Surface,
 )
 from robocas_ms3.assets.pack import available_packs, load_pack, sha256
 from robocas_ms3.errors import AssetError
@@ -132,10 +131,62 @@ def test_a_damaged_manifest_says_where(box_pack):
         load_pack(box_pack)
 
 
-def test_a_pack_of_another_format_says_so(box_pack):
+@pytest.mark.parametrize(
+    ("instead", "found"),
+    [('"schema_version":1,', "1"), ('"schema_version":2.0,', "2.0"), ('"schema_version":"2",', "'2'"), ("", "none")],
+)
+def test_a_pack_of_another_format_says_so(box_pack, instead, found):
     path = box_pack / "manifest.json"
-    path.write_text(path.read_text().replace('"schema_version":2', '"schema_version":1'))
-    with pytest.raises(AssetError, match=r"another format \(expected pack format 2, found 1\).*Make the pack again"):
+    path.write_text(path.read_text().replace('"schema_version":2,', instead))
+    message = rf"another format \(expected pack format 2, found {found}\).*Make the pack again"
+    with pytest.raises(AssetError, match=message):
+        load_pack(box_pack)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mass": "0.1"}, r"valid number, found at assets\.0\.object\.mass"),
+        ({"mass": True}, r"valid number, found at assets\.0\.object\.mass"),
+        ({"friction": float("inf")}, r"finite number, found at .*friction"),
+        ({"center_of_mass": [0, 0, float("nan")]}, r"finite number, found at .*center_of_mass\.2"),
+        ({"grasp_count": 1.0}, r"valid integer, found at .*grasp_count"),
+        ({"extents": [0.1, -0.06, 0.04]}, r"greater than or equal to 0, found at .*extents\.1"),
+        ({"inertia_wxyz": [1, 0.1, 0, 0]}, "no unit quaternion"),
+        ({"inertia": [1e-5, 1e-5, 2.1e-5]}, "no body has the moments of inertia"),
+        ({"files": {"hulls.obj": "g" * 64}}, r"match pattern .*files\.hulls\.obj"),
+        ({"files": {"hulls.obj": "0" * 63}}, r"match pattern .*files\.hulls\.obj"),
+        ({"files": {"hulls.obj\n": "0" * 64}}, r"match pattern .*files\.hulls\.obj"),
+        ({"files": {"Hulls.obj": "0" * 64}}, r"match pattern .*files\.Hulls\.obj"),
+        ({"files": {"../hulls.obj": "0" * 64}}, "no plain path inside the asset's folder"),
+        ({"files": {"links/../hulls.obj": "0" * 64}}, "no plain path inside"),
+        ({"files": {"/hulls.obj": "0" * 64}}, "no plain path inside"),
+        ({"files": {"./hulls.obj": "0" * 64}}, "no plain path inside"),
+    ],
+)
+def test_manifests_that_make_no_sense(box_pack, changes, message):
+    path = box_pack / "manifest.json"
+    data = json.loads(path.read_text())
+    data["assets"][0].update(changes)
+    path.write_text(json.dumps(data))
+    with pytest.raises(AssetError, match=f"the manifest is damaged .*{message}") as caught:
+        load_pack(box_pack)
+    assert "\n" not in str(caught.value)
+
+
+def test_moments_of_inertia_may_be_rounded():
+    body = {"name": "lid", "joint": JOINT, "mass": 1, "center_of_mass": (0, 0, 0)}
+    Link.model_validate(body | {"inertia": (0.5, 0.497, 1)})
+    with pytest.raises(ValidationError, match="no body has"):
+        Link.model_validate(body | {"inertia": (0.5, 0.487, 1)})
+
+
+def test_a_file_that_is_not_listed(box_pack):
+    (box_pack / "box" / ".DS_Store").write_text("hidden ones don't count")
+    load_pack(box_pack)
+    (box_pack / "box" / "links").mkdir()
+    (box_pack / "box" / "links" / "more.glb").write_text("glTF")
+    with pytest.raises(AssetError, match=r"box/links/more\.glb: .*doesn't list this file"):
         load_pack(box_pack)
 
 
@@ -156,24 +207,50 @@ def test_joints_that_make_no_sense(changes, message):
         Joint(**JOINT | changes)
 
 
-def test_parts_that_are_not_there():
-    facts = {
-        "id": "cabinet",
-        "name": "cabinet",
-        "category": "cabinet",
-        "source": "test",
-        "licence": "MIT",
-        "attribution": "none",
-        "extents": (1, 1, 1),
-        "files": {},
-        "quality": FurnitureQuality(hull_count=1, hull_vertices=8),
-    }
-    surface = Surface(link="drawer", min_xy=(0, 0), max_xy=(1, 1), z=0)
-    with pytest.raises(ValidationError, match="'top' belongs to link 'drawer', which is not there"):
-        FurnitureAsset(**facts, surfaces={"top": surface})
-    link = Link(name="knob", parent="door", joint=Joint(**JOINT), mass=1, center_of_mass=(0, 0, 0), inertia=(1, 1, 1))
-    with pytest.raises(ValidationError, match="hangs on 'door'"):
-        FurnitureAsset(**facts, links=(link,))
+CABINET = {
+    "id": "cabinet",
+    "name": "cabinet",
+    "category": "cabinet",
+    "source": "test",
+    "licence": "MIT",
+    "attribution": "none",
+    "extents": (1, 1, 1),
+    "files": {},
+    "quality": FurnitureQuality(hull_count=1, hull_vertices=8),
+}
+SURFACE = {"link": "", "min_xy": (0, 0), "max_xy": (1, 1), "z": 0}
+
+
+def link(name="door", joint="hinge", parent=""):
+    facts = {"mass": 1, "center_of_mass": (0, 0, 0), "inertia": (1, 1, 1)}
+    return {"name": name, "parent": parent, "joint": JOINT | {"name": joint}} | facts
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"surfaces": {"top": SURFACE | {"link": "drawer"}}}, "'top' belongs to link 'drawer', which is not there"),
+        ({"surfaces": {"top": SURFACE | {"max_xy": (1, 0)}}}, "must lie below max_xy"),
+        ({"links": (link(parent="box"),)}, "hangs on 'box'"),
+        ({"links": (link(), link(joint="slide"))}, "two links are called 'door'"),
+        ({"links": (link(), link(name="drawer"))}, "two joints are called 'hinge'"),
+        ({"links": (link(name="body"),)}, "'body' is the fixed one"),
+        ({"links": (link(joint="body"),)}, "'body' is the fixed one"),
+        ({"finishes": {"wall": ()}}, "at least 1 item"),
+        ({"mass": 2.0}, "needs its inertia too"),
+        (
+            {
+                "links": (link(),),
+                "handles": {"a": {"link": "door", "position": (0, 0, 0), "wxyz": (0.7, 0, 0, 0.7), "width": 0.02}},
+            },
+            "no unit quaternion",
+        ),
+    ],
+)
+def test_furniture_that_makes_no_sense(changes, message):
+    FurnitureAsset.model_validate(CABINET | {"surfaces": {"top": SURFACE}, "links": (link(),)})
+    with pytest.raises(ValidationError, match=message):
+        FurnitureAsset.model_validate(CABINET | changes)
 
 
 def test_a_footprint_has_each_corner_once():
