@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from asset_tools.quality.overlap import Convex, convex, overlap
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Joint
 
@@ -18,22 +17,9 @@ Array = np.ndarray
 GAP = 0.0015  # m between a moving part and the rest
 DEEPEST = 0.03  # m that may be cut off
 LEAST = 0.2  # share of a piece that must be left
+PASSES = 3  # what one cut left too deep for the next may be shallow after it
 # Shares of a hinge's range; what is passed between two of them is taken for the hull of both
 STOPS = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-
-
-@dataclass(frozen=True)
-class _Convex:
-    points: Array  # (V, 3) corners
-    normals: Array  # (N, 3) of its faces, outward
-
-    @cached_property
-    def low(self) -> Array:
-        return self.points.min(axis=0)
-
-    @cached_property
-    def high(self) -> Array:
-        return self.points.max(axis=0)
 
 
 def trimmed(pieces: Sequence[Array], others: Sequence[Array], joint: Joint) -> list[Array]:
@@ -50,15 +36,19 @@ def trimmed(pieces: Sequence[Array], others: Sequence[Array], joint: Joint) -> l
     passed = [_passed(other, joint, span) for span in pairwise(stops) for other in others]
     found = []
     for piece in pieces:
-        convex, volume = _convex(piece), ConvexHull(piece).volume
-        for other in passed:
-            depth, plane = _overlap(convex, other)
-            if plane is None or depth > DEEPEST:
-                continue
-            cut = _below(convex.points, plane)
-            if cut is not None and ConvexHull(cut).volume >= LEAST * volume:
-                convex = _convex(cut)
-        found.append(convex.points)
+        body, volume = convex(piece), ConvexHull(piece).volume
+        for _ in range(PASSES):
+            before = body
+            for other in passed:
+                depth, plane = overlap(body, other, GAP)
+                if plane is None or depth > DEEPEST:
+                    continue
+                cut = _below(body.points, plane)
+                if cut is not None and ConvexHull(cut).volume >= LEAST * volume:
+                    body = convex(cut)
+            if body is before:
+                break
+        found.append(body.points)
     return found
 
 
@@ -72,40 +62,18 @@ def overlaps(pieces: Sequence[Array], others: Sequence[Array], joint: Joint, sha
         share: of its range at which it stands.
     """
     rest = [_passed(other, joint, (share, share)) for other in others]
-    depths = [[_overlap(_convex(piece), other)[0] - GAP for other in rest] for piece in pieces]
-    return np.maximum(np.array(depths).reshape(len(pieces), len(rest)), 0.0)
+    depths = [[overlap(convex(piece), other)[0] for other in rest] for piece in pieces]
+    return np.array(depths).reshape(len(pieces), len(rest))
 
 
-def _convex(points: Array) -> _Convex:
-    hull = ConvexHull(points)
-    corners = points[hull.vertices]
-    return _Convex(corners, np.unique(np.round(hull.equations[:, :3], 6), axis=0))
-
-
-def _passed(other: Array, joint: Joint, span: tuple[float, float]) -> _Convex:
+def _passed(other: Array, joint: Joint, span: tuple[float, float]) -> Convex:
     """Where something that stays is while a joint moves, as its link sees it."""
     far = max(joint.limits, key=abs)
     places = []
     for share in dict.fromkeys(span):
         motion = joint_motion(joint, share * far)
         places.append((other - motion[:3, 3]) @ motion[:3, :3])
-    return _convex(np.concatenate(places))
-
-
-def _overlap(moving: _Convex, other: _Convex) -> tuple[float, Array | None]:
-    """How much must come off a moving piece, m, and the plane (4,) to cut it at; 0 and none if there is room enough.
-
-    Directions are those of the faces of both.
-    """
-    if (moving.low > other.high + GAP).any() or (other.low > moving.high + GAP).any():
-        return 0.0, None
-    normals = np.concatenate([moving.normals, -other.normals])
-    edges = (other.points @ normals.T).min(axis=0) - GAP
-    depths = (moving.points @ normals.T).max(axis=0) - edges
-    best = int(depths.argmin())
-    if depths[best] <= 1e-6:
-        return 0.0, None
-    return float(depths[best]), np.append(normals[best], -edges[best])
+    return convex(np.concatenate(places))
 
 
 def _below(points: Array, plane: Array) -> Array | None:

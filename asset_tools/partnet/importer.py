@@ -186,8 +186,6 @@ def _check(model: Mobility, annotation: Annotation, bounds: Array) -> None:
 
 def _check_surface(name: str, surface: Surface, bounds: Array, where: str) -> None:
     low, high = np.array([*surface.min_xy, surface.z]), np.array([*surface.max_xy, surface.z])
-    if (low[:2] >= high[:2]).any():
-        raise AssetError(f"the surface {name!r} has no area", where=where, expected="min_xy < max_xy")
     if (low < bounds[0] - EDGE).any() or (high > bounds[1] + EDGE).any():
         span = " ".join(f"{axis} {a:.3f}..{b:.3f}" for axis, a, b in zip("xyz", *bounds, strict=True))
         found = f"{[round(float(value), 3) for value in low]} to {[round(float(value), 3) for value in high]}"

@@ -9,15 +9,15 @@ import numpy as np
 import sapien
 from sapien import physx
 
-from asset_tools.inertia import piece_inertia
-from asset_tools.physics import TIME_STEP, add_component, cook, engine_settings, new_scene, pose_matrix
+from asset_tools.physics import TIME_STEP, add_component, cook, engine_settings, pose_matrix
+from asset_tools.quality.overlap import convex, deepest, distances
+from asset_tools.quality.stage import Model, Stage, model_of
 from asset_tools.quality.surfaces import BLOCKED, Probe, clearances, probes
 from asset_tools.sources import FurnitureSource
 from robocas_ms3.assets.hulls import convex_faces
-from robocas_ms3.assets.kinematics import joint_frame, link_poses
+from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import FurnitureQuality, Handle, Link, Surface
 from robocas_ms3.assets.pack import LoadedFurniture
-from robocas_ms3.errors import AssetError
 
 Array = np.ndarray
 
@@ -26,7 +26,11 @@ HAND_SPEED = 0.25  # m/s: the hand pushes less the nearer the handle comes to it
 OPEN, CLOSED = 0.9, 0.05  # shares of the range
 STILL = 0.01  # share of the range that a part left alone may move in a second
 FASTEST = {"prismatic": 2.0, "revolute": 10.0}  # m/s, rad/s: nothing a hand of this speed could cause
-MOVED, SPEED = 0.01, 0.01  # m, m/s: what a thing put down may do
+JAMMED = 0.002  # m that a moving part may reach into others
+STOPS = (0.0, 0.02, 0.05, 0.2, 0.4, 0.6, 0.8, 1.0)  # shares of the range where that is looked at
+GRIP = 0.005  # m from a handle's TCP to what it should hold
+OPENING = 0.08  # m between the open fingers
+SLID, OFF, SPEED = 0.01, 0.002, 0.01  # m along the surface and off its height, m/s: what a thing put down may do
 PROBE_DENSITY = 500.0  # kg/m3
 
 
@@ -40,6 +44,10 @@ class JointReport:
         drifted: how far it moved by itself within a second, closed.
         fastest: speed of any joint meanwhile, m/s or rad/s, infinite for no number.
         bounded: whether no joint was faster than a hand could make it.
+        overlap: how deep it reaches into what doesn't move with it, anywhere on its way, m. The engine doesn't see
+            that: it ignores contacts between a link and its parent, so a drawer slides through solid wood.
+        grip: how far the worst of its handles is from the part it should take hold of, m; 0 without handles, infinite
+            where there is no room for the open fingers beside it.
     """
 
     opened: float
@@ -47,11 +55,14 @@ class JointReport:
     drifted: float
     fastest: float
     bounded: bool
+    overlap: float
+    grip: float
 
     @property
     def works(self) -> bool:
-        """Whether it opens, closes and stays still."""
-        return self.bounded and self.opened >= OPEN and abs(self.closed) <= CLOSED and self.drifted <= STILL
+        """Whether it opens, closes and stays still, has room to, and can be taken hold of."""
+        moves = self.bounded and self.opened >= OPEN and abs(self.closed) <= CLOSED and self.drifted <= STILL
+        return moves and self.overlap <= JAMMED and self.grip <= GRIP
 
 
 @dataclass(frozen=True)
@@ -60,14 +71,16 @@ class SurfaceReport:
 
     Attributes:
         probes: how many were put there.
-        moved: the farthest that one of them moved in a second, m.
+        slid: the farthest that one of them moved along the surface in a second, m.
+        off: the most that one of them then stood above or below the surface's height, m.
         speed: of the fastest at the end, m/s.
         headroom: the least free height found above it, m; infinite under the open sky.
         enough: whether that is what the surface says.
     """
 
     probes: int
-    moved: float
+    slid: float
+    off: float
     speed: float
     headroom: float
     enough: bool
@@ -75,7 +88,8 @@ class SurfaceReport:
     @property
     def holds(self) -> bool:
         """Whether things stay on it, and there is as much room above it as it says."""
-        return self.probes > 0 and self.moved < MOVED and self.speed < SPEED and self.enough
+        stays = self.slid < SLID and self.off <= OFF and self.speed < SPEED
+        return self.probes > 0 and stays and self.enough
 
 
 @dataclass(frozen=True)
@@ -86,22 +100,13 @@ class FurnitureReport:
     surfaces: dict[str, SurfaceReport]
 
 
-@dataclass(frozen=True)
-class _Model:
-    pieces: dict[str, list[Array]]  # by link; "" is the fixed body
-    links: tuple[Link, ...]
-    surfaces: Mapping[str, Surface]
-    handles: Mapping[str, Handle]
-    friction: float
-
-
 def measure_furniture(furniture: FurnitureSource | LoadedFurniture) -> FurnitureQuality:
     """Shares of joints that work and surfaces that hold. The same furniture gives the same figures.
 
     Raises:
         AssetError: the physics engine refuses a hull.
     """
-    model = _model(furniture)
+    model = model_of(furniture)
     report = _examine(model)
     hulls = [piece for pieces in model.pieces.values() for piece in pieces]
     return FurnitureQuality(
@@ -118,15 +123,15 @@ def examine_furniture(furniture: FurnitureSource | LoadedFurniture) -> Furniture
     Raises:
         AssetError: the physics engine refuses a hull.
     """
-    return _examine(_model(furniture))
+    return _examine(model_of(furniture))
 
 
-def _examine(model: _Model) -> FurnitureReport:
+def _examine(model: Model) -> FurnitureReport:
     with engine_settings():
         return _examine_in_engine(model)
 
 
-def _examine_in_engine(model: _Model) -> FurnitureReport:
+def _examine_in_engine(model: Model) -> FurnitureReport:
     joints = {link.joint.name: _try_joint(model, link) for link in model.links}
     return FurnitureReport(joints, {name: _try_surface(model, surface) for name, surface in model.surfaces.items()})
 
@@ -136,91 +141,8 @@ def _share(flags: Iterable[bool]) -> float | None:
     return sum(found) / len(found) if found else None
 
 
-def _model(furniture: FurnitureSource | LoadedFurniture) -> _Model:
-    if isinstance(furniture, LoadedFurniture):
-        facts = furniture.asset
-        pieces = {"": furniture.hulls} | {name: part.hulls for name, part in furniture.links.items()}
-        return _Model(pieces, facts.links, facts.surfaces, facts.handles, facts.friction)
-    pieces = {"": furniture.pieces} | {link.name: link.pieces for link in furniture.links}
-    links = []
-    for link in furniture.links:
-        center, inertia, axes = piece_inertia(link.pieces, link.mass)
-        links.append(
-            Link(
-                name=link.name,
-                parent=link.parent,
-                joint=link.joint,
-                mass=link.mass,
-                center_of_mass=tuple(center),
-                inertia=tuple(inertia),
-                inertia_wxyz=axes,
-            )
-        )
-    return _Model(pieces, tuple(links), furniture.surfaces, furniture.handles, furniture.friction)
-
-
-class _Stage:
-    """A scene with the furniture in it, its body fixed, its frame the world's."""
-
-    def __init__(self, model: _Model, positions: Mapping[str, float] | None = None) -> None:
-        self.scene = new_scene()
-        self.material = physx.PhysxMaterial(model.friction, model.friction, 0.0)
-        self.links: dict[str, physx.PhysxArticulationLinkComponent] = {}
-        if not model.links:
-            ground = physx.PhysxRigidStaticComponent()
-            self._attach(ground, model.pieces[""])
-            add_component(self.scene, ground, sapien.Pose())
-            return
-        root = physx.PhysxArticulationLinkComponent()
-        self._attach(root, model.pieces[""])
-        root.joint.type = "fixed"
-        self.links[""] = root
-        for link in model.links:
-            self.links[link.name] = self._link(link, model.pieces[link.name])
-        for part in self.links.values():
-            add_component(self.scene, part, sapien.Pose())
-        self.articulation = root.articulation
-        # the engine has an order of its own
-        self.order = {joint.name: index for index, joint in enumerate(self.articulation.active_joints)}
-        wanted = np.zeros(len(self.order), np.float32)
-        for name, position in (positions or {}).items():
-            wanted[self.order[name]] = position
-        self.articulation.qpos = wanted
-
-    def _link(self, link: Link, pieces: Sequence[Array]) -> physx.PhysxArticulationLinkComponent:
-        part = physx.PhysxArticulationLinkComponent(self.links[link.parent])
-        self._attach(part, pieces)
-        part.mass = link.mass
-        part.cmass_local_pose = sapien.Pose(link.center_of_mass, link.inertia_wxyz)
-        part.inertia = np.asarray(link.inertia, np.float32)
-        frame = sapien.Pose(joint_frame(link.joint))
-        part.joint.name = link.joint.name
-        part.joint.type = link.joint.kind
-        part.joint.pose_in_parent = part.joint.pose_in_child = frame
-        part.joint.limit = np.asarray(link.joint.limits, np.float32)
-        part.joint.set_drive_property(0, link.joint.damping)
-        part.joint.set_friction(link.joint.friction)
-        return part
-
-    def _attach(self, component: physx.PhysxRigidBaseComponent, pieces: Sequence[Array]) -> None:
-        for piece in pieces:
-            try:
-                component.attach(cook(piece, self.material))
-            except RuntimeError as error:
-                raise AssetError("the physics engine refused a convex hull", found=error) from error
-
-    def position(self, joint: str) -> float:
-        return float(self.articulation.qpos[self.order[joint]])
-
-    def speed(self, joint: str) -> float:
-        return float(self.articulation.qvel[self.order[joint]])
-
-    def matrix(self, link: str) -> Array:
-        return pose_matrix(self.links[link]) if self.links else np.eye(4)
-
-
-def _try_joint(model: _Model, link: Link) -> JointReport:
-    joint, stage = link.joint, _Stage(model)
+def _try_joint(model: Model, link: Link) -> JointReport:
+    joint, stage = link.joint, Stage(model)
     far = max(joint.limits, key=abs)
     fastest, bounded = 0.0, True
 
@@ -251,7 +173,38 @@ def _try_joint(model: _Model, link: Link) -> JointReport:
             _pull(stage, link, point, way, reach)
             step()
         reached.append(stage.position(joint.name) / far)
-    return JointReport(reached[0], reached[1], drifted, fastest, bounded)
+    return JointReport(reached[0], reached[1], drifted, fastest, bounded, _jam(model, link), _grip(model, link))
+
+
+def _jam(model: Model, link: Link) -> float:
+    """How deep a part, with all that hangs on it, reaches into the rest, the other joints closed, m."""
+    carried = {link.name}
+    for other in model.links:
+        if other.parent in carried:
+            carried.add(other.name)
+    moving = [convex(piece) for name in model.pieces if name in carried for piece in model.pieces[name]]
+    rest = [convex(piece) for name in model.pieces if name not in carried for piece in model.pieces[name]]
+    low, high = link.joint.limits
+    found = 0.0
+    for share in (*STOPS, -low / (high - low)):
+        pose = link_poses(model.links, {link.joint.name: low + share * (high - low)})[link.name]
+        found = max(found, deepest([body.moved(pose) for body in moving], rest))
+    return found
+
+
+def _grip(model: Model, link: Link) -> float:
+    """How far the worst handle is from its part, m; infinite where an open finger would stand in something."""
+    worst = 0.0
+    everything = [piece for pieces in model.pieces.values() for piece in pieces]
+    for handle in model.handles.values():
+        if handle.link != link.name:
+            continue
+        tcp = np.array(handle.position)
+        fingers = tcp + OPENING / 2 * np.outer((-1, 1), sapien.Pose(q=handle.wxyz).to_transformation_matrix()[:3, 1])
+        worst = max(worst, float(distances(model.pieces[link.name], tcp[None])[0]))
+        if (distances(everything, fingers) <= 0).any():
+            worst = np.inf
+    return worst
 
 
 def grip_point(link: Link, pieces: Sequence[Array], handles: Mapping[str, Handle]) -> Array:
@@ -275,7 +228,7 @@ def _lever(link: Link, point: Array) -> float:
     return float(np.linalg.norm(np.cross(link.joint.axis, point - np.asarray(link.joint.origin))))
 
 
-def _pull(stage: _Stage, link: Link, point: Array, way: float, reach: float) -> None:
+def _pull(stage: Stage, link: Link, point: Array, way: float, reach: float) -> None:
     """Push with the hand for one step along the way the point can move."""
     pose = stage.matrix(link.name)
     axis, place = pose[:3, :3] @ link.joint.axis, pose[:3, :3] @ point + pose[:3, 3]
@@ -287,7 +240,7 @@ def _pull(stage: _Stage, link: Link, point: Array, way: float, reach: float) -> 
     stage.links[link.name].add_force_at_point((way * force * axis).astype(np.float32), place.astype(np.float32))
 
 
-def _try_surface(model: _Model, surface: Surface) -> SurfaceReport:
+def _try_surface(model: Model, surface: Surface) -> SurfaceReport:
     """Put things down with everything closed and, on a moving part, with it open as well."""
     states: list[dict[str, float]] = [{}]
     for link in model.links:
@@ -298,18 +251,16 @@ def _try_surface(model: _Model, surface: Surface) -> SurfaceReport:
     closed = [piece for pieces in model.pieces.values() for piece in pieces]
     spots = np.array([(*thing.xy, surface.z + BLOCKED) for thing in things]).reshape(-1, 3)
     room = float(clearances(closed, spots)[1].min() + BLOCKED) if things else 0.0
-    moved = speed = 0.0
-    for state in states:
-        far, fast = _put_down(model, surface, things, state)
-        moved, speed = max(moved, far), max(speed, fast)
-    return SurfaceReport(len(things), moved, speed, room, room >= (surface.headroom or np.inf) - BLOCKED)
+    found = np.max([_put_down(model, surface, things, state) for state in states], axis=0)
+    slid, off, speed = (float(value) for value in found)
+    return SurfaceReport(len(things), slid, off, speed, room, room >= (surface.headroom or np.inf) - OFF)
 
 
 def _put_down(
-    model: _Model, surface: Surface, things: Sequence[Probe], state: Mapping[str, float]
-) -> tuple[float, float]:
-    """The farthest that things moved on their surface in a second, m, and their greatest speed then, m/s."""
-    stage = _Stage(model, state)
+    model: Model, surface: Surface, things: Sequence[Probe], state: Mapping[str, float]
+) -> tuple[float, float, float]:
+    """The farthest that things moved along their surface in a second and then were off its height, m; their speed."""
+    stage = Stage(model, state)
     start = link_poses(model.links, state)[surface.link] if surface.link else np.eye(4)
     bodies = []
     for thing in things:
@@ -320,15 +271,17 @@ def _put_down(
         pose = start.copy()
         pose[:3, 3] = start[:3, :3] @ (*thing.xy, surface.z + 0.0005) + start[:3, 3]
         add_component(stage.scene, body, sapien.Pose(pose))
+        pose[:3, 3] = start[:3, :3] @ (*thing.xy, surface.z) + start[:3, 3]
         bodies.append((body, np.linalg.inv(start) @ pose))
     for _ in range(round(1 / TIME_STEP)):
         stage.scene.step()
     now = np.linalg.inv(stage.matrix(surface.link))
-    moved = speed = 0.0
+    slid, off, speed = [0.0], [0.0], [0.0]
     for thing, (body, before) in zip(things, bodies, strict=True):
         after = now @ pose_matrix(body)
         ends = np.concatenate([thing.corners, np.ones((len(thing.corners), 1))], axis=1)
-        step = np.linalg.norm((ends @ (after - before).T)[:, :3], axis=1).max()
-        moved = max(moved, float(step) if np.isfinite(step) else np.inf)
-        speed = max(speed, float(np.linalg.norm(body.linear_velocity)))
-    return moved, speed
+        steps = np.nan_to_num(ends @ (after - before).T, nan=np.inf, posinf=np.inf, neginf=np.inf)
+        slid.append(float(np.linalg.norm(steps[:, :2], axis=1).max()))
+        off.append(float(np.abs(steps[:, 2]).max()))
+        speed.append(float(np.linalg.norm(body.linear_velocity)))
+    return max(slid), max(off), max(speed)

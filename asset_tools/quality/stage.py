@@ -1,0 +1,126 @@
+"""Furniture in the physics engine: its body fixed, its joints free."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import sapien
+from sapien import physx
+
+from asset_tools.inertia import piece_inertia
+from asset_tools.physics import add_component, cook, new_scene, pose_matrix
+from asset_tools.sources import FurnitureSource
+from robocas_ms3.assets.kinematics import joint_frame
+from robocas_ms3.assets.manifest import Handle, Link, Surface
+from robocas_ms3.assets.pack import LoadedFurniture
+from robocas_ms3.errors import AssetError
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is measured of a piece of furniture, read from its files or still to be written.
+
+    Attributes:
+        pieces: (V, 3) corners of the hulls of each link; that of the empty name is the fixed body.
+        links: moving parts, parents first.
+        surfaces: where things may stand.
+        handles: of the moving parts.
+        friction: of all surfaces.
+    """
+
+    pieces: dict[str, list[Array]]
+    links: tuple[Link, ...]
+    surfaces: Mapping[str, Surface]
+    handles: Mapping[str, Handle]
+    friction: float
+
+
+def model_of(furniture: FurnitureSource | LoadedFurniture) -> Model:
+    """What is measured of furniture."""
+    if isinstance(furniture, LoadedFurniture):
+        facts = furniture.asset
+        pieces = {"": furniture.hulls} | {name: part.hulls for name, part in furniture.links.items()}
+        return Model(pieces, facts.links, facts.surfaces, facts.handles, facts.friction)
+    pieces = {"": furniture.pieces} | {link.name: link.pieces for link in furniture.links}
+    links = []
+    for link in furniture.links:
+        center, inertia, axes = piece_inertia(link.pieces, link.mass)
+        links.append(
+            Link(
+                name=link.name,
+                parent=link.parent,
+                joint=link.joint,
+                mass=link.mass,
+                center_of_mass=tuple(center),
+                inertia=tuple(inertia),
+                inertia_wxyz=axes,
+            )
+        )
+    return Model(pieces, tuple(links), furniture.surfaces, furniture.handles, furniture.friction)
+
+
+class Stage:
+    """A scene with the furniture in it, its body fixed, its frame the world's."""
+
+    def __init__(self, model: Model, positions: Mapping[str, float] | None = None) -> None:
+        self.scene = new_scene()
+        self.material = physx.PhysxMaterial(model.friction, model.friction, 0.0)
+        self.links: dict[str, physx.PhysxArticulationLinkComponent] = {}
+        if not model.links:
+            ground = physx.PhysxRigidStaticComponent()
+            self._attach(ground, model.pieces[""])
+            add_component(self.scene, ground, sapien.Pose())
+            return
+        root = physx.PhysxArticulationLinkComponent()
+        self._attach(root, model.pieces[""])
+        root.joint.type = "fixed"
+        self.links[""] = root
+        for link in model.links:
+            self.links[link.name] = self._link(link, model.pieces[link.name])
+        for part in self.links.values():
+            add_component(self.scene, part, sapien.Pose())
+        self.articulation = root.articulation
+        # the engine has an order of its own
+        self.order = {joint.name: index for index, joint in enumerate(self.articulation.active_joints)}
+        wanted = np.zeros(len(self.order), np.float32)
+        for name, position in (positions or {}).items():
+            wanted[self.order[name]] = position
+        self.articulation.qpos = wanted
+
+    def _link(self, link: Link, pieces: Sequence[Array]) -> physx.PhysxArticulationLinkComponent:
+        part = physx.PhysxArticulationLinkComponent(self.links[link.parent])
+        self._attach(part, pieces)
+        part.mass = link.mass
+        part.cmass_local_pose = sapien.Pose(link.center_of_mass, link.inertia_wxyz)
+        part.inertia = np.asarray(link.inertia, np.float32)
+        frame = sapien.Pose(joint_frame(link.joint))
+        part.joint.name = link.joint.name
+        part.joint.type = link.joint.kind
+        part.joint.pose_in_parent = part.joint.pose_in_child = frame
+        part.joint.limit = np.asarray(link.joint.limits, np.float32)
+        part.joint.set_drive_property(0, link.joint.damping)
+        part.joint.set_friction(link.joint.friction)
+        return part
+
+    def _attach(self, component: physx.PhysxRigidBaseComponent, pieces: Sequence[Array]) -> None:
+        for piece in pieces:
+            try:
+                component.attach(cook(piece, self.material))
+            except RuntimeError as error:
+                raise AssetError("the physics engine refused a convex hull", found=error) from error
+
+    def position(self, joint: str) -> float:
+        """Where a joint is, m or rad."""
+        return float(self.articulation.qpos[self.order[joint]])
+
+    def speed(self, joint: str) -> float:
+        """How fast it moves, m/s or rad/s."""
+        return float(self.articulation.qvel[self.order[joint]])
+
+    def matrix(self, link: str) -> Array:
+        """Pose (4, 4) of a link."""
+        return pose_matrix(self.links[link]) if self.links else np.eye(4)
