@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Sequence
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
+from asset_tools.quality.measure import top_grasps
 from asset_tools.studio import PAPER, Body, Colour, Studio, box_faces
 from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import Hull
@@ -27,7 +27,7 @@ CELLS = 5  # pictures of an asset, side by side
 LARGE, SMALL = 220, 154  # px, a picture's side: of packs with few and with many assets
 FEW = 16
 GAP, CAPTION, LABEL = 6, 33, 14  # px between assets, of the text above the pictures, of that below
-POSES, GRASPS = 4, 20
+POSES = 4
 GROUND, GREY, RED = (0.80, 0.80, 0.78), (0.55, 0.55, 0.55), (0.9, 0.1, 0.1)
 INK, FAINT = (25, 25, 25), (120, 120, 120)
 FINGER = 0.003  # m, thickness of drawn grippers
@@ -104,8 +104,10 @@ def _object_pictures(studio: Studio, asset: LoadedObject) -> list[Picture]:
     notes = asset.annotations
     points = np.concatenate(asset.hulls)
     fast = Body(points, file=asset.visual("fast"))
-    grasps = zip(notes.grasps_tcp_in_object, notes.grasp_widths, notes.grasp_qualities, strict=True)
-    grippers = [_solid(gripper_faces(width), _tone(quality), pose) for pose, width, quality in islice(grasps, GRASPS)]
+    grippers = [
+        _solid(gripper_faces(notes.grasp_widths[i]), _tone(notes.grasp_qualities[i]), notes.grasps_tcp_in_object[i])
+        for i in top_grasps(notes)
+    ]
     best = _shown_poses(notes)
     chances = " ".join(f"{notes.resting_probabilities[i]:.0%}" for i in best)
     return [
@@ -113,7 +115,7 @@ def _object_pictures(studio: Studio, asset: LoadedObject) -> list[Picture]:
         ("full, from behind", studio.picture([Body(points, file=asset.visual("full"))], 120, 25)),
         ("hulls", studio.picture(hull_bodies(asset.hull_meshes), -60, 25)),
         (f"rests {chances}", studio.picture(standing(fast, notes.resting_poses[best]), -60, 30)),
-        (f"{len(grippers)} of {len(notes.grasp_widths)} grasps", studio.picture([fast, *grippers], -60, 30)),
+        (f"best {len(grippers)} of {len(notes.grasp_widths)} grasps", studio.picture([fast, *grippers], -60, 30)),
     ]
 
 

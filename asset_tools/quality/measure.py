@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
-from asset_tools.physics import Array, Solid
+from asset_tools.physics import Solid
 from asset_tools.quality.drops import DropReport, drop_test
 from asset_tools.quality.holding import hold_test
 from asset_tools.quality.hulls import hull_quality
 from robocas_ms3.assets.annotations import Annotations
-from robocas_ms3.assets.manifest import ObjectQuality
+from robocas_ms3.assets.manifest import ObjectAsset, ObjectQuality
 from robocas_ms3.assets.pack import LoadedObject
 
 TOP_GRASPS = 20
@@ -26,8 +27,9 @@ HULL_VERTICES = 64  # more don't go into a GPU's hull
 REST_SHARE = 0.90  # of drops
 REST_TIME = 2.0  # s
 PENETRATION = 0.002  # m
-JITTER = 1e-3  # J; a drop counts as at rest below 4.5e-4 J per kg anyway
-# Of the median over the pack:
+JITTER = 0.05  # J per kg, of any drop that doesn't roll, at rest or not: a tenth of what it fell with
+GRASPS = 50  # of an object, or the manifest says why it has fewer
+# Of the medians over the pack:
 MEDIAN_OVERLAP = 0.90
 MEDIAN_HULLS = 8
 MEDIAN_HELD = 0.80  # of the top grasps
@@ -96,20 +98,20 @@ def remeasure(loaded: LoadedObject) -> ObjectQuality:
     )
 
 
-def top_grasps(annotations: Annotations, count: int = TOP_GRASPS) -> Array:
-    """The best grasps (K, 4, 4): lowest friction first, equals in the order of the annotations, better ones first."""
-    order = np.argsort(annotations.grasp_qualities, kind="stable")[:count]
-    return np.asarray(annotations.grasps_tcp_in_object, float)[order]
+def top_grasps(annotations: Annotations, count: int = TOP_GRASPS) -> NDArray[np.intp]:
+    """Which grasps (K,) are the best: lowest friction first, equals in the order of the annotations."""
+    return np.argsort(annotations.grasp_qualities, kind="stable")[:count]
 
 
-def judge(qualities: Mapping[str, ObjectQuality]) -> list[Violation]:
+def judge(assets: Mapping[str, ObjectAsset]) -> list[Violation]:
     """Say which promises a pack's objects break, object by object and then over all.
 
     Args:
-        qualities: by asset id.
+        assets: by id; their quality may have been measured anew.
     """
     found: list[Violation] = []
-    for asset, quality in qualities.items():
+    for name, asset in assets.items():
+        quality = asset.quality
         overlap, distance = quality.volume_iou, quality.surface_p95
         checks = [
             (
@@ -121,70 +123,101 @@ def judge(qualities: Mapping[str, ObjectQuality]) -> list[Violation]:
             (quality.rest_share >= REST_SHARE, "drops at rest", f">= {REST_SHARE:.0%}", f"{quality.rest_share:.0%}"),
             (quality.rest_time <= REST_TIME, "median time to rest", f"<= {REST_TIME:g} s", f"{quality.rest_time:g} s"),
             (quality.penetration <= PENETRATION, "penetration", _mm_below(PENETRATION), _mm(quality.penetration)),
-            (quality.jitter <= JITTER, "jitter", f"<= {JITTER:g} J", f"{quality.jitter:.2g} J"),
+            (quality.jitter <= JITTER, "jitter", f"<= {JITTER:g} J/kg", f"{quality.jitter:.2g} J/kg"),
+            (
+                asset.grasp_count >= GRASPS or bool(asset.no_grasps_because),
+                "number of grasps",
+                f">= {GRASPS}, or a reason",
+                asset.grasp_count,
+            ),
         ]
         if quality.compact:
             checks.append((overlap >= COMPACT_OVERLAP, "volume IoU", f">= {COMPACT_OVERLAP:.2f}", f"{overlap:.2f}"))
         else:
-            name = "distance of the surfaces"
-            checks.append((distance <= SURFACE_DISTANCE, name, _mm_below(SURFACE_DISTANCE), _mm(distance)))
-        found += [Violation(asset, what, limit, str(value)) for good, what, limit, value in checks if not good]
-    return found + _judge_medians(list(qualities.values()))
+            what = "distance of the surfaces"
+            checks.append((distance <= SURFACE_DISTANCE, what, _mm_below(SURFACE_DISTANCE), _mm(distance)))
+        found += [Violation(name, what, limit, str(value)) for good, what, limit, value in checks if not good]
+    return found + _judge_medians([asset.quality for asset in assets.values()])
 
 
-HEADER = ("object", "kind", "hulls", "IoU", "p95 mm", "rest %", "rest s", "sunk mm", "jitter mJ", "held %")
+def differences(loaded: LoadedObject, measured: ObjectQuality) -> list[Violation]:
+    """Say where the manifest tells other numbers of an object than its files and its simulation do.
+
+    Args:
+        loaded: the object.
+        measured: what `remeasure` found of it.
+    """
+    asset = loaded.asset
+    said, found = asset.quality.model_dump(), measured.model_dump()
+    pairs = [(name, said[name], found[name]) for name in said if said[name] != found[name]]
+    grasps = len(loaded.annotations.grasp_widths)
+    if asset.grasp_count != grasps:
+        pairs.append(("grasp_count", asset.grasp_count, grasps))
+    return [
+        Violation(asset.id, f"measured {name}", f"{value:g}, as the manifest says", f"{other:g}")
+        for name, value, other in pairs
+    ]
+
+
+HEADER = ("object", "kind", "hulls", "IoU (stored)", "p95 mm (stored)", "rest %", "rolling %", "rest s", "sunk mm") + (
+    "jitter mJ/kg",
+    "held %",
+)
 
 
 def rows(qualities: Mapping[str, ObjectQuality]) -> list[tuple[str, ...]]:
-    """The table: a row of text for each object, as `HEADER` names it, and a last one of the medians."""
+    """The table: a row of text for each object, as `HEADER` names it, and a last one of the medians.
 
-    def row(name: str, kind: str, numbers: list[float]) -> tuple[str, ...]:
-        formats = ("g", ".2f", ".1f", ".0f", ".2f", ".2f", ".3f", ".0f")
+    Those are over what is judged: of IoU over compact objects, of p95 over the others, of grasps held over those that
+    have grasps, of the rest over all.
+    """
+
+    def row(name: str, kind: str, numbers: Sequence[float]) -> tuple[str, ...]:
+        formats = ("g", ".2f", ".1f", ".0f", ".0f", ".2f", ".2f", ".3f", ".0f")
         cells = ("-" if np.isnan(x) else format(x, f) for x, f in zip(numbers, formats, strict=True))
         return (name, kind, *cells)
 
-    numbers = {
-        name: [
+    table, columns = [], []
+    for name, q in qualities.items():
+        numbers = [
             q.hull_count,
             q.volume_iou,
             1e3 * q.surface_p95,
             100 * q.rest_share,
+            100 * q.rolling_share,
             q.rest_time,
             1e3 * q.penetration,
             1e3 * q.jitter,
             100 * q.grasps_held if q.grasps_tried else np.nan,
         ]
-        for name, q in qualities.items()
-    }
-    table = [row(name, "compact" if qualities[name].compact else "thin", values) for name, values in numbers.items()]
-    if numbers:
-        values = np.array(list(numbers.values()))
-        graspable = np.isfinite(values[:, -1]).any()
-        medians = [*np.median(values[:, :-1], axis=0), np.nanmedian(values[:, -1]) if graspable else np.nan]
-        table.append(row("median", "", medians))
+        table.append(row(name, "compact" if q.compact else "thin", numbers))
+        numbers[2 if q.compact else 1] = np.nan
+        columns.append(numbers)
+    if table:
+        kept = [values[np.isfinite(values)] for values in np.array(columns).T]
+        table.append(row("median", "", [float(np.median(values)) if len(values) else np.nan for values in kept]))
     return table
 
 
 def _physics(solid: Solid, annotations: Annotations) -> dict[str, Any]:
     """The fields of `ObjectQuality` that come out of the engine."""
     dropped = drop_test(solid, annotations.resting_poses)
-    grasps = top_grasps(annotations)
+    grasps = np.asarray(annotations.grasps_tcp_in_object, float)[top_grasps(annotations)]
     held = hold_test(solid, grasps)
     return dict(
         rest_share=round(float(dropped.good.mean()), 4),
+        rolling_share=round(float(np.mean(dropped.good & dropped.rolling)), 4),
         rest_time=round(float(np.median(dropped.rest_times)), 4),
         penetration=round(float(dropped.penetrations.max()), 6),
-        jitter=round(_jitter(dropped), 9),
+        jitter=round(_jitter(dropped) / solid.mass, 9),
         grasps_tried=len(grasps),
         grasps_held=round(float(held.mean()), 4) if len(grasps) else 0.0,
     )
 
 
 def _jitter(dropped: DropReport) -> float:
-    """Largest kinetic energy at rest, J, of drops that don't roll; if none came to rest, of those that should have."""
-    still = ~dropped.rolling
-    chosen = still & dropped.good if (still & dropped.good).any() else still
-    return float(max(dropped.jitters[chosen], default=0.0))
+    """Largest kinetic energy in the second after the time limit, J, of drops that don't roll, at rest or not."""
+    return float(max(dropped.jitters[~dropped.rolling], default=0.0))
 
 
 def _judge_medians(qualities: list[ObjectQuality]) -> list[Violation]:
@@ -195,6 +228,8 @@ def _judge_medians(qualities: list[ObjectQuality]) -> list[Violation]:
         ("median of grasps held", [q.grasps_held for q in qualities if q.grasps_tried], MEDIAN_HELD, ".0%", True),
     ]
     found = []
+    if qualities and not any(q.grasps_tried for q in qualities):
+        found.append(Violation("", "number of objects that can be grasped", ">= 1", "0"))
     for what, values, limit, form, at_least in medians:
         if values:
             median = float(np.median(values))

@@ -148,9 +148,10 @@ class ObjectQuality(StrictModel):
     volume_iou: Share = Field(description="overlap of the hulls with the closed mesh they were made from")
     surface_p95: NotNegative = Field(description="95th percentile of the distances between both surfaces, m")
     rest_share: Share = Field(description="of drops that end in a listed resting pose, at rest in time, not jittering")
+    rolling_share: Share = Field(default=0, description="of drops that count as at rest only because they roll evenly")
     rest_time: NotNegative = Field(description="median time until at rest after the drop, s")
     penetration: NotNegative = Field(description="deepest into the plane at rest, m")
-    jitter: NotNegative = Field(description="largest kinetic energy once at rest, J")
+    jitter: NotNegative = Field(description="largest kinetic energy from 2 s to 3 s of drops that don't roll, J per kg")
     grasps_tried: int = Field(ge=0)
     grasps_held: Share = Field(description="of those tried: still in the hand after lifting and shaking")
 

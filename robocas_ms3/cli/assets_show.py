@@ -162,7 +162,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     from rich.table import Table
 
     with mesh_tools():
-        from asset_tools.quality.measure import HEADER, judge, rows
+        from asset_tools.quality.measure import HEADER, differences, judge, rows
         from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
     from robocas_ms3.files import write_json
 
@@ -177,7 +177,9 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
             for row in cells:
                 table.add_row(*row)
             console.print(table)
-    violations = [*judge(objects), *judge_furniture(furniture)]
+    anew = {name: pack.objects[name].asset.model_copy(update={"quality": found}) for name, found in objects.items()}
+    violations = [*judge(anew), *judge_furniture(furniture)]
+    violations += [other for name, found in objects.items() for other in differences(pack.objects[name], found)]
     for violation in violations:
         where = violation.asset or "the pack"
         console.print(f"{where}: {violation.what} is {violation.found}, expected {violation.expected}", style="red")

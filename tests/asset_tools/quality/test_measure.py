@@ -1,12 +1,18 @@
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 import trimesh
 
 from asset_tools.grasps import sample_grasps
-from asset_tools.quality.measure import HEADER, judge, measure_object, rows, top_grasps
+from asset_tools.quality import measure
+from asset_tools.quality.drops import DropReport
+from asset_tools.quality.measure import HEADER, differences, judge, measure_object, rows, top_grasps
 from asset_tools.resting import resting_poses
 from robocas_ms3.assets.annotations import Annotations, footprints
-from robocas_ms3.assets.manifest import ObjectQuality
+from robocas_ms3.assets.manifest import ObjectAsset, ObjectQuality
+from robocas_ms3.assets.pack import LoadedObject
 
 GOOD = ObjectQuality(
     compact=True,
@@ -21,6 +27,40 @@ GOOD = ObjectQuality(
     grasps_tried=20,
     grasps_held=0.9,
 )
+
+
+REPORT = DropReport(
+    ends=np.tile(np.eye(4), (3, 1, 1)),
+    rest_times=np.array([0.5, 3.0, 1.0]),
+    matches=np.array([0, 0, 0]),
+    penetrations=np.zeros(3),
+    jitters=np.array([1e-6, 0.006, 0.05]),
+    rolling=np.array([False, False, True]),
+    good=np.array([True, False, True]),
+)
+
+
+def asset(quality=GOOD, grasp_count=60, no_grasps_because=""):
+    return ObjectAsset(
+        id="a",
+        name="thing",
+        category="box",
+        source="builtin",
+        licence="MIT",
+        attribution="-",
+        extents=(0.1, 0.1, 0.1),
+        files={},
+        mass=0.1,
+        center_of_mass=(0, 0, 0),
+        inertia=(1e-4, 1e-4, 1e-4),
+        grasp_count=grasp_count,
+        no_grasps_because=no_grasps_because,
+        quality=quality,
+    )
+
+
+def but(**change):
+    return asset(GOOD.model_copy(update=change))
 
 
 def annotate(mesh, solid, count=60):
@@ -47,7 +87,7 @@ def test_a_block_passes_all(block):
     assert (quality.compact, quality.hull_count, quality.hull_vertices) == (True, 1, 8)
     assert quality.volume_iou == 1 and quality.surface_p95 == 0
     assert quality.rest_share == 1 and quality.grasps_tried == 20 and quality.grasps_held >= 0.95
-    assert judge({"block": quality}) == []
+    assert judge({"block": asset(quality)}) == []
     assert measure_object(mesh, solid, notes) == quality
 
 
@@ -55,7 +95,12 @@ def test_an_object_without_grasps(block):
     mesh, solid = trimesh.creation.box((0.12, 0.12, 0.12)), block(0.12, 0.12, 0.12)
     quality = measure_object(mesh, solid, annotate(mesh, solid))
     assert (quality.grasps_tried, quality.grasps_held) == (0, 0)
-    assert judge({"cube": quality, "fine": GOOD}) == []
+    assert judge({"cube": asset(quality, grasp_count=0, no_grasps_because="too thick"), "fine": asset()}) == []
+    found = judge({"cube": asset(quality, grasp_count=0)})
+    assert [(broken.asset, broken.what) for broken in found] == [
+        ("cube", "number of grasps"),
+        ("", "number of objects that can be grasped"),
+    ]
     assert rows({"cube": quality})[0][-1] == "-"
 
 
@@ -63,7 +108,7 @@ def test_top_grasps_go_by_friction_then_by_order(block):
     mesh, solid = trimesh.creation.box((0.05, 0.08, 0.12)), block(0.05, 0.08, 0.12)
     notes = annotate(mesh, solid, count=4)
     notes = Annotations(**{**vars(notes), "grasp_qualities": np.array([0.3, 0.1, 0.2, 0.1])})
-    np.testing.assert_array_equal(top_grasps(notes, 3), notes.grasps_tcp_in_object[[1, 3, 2]])
+    assert top_grasps(notes, 3).tolist() == [1, 3, 2]
 
 
 @pytest.mark.parametrize(
@@ -74,25 +119,25 @@ def test_top_grasps_go_by_friction_then_by_order(block):
         (dict(rest_share=0.85), "drops at rest"),
         (dict(rest_time=2.1), "median time to rest"),
         (dict(penetration=0.0021), "penetration"),
-        (dict(jitter=0.002), "jitter"),
+        (dict(jitter=0.051), "jitter"),
         (dict(compact=False, surface_p95=0.0041), "distance of the surfaces"),
     ],
 )
 def test_each_limit_of_an_object(change, what):
-    pack = {"a": GOOD, "b": GOOD, "bad": GOOD.model_copy(update=change)}
+    pack = {"a": asset(), "b": asset(), "bad": but(**change)}
     assert [(broken.asset, broken.what) for broken in judge(pack)] == [("bad", what)]
 
 
 def test_limits_hold_for_the_right_kind():
-    assert judge({"a": GOOD.model_copy(update=dict(surface_p95=0.01))}) == []
-    assert judge({"a": GOOD.model_copy(update=dict(compact=False, volume_iou=0.3))}) == []
+    assert judge({"a": but(surface_p95=0.01)}) == []
+    assert judge({"a": but(compact=False, volume_iou=0.3)}) == []
 
 
 def test_medians_of_the_pack():
     weak = dict(volume_iou=0.85, hull_count=9, grasps_held=0.75)
-    one = {"a": GOOD, "b": GOOD, "c": GOOD.model_copy(update=weak)}
+    one = {"a": asset(), "b": asset(), "c": but(**weak)}
     assert judge(one) == []
-    most = {"a": GOOD, "b": GOOD.model_copy(update=weak), "c": GOOD.model_copy(update=weak)}
+    most = {"a": asset(), "b": but(**weak), "c": but(**weak)}
     found = judge(most)
     assert [(broken.asset, broken.what, broken.expected, broken.found) for broken in found] == [
         ("", "median volume IoU", ">= 0.90", "0.85"),
@@ -102,10 +147,41 @@ def test_medians_of_the_pack():
     assert judge({}) == []
 
 
+def test_too_few_grasps_need_a_reason():
+    found = judge({"a": asset(), "few": asset(grasp_count=49)})
+    assert [(broken.asset, broken.what, broken.found) for broken in found] == [("few", "number of grasps", "49")]
+    assert judge({"a": asset(), "few": asset(grasp_count=49, no_grasps_because="wide")}) == []
+
+
+def test_what_the_manifest_says_is_compared():
+    def loaded(grasps):
+        notes = SimpleNamespace(grasp_widths=np.zeros(grasps))
+        return cast(LoadedObject, SimpleNamespace(asset=asset(), annotations=notes))
+
+    assert differences(loaded(60), GOOD) == []
+    found = differences(loaded(59), GOOD.model_copy(update=dict(rest_share=0.95, grasps_held=0.85)))
+    assert [(broken.what, broken.expected, broken.found) for broken in found] == [
+        ("measured rest_share", "1, as the manifest says", "0.95"),
+        ("measured grasps_held", "0.9, as the manifest says", "0.85"),
+        ("measured grasp_count", "60, as the manifest says", "59"),
+    ]
+
+
+def test_a_drop_that_moves_on_is_jitter_unless_it_rolls(block):
+    """Only a drop that rolls evenly may move after two seconds: one that isn't at rest counts as well."""
+    mesh, solid = trimesh.creation.box((0.05, 0.08, 0.12)), block(0.05, 0.08, 0.12)
+    notes = annotate(mesh, solid, count=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measure, "drop_test", lambda *_: REPORT)
+        quality = measure_object(mesh, solid, notes)
+    assert (quality.rest_share, quality.rolling_share) == (0.6667, 0.3333)
+    assert quality.jitter == pytest.approx(0.006 / 0.2)  # J of the second drop, kg
+
+
 def test_table():
     table = rows({"a": GOOD, "b": GOOD.model_copy(update=dict(volume_iou=0.85, compact=False))})
     assert [len(row) for row in table] == [len(HEADER)] * 3
-    assert table[0] == ("a", "compact", "4", "0.95", "1.0", "100", "0.50", "0.50", "0.001", "90")
+    assert table[0] == ("a", "compact", "4", "0.95", "1.0", "100", "0", "0.50", "0.50", "0.001", "90")
     assert table[1][:4] == ("b", "thin", "4", "0.85")
-    assert table[2][:4] == ("median", "", "4", "0.90")
+    assert table[2][:4] == ("median", "", "4", "0.95")
     assert rows({}) == []
