@@ -32,7 +32,7 @@ CHUNK = 128
 
 @dataclass(frozen=True)
 class Grasps:
-    """Grasps in the object's frame, good ones first.
+    """Grasps in the object's frame, each the one that adds most to those before it: good, and unlike them.
 
     Attributes:
         tcp_in_object: (G, 4, 4) TCP poses: z approach, y closing, origin midway between the finger tips; m.
