@@ -102,11 +102,14 @@ def _furniture_line(furniture: LoadedFurniture) -> str:
 
 def _object_pictures(studio: Studio, asset: LoadedObject) -> list[Picture]:
     notes = asset.annotations
-    points = np.concatenate(asset.hulls)
+    points, tried = np.concatenate(asset.hulls), top_grasps(notes)
     fast = Body(points, file=asset.visual("fast"))
     grippers = [
-        _solid(gripper_faces(notes.grasp_widths[i]), _tone(notes.grasp_qualities[i]), notes.grasps_tcp_in_object[i])
-        for i in top_grasps(notes)
+        _solid(gripper_faces(float(width)), _tone(float(quality)), pose)
+        for pose, width, quality in zip(
+            *(values[tried] for values in (notes.grasps_tcp_in_object, notes.grasp_widths, notes.grasp_qualities)),
+            strict=True,
+        )
     ]
     best = _shown_poses(notes)
     chances = " ".join(f"{notes.resting_probabilities[i]:.0%}" for i in best)
