@@ -47,6 +47,11 @@ class Grasps:
     def __len__(self) -> int:
         return len(self.widths)
 
+    def joined(self, more: Grasps) -> Grasps:
+        """These, then others."""
+        pairs = zip(vars(self).values(), vars(more).values(), strict=True)
+        return Grasps(*(np.concatenate(pair) for pair in pairs))
+
 
 @dataclass(frozen=True)
 class _Pairs:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from asset_tools.build import build_object
+import numpy as np
+import trimesh
+
+from asset_tools.build import FEW_GRASPS, GRASPS, build_object
 from asset_tools.graspnet.catalogue import COUNT, ENTRIES, catalogue_entry
-from asset_tools.graspnet.labels import label_grasps
+from asset_tools.graspnet.labels import label_checksums, label_grasps
+from asset_tools.grasps import Grasps, sample_grasps
 from asset_tools.import_scans import estimate_mass, scan_files
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.prepare import prepare
@@ -51,7 +56,8 @@ def graspnet_jobs(root: Path, ids: Sequence[int] = ()) -> list[Job]:
 def graspnet_source(root: Path, number: int) -> ObjectSource:
     """An object of the dataset: its model as it is, its labelled grasps where its label file is there.
 
-    Models are in metres, z up where that can be said; their frame stays, as the labels are given in it.
+    Where fewer than 50 of those fit the gripper, others are sampled as well, and ``repairs`` say so. Models are in
+    metres, z up where that can be said; their frame stays, as the labels are given in it.
 
     Args:
         root: the dataset's folder.
@@ -62,7 +68,7 @@ def graspnet_source(root: Path, number: int) -> ObjectSource:
     """
     entry = catalogue_entry(number)
     model = prepare(_model(root, number), up="z", unit="m")
-    labels = _labels(root, number)
+    grasps, notes = _grasps(_labels(root, number), model.closed, entry.id)
     return ObjectSource(
         id=entry.id,
         name=entry.name,
@@ -73,20 +79,38 @@ def graspnet_source(root: Path, number: int) -> ObjectSource:
         source="graspnet",
         licence=LICENCE,
         attribution=ATTRIBUTION,
-        repairs=model.repairs,
+        repairs=(*model.repairs, *notes),
         graspnet_id=number,
-        grasps=label_grasps(labels, model.closed) if labels.is_file() else None,
+        grasps=grasps,
         hollow=entry.hollow,
     )
 
 
+def _grasps(labels: Path, closed: trimesh.Trimesh, id_: str) -> tuple[Grasps | None, tuple[str, ...]]:
+    """The labelled grasps that fit, topped up with sampled ones where they are few, and what to say of that."""
+    if not labels.is_file():
+        return None, ()
+    found, labelled = label_grasps(labels, closed)
+    if len(found) >= FEW_GRASPS:
+        return found, ()
+    rng = np.random.default_rng(zlib.crc32(id_.encode()))
+    sampled = sample_grasps(closed, np.asarray(closed.center_mass), rng, count=GRASPS - len(found))
+    note = f"of {labelled} good grasp labels {len(found)} fit the gripper; sampled {len(sampled)} more"
+    return found.joined(sampled), (note,)
+
+
 def _job(root: Path, number: int) -> Job:
     labels = _labels(root, number)
-    files = [*scan_files(find_mesh(_model(root, number))), *([labels] if labels.is_file() else [])]
     return Job(
         catalogue_entry(number).id,
         partial(_make, root, number),
-        content_hash("graspnet", number, files=files, packages=["graspnet"]),
+        content_hash(
+            "graspnet",
+            number,
+            label_checksums(labels) if labels.is_file() else (),
+            files=scan_files(find_mesh(_model(root, number))),
+            packages=["graspnet"],
+        ),
     )
 
 

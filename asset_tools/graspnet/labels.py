@@ -86,7 +86,7 @@ class _Member:
         self.file.read(1)
 
 
-def label_grasps(path: Path, closed: trimesh.Trimesh, *, count: int = 800, seed: int = 0) -> Grasps:
+def label_grasps(path: Path, closed: trimesh.Trimesh, *, count: int = 800, seed: int = 0) -> tuple[Grasps, int]:
     """The labelled grasps that our open gripper reaches on a straight way in, spread over directions and places.
 
     Args:
@@ -94,6 +94,9 @@ def label_grasps(path: Path, closed: trimesh.Trimesh, *, count: int = 800, seed:
         closed: watertight mesh of the object in the model's frame, m.
         count: how many at most.
         seed: of the choice among many labels, and of surface points.
+
+    Returns:
+        The grasps, and the number of good labels (20 000 at most) that they were chosen from.
 
     Raises:
         AssetError: the file is damaged or not of this format.
@@ -109,7 +112,19 @@ def label_grasps(path: Path, closed: trimesh.Trimesh, *, count: int = 800, seed:
     lever = np.linalg.norm(np.cross(to_center, poses[:, :3, 2]), axis=1)
     scores = -2.0 * frictions - lever / 0.15 - np.linalg.norm(to_center, axis=1) / 0.3
     chosen = spread_out(poses, scores, count)
-    return Grasps(poses[chosen], labels.widths[clear][chosen], frictions[chosen])
+    return Grasps(poses[chosen], labels.widths[clear][chosen], frictions[chosen]), len(labels)
+
+
+def label_checksums(path: Path) -> tuple[tuple[str, int, int], ...]:
+    """Names, sizes and CRCs of the arrays in a label file, from its directory: what it holds, without reading it all.
+
+    Of a file without a directory, just its size; `read_labels` says what is wrong with it.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return tuple((member.filename, member.file_size, member.CRC) for member in archive.infolist())
+    except zipfile.BadZipFile:
+        return ((path.name, path.stat().st_size, 0),)
 
 
 def read_labels(path: Path, rng: np.random.Generator | None = None, *, limit: int = CANDIDATES) -> Labels:

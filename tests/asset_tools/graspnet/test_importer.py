@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 import trimesh
@@ -95,7 +97,7 @@ def labelled_banana(shared_dir, tmp_path_factory):
     root = tmp_path_factory.mktemp("graspnet")
     (root / "models").symlink_to(shared_dir / "graspnet_sample" / "models")
     plain = graspnet_source(root, 5)
-    grasps = sample_grasps(plain.closed, plain.closed.center_mass, np.random.default_rng(0), count=60)
+    grasps = sample_grasps(plain.closed, plain.closed.center_mass, np.random.default_rng(0), count=30)
     poses = write_labels(root / "grasp_label" / "005_labels.npz", grasps.tcp_in_object)
     return graspnet_source(root, 5), poses
 
@@ -103,20 +105,35 @@ def labelled_banana(shared_dir, tmp_path_factory):
 def test_a_banana_with_labels(labelled_banana):
     source, labelled = labelled_banana
     assert source.id == "banana"
+    notes = "; ".join(source.repairs)
+    assert source.grasps is not None
     assert source.closed.is_watertight
     assert source.mesh.visual.material.image is not None
     assert source.closed.bounds == pytest.approx(source.mesh.bounds, abs=1e-3)
     assert source.mesh.extents == pytest.approx([0.196, 0.079, 0.038], abs=1e-3)  # a banana on its side
-    assert 10 <= len(source.grasps) <= 60
-    for pose in source.grasps.tcp_in_object:
+    fit, more = map(int, re.findall(r"of 30 good grasp labels (\d+) fit the gripper; sampled (\d+) more", notes)[0])
+    assert 10 <= fit <= 30 and len(source.grasps) == fit + more >= 50
+    for pose in source.grasps.tcp_in_object[:fit]:
         assert np.abs(labelled - pose).max(axis=(1, 2)).min() < 1e-5
+    assert source.grasps.qualities[:fit] == pytest.approx(np.full(fit, 0.2), abs=1e-6)
+
+
+def test_enough_labels_are_all_there_is(tmp_path):
+    write_models(tmp_path, [1])
+    plain = graspnet_source(tmp_path, 1)
+    grasps = sample_grasps(plain.closed, plain.closed.center_mass, np.random.default_rng(0), count=90)
+    write_labels(tmp_path / "grasp_label" / "001_labels.npz", grasps.tcp_in_object)
+    source = graspnet_source(tmp_path, 1)
+    assert source.grasps is not None
+    assert 50 <= len(source.grasps) <= 90
+    assert not any("label" in note for note in source.repairs)
     assert source.grasps.qualities == pytest.approx(np.full(len(source.grasps), 0.2), abs=1e-6)
 
 
 def test_labelled_grasps_have_the_object_between_the_fingers(labelled_banana):
     source, _ = labelled_banana
     points = surface_samples(source.closed, 4000, np.random.default_rng(0))[0]
-    for pose in source.grasps.tcp_in_object:
+    for pose in source.grasps.tcp_in_object[:10]:
         x, y, z = np.abs((points - pose[:3, 3]) @ pose[:3, :3]).T
         between = (x < 0.01) & (z < 0.0085)  # m, the pads
         assert between.sum() > 5

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.graspnet.labels import label_grasps, read_labels, tcp_poses, view_directions
+from asset_tools.graspnet.labels import label_checksums, label_grasps, read_labels, tcp_poses, view_directions
 from robocas_ms3.errors import AssetError
 
 TOP_VIEW = 299  # the last of the lattice, 4.7 deg off +z
@@ -85,8 +85,8 @@ def test_the_closing_axis_crosses_the_box_from_side_to_side(tmp_path):
     assert sorted(hits[:, 0]) == pytest.approx([-0.02, 0.02], abs=1e-9)
     assert np.linalg.norm(hits[1] - hits[0]) == pytest.approx(0.04, rel=0.01)
 
-    grasps = label_grasps(path, box)  # along y the box is 10 cm wide: the open gripper would hit it
-    assert len(grasps) == 1
+    grasps, labelled = label_grasps(path, box)  # along y the box is 10 cm wide: the open gripper would hit it
+    assert (len(grasps), labelled) == (1, 2)
     assert grasps.tcp_in_object[0] == pytest.approx(along)
     assert grasps.widths == pytest.approx([0.06])
     assert grasps.qualities == pytest.approx([0.1])
@@ -193,3 +193,13 @@ def test_a_large_file_is_read_in_little_memory(tmp_path):
     count, growth = done.stdout.split()
     assert int(count) == 20_000
     assert float(growth) < 150  # MB
+
+
+def test_checksums_tell_label_files_apart(tmp_path):
+    one = label_checksums(write(tmp_path / "one.npz"))
+    assert label_checksums(write(tmp_path / "same.npz")) == one
+    other = label_checksums(write(tmp_path / "other.npz", [((0, 0, 0, 0), (0, 0.01, 0.05, 0.3, False))]))
+    assert [name for name, *_ in other] == [name for name, *_ in one]
+    assert [a[0] for a, b in zip(one, other, strict=True) if a != b] == ["offsets.npy", "scores.npy"]
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "one.npz").read_bytes()[:-10])
+    assert label_checksums(tmp_path / "cut.npz")[0][0] == "cut.npz"
