@@ -68,7 +68,7 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
     # as the manifest has them, so that whoever measures the pack again finds the same
     center = np.array(_triple(closed.center_mass))
     moments, axes = principal_inertia(closed, source.mass)
-    inertia = np.array(_triple(moments))
+    inertia = np.array(_moments(moments))
     solid = Solid(hulls, source.mass, center, inertia, np.array(axes), source.friction)
     rest = resting_poses(
         hulls,
@@ -115,7 +115,7 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
         graspnet_id=source.graspnet_id,
         mass=source.mass,
         center_of_mass=_triple(center),
-        inertia=_triple(inertia),
+        inertia=_moments(inertia),
         inertia_wxyz=axes,
         grasp_count=len(grasps),
         no_grasps_because=reason,
@@ -138,7 +138,7 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
         body = {
             "mass": source.mass,
             "center_of_mass": _triple(center),
-            "inertia": _triple(inertia),
+            "inertia": _moments(inertia),
             "inertia_wxyz": axes,
         }
     return FurnitureAsset(
@@ -186,7 +186,7 @@ def _link(link: LinkSource) -> Link:
         joint=link.joint,
         mass=link.mass,
         center_of_mass=_triple(center),
-        inertia=_triple(inertia),
+        inertia=_moments(inertia),
         inertia_wxyz=axes,
     )
 
@@ -203,4 +203,10 @@ def _hashes(folder: Path) -> dict[str, str]:
 
 def _triple(values: np.ndarray) -> tuple[float, float, float]:
     x, y, z = (round(float(value), 9) for value in values)
+    return x, y, z
+
+
+def _moments(values: np.ndarray) -> tuple[float, float, float]:
+    """To nine digits, however small: those of a dice are 4e-10 kg m2."""
+    x, y, z = (float(f"{value:.9g}") for value in values)
     return x, y, z
