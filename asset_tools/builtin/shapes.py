@@ -69,7 +69,8 @@ def can(size: Size, *, exponent: float = 2.0) -> Shape:
         ),
     ]
     part = loft(sections, segments=segments)
-    pieces = [prism_piece([(a, 0), (a, h)], 20)] if exponent == 2.0 else stacked_pieces(part)
+    # few sides: with 16 or 20, some drops roll on for seconds
+    pieces = [prism_piece([(a, 0), (a, h)], 12)] if exponent == 2.0 else stacked_pieces(part)
     return fitted([part], size, pieces=pieces)
 
 
@@ -120,7 +121,7 @@ def jar(size: Size) -> Shape:
     part = loft(sections)
     low = [(r * 0.88, 0), (r, 0.005), (r, h - lid - 0.003)]
     high = [(neck, h - lid - 0.003), (neck, h)]
-    return fitted([part], size, pieces=[prism_piece(low), prism_piece(high)])
+    return fitted([part], size, pieces=[prism_piece(low, 12), prism_piece(high, 12)])
 
 
 def mug(size: Size, *, wall: float = 0.004) -> Shape:
