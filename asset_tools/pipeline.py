@@ -199,7 +199,7 @@ def _failed(job: Job, message: str) -> Made:
 def _copied(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset | None:
     """Copy an asset that was kept; none if there is none, or it was damaged since."""
     try:
-        asset = _ASSET.validate_json((place / ENTRY).read_bytes())
+        asset = _ASSET.validate_json((place / ENTRY).read_bytes(), strict=True)
         place.touch()
         shutil.copytree(place, folder, ignore=shutil.ignore_patterns(ENTRY))
         if all(sha256(folder / name) == found for name, found in asset.files.items()):
