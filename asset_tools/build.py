@@ -21,14 +21,15 @@ from asset_tools.sources import FurnitureSource, LinkSource, ObjectSource
 from asset_tools.visual import to_display, write_glb
 from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.hulls import read_hulls, write_hulls
-from robocas_ms3.assets.manifest import FurnitureAsset, Link, ObjectAsset
-from robocas_ms3.assets.pack import ANNOTATIONS, FINISHES, HULLS, LINKS, VISUALS, sha256
+from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, Link, ObjectAsset
+from robocas_ms3.assets.pack import ANNOTATIONS, FINISHES, HULLS, LINKS, VISUALS, LoadedFurniture, Part, sha256
 from robocas_ms3.errors import AssetError
 
 SURFACE_POINTS = 1024
 GRASPS = 800  # many, since of an object on a table most are from below or blocked by neighbours
 FEW_GRASPS = 50  # with fewer, the manifest says why
 FAST, FAST_ENOUGH = 1000, 1500  # triangles: what `fast` is decimated to, and what is left as it is
+FAST_BODY = (FAST, 2 * FAST, 4 * FAST, 6 * FAST)  # the same of furniture, the first that can be had
 FULL, FULL_TEXTURE = 12_000, 1024
 
 
@@ -141,7 +142,7 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
             "inertia": _moments(inertia),
             "inertia_wxyz": axes,
         }
-    return FurnitureAsset(
+    asset = FurnitureAsset(
         id=source.id,
         name=source.name,
         category=source.category,
@@ -158,9 +159,12 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
         links=tuple(_link(link) for link in source.links),
         handles=source.handles,
         finishes={part: tuple(finishes) for part, finishes in source.finishes.items()},
-        quality=measure_furniture(source),
+        quality=FurnitureQuality(hull_count=1, hull_vertices=4, joints_open=None, surfaces_hold=None),
         **body,
     )
+    # of what the simulator will load, not of what it was written from
+    parts = {link.name: Part(folder / LINKS / link.name) for link in asset.links}
+    return asset.model_copy(update={"quality": measure_furniture(LoadedFurniture(folder, asset=asset, links=parts))})
 
 
 def write_visuals(mesh: trimesh.Trimesh, folder: Path) -> None:
@@ -172,10 +176,23 @@ def write_visuals(mesh: trimesh.Trimesh, folder: Path) -> None:
 
 def _write_body(mesh: trimesh.Trimesh, pieces: list[np.ndarray], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    # furniture is looked at from farther away than what stands on it: one mesh, of few triangles, serves both levels
-    for name in VISUALS.values():
-        write_glb(mesh, folder / name)
+    # of few triangles, one mesh serves both levels
+    full = mesh if len(mesh.faces) <= FULL else to_display(mesh, triangles=FULL, texture_size=FULL_TEXTURE)
+    write_glb(_fast_body(mesh), folder / VISUALS["fast"])
+    write_glb(full, folder / VISUALS["full"])
     write_hulls(folder / HULLS, pieces)
+
+
+def _fast_body(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A body with few triangles: of many loose sheets, as few as leave each of them there."""
+    if len(mesh.faces) <= FAST_ENOUGH:
+        return mesh
+    for triangles in FAST_BODY:
+        try:
+            return to_display(mesh, triangles=triangles, texture_size=FULL_TEXTURE)
+        except AssetError:
+            continue
+    return mesh
 
 
 def _link(link: LinkSource) -> Link:
