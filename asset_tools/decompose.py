@@ -16,6 +16,7 @@ from robocas_ms3.errors import AssetError, MissingExtraError
 Array = NDArray[np.float64]
 
 MAX_VERTICES = 48  # a hull; PhysX takes up to 64 on a GPU, but thins hulls of more than about 50 by itself
+FEWER_VERTICES = 40  # of a hull that stands for a whole body: the more facets, the longer an oval rocks on them
 MAX_HULLS = 32
 WANTED_OVERLAP = 0.9  # the fewest hulls that reach it are taken
 THRESHOLDS = (0.2, 0.12, 0.08, 0.05)  # CoACD's concavity, coarse first
@@ -54,7 +55,7 @@ def decompose(closed: trimesh.Trimesh) -> Decomposition:
         raise AssetError("can't decompose a mesh that isn't closed", expected="watertight, volume > 0")
     best: Decomposition | None = None
     if closed.volume / closed.convex_hull.volume >= WANTED_OVERLAP - 0.02:
-        hulls = [few_vertices(np.asarray(closed.vertices))]
+        hulls = [few_vertices(np.asarray(closed.vertices), FEWER_VERTICES)]
         best = Decomposition(hulls, volume_iou(closed, hulls))
         if best.volume_iou >= WANTED_OVERLAP:
             return best

@@ -13,19 +13,6 @@ from robocas_ms3.errors import AssetError
 
 SHIPPED = Path(__file__).parent / "annotations"
 
-TEMPLATE = """\
-name: kitchen cabinet         # for language
-category: cabinet
-origin_lift: 0.5              # height of the model's origin above its lowest point, m
-surfaces:                     # where objects may stand; m, x out of the front, z up, joints closed
-  top: {min_xy: [-0.2, -0.4], max_xy: [0.2, 0.4], z: 0.5}
-  drawer: {link: link_0, min_xy: [-0.2, -0.4], max_xy: [0.2, 0.4], z: 0.1, headroom: 0.1}
-handles:                      # pose of the gripper's TCP (z approach, y closing) in the same frame
-  drawer: {joint: joint_0, position: [0.3, 0, 0.2], wxyz: [0.5, 0.5, -0.5, -0.5], width: 0.012}
-joints:                       # all optional
-  joint_0: {mass: 2.0, friction: 0.05, damping: 5.0, limits: [0, 0.3]}
-"""
-
 
 class HandleNote(StrictModel):
     """Where to take hold of what a joint moves: pose of the TCP in the furniture's frame, joints closed."""
@@ -78,7 +65,7 @@ def find_annotation(model_id: str, folder: Path | None = None) -> Annotation:
         "no annotation of this model",
         where=model_id,
         expected=f"{model_id}.yaml in the folder given by --annotations, or one of those shipped ({shipped})",
-        fix=f"Write one like this:\n{TEMPLATE}",
+        fix="`robocas assets import-partnet DIR --template` prints one to start from.",
     )
 
 

@@ -129,8 +129,8 @@ def import_ycb(command: ImportYCB) -> int:
 def import_partnet(command: ImportPartNet) -> int:
     """Run ``import-partnet``."""
     with mesh_tools():
-        from asset_tools.partnet.annotation import template
         from asset_tools.partnet.importer import partnet_jobs
+        from asset_tools.partnet.template import template
     if command.template:
         print(template(command.models[0]))  # noqa: T201
         return 0

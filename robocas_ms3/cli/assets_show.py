@@ -199,5 +199,7 @@ def mesh_tools() -> Iterator[None]:
     try:
         yield
     except ImportError as error:
+        if (error.name or "").partition(".")[0] in ("asset_tools", "robocas_ms3"):
+            raise  # a fault of ours, no missing package
         what, fix = "mesh tools are not installed", "pip install 'robocas-ms3[assets]'"
         raise MissingExtraError(what, found=error.name or error, fix=fix) from error

@@ -11,6 +11,7 @@ from sapien import physx
 from asset_tools.partnet.annotation import SHIPPED, Annotation, find_annotation, load_annotation
 from asset_tools.partnet.clearance import overlaps
 from asset_tools.partnet.importer import partnet_jobs, read_partnet
+from asset_tools.partnet.template import template
 from asset_tools.pipeline import write_pack
 from asset_tools.quality.furniture import examine_furniture
 from robocas_ms3.assets.pack import load_pack
@@ -160,7 +161,7 @@ def test_bad_annotations_are_named(tmp_path):
         load_annotation(path)
     with pytest.raises(AssetError, match=r"8: no annotation.*8\.yaml in the folder given by --annotations") as raised:
         find_annotation("8", tmp_path)
-    assert "origin_lift" in str(raised.value)  # a template
+    assert "--template" in str(raised.value) and "\n" not in str(raised.value)
 
 
 def test_the_users_annotation_goes_first(tmp_path):
@@ -241,3 +242,11 @@ def test_a_ball_dropped_into_an_open_drawer_goes_in(shared_dir, name, link):
     for _ in range(200):
         scene.step()
     assert entities[1].pose.p[2] == pytest.approx(surface.z + 0.03, abs=0.003)
+
+
+def test_a_template_names_the_models_own_joints_and_is_an_annotation(shared_dir, tmp_path):
+    text = template(shared_dir / "partnet_mobility" / "45949")
+    (tmp_path / "45949.yaml").write_text(text)
+    note = find_annotation("45949", tmp_path)
+    assert set(note.joints) == {"joint_0", "joint_1", "joint_2"} and len(note.handles) == 3
+    assert text.count("prismatic") == 1 and note.surfaces["link_2"].link == "link_2"
