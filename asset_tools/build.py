@@ -29,7 +29,6 @@ SURFACE_POINTS = 1024
 GRASPS = 800  # many, since of an object on a table most are from below or blocked by neighbours
 FEW_GRASPS = 50  # with fewer, the manifest says why
 FAST, FAST_ENOUGH = 1000, 1500  # triangles: what `fast` is decimated to, and what is left as it is
-FAST_BODY = (FAST, 2 * FAST, 4 * FAST, 6 * FAST)  # the same of furniture, the first that can be had
 FULL, FULL_TEXTURE = 12_000, 1024
 
 
@@ -176,23 +175,11 @@ def write_visuals(mesh: trimesh.Trimesh, folder: Path) -> None:
 
 def _write_body(mesh: trimesh.Trimesh, pieces: list[np.ndarray], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    # of few triangles, one mesh serves both levels
-    full = mesh if len(mesh.faces) <= FULL else to_display(mesh, triangles=FULL, texture_size=FULL_TEXTURE)
-    write_glb(_fast_body(mesh), folder / VISUALS["fast"])
-    write_glb(full, folder / VISUALS["full"])
+    # One mesh serves both levels: furniture is made of loose boards and sheets, of which decimation drops some.
+    body = mesh if len(mesh.faces) <= FULL else to_display(mesh, triangles=FULL, texture_size=FULL_TEXTURE)
+    for name in VISUALS.values():
+        write_glb(body, folder / name)
     write_hulls(folder / HULLS, pieces)
-
-
-def _fast_body(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A body with few triangles: of many loose sheets, as few as leave each of them there."""
-    if len(mesh.faces) <= FAST_ENOUGH:
-        return mesh
-    for triangles in FAST_BODY:
-        try:
-            return to_display(mesh, triangles=triangles, texture_size=FULL_TEXTURE)
-        except AssetError:
-            continue
-    return mesh
 
 
 def _link(link: LinkSource) -> Link:

@@ -53,6 +53,9 @@ def read_partnet(folder: Path, annotation: Annotation) -> FurnitureSource:
     corners = np.concatenate([faces.corners.reshape(-1, 3) for group in looks.values() for _, _, faces in group])
     bounds = np.array([corners.min(axis=0), corners.max(axis=0)])
     _check(model, annotation, bounds)
+    if annotation.mass is not None and model.links:
+        fix = "Leave `mass` out; that of moving parts goes under `joints`."
+        raise AssetError("furniture with moving parts stands fixed", where=folder.name, found="a mass", fix=fix)
     middle = bounds.mean(axis=0)
     pieces = {name: pieces_of(_parts(group), middle) for name, group in looks.items()}
     joints = {link.name: _joint(link, notes.get(link.joint, JointNote())) for link in model.links}

@@ -250,3 +250,9 @@ def test_a_template_names_the_models_own_joints_and_is_an_annotation(shared_dir,
     note = find_annotation("45949", tmp_path)
     assert set(note.joints) == {"joint_0", "joint_1", "joint_2"} and len(note.handles) == 3
     assert text.count("prismatic") == 1 and note.surfaces["link_2"].link == "link_2"
+
+
+def test_furniture_with_joints_can_have_no_mass_of_its_own(shared_dir):
+    note = load_annotation(SHIPPED / "45855.yaml").model_copy(update={"mass": 20.0})
+    with pytest.raises(AssetError, match="45855: furniture with moving parts stands fixed.*under `joints`"):
+        read_partnet(shared_dir / "partnet_mobility" / "45855", note)
