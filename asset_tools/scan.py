@@ -26,6 +26,7 @@ UPS: tuple[str, ...] = get_args(Up)
 FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off", ".dae", ".3mf")  # the better first
 PLAUSIBLE = (0.005, 1.5)  # m, longest side of a thing that a hand can pick up, generously
 TYPICAL = 0.15  # m, longest side of a household object
+GIANT = 5.0  # times the typical size: next to scans in another unit, more likely one of ten times smaller things
 FAR = np.log(20)  # from the typical size, where a scan no longer tells what unit the others have
 STANDS = 0.27  # thickness over height down to which people put a box on its end
 BOX_FILL = 0.93  # share of its rectangle that a box's outline fills; an ellipse fills 0.785
@@ -143,7 +144,7 @@ def guess_units(longest: Mapping[str, float]) -> dict[str, Unit]:
     usual: Any = min(cost, key=lambda unit: cost[unit])
     units: dict[str, Unit] = {}
     for name, side in longest.items():
-        fits = PLAUSIBLE[0] <= side * METRES[usual] <= PLAUSIBLE[1]
+        fits = PLAUSIBLE[0] <= side * METRES[usual] <= GIANT * TYPICAL
         try:
             units[name] = usual if fits else guess_unit([side])
         except AssetError as error:
