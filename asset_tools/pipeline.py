@@ -193,7 +193,7 @@ def _make(job: Job, place: Path) -> Made:
 
 
 def _failed(job: Job, message: str) -> Made:
-    return Made(job.id, None, message if job.id in message else f"{job.id}: {message}")
+    return Made(job.id, None, message if message.startswith(job.id) else f"{job.id}: {message}")
 
 
 def _copied(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset | None:
@@ -248,7 +248,7 @@ def write_pack(
     with replacing_folder(folder) as tmp:
         for made in make_assets(jobs, tmp, kept, processes=processes):
             if made.asset is None and not skip_bad:
-                raise AssetError(made.error, fix="Mend it, or pass --skip-bad to leave it out.")
+                raise AssetError(made.error.rstrip("."), fix="Mend it, or pass --skip-bad to leave it out.")
             results.append(made)
             on_made(made)
         assets = sorted((made.asset for made in results if made.asset), key=lambda asset: (asset.kind, asset.id))

@@ -15,7 +15,7 @@ from mani_skill.utils.structs import Actor, Articulation, Pose
 from mani_skill.utils.structs.types import SimConfig
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.assets.pack import LoadedObject, VisualLevel, load_pack
+from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
 from robocas_ms3.config import TaskConfig, load_task_config
 from robocas_ms3.errors import ConfigError, LayoutError
 from robocas_ms3.robots.constants import HAND_LINK
@@ -74,6 +74,8 @@ class RoboCASEnv(BaseEnv):
                 expected=f"task: {self.SPEC.name}",
                 found=f"task: {self.task_config.task}",
             )
+        if visual_level not in VISUALS:
+            raise ConfigError("no such visual_level", expected=f"one of {list(VISUALS)}", found=visual_level)
         self.object_pack = load_pack(pack)
         self.furniture_pack = load_pack(furniture_pack)
         self._object_ids = build.find_objects(self.object_pack, self.task_config)

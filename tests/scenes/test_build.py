@@ -91,3 +91,8 @@ def test_finishes_and_levels_are_seen(needs_renderer):
     oak, blue = pictures["oak"][corner].mean(axis=(0, 1)), pictures["blue"][corner].mean(axis=(0, 1))
     assert oak[0] > oak[2] + 20 and blue[2] > blue[0] + 10
     assert 0 < np.abs(pictures["full"] - pictures["blue"]).mean() < 3
+
+
+def test_an_unknown_level_of_detail_is_an_error():
+    with pytest.raises(ConfigError, match=r"no such visual_level \(expected one of \['fast', 'full'\], found fulll\)"):
+        gym.make("RoboCASPick-v1", visual_level="fulll", render_backend="none")
