@@ -1,0 +1,37 @@
+"""What a layout is: where everything stands at the beginning of an episode. No simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A settled arrangement of objects and its target. K objects; world frame, metres.
+
+    Attributes:
+        object_ids: K ids of the object pack, one a slot.
+        object_poses: (K, 4, 4) objects in the world, at rest.
+        robot_pose: (4, 4) the robot's root on the floor, in the world.
+        basket_pose: (4, 4) the basket's frame in the world.
+        target: slot of the target.
+        relation: how the instruction tells the target from its likes, e.g. ``nearest``; empty where its name does.
+        visible_shares: (K,) p_vis of each object from the selection camera; NaN where it was not asked for.
+    """
+
+    object_ids: tuple[str, ...]
+    object_poses: Array
+    robot_pose: Array
+    basket_pose: Array
+    target: int
+    relation: str = ""
+    visible_shares: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if len(self.visible_shares) == 0:
+            object.__setattr__(self, "visible_shares", np.full(len(self.object_ids), np.nan))
