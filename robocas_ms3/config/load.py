@@ -25,6 +25,7 @@ _EXPECTED = {
     "list_type": "a list",
     "model_type": "a mapping",
     "dict_type": "a mapping",
+    "union_tag_not_found": "a mapping with its kind",
 }
 
 
@@ -119,10 +120,14 @@ def _known_keys(location: tuple[int | str, ...]) -> list[str]:
     for part in location:
         if part in node.get("properties", {}):
             node = node["properties"][part]
+        elif part in node.get("discriminator", {}).get("mapping", {}):
+            node = {"$ref": node["discriminator"]["mapping"][part]}
         elif isinstance(node.get("additionalProperties"), dict):
             node = node["additionalProperties"]
         else:
             return []
+        for choice in node.get("anyOf", ()):  # X | None
+            node = choice if "$ref" in choice else node
         if "$ref" in node:
             node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
     return sorted(node.get("properties", {}))

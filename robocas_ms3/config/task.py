@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StrictInt, model_validator
 
+from robocas_ms3.config.relations import RELATIONS, Relation
+
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 
@@ -75,6 +77,34 @@ class ScatteredLayout(StrictModel):
     max_tries: Annotated[int, Field(ge=1)] = 40_000
 
 
+class OrderlyLayout(StrictModel):
+    """Objects of a kind one behind the other from the front edge, kinds side by side, standing, labels to the front."""
+
+    kind: Literal["orderly"]
+    copies: Annotated[int, Field(ge=1, le=8)] = Field(default=2, description="objects of each kind")
+    rows: Annotated[int, Field(ge=1, le=8)] = Field(
+        default=2, description="objects in a column; further copies begin another column"
+    )
+    row_gap: Annotated[float, Field(ge=0, le=0.2)] = Field(default=0.01, description="space within a column, m")
+    column_spacing: Annotated[float, Field(ge=1, le=4)] = Field(
+        default=1.3, description="distance of neighbouring columns as a multiple of their width"
+    )
+    yaw_jitter_deg: Annotated[float, Field(ge=0, le=45)] = 0.0
+
+
+class StackedLayout(StrictModel):
+    """A heap: objects dropped one by one into a bounded region, whose walls are then taken away."""
+
+    kind: Literal["stacked"]
+    drop_height: Annotated[float, Field(gt=0, le=1)] = Field(default=0.3, description="above the surface or heap, m")
+    tumble_probability: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.6, description="of an object falling in any orientation; else in a stable pose at a random yaw"
+    )
+
+
+LayoutConfig = Annotated[ScatteredLayout | OrderlyLayout | StackedLayout, Field(discriminator="kind")]
+
+
 class ObjectsConfig(StrictModel):
     """Which objects are on the surface."""
 
@@ -94,12 +124,87 @@ class TargetConfig(StrictModel):
     max_distance: Annotated[float, Field(gt=0)] = Field(
         default=0.8, description="horizontal distance from the arm's base to the object's centre, m"
     )
+    approach: Literal["top", "front"] = Field(
+        default="top", description="top: from above; front: level, as into a shelf"
+    )
+    relations: list[Relation] = Field(default=list(RELATIONS), description="select: how the target is told apart")
+    max_visible_share: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=0.9, description="search: the target's p_vis from above is lower"
+    )
+
+
+class OpeningConfig(StrictModel):
+    """The door or drawer to open first."""
+
+    furniture: str = Field(description="key in `furniture`")
+    handle: str = Field(description="handle of that furniture")
+    opened_at: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=0.6, description="share of the joint's range from which it counts as opened"
+    )
+
+
+class LanguageConfig(StrictModel):
+    """The words of instructions."""
+
+    split: Literal["upstream", "train", "held_out"] = Field(
+        default="upstream", description="upstream: its one template; train, held_out: one of many, drawn by the seed"
+    )
+    synonyms: bool = Field(default=True, description="with train or held_out: also call things by their synonyms")
+
+
+Range = Annotated[tuple[float, float], Field(description="least and greatest")]
+
+
+class LightRandomisation(StrictModel):
+    """Lights are drawn for every episode."""
+
+    ambient: Range = (0.25, 0.6)
+    directional: Range = (0.6, 1.4)
+    direction_deg: Annotated[float, Field(ge=0, le=60)] = Field(default=20.0, description="greatest turn")
+
+
+class CameraRandomisation(StrictModel):
+    """Cameras are shifted and turned for every episode."""
+
+    position: Annotated[float, Field(ge=0, le=0.2)] = Field(default=0.02, description="greatest shift an axis, m")
+    rotation_deg: Annotated[float, Field(ge=0, le=20)] = Field(default=2.0, description="greatest turn an axis")
+
+
+class PoseRandomisation(StrictModel):
+    """Something that stands is shifted and turned for every episode."""
+
+    position: Annotated[float, Field(ge=0, le=0.5)] = Field(default=0.03, description="greatest shift in x and y, m")
+    yaw_deg: Annotated[float, Field(ge=0, le=180)] = 5.0
+
+
+class DistractorConfig(StrictModel):
+    """Further objects that are never the target."""
+
+    ids: list[str | StrictInt]
+    count: tuple[Annotated[int, Field(ge=0, le=16)], Annotated[int, Field(ge=0, le=16)]] = (1, 3)
+
+
+class RandomisationConfig(StrictModel):
+    """What else a seed decides. Each block is off unless given; all draws come from the episode's seed."""
+
+    room: list[str] | None = Field(
+        default=None, description="parts of the room whose finish is drawn: wall, floor, ..."
+    )
+    lights: LightRandomisation | None = None
+    cameras: CameraRandomisation | None = None
+    robot: PoseRandomisation | None = None
+    basket: PoseRandomisation | None = None
+    object_sets: list[list[str | StrictInt]] | None = Field(default=None, description="one of them in place of `ids`")
+    count: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = Field(
+        default=None, description="number of objects, at most objects.count"
+    )
+    distractors: DistractorConfig | None = None
 
 
 class TaskConfig(StrictModel):
     """One task configuration: a file of ``task_configs/``."""
 
-    task: Literal["pick"]
+    task: Literal["pick", "select", "search", "open_pick"]
     description: str = ""
     support: str = Field(description="what the instruction calls the place the objects are on: 'table'")
     room: RoomConfig
@@ -109,13 +214,27 @@ class TaskConfig(StrictModel):
     robot: PoseConfig = Field(description="pose of the mobile base's frame on the floor")
     surface: SurfaceConfig
     objects: ObjectsConfig = ObjectsConfig()
-    layout: ScatteredLayout
+    layout: LayoutConfig
     target: TargetConfig = TargetConfig()
+    opening: OpeningConfig | None = Field(default=None, description="open_pick: what is opened")
+    language: LanguageConfig = LanguageConfig()
+    base_motion: bool = Field(default=False, description="scripted policies may drive the base; actions then hold it")
+    randomisation: RandomisationConfig = RandomisationConfig()
 
     @model_validator(mode="after")
-    def _surface_has_furniture(self) -> TaskConfig:
-        if self.surface.furniture not in self.furniture:
+    def _parts_fit(self) -> TaskConfig:
+        for name, part in (("surface", self.surface), ("opening", self.opening)):
+            if part is not None and part.furniture not in self.furniture:
+                raise ValueError(
+                    f"{name}.furniture: expected one of {sorted(self.furniture)}, found {part.furniture!r}"
+                )
+        if (self.opening is not None) != (self.task == "open_pick"):
+            raise ValueError("`opening` goes with task open_pick, and only with it")
+        if self.task == "select" and not (isinstance(self.layout, OrderlyLayout) and self.layout.copies > 1):
+            raise ValueError("task select needs layout.kind orderly with layout.copies > 1")
+        count = self.randomisation.count
+        if count is not None and not count[0] <= count[1] <= self.objects.count:
             raise ValueError(
-                f"surface.furniture: expected one of {sorted(self.furniture)}, found {self.surface.furniture!r}"
+                f"randomisation.count {list(count)} must rise and end at objects.count {self.objects.count}"
             )
         return self

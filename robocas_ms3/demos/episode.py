@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-from robocas_ms3.config import TaskConfig
+from robocas_ms3.config import TaskConfig, load_task_config
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.record import EpisodeRecorder
 from robocas_ms3.errors import LayoutError, PlanningFailed
@@ -20,6 +21,7 @@ from robocas_ms3.planning.executor import Executor, Seconds
 from robocas_ms3.planning.mplib_backend import MplibPlanner
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.robots.urdf import robot_files
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.spec import TASKS
@@ -67,16 +69,6 @@ class EpisodeResult:
     failures: list[Failure] = field(default_factory=list)
 
 
-class Solver(Protocol):
-    """A task's scripted policy."""
-
-    def attempt(self, executor: Executor, rng: np.random.Generator) -> None:
-        """Try once; raises ``PlanningFailed``."""
-
-    def recover(self, executor: Executor) -> None:
-        """Get out of a failed attempt that stays in the record."""
-
-
 class EpisodeGenerator:
     """Makes episodes of one task in one process: holds the environment, the planner and the policy.
 
@@ -86,13 +78,14 @@ class EpisodeGenerator:
 
     def __init__(self, settings: EpisodeSettings) -> None:
         self.settings = settings
+        config = load_task_config(settings.config)
         self.env = gym.make(
             TASKS[settings.task].env_id,
             config=settings.config,
             pack=settings.pack,
             obs_mode="none",
             reward_mode="none",
-            control_mode="pd_joint_pos",
+            control_mode="pd_joint_pos_base" if config.base_motion else "pd_joint_pos",
             render_backend="none",
             sim_config={"control_freq": settings.control_freq},
         )
@@ -100,9 +93,9 @@ class EpisodeGenerator:
         assert isinstance(base_env, RoboCASEnv)
         files = robot_files()
         self.planner: Planner = MplibPlanner(str(files.arm_urdf), str(files.arm_srdf), dt=base_env.control_timestep)
-        module, name = TASKS[settings.task].solver.split(":")
-        solver_class = getattr(import_module(module), name)
-        self.solver: Solver = solver_class(base_env, self.planner, Reachability(str(files.arm_urdf)))
+        self.reachability = Reachability(str(files.arm_urdf))
+        # a scripted policy tries once, from wherever the episode stands, and raises PlanningFailed
+        self.policy: Callable[[Arm], None] = import_module(TASKS[settings.task].solver).attempt
 
     def generate(self, seed: int, folder: Path, name: str) -> EpisodeResult:
         """Make the episode of a seed, as ``folder/name.h5`` and ``.json``; no files where every attempt failed.
@@ -136,8 +129,9 @@ class EpisodeGenerator:
             # seeded by seed and attempt alone: what was planned before must not matter
             entropy = np.random.SeedSequence([executor.seed, attempt])
             self.planner.seed(int(entropy.generate_state(1)[0]))
+            arm = Arm(self.planner, self.reachability, executor, np.random.default_rng(entropy))
             try:
-                self.solver.attempt(executor, np.random.default_rng(entropy))
+                self.policy(arm)
                 result.success, result.steps = True, len(executor.actions)
                 return recoveries
             except PlanningFailed as error:
@@ -150,7 +144,7 @@ class EpisodeGenerator:
                 recoveries = []
                 continue
             try:
-                self.solver.recover(executor)
+                arm.back_out()
                 recoveries.append(
                     {"range": [first, len(executor.actions) - 1], "stage": last.stage, "reason": last.reason}
                 )

@@ -52,15 +52,16 @@ class Seconds:
 
 @dataclass
 class Executor:
-    """Steps one environment (``pd_joint_pos``, one env) and remembers every action since the reset.
+    """Steps one environment (``pd_joint_pos`` or ``pd_joint_pos_base``, one env); keeps all actions since the reset.
 
     Attributes:
         env: the environment, possibly wrapped by a recorder.
         seed: the episode's seed.
-        actions: every action since the reset, (8,) each.
+        actions: every action since the reset, (8,) each, or (11,) where the base is driven.
         segments: the sub-goals so far.
         info: of the last step or reset.
         gripper: the gripper's command as it stands.
+        base: (3,) where the base's joints are told to be: x m, y m, yaw rad.
         seconds: where the time went.
     """
 
@@ -70,6 +71,7 @@ class Executor:
     segments: list[Segment] = field(default_factory=list)
     info: dict[str, Any] = field(default_factory=dict)
     gripper: float = OPEN
+    base: Array = field(default_factory=lambda: np.zeros(3))
     seconds: Seconds = field(default_factory=Seconds)
 
     @property
@@ -88,7 +90,7 @@ class Executor:
         """Start the episode from its seed, forgetting all actions."""
         with self.seconds.spent_on("reset"):
             _, self.info = self.env.reset(seed=self.seed)
-        self.actions, self.segments, self.gripper = [], [], OPEN
+        self.actions, self.segments, self.gripper, self.base = [], [], OPEN, np.zeros(3)
 
     def rewind(self, length: int) -> None:
         """Undo all but the first ``length`` actions: reset, then simulate those again exactly."""
@@ -111,7 +113,7 @@ class Executor:
         for qpos in trajectory.qpos:
             if until and self.flag(until):
                 return True
-            self._step(np.append(qpos, self.gripper).astype(np.float32))
+            self._step(self._action(qpos))
         return until is None or self.flag(until)
 
     def move_gripper(self, command: float, hold: Array, *, seconds: float) -> None:
@@ -124,7 +126,27 @@ class Executor:
         """
         self.gripper = command
         for _ in range(max(1, round(seconds / self.dt))):
-            self._step(np.append(hold, command).astype(np.float32))
+            self._step(self._action(hold))
+
+    @property
+    def drives(self) -> bool:
+        """Whether actions command the base too."""
+        return self.base_env.control_mode.endswith("_base")
+
+    def drive(self, waypoints: Array, hold: Array) -> None:
+        """Send base joint targets, the arm held.
+
+        Args:
+            waypoints: (T, 3) x m, y m, yaw rad, one a control step.
+            hold: (7,) arm target meanwhile.
+        """
+        for base in waypoints:
+            self.base = base
+            self._step(self._action(hold))
+
+    def _action(self, qpos: Array) -> np.ndarray:
+        base = self.base if self.drives else ()
+        return np.concatenate([qpos, [self.gripper], base]).astype(np.float32)
 
     def label(self, goal_type: str, goal_description: str) -> None:
         """Begin a sub-goal with the next action; a label that repeats the last one changes nothing."""

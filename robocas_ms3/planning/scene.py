@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from mani_skill.utils.structs import Articulation
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.planning.protocol import Array
-from robocas_ms3.scenes import build
 from robocas_ms3.scenes.placement import transform
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -38,12 +38,21 @@ class PlanningScene:
 
     def __init__(self, env: RoboCASEnv) -> None:
         self.env = env
-        config = env.task_config
+
+    def _furniture_in_world(self) -> Array:
+        """Samples (P, 3) of the surfaces of all furniture, its doors and drawers as they stand."""
         pieces = []
-        for item in config.furniture.values():
-            asset = env.furniture_pack.furniture[item.asset]
-            pieces.append(transform(build.furniture_pose(item, asset), asset.all_surface_points(spacing=SPACING)))
-        self._fixed_in_world = np.concatenate(pieces)
+        for name, asset in self.env.model.furniture.items():
+            points = asset.all_surface_points(self.joint_positions(name), SPACING)
+            pieces.append(transform(self.env.model.furniture_poses[name], points))
+        return np.concatenate(pieces)
+
+    def joint_positions(self, furniture: str) -> dict[str, float]:
+        """Positions of a piece of furniture's joints by name, m or rad."""
+        built = self.env.fixtures.furniture[furniture]
+        if not isinstance(built, Articulation):
+            return {}
+        return dict(zip((j.name for j in built.active_joints), built.get_qpos()[0].tolist(), strict=True))
 
     @property
     def arm_base_in_world(self) -> Array:
@@ -76,10 +85,9 @@ class PlanningScene:
             without: slot of an object to leave out.
         """
         to_base = inverse(self.arm_base_in_world)
-        basket = self.env.furniture_pack.furniture[self.env.task_config.basket.asset]
         pieces = [
-            transform(to_base, self._fixed_in_world),
-            transform(self.basket_in_base, basket.surface_points(SPACING)),
+            transform(to_base, self._furniture_in_world()),
+            transform(self.basket_in_base, self.env.model.basket.surface_points(SPACING)),
         ]
         for slot, asset in enumerate(self.env.object_assets[0]):
             if slot != without:

@@ -10,17 +10,21 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+PARKING_HEIGHT = -5.0  # z of the plane, m, on which slots wait that an episode does not use
+
+
 @dataclass(frozen=True)
 class Layout:
     """A settled arrangement of objects and its target. K objects; world frame, metres.
 
     Attributes:
         object_ids: K ids of the object pack, one a slot.
-        object_poses: (K, 4, 4) objects in the world, at rest.
+        object_poses: (K, 4, 4) objects in the world, at rest; of those that aren't present, where they wait.
         robot_pose: (4, 4) the robot's root on the floor, in the world.
         basket_pose: (4, 4) the basket's frame in the world.
         target: slot of the target.
         relation: how the instruction tells the target from its likes, e.g. ``nearest``; empty where its name does.
+        present: (K,) which slots take part; default: all. Slots are as many for every seed, their use may vary.
         visible_shares: (K,) p_vis of each object from the selection camera; NaN where it was not asked for.
     """
 
@@ -30,8 +34,11 @@ class Layout:
     basket_pose: Array
     target: int
     relation: str = ""
+    present: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     visible_shares: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
+        if len(self.present) == 0:
+            object.__setattr__(self, "present", np.ones(len(self.object_ids), dtype=bool))
         if len(self.visible_shares) == 0:
             object.__setattr__(self, "visible_shares", np.full(len(self.object_ids), np.nan))

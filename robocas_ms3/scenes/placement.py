@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,12 +26,14 @@ class Placeable:
             centre of mass, m.
         probabilities: (S,) how often the object comes to rest so; any positive scale.
         footprints: S convex polygons (K, 2): the object's outline from above in each resting pose, m.
+        display_pose: index of the resting pose in which it stands upright, or -1.
     """
 
     name: str
     resting_poses: Array
     probabilities: Array
     footprints: list[Array]
+    display_pose: int = -1
 
 
 @dataclass(frozen=True)
@@ -144,38 +145,3 @@ def choose_objects(rng: np.random.Generator, ids: list[str], count: int) -> list
         order = [ids[i] for i in rng.permutation(len(ids))]
         chosen += order[: count - len(chosen)]
     return chosen
-
-
-def choose_target(
-    rng: np.random.Generator,
-    names: list[str],
-    positions_xy: Array,
-    eligible: NDArray[np.bool_],
-    robot_xy: Array,
-    graspable: Callable[[int], bool] = lambda index: True,
-) -> int | None:
-    """Draw the target of a pick among the eligible objects.
-
-    An instruction names the target by its name alone, so among objects of the drawn name the one nearest the robot is
-    meant; if that one isn't eligible, the name isn't drawn.
-
-    Args:
-        rng: source of all randomness.
-        names: K names.
-        positions_xy: (K, 2) m.
-        eligible: (K,) which objects may be the target.
-        robot_xy: (2,) m, same frame.
-        graspable: a test that takes longer, asked of one drawn object after the other until one passes.
-
-    Returns:
-        Index of the target; None if no object qualifies.
-    """
-    distances = np.linalg.norm(np.asarray(positions_xy) - robot_xy, axis=1)
-    nearest = {}
-    for index in np.argsort(distances, kind="stable"):
-        nearest.setdefault(names[index], int(index))
-    candidates = sorted(index for index in nearest.values() if eligible[index])
-    for index in rng.permutation(np.array(candidates, dtype=int)):
-        if graspable(int(index)):
-            return int(index)
-    return None

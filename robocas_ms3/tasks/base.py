@@ -9,6 +9,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Actor, Articulation, Pose
@@ -17,19 +18,18 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
 from robocas_ms3.config import TaskConfig, load_task_config
-from robocas_ms3.errors import ConfigError, LayoutError
+from robocas_ms3.errors import ConfigError
 from robocas_ms3.robots.constants import HAND_LINK
 from robocas_ms3.robots.mobile_panda import RoboCASMobilePanda
 from robocas_ms3.scenes import build
-from robocas_ms3.scenes.grasping import count_free_grasps
-from robocas_ms3.scenes.placement import choose_objects, choose_target, sample_scattered, transform
+from robocas_ms3.scenes.layout import Array, Layout
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.sample import object_set, sample_layout
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.contacts import contact_forces
 from robocas_ms3.tasks.spec import TaskSpec
 
-# Every random decision of a scene has a stream of its own, so that a new one never shifts the others.
-_OBJECTS, _LAYOUT, _TARGET = range(3)
-_LAYOUT_TRIES = 50
+_RESETS_PER_COLLECTION = 20
 
 
 class RoboCASEnv(BaseEnv):
@@ -44,6 +44,9 @@ class RoboCASEnv(BaseEnv):
         pack: name or folder of the pack that objects come from.
         furniture_pack: the same for room, furniture and basket.
         visual_level: ``fast`` or ``full`` meshes to render.
+        layouts: folder of the layout bank; default: in the cache, filled as layouts are asked for; None: no bank,
+            every layout is sampled anew (the same ones, only slower).
+        seeds: least and greatest seed that unseeded resets draw from, such as those of a bank built ahead.
         robot_uids: the robot; only RoboCAS's mobile Panda is supported.
         reconfiguration_freq: see ``BaseEnv``; default 1 for one env, 0 for several.
         kwargs: passed to ``BaseEnv``.
@@ -62,6 +65,8 @@ class RoboCASEnv(BaseEnv):
         pack: str | Path = "builtin",
         furniture_pack: str | Path = "builtin",
         visual_level: VisualLevel = "fast",
+        layouts: str | Path | None = "auto",
+        seeds: tuple[int, int] | None = None,
         robot_uids: str = "robocas_mobile_panda",
         num_envs: int = 1,
         reconfiguration_freq: int | None = None,
@@ -76,17 +81,16 @@ class RoboCASEnv(BaseEnv):
             )
         if visual_level not in VISUALS:
             raise ConfigError("no such visual_level", expected=f"one of {list(VISUALS)}", found=visual_level)
-        self.object_pack = load_pack(pack)
-        self.furniture_pack = load_pack(furniture_pack)
-        self._object_ids = build.find_objects(self.object_pack, self.task_config)
-        surface = self.task_config.surface
-        support = self.task_config.furniture[surface.furniture]
-        furniture = build.find_furniture(self.furniture_pack, support.asset, key=f"furniture.{surface.furniture}.asset")
-        self._support_in_world = build.furniture_pose(support, furniture)
-        self._region = build.find_region(surface, furniture)
+        self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack))
+        self._layouts = lambda objects_seed, seed: sample_layout(self.model, objects_seed, seed)
         self._visual_level: VisualLevel = visual_level
-        self._fixture_points = build.fixture_points(self.task_config, self.furniture_pack)
-        self._basket_asset = build.find_container(self.furniture_pack, self.task_config.basket)
+        if seeds is not None and not 0 <= seeds[0] <= seeds[1]:
+            raise ConfigError("seeds are a range", expected="0 <= first <= last", found=seeds)
+        self._seed_range = seeds
+        self._resets_seeded = True
+        self._layout_seeds = np.zeros(num_envs, dtype=np.int64)
+        self._objects_seeds = np.zeros(num_envs, dtype=np.int64)
+        self._resets = 0
         if reconfiguration_freq is None:
             reconfiguration_freq = 1 if num_envs == 1 else 0
         super().__init__(
@@ -102,32 +106,85 @@ class RoboCASEnv(BaseEnv):
         eye = sapien_utils.look_at([2.2, -0.1, 1.7], [0.85, 0.75, 0.6])
         return CameraConfig("render_camera", eye, 640, 480, np.pi / 3, 0.01, 20)
 
+    # ------------------------------------------------------------------ seeds
+
+    def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
+        """Reset; see ``BaseEnv``. The same seed gives the same layout, whichever envs are reset."""
+        self._resets_seeded = seed is not None
+        return super().reset(seed, options)
+
+    def _set_episode_rng(self, seed: Any, env_idx: torch.Tensor) -> None:
+        """Seed the episodes of some envs and no others; ManiSkill's own forgets the others' seeds."""
+        index = env_idx.cpu().numpy()
+        if seed is not None:
+            seed = np.atleast_1d(np.asarray(seed, dtype=np.int64))
+            if not self._resets_seeded and self._seed_range is not None:
+                low, high = self._seed_range
+                seed = np.where((seed >= low) & (seed <= high), seed, low + seed % (high - low + 1))
+        if seed is None or self._batched_episode_rng is None or len(index) == self.num_envs:
+            super()._set_episode_rng(seed, env_idx)
+        else:
+            if len(seed) == 1 and len(index) > 1:
+                seed = np.concatenate([seed, np.random.RandomState(seed[0]).randint(2**31, size=len(index) - 1)])
+            self._episode_seed[index] = seed
+            self._batched_episode_rng[index] = BatchedRNG.from_seeds(seed, backend=self._batched_rng_backend)
+        for i in index:
+            if seed is not None:
+                self._layout_seeds[i] = self._episode_seed[i]
+            else:  # the episode's generator goes on
+                drawn = int(self._batched_episode_rng[i].randint(2**31))
+                low, high = self._seed_range or (0, 2**31 - 1)
+                self._layout_seeds[i] = low + drawn % (high - low + 1)
+
+    def _clear(self) -> None:
+        """Forget the scene. ManiSkill collects garbage each time, 0.14 s; here only now and then."""
+        self._resets += 1
+        if self._resets % _RESETS_PER_COLLECTION == 0 or self.num_envs > 1:
+            super()._clear()
+            return
+        self._close_viewer()
+        self.agent = None  # pyright: ignore[reportAttributeAccessIssue]
+        self._sensors, self._human_render_cameras, self._hidden_objects = {}, {}, []
+        self.scene = None  # pyright: ignore[reportAttributeAccessIssue]
+
+    def close(self) -> None:
+        """Close the environment and free what it held."""
+        self._resets = -1
+        super().close()
+
     # ------------------------------------------------------------------ scene
 
     def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
-        super()._load_agent(options, sapien.Pose(build.fixture_pose(self.task_config.robot)))
+        super()._load_agent(options, sapien.Pose(self.model.robot_pose))
 
     def _load_scene(self, options: dict) -> None:
-        self.fixtures = build.build_fixtures(self.scene, self.task_config, self.furniture_pack, self._visual_level)
-        count = self.task_config.objects.count
-        draws = self._draw_seeds(torch.arange(self.num_envs))
-        chosen = [choose_objects(np.random.default_rng([d, _OBJECTS]), self._object_ids, count) for d in draws]
-        self.object_assets: list[list[LoadedObject]] = [[self.object_pack.objects[i] for i in ids] for ids in chosen]
+        self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level)
+        assert self._episode_seed is not None
+        self._objects_seeds = np.array(self._episode_seed, dtype=np.int64)
+        chosen = [object_set(self.model, int(seed)) for seed in self._objects_seeds]
+        objects = self.model.object_pack.objects
+        self.object_assets: list[list[LoadedObject]] = [[objects[i] for i in ids] for ids in chosen]
         self.objects: list[Actor] = [
             build.build_object_slot(
                 self.scene, slot, [assets[slot] for assets in self.object_assets], self._visual_level
             )
-            for slot in range(count)
+            for slot in range(len(chosen[0]))
         ]
+        random = self.task_config.randomisation
+        if random.count or random.distractors:
+            build.build_parking(self.scene, len(self.objects))
         facts = [[asset.asset for asset in assets] for assets in self.object_assets]
         self._centers_of_mass = torch.tensor(
             [[f.center_of_mass for f in row] for row in facts], dtype=torch.float32, device=self.device
         )
-        self._rest_height = torch.zeros(self.num_envs, count, device=self.device)
+        slots = len(self.objects)
+        self.layouts: list[Layout | None] = [None] * self.num_envs
+        self.start_poses = torch.zeros(self.num_envs, slots, 7, device=self.device)
+        self.present = torch.ones(self.num_envs, slots, dtype=torch.bool, device=self.device)
         self.target_slot = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
-        self.basket_at_start = Pose.create(sapien.Pose(self._basket_pose()), device=self.device)
-        inner = self._basket_asset.asset.inner
-        assert inner is not None  # find_container saw to it
+        self.basket_at_start = torch.zeros(self.num_envs, 7, device=self.device)
+        inner = self.model.basket.asset.inner
+        assert inner is not None  # the model saw to it
         self._basket_low = torch.tensor(inner.min, device=self.device)
         self._basket_high = torch.tensor(inner.max, device=self.device)
 
@@ -143,77 +200,32 @@ class RoboCASEnv(BaseEnv):
         )
         self.scene.add_directional_light([0, 0, -1], [lights.directional] * 3)
 
-    def _basket_pose(self) -> np.ndarray:
-        return build.furniture_pose(self.task_config.basket, self._basket_asset)
-
-    def _draw_seeds(self, env_idx: torch.Tensor) -> list[int]:
-        """Draw the seed of what follows for each env, from its own episode generator.
-
-        Drawn rather than read from ``_episode_seed``, which an unseeded partial reset leaves as it was.
-        """
-        assert self._batched_episode_rng is not None
-        return [int(self._batched_episode_rng[i].randint(2**31)) for i in env_idx.tolist()]
-
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        layouts = [self._layouts(int(self._objects_seeds[i]), int(self._layout_seeds[i])) for i in env_idx.tolist()]
         with torch.device(self.device):
             count = len(env_idx)
             rest = torch.as_tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32)
             self.agent.reset(rest.repeat(count, 1))
-            self.agent.robot.set_pose(sapien.Pose(build.fixture_pose(self.task_config.robot)))
+            self.agent.robot.set_pose(self._pose([layout.robot_pose for layout in layouts]))
             for furniture in self.fixtures.furniture.values():
                 if isinstance(furniture, Articulation):
                     furniture.set_qpos(torch.zeros(count, furniture.max_dof))
                     furniture.set_qvel(torch.zeros(count, furniture.max_dof))
-            self.fixtures.basket.set_pose(Pose.create(sapien.Pose(self._basket_pose())))
-            poses, targets = self._sample_layouts(env_idx)
+            basket = self._pose([layout.basket_pose for layout in layouts])
+            self.fixtures.basket.set_pose(basket)
+            self.basket_at_start[env_idx] = basket.raw_pose
             for slot, actor in enumerate(self.objects):
-                actor.set_pose(Pose.create(torch.as_tensor(_raw_poses(poses[:, slot]), device=self.device)))
-            self.target_slot[env_idx] = torch.as_tensor(targets, device=self.device)
-            self._rest_height[env_idx] = torch.as_tensor(poses[:, :, 2, 3], dtype=torch.float32, device=self.device)
+                pose = self._pose([layout.object_poses[slot] for layout in layouts])
+                actor.set_pose(pose)
+                self.start_poses[env_idx, slot] = pose.raw_pose
+            self.target_slot[env_idx] = torch.tensor([layout.target for layout in layouts])
+            self.present[env_idx] = torch.as_tensor(np.stack([layout.present for layout in layouts])).to(self.device)
+        for i, layout in zip(env_idx.tolist(), layouts, strict=True):
+            self.layouts[i] = layout
 
-    def _sample_layouts(self, env_idx: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """Layout and target of each env: (n, K, 4, 4) objects in the world, (n,) slots."""
-        layouts, targets = [], []
-        for env, seed in zip(env_idx.tolist(), self._draw_seeds(env_idx), strict=True):
-            layout_rng, target_rng = (np.random.default_rng([seed, stream]) for stream in (_LAYOUT, _TARGET))
-            assets = self.object_assets[env]
-            for _ in range(_LAYOUT_TRIES):
-                poses = self._support_in_world @ sample_scattered(
-                    layout_rng,
-                    [build.placeable(asset) for asset in assets],
-                    self._region,
-                    min_gap=self.task_config.layout.min_gap,
-                    max_tries=self.task_config.layout.max_tries,
-                )
-                target = self._choose_target(target_rng, assets, poses)
-                if target is not None:
-                    break
-            else:
-                raise LayoutError(
-                    "no object qualifies as the target",
-                    where="target",
-                    found=f"{_LAYOUT_TRIES} layouts tried",
-                    fix="Raise target.max_distance, lower target.min_grasps, or use other objects.",
-                )
-            layouts.append(poses)
-            targets.append(target)
-        return np.stack(layouts), np.array(targets)
-
-    def _choose_target(self, rng: np.random.Generator, assets: list[LoadedObject], poses: np.ndarray) -> int | None:
-        rules = self.task_config.target
-        robot_xy = np.array(self.task_config.robot.position[:2])
-        distance = np.linalg.norm(poses[:, :2, 3] - robot_xy, axis=1)
-        graspable = np.array([asset.asset.grasp_count >= rules.min_grasps for asset in assets])
-        names = [asset.asset.name for asset in assets]
-        eligible = graspable & (distance <= rules.max_distance)
-
-        def has_free_grasps(slot: int) -> bool:
-            others = [transform(p, a.surface_points()) for a, p in zip(assets, poses, strict=True)]
-            del others[slot]
-            points = np.concatenate([self._fixture_points, *others])
-            return count_free_grasps(assets[slot], poses[slot], points, robot_xy) >= rules.min_free_grasps
-
-        return choose_target(rng, names, poses[:, :2, 3], eligible, robot_xy, has_free_grasps)
+    def _pose(self, matrices: list[Array]) -> Pose:
+        """Batch of poses from 4x4 matrices."""
+        return Pose.create(torch.as_tensor(_raw_poses(np.stack(matrices)), device=self.device))
 
     # ------------------------------------------------------------------ state
 
@@ -242,20 +254,12 @@ class RoboCASEnv(BaseEnv):
         # the left finger opens along its own +y
         return terms.finger_grasps(forces[:, 0], forces[:, 1], terms.rotate(self.agent.finger1_link.pose.q, y))
 
-    def target_measures(self) -> dict[str, torch.Tensor]:
-        """Conditions of success that have to hold at the same moment, (N,) bool each; for reports."""
-        raise NotImplementedError
-
-    def get_language_instruction(self) -> list[str]:
-        """The instruction of each env."""
-        raise NotImplementedError
-
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         """Nothing in visual modes; in state modes what only a simulator knows."""
         if not self.obs_mode_struct.state and self.obs_mode not in {"state", "state_dict"}:
             return {}
         return {
-            "object_poses": self.object_poses.flatten(1),
+            "object_poses": torch.where(self.present[..., None], self.object_poses, 0.0).flatten(1),
             "target": torch.nn.functional.one_hot(self.target_slot, len(self.objects)).float(),
             "basket_pose": self.fixtures.basket.pose.raw_pose,
         }

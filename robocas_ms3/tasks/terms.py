@@ -128,3 +128,29 @@ def stands(
 def of_target(values: Tensor, target: Tensor) -> Tensor:
     """Pick the target's entry of per-object values: (N, K, ...) and (N,) indices -> (N, ...)."""
     return values[torch.arange(len(target), device=values.device), target]
+
+
+def disturbed(
+    poses: Tensor, start: Tensor, undo: Tensor | None = None, *, max_shift: float = 0.03, max_tilt_deg: float = 30.0
+) -> Tensor:
+    """Which objects are no longer where they stood, or have fallen over.
+
+    Args:
+        poses: (N, K, 7) now: position, quaternion wxyz.
+        start: (N, K, 7) as they stood.
+        undo: (N, 7) motion that brings what they stand on back to where it was; none: it can't move.
+        max_shift: m.
+        max_tilt_deg: degrees.
+
+    Returns:
+        (N, K) bool.
+    """
+    z = torch.zeros_like(poses[..., :3])
+    z[..., 2] = 1
+    position, up, up_at_start = poses[..., :3], rotate(poses[..., 3:], z), rotate(start[..., 3:], z)
+    if undo is not None:
+        turn = undo[:, None, 3:].expand_as(poses[..., 3:])
+        position, up = undo[:, None, :3] + rotate(turn, position), rotate(turn, up)
+    angle = torch.atan2(torch.linalg.norm(torch.linalg.cross(up, up_at_start), dim=-1), (up * up_at_start).sum(-1))
+    shift = torch.linalg.norm(position - start[..., :3], dim=-1)
+    return (shift > max_shift) | (torch.rad2deg(angle) > max_tilt_deg)

@@ -1,0 +1,122 @@
+"""The arm as skills see it: an environment, a planner, an executor, and where the arm was last told to be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
+from robocas_ms3.planning.protocol import Array, Planner, Trajectory
+from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.planning.scene import PlanningScene
+from robocas_ms3.robots.constants import ARM_REST
+from robocas_ms3.scenes.grasping import MAX_WIDTH
+from robocas_ms3.tasks.base import RoboCASEnv
+
+OPEN_SECONDS, CLOSE_SECONDS = 0.30, 0.45
+
+
+@dataclass
+class Arm:
+    """One attempt's tools. All poses are in the arm's base frame.
+
+    Attributes:
+        planner: motion planner.
+        reachability: batched inverse kinematics of the same arm.
+        executor: runs motions in the environment and remembers them.
+        rng: source of all randomness of the attempt.
+        at: (7,) rad where the arm was last told to be; at first, where it is.
+    """
+
+    planner: Planner
+    reachability: Reachability
+    executor: Executor
+    rng: np.random.Generator
+    at: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.scene = PlanningScene(self.env)
+        self.at = self.scene.arm_qpos
+        self.hold_nothing()
+
+    @property
+    def env(self) -> RoboCASEnv:
+        """The environment under its wrappers: control mode ``pd_joint_pos``, one env."""
+        return self.executor.base_env
+
+    def planning(self):
+        """Count the time spent inside as planning."""
+        return self.executor.seconds.spent_on("planning")
+
+    def follow(self, *motions: Trajectory, until: str | None = None) -> bool:
+        """Run motions one after the other; see ``Executor.follow``."""
+        reached = True
+        for motion in motions:
+            reached = self.executor.follow(motion, until=until)
+            self.at = motion.qpos[-1]
+        return reached
+
+    def open_gripper(self) -> None:
+        """Open the gripper, the arm standing still."""
+        self.executor.move_gripper(OPEN, self.at, seconds=OPEN_SECONDS)
+
+    def close_gripper(self) -> None:
+        """Close the gripper, the arm standing still."""
+        self.executor.move_gripper(CLOSED, self.at, seconds=CLOSE_SECONDS)
+
+    def hold_nothing(self) -> None:
+        """Tell the planner that the gripper is empty and open."""
+        self.planner.attach(None)
+        self.planner.finger_width = MAX_WIDTH
+
+    def holds(self, slot: int) -> bool:
+        """Whether both fingers press on an object right now."""
+        return bool(self.env.grasped()[0, slot])
+
+    def first_line(
+        self, start: Array, goals: list[Array], *, stage: str, check_collisions: bool = True, speed: float = 1.0
+    ) -> Trajectory:
+        """Plan a straight line to the first of several poses that one leads to.
+
+        Raises:
+            PlanningFailed: none of them can be reached on a straight line.
+        """
+        failure = PlanningFailed(stage, "no_goal")
+        for goal in goals:
+            try:
+                return self.planner.plan_straight(
+                    start, goal, stage=stage, check_collisions=check_collisions, speed=speed
+                )
+            except PlanningFailed as error:
+                failure = error
+        raise failure
+
+    def plan_home(self, start: Array) -> Trajectory:
+        """Plan to the rest configuration."""
+        return self.planner.plan_to_qpos(start, [np.array(ARM_REST)], stage="home")
+
+    def back_out(self) -> None:
+        """After a failed attempt that stays in the record: open the gripper and rise out of whatever is there."""
+        self.hold_nothing()
+        self.open_gripper()
+        with self.planning():
+            self.planner.set_scene(self.scene.obstacles_in_base())
+            goal = raised(self.scene.tcp_in_base, 0.10)
+            motion = self.planner.plan_straight(self.at, goal, stage="recover", check_collisions=False)
+        self.follow(motion)
+
+
+def raised(tcp_in_base: Array, height: float) -> Array:
+    """A pose moved straight up by ``height`` metres (the arm's base stands upright)."""
+    result = tcp_in_base.copy()
+    result[2, 3] += height
+    return result
+
+
+def moved_back(tcp_in_base: Array, distance: float) -> Array:
+    """A pose moved against its approach by ``distance`` metres."""
+    result = tcp_in_base.copy()
+    result[:3, 3] -= distance * tcp_in_base[:3, 2]
+    return result

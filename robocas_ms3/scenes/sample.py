@@ -1,0 +1,147 @@
+"""From a seed to a layout: which objects, where they stand, which one is the target."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robocas_ms3.assets.pack import LoadedObject
+from robocas_ms3.config.task import OrderlyLayout, PoseRandomisation, ScatteredLayout
+from robocas_ms3.errors import LayoutError
+from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout
+from robocas_ms3.scenes.model import SceneModel, placeable, resolve_ids
+from robocas_ms3.scenes.placement import Array, choose_objects, planar_pose, sample_scattered
+from robocas_ms3.scenes.targets import Arrangement, Choice, choose_target
+
+# Every random decision of a scene has a stream of its own, so that a new one never shifts the others.
+_OBJECTS, _LAYOUT, _TARGET, _ROBOT, _BASKET, _COUNT = range(6)
+_TRIES = 50
+
+
+def object_set(model: SceneModel, objects_seed: int) -> tuple[str, ...]:
+    """The objects of a scene, one id a slot: those of the task, then distractors.
+
+    Args:
+        model: the scene's assets.
+        objects_seed: decides them, and nothing else does.
+    """
+    config = model.config
+    rng = np.random.default_rng([objects_seed, _OBJECTS])
+    ids = list(model.object_ids)
+    if config.randomisation.object_sets:
+        wanted = config.randomisation.object_sets[rng.integers(len(config.randomisation.object_sets))]
+        ids = resolve_ids(model.object_pack, wanted, key="randomisation.object_sets")
+    count = config.objects.count
+    if isinstance(config.layout, OrderlyLayout):
+        copies = config.layout.copies
+        kinds = choose_objects(rng, ids, -(-count // copies))
+        chosen = [kind for kind in kinds for _ in range(copies)][:count]
+    else:
+        chosen = choose_objects(rng, ids, count)
+    distractors = config.randomisation.distractors
+    if distractors is not None:
+        others = resolve_ids(model.object_pack, distractors.ids, key="randomisation.distractors.ids")
+        chosen += choose_objects(rng, [i for i in others if i not in chosen] or others, distractors.count[1])
+    return tuple(chosen)
+
+
+def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
+    """Draw a layout, let it settle, and choose its target. The same seeds give the same layout.
+
+    Args:
+        model: the scene's assets.
+        objects_seed: decides the objects (see `object_set`); on a CPU the same as ``seed``.
+        seed: decides everything else.
+
+    Raises:
+        LayoutError: the objects don't fit, don't come to rest, or none qualifies as the target.
+    """
+
+    def rng(stream: int) -> np.random.Generator:
+        return np.random.default_rng([seed, stream])
+
+    config = model.config
+    ids = object_set(model, objects_seed)
+    assets = [model.object_pack.objects[i] for i in ids]
+    present, candidate = _presence(model, len(ids), rng(_COUNT))
+    robot_pose = _moved(model.robot_pose, config.randomisation.robot, rng(_ROBOT))
+    basket_pose = _moved(model.basket_pose, config.randomisation.basket, rng(_BASKET))
+    layout_rng, target_rng = rng(_LAYOUT), rng(_TARGET)
+    unsettled = 0
+    choice: Choice | None = None
+    for _ in range(_TRIES):
+        poses = np.stack([_parked(slot, asset) for slot, asset in enumerate(assets)])
+        poses[present] = model.support_pose @ _arrange(
+            layout_rng, model, [a for a, p in zip(assets, present, strict=True) if p]
+        )
+        choice = choose_target(
+            target_rng, Arrangement(model, assets, poses, present, candidate, robot_pose, basket_pose)
+        )
+        if choice is not None:
+            return Layout(
+                ids, poses, robot_pose, basket_pose, choice.slot, choice.relation, present, choice.visible_shares
+            )
+    raise LayoutError(
+        "no object qualifies as the target",
+        where="target",
+        found=f"{_TRIES} layouts tried, {unsettled} of which did not come to rest",
+        fix="Raise target.max_distance, lower target.min_grasps or min_free_grasps, or use other objects.",
+    )
+
+
+def _arrange(rng: np.random.Generator, model: SceneModel, assets: list[LoadedObject]) -> Array:
+    """(K, 4, 4) objects in the support's frame."""
+    layout, region = model.config.layout, model.region
+    if isinstance(layout, ScatteredLayout):
+        placeables = [placeable(asset) for asset in assets]
+        return sample_scattered(rng, placeables, region, min_gap=layout.min_gap, max_tries=layout.max_tries)
+    if isinstance(layout, OrderlyLayout):
+        from robocas_ms3.scenes.orderly import sample_orderly
+
+        return sample_orderly(
+            rng,
+            [placeable(asset) for asset in assets],
+            _columns([asset.asset.id for asset in assets], layout.rows),
+            region,
+            front=model.front,
+            row_gap=layout.row_gap,
+            column_spacing=layout.column_spacing,
+            yaw_jitter=np.deg2rad(layout.yaw_jitter_deg),
+        )
+    from robocas_ms3.scenes.stacked import drop_heap
+
+    return drop_heap(rng, assets, region, drop_height=layout.drop_height, tumble_probability=layout.tumble_probability)
+
+
+def _columns(ids: list[str], rows: int) -> list[str]:
+    """Name the column of each object: objects of a kind, at most ``rows`` of them."""
+    seen: dict[str, int] = {}
+    columns = []
+    for i in ids:
+        columns.append(f"{i}/{seen.get(i, 0) // rows}")
+        seen[i] = seen.get(i, 0) + 1
+    return columns
+
+
+def _presence(model: SceneModel, slots: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """(K,) which slots take part, (K,) which of them may be the target."""
+    config = model.config
+    count, random = config.objects.count, config.randomisation
+    used = int(rng.integers(random.count[0], random.count[1] + 1)) if random.count else count
+    extra = int(rng.integers(random.distractors.count[0], random.distractors.count[1] + 1)) if random.distractors else 0
+    slot = np.arange(slots)
+    candidate = slot < used
+    return candidate | ((slot >= count) & (slot < count + extra)), candidate
+
+
+def _moved(pose: Array, by: PoseRandomisation | None, rng: np.random.Generator) -> Array:
+    """Shift a pose in x and y and turn it about its own vertical."""
+    if by is None:
+        return pose
+    shift, yaw = rng.uniform(-by.position, by.position, 2), np.deg2rad(rng.uniform(-by.yaw_deg, by.yaw_deg))
+    moved = pose @ planar_pose(0, 0, 0, yaw)
+    moved[:2, 3] += shift
+    return moved
+
+
+def _parked(slot: int, asset: LoadedObject) -> Array:
+    return planar_pose(slot * 0.5, 0, PARKING_HEIGHT, 0) @ asset.annotations.resting_poses[0]

@@ -1,0 +1,157 @@
+"""Which object of an arrangement is the target: one rule a task. No simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.assets.pack import LoadedObject
+from robocas_ms3.scenes.grasping import count_free_grasps
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.placement import Array, transform
+from robocas_ms3.scenes.relations import related
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The target.
+
+    Attributes:
+        slot: its index.
+        relation: how the instruction tells it from objects of the same name; empty: not needed.
+        visible_shares: (K,) p_vis where the rule asked for it; empty: it did not.
+    """
+
+    slot: int
+    relation: str = ""
+    visible_shares: Array = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Settled objects, before a target is chosen. K slots; poses 4x4 in the world, m.
+
+    Attributes:
+        model: configuration and assets.
+        assets: one a slot.
+        poses: (K, 4, 4).
+        present: (K,) which slots take part.
+        candidate: (K,) which may be the target: present, and no distractor.
+        robot_pose: of the robot's root.
+        basket_pose: of the basket's frame.
+    """
+
+    model: SceneModel
+    assets: list[LoadedObject]
+    poses: Array
+    present: NDArray[np.bool_]
+    candidate: NDArray[np.bool_]
+    robot_pose: Array
+    basket_pose: Array
+
+    @property
+    def names(self) -> list[str]:
+        """K names."""
+        return [asset.asset.name for asset in self.assets]
+
+    @cached_property
+    def opened_poses(self) -> Array:
+        """(K, 4, 4) where the objects will be once the furniture is open."""
+        frame = self.model.support_pose
+        moved = frame @ self.model.support_motion(opened=True) @ np.linalg.inv(frame)
+        return np.where(self.present[:, None, None], moved @ self.poses, self.poses)
+
+    @property
+    def xy_in_robot(self) -> Array:
+        """(K, 2) m, objects in the robot's frame: x ahead, y to its left."""
+        return (np.linalg.inv(self.robot_pose) @ self.opened_poses)[:, :2, 3]
+
+    @property
+    def eligible(self) -> NDArray[np.bool_]:
+        """(K,) candidates with enough grasps that are near enough to the robot."""
+        rules = self.model.config.target
+        near = np.linalg.norm(self.xy_in_robot, axis=1) <= rules.max_distance
+        graspable = np.array([asset.asset.grasp_count >= rules.min_grasps for asset in self.assets])
+        return self.candidate & near & graspable
+
+    def has_free_grasps(self, slot: int) -> bool:
+        """Whether enough of an object's grasps are clear of everything else."""
+        rules = self.model.config.target
+        points = [self.model.fixture_points(self.basket_pose, opened=True)]
+        for other in np.flatnonzero(self.present):
+            if other != slot:
+                points.append(transform(self.opened_poses[other], self.assets[other].surface_points()))
+        free = count_free_grasps(
+            self.assets[slot],
+            self.opened_poses[slot],
+            np.concatenate(points),
+            self.robot_pose[:2, 3],
+        )
+        return free >= rules.min_free_grasps
+
+
+def choose_target(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
+    """Choose the target by the task's rule; None where no object qualifies."""
+    return _RULES[scene.model.config.task](rng, scene)
+
+
+def _by_name(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
+    """Any object; its name is all the instruction says, so among same-named ones the nearest is meant."""
+    distances = np.linalg.norm(scene.xy_in_robot, axis=1)
+    nearest: dict[str, int] = {}
+    for slot in np.argsort(distances, kind="stable"):
+        if scene.present[slot]:
+            nearest.setdefault(scene.names[slot], int(slot))
+    slots = sorted(slot for slot in nearest.values() if scene.eligible[slot])
+    return _first(rng, slots, scene.has_free_grasps)
+
+
+def _first(rng: np.random.Generator, slots: list[int], test: Callable[[int], bool]) -> Choice | None:
+    for slot in rng.permutation(np.array(slots, dtype=int)):
+        if test(int(slot)):
+            return Choice(int(slot))
+    return None
+
+
+def _by_relation(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
+    """One of several identical objects, named by where it stands among them."""
+    pairs = [(name, relation) for name in sorted(set(scene.names)) for relation in scene.model.config.target.relations]
+    for index in rng.permutation(len(pairs)):
+        name, relation = pairs[index]
+        slots = [s for s, n in enumerate(scene.names) if n == name and scene.present[s]]
+        found = related(relation, scene.xy_in_robot[slots])
+        if found is not None and scene.eligible[slots[found]] and scene.has_free_grasps(slots[found]):
+            return Choice(slots[found], relation)
+    return None
+
+
+def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
+    """A hidden object, near ones more often: weight 1 / distance to the robot (upstream's)."""
+    from robocas_ms3.scenes.visibility import object_mesh, top_down_camera, visible_shares
+
+    model, slots = scene.model, np.flatnonzero(scene.present)
+    region = model.region
+    middle = np.append(np.add(region.min_xy, region.max_xy) / 2, region.z)
+    center = transform(model.support_pose, middle[None])[0]
+    camera = top_down_camera(center[:2], center[2])
+    shares = np.full(len(scene.assets), np.nan)
+    shares[slots] = visible_shares(camera, [object_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
+    unique = np.array([scene.names.count(name) == 1 for name in scene.names])
+    hidden = scene.eligible & unique & (shares < model.config.target.max_visible_share)
+    if not hidden.any():
+        return None
+    weight = np.where(hidden, 1 / np.linalg.norm(scene.xy_in_robot, axis=1), 0)
+    slot = int(rng.choice(len(weight), p=weight / weight.sum()))
+    return Choice(slot, visible_shares=shares)
+
+
+_RULES: dict[str, Callable[[np.random.Generator, Arrangement], Choice | None]] = {
+    "pick": _by_name,
+    "open_pick": _by_name,
+    "select": _by_relation,
+    "search": _by_visibility,
+}

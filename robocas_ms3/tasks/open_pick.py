@@ -1,0 +1,37 @@
+"""RoboCASOpenPick-v1: open a door or drawer, take the named object out, drop it into the basket."""
+
+from __future__ import annotations
+
+import torch
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs import Articulation
+
+from robocas_ms3.tasks.spec import OPEN_PICK
+from robocas_ms3.tasks.transfer import STAGES, TransferEnv
+
+
+@register_env(OPEN_PICK.env_id, max_episode_steps=OPEN_PICK.max_episode_steps)
+class RoboCASOpenPickEnv(TransferEnv):
+    """Open and pick. The stages begin with ``furniture_opened``: the joint was past ``opening.opened_at`` of its range.
+
+    Success is pick's: how the object got out is up to the policy.
+    """
+
+    SPEC = OPEN_PICK
+    STAGES = ("furniture_opened", *STAGES)
+
+    def opening_position(self) -> torch.Tensor:
+        """(N,) m or rad, where the joint stands that has to be opened."""
+        opening, joint = self.task_config.opening, self.model.opened_joint
+        assert opening is not None  # the configuration saw to it
+        assert joint is not None
+        furniture = self.fixtures.furniture[opening.furniture]
+        assert isinstance(furniture, Articulation)
+        index = [active.name for active in furniture.active_joints].index(joint.name)
+        return furniture.get_qpos()[:, index]
+
+    def task_stages(self) -> dict[str, torch.Tensor]:
+        """Whether the furniture is open, (N,) bool."""
+        goal = self.model.opened_position
+        position = self.opening_position()
+        return {"furniture_opened": position >= goal if goal > 0 else position <= goal}

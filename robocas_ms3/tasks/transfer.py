@@ -1,0 +1,126 @@
+"""What the benchmark's tasks have in common: the target has to end up in the basket. Stages, success, instruction."""
+
+from __future__ import annotations
+
+from typing import ClassVar, cast
+
+import numpy as np
+import torch
+from mani_skill.utils.structs import Articulation
+
+from robocas_ms3.assets.manifest import BODY
+from robocas_ms3.config.relations import Relation
+from robocas_ms3.language.instructions import Instruction, choose_instruction, part_name
+from robocas_ms3.tasks import terms
+from robocas_ms3.tasks.base import RoboCASEnv
+
+_LANGUAGE = 100  # stream of an episode's seed; those of layouts are in scenes/sample.py
+STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
+
+
+class TransferEnv(RoboCASEnv):
+    """Move the target to the basket.
+
+    ``evaluate()`` gives (N,) bools. The stages are sticky over an episode: ``reached_any`` (the gripper touched any
+    object), ``picked_any`` (both fingers held any object >= 3 cm above where it stood), ``reached_target``,
+    ``target_grasped``, ``target_lifted`` (as ``picked_any``, of the target), ``target_in_basket``. ``success`` is not:
+    the target was lifted, now lies in the basket's inner volume at rest, untouched by the gripper, and the basket
+    stands (moved <= 0.1 m, tilted <= 20 deg). ``disturbed`` (N,) int counts the objects other than the target that are
+    more than 3 cm from where they stood, or have fallen over (30 deg), relative to the door or drawer they are on.
+    """
+
+    STAGES: ClassVar[tuple[str, ...]] = STAGES
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        super()._initialize_episode(env_idx, options)
+        if not hasattr(self, "_stages") or len(self._stages["reached_any"]) != self.num_envs:
+            self._stages = {s: torch.zeros(self.num_envs, dtype=torch.bool, device=self.device) for s in self.STAGES}
+        for flags in self._stages.values():
+            flags[env_idx] = False
+        said = {env: self._instruct(env) for env in env_idx.tolist()}
+        kept = getattr(self, "instructions", [])
+        self.instructions = [said[env] if env in said else kept[env] for env in range(self.num_envs)]
+
+    def _instruct(self, env: int) -> Instruction:
+        config, layout = self.task_config, self.layouts[env]
+        assert layout is not None  # the reset gave it one
+        name = self.target_asset(env).asset.name
+        names = {asset.asset.name for asset, used in zip(self.object_assets[env], layout.present, strict=True) if used}
+        return choose_instruction(
+            np.random.default_rng([int(self._layout_seeds[env]), _LANGUAGE]),
+            config.task,
+            config.language.split,
+            object=name,
+            support=config.support,
+            relation=cast("Relation | None", layout.relation or None),
+            part=part_name(config.opening.handle) if config.opening else "",
+            others=sorted(names - {name}),
+            synonyms=config.language.synonyms,
+        )
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Stages and success of each env, (N,) bool each; ``disturbed`` (N,) int."""
+        forces = self.gripper_forces()
+        grasped = self.grasped(forces)
+        touched = terms.touched(forces)
+        poses = self.object_poses
+        lifted = terms.lifted(poses[..., 2], self.start_poses[..., 2], grasped)
+        measures = self.target_measures(touched)
+        now = {
+            "reached_any": touched.any(dim=1),
+            "picked_any": lifted.any(dim=1),
+            "reached_target": terms.of_target(touched, self.target_slot),
+            "target_grasped": terms.of_target(grasped, self.target_slot),
+            "target_lifted": terms.of_target(lifted, self.target_slot),
+            "target_in_basket": measures["in_basket"],
+            **self.task_stages(),
+        }
+        for stage, flags in now.items():
+            self._stages[stage] |= flags
+        success = self._stages["target_lifted"] & torch.stack(list(measures.values())).all(dim=0)
+        return {
+            **{stage: flags.clone() for stage, flags in self._stages.items()},
+            "success": success,
+            "disturbed": self._disturbed(poses),
+        }
+
+    def task_stages(self) -> dict[str, torch.Tensor]:
+        """What a task adds to the stages: (N,) bool each, of this moment."""
+        return {}
+
+    def target_measures(self, touched: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        """What has to hold at the same moment for success, besides the target having been lifted: (N,) bool each.
+
+        Args:
+            touched: (N, K) bool, which objects the gripper touches, if that is known already.
+        """
+        if touched is None:
+            touched = terms.touched(self.gripper_forces())
+        basket, start, slot = self.fixtures.basket.pose, self.basket_at_start, self.target_slot
+        pose = terms.of_target(self.object_poses, slot)
+        center = pose[:, :3] + terms.rotate(pose[:, 3:], terms.of_target(self._centers_of_mass, slot))
+        linear = torch.stack([actor.linear_velocity for actor in self.objects], dim=1)
+        angular = torch.stack([actor.angular_velocity for actor in self.objects], dim=1)
+        return {
+            "in_basket": terms.inside_box(center, basket.p, basket.q, self._basket_low, self._basket_high),
+            "untouched": ~terms.of_target(touched, slot),
+            "at_rest": terms.at_rest(terms.of_target(linear, slot), terms.of_target(angular, slot)),
+            "basket_stands": terms.stands(basket.p, basket.q, start[:, :3], start[:, 3:]),
+        }
+
+    def _disturbed(self, poses: torch.Tensor) -> torch.Tensor:
+        """(N,) how many objects other than the target no longer stand as they stood."""
+        support = self.fixtures.furniture[self.task_config.surface.furniture]
+        undo = None
+        if isinstance(support, Articulation) and self.model.support_link:
+            # the frames of body and links coincide while everything is closed, as it is after a reset
+            links = support.links_map
+            undo = (links[BODY].pose * links[self.model.support_link].pose.inv()).raw_pose
+        moved = terms.disturbed(poses, self.start_poses, undo)
+        moved &= self.present
+        moved[torch.arange(self.num_envs, device=self.device), self.target_slot] = False
+        return moved.sum(dim=1)
+
+    def get_language_instruction(self) -> list[str]:
+        """The instruction of each env."""
+        return [said.text for said in self.instructions]
