@@ -1,0 +1,124 @@
+"""Read the instructions and synonyms that lie beside this file."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from string import Formatter
+from typing import Annotated, Literal, TypeVar
+
+import yaml
+from pydantic import Field, ValidationError, model_validator
+
+from robocas_ms3.config.relations import Relation
+from robocas_ms3.config.task import StrictModel
+from robocas_ms3.errors import ConfigError
+
+Task = Literal["pick", "select", "search", "open_pick"]
+Split = Literal["upstream", "train", "held_out"]
+
+INSTRUCTIONS_FILE = Path(__file__).with_name("instructions.yaml")
+SYNONYMS_FILE = Path(__file__).with_name("synonyms.yaml")
+
+Words = tuple[Annotated[str, Field(min_length=1)], ...]
+_Model = TypeVar("_Model", bound=StrictModel)
+_REPEATABLE = {"it", "on"}
+
+
+class Templates(StrictModel):
+    """The templates of a task; ``upstream`` is the default."""
+
+    upstream: Annotated[Words, Field(min_length=1)]
+    train: Words
+    held_out: Words
+
+    def of(self, split: Split) -> Words:
+        """Templates of one split."""
+        return {"upstream": self.upstream, "train": self.train, "held_out": self.held_out}[split]
+
+
+class Synonyms(StrictModel):
+    """Other words for a thing."""
+
+    train: Words = ()
+    held_out: Words = ()
+
+    def of(self, split: Split) -> Words:
+        """Words of one split; upstream has none."""
+        return {"upstream": (), "train": self.train, "held_out": self.held_out}[split]
+
+
+class SupportWords(Synonyms):
+    """Other words for a support, and whether things are in it (cabinet) or on it (table)."""
+
+    inside: bool = False
+
+
+class RelationPhrases(Synonyms):
+    """How a relation is said; a phrase has one ``{object}``."""
+
+    plain: str
+
+    @model_validator(mode="after")
+    def _fields(self) -> RelationPhrases:
+        for phrase in (self.plain, *self.train, *self.held_out):
+            _check_fields(phrase, needed={"object"}, allowed={"object"})
+        return self
+
+
+class InstructionTexts(StrictModel):
+    """``instructions.yaml``."""
+
+    tasks: dict[Task, Templates]
+    relations: dict[Relation, RelationPhrases]
+
+    @model_validator(mode="after")
+    def _fields(self) -> InstructionTexts:
+        for task, templates in self.tasks.items():
+            needed = {"object", "part"} if task == "open_pick" else {"object"}
+            for template in (*templates.upstream, *templates.train, *templates.held_out):
+                _check_fields(template, needed=needed, allowed=needed | {"support"} | _REPEATABLE)
+        return self
+
+
+class SynonymTexts(StrictModel):
+    """``synonyms.yaml``."""
+
+    plurals: Words
+    objects: dict[str, Synonyms]
+    supports: dict[str, SupportWords]
+
+
+@lru_cache
+def instruction_texts() -> InstructionTexts:
+    """Templates of all tasks and phrases of all relations."""
+    return read_texts(INSTRUCTIONS_FILE, InstructionTexts)
+
+
+@lru_cache
+def synonym_texts() -> SynonymTexts:
+    """Synonyms of objects and supports."""
+    return read_texts(SYNONYMS_FILE, SynonymTexts)
+
+
+def read_texts(path: Path, model: type[_Model]) -> _Model:
+    """Read a file of texts.
+
+    Raises:
+        ConfigError: unknown keys, wrong types, a template with wrong fields: the first mistake.
+    """
+    try:
+        return model.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(f"{key}: {first['msg']}".removeprefix(": "), where=path) from error
+
+
+def _check_fields(template: str, *, needed: set[str], allowed: set[str]) -> None:
+    """Each needed field once, others allowed at most once; only {it} and {on} may come again."""
+    fields = [field for _, field, _, _ in Formatter().parse(template) if field is not None]
+    wrong = (set(fields) - allowed) | (needed - set(fields))
+    wrong |= {field for field in fields if fields.count(field) > 1} - _REPEATABLE
+    if wrong:
+        raise ValueError(f"{template!r}: unknown, missing or repeated fields {sorted(wrong)}")
