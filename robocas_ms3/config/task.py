@@ -41,14 +41,20 @@ class LightConfig(StrictModel):
     shadow: bool = Field(default=False, description="doubles the cost of a frame on a CPU")
 
 
-class FurnitureConfig(StrictModel):
-    """A piece of furniture and where its lowest point stands."""
+class PlacedConfig(StrictModel):
+    """An asset and where its lowest point stands."""
 
-    asset: str
+    asset: str = Field(description="id in the furniture pack, or pack/id")
     pose: PoseConfig
 
 
-class BasketConfig(FurnitureConfig):
+class FurnitureConfig(PlacedConfig):
+    """A piece of furniture."""
+
+    joints: dict[str, float] = Field(default={}, description="where doors and drawers stand at first, m or rad; else 0")
+
+
+class BasketConfig(PlacedConfig):
     """The container that objects go into."""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack, load_pack
-from robocas_ms3.config.task import FurnitureConfig, PoseConfig, SurfaceConfig, TaskConfig
+from robocas_ms3.config.task import PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.scenes.placement import Array, Placeable, Region, planar_pose, transform
 
@@ -67,10 +67,20 @@ class SceneModel:
             robot_pose=fixture_pose(config.robot),
             region=find_region(config.surface, furniture[config.surface.furniture]),
         )
-        model._check_opening()
+        model._check_joints()
         return model
 
-    def _check_opening(self) -> None:
+    def _check_joints(self) -> None:
+        for name, item in self.config.furniture.items():
+            known = {link.joint.name: link.joint.limits for link in self.furniture[name].asset.links}
+            for joint, position in item.joints.items():
+                if joint not in known:
+                    where = f"furniture.{name}.joints: no such joint"
+                    raise ConfigError(where, expected=f"one of {sorted(known)}", found=joint)
+                low, high = known[joint]
+                if not low <= position <= high:
+                    where = f"furniture.{name}.joints.{joint}: out of its limits"
+                    raise ConfigError(where, expected=f"{low}..{high}", found=position)
         opening = self.config.opening
         if opening is None:
             return
@@ -110,20 +120,20 @@ class SceneModel:
         return opening.opened_at * max(joint.limits, key=abs)
 
     def joint_positions(self, name: str, *, opened: bool) -> dict[str, float]:
-        """Positions of a piece of furniture's joints: closed, or as the task wants them."""
+        """Positions of a piece of furniture's joints by name: as at first, or as the task wants them; others are at 0."""
+        positions = dict(self.config.furniture[name].joints)
         joint, opening = self.opened_joint, self.config.opening
-        if not opened or joint is None or opening is None or opening.furniture != name:
-            return {}
-        return {joint.name: self.opened_position}
+        if opened and joint is not None and opening is not None and opening.furniture == name:
+            positions[joint.name] = self.opened_position
+        return positions
 
     def support_motion(self, *, opened: bool) -> Array:
-        """4x4 by which opening moves what stands on the support, in the support's frame."""
+        """4x4 by which joints have moved what objects stand on from where it is when closed, in the support's frame."""
         name = self.config.surface.furniture
         if not self.support_link:
             return np.eye(4)
-        return link_poses(self.furniture[name].asset.links, self.joint_positions(name, opened=opened))[
-            self.support_link
-        ]
+        positions = self.joint_positions(name, opened=opened)
+        return link_poses(self.furniture[name].asset.links, positions)[self.support_link]
 
     def fixture_points(self, basket_pose: Array, *, opened: bool = False) -> Array:
         """Samples (P, 3) of the collision surfaces of furniture and basket, world, m.
@@ -167,7 +177,7 @@ def fixture_pose(config: PoseConfig) -> Array:
     return planar_pose(*config.position, np.deg2rad(config.yaw_deg))
 
 
-def furniture_pose(config: FurnitureConfig, furniture: LoadedFurniture) -> Array:
+def furniture_pose(config: PlacedConfig, furniture: LoadedFurniture) -> Array:
     """4x4 of a piece of furniture's frame: the configuration says where its lowest point stands."""
     pose = fixture_pose(config.pose)
     pose[2, 3] += furniture.asset.origin_height
@@ -210,7 +220,7 @@ def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
     return room
 
 
-def find_container(pack: Pack, config: FurnitureConfig) -> LoadedFurniture:
+def find_container(pack: Pack, config: PlacedConfig) -> LoadedFurniture:
     """Look up the basket.
 
     Raises:

@@ -70,8 +70,10 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
     choice: Choice | None = None
     for _ in range(_TRIES):
         poses = np.stack([_parked(slot, asset) for slot, asset in enumerate(assets)])
-        poses[present] = model.support_pose @ _arrange(
-            layout_rng, model, [a for a, p in zip(assets, present, strict=True) if p]
+        poses[present] = (
+            model.support_pose
+            @ model.support_motion(opened=False)
+            @ _arrange(layout_rng, model, [a for a, p in zip(assets, present, strict=True) if p])
         )
         choice = choose_target(
             target_rng, Arrangement(model, assets, poses, present, candidate, robot_pose, basket_pose)

@@ -62,7 +62,8 @@ class Arrangement:
     def opened_poses(self) -> Array:
         """(K, 4, 4) where the objects will be once the furniture is open."""
         frame = self.model.support_pose
-        moved = frame @ self.model.support_motion(opened=True) @ np.linalg.inv(frame)
+        before, after = (self.model.support_motion(opened=opened) for opened in (False, True))
+        moved = frame @ after @ np.linalg.inv(frame @ before)
         return np.where(self.present[:, None, None], moved @ self.poses, self.poses)
 
     @property

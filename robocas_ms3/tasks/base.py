@@ -207,9 +207,11 @@ class RoboCASEnv(BaseEnv):
             rest = torch.as_tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32)
             self.agent.reset(rest.repeat(count, 1))
             self.agent.robot.set_pose(self._pose([layout.robot_pose for layout in layouts]))
-            for furniture in self.fixtures.furniture.values():
+            for name, furniture in self.fixtures.furniture.items():
                 if isinstance(furniture, Articulation):
-                    furniture.set_qpos(torch.zeros(count, furniture.max_dof))
+                    positions = self.model.joint_positions(name, opened=False)
+                    qpos = torch.tensor([positions.get(joint.name, 0.0) for joint in furniture.active_joints])
+                    furniture.set_qpos(qpos.repeat(count, 1))
                     furniture.set_qvel(torch.zeros(count, furniture.max_dof))
             basket = self._pose([layout.basket_pose for layout in layouts])
             self.fixtures.basket.set_pose(basket)

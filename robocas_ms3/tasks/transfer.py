@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import ClassVar, cast
 
 import numpy as np
+import sapien
 import torch
-from mani_skill.utils.structs import Articulation
+from mani_skill.utils.structs import Articulation, Pose
 
 from robocas_ms3.assets.manifest import BODY
 from robocas_ms3.config.relations import Relation
@@ -113,9 +114,9 @@ class TransferEnv(RoboCASEnv):
         support = self.fixtures.furniture[self.task_config.surface.furniture]
         undo = None
         if isinstance(support, Articulation) and self.model.support_link:
-            # the frames of body and links coincide while everything is closed, as it is after a reset
             links = support.links_map
-            undo = (links[BODY].pose * links[self.model.support_link].pose.inv()).raw_pose
+            before = Pose.create(sapien.Pose(self.model.support_motion(opened=False)), device=self.device)
+            undo = (links[BODY].pose * before * links[self.model.support_link].pose.inv()).raw_pose
         moved = terms.disturbed(poses, self.start_poses, undo)
         moved &= self.present
         moved[torch.arange(self.num_envs, device=self.device), self.target_slot] = False
