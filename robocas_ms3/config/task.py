@@ -144,6 +144,7 @@ class OpeningConfig(StrictModel):
 
     furniture: str = Field(description="key in `furniture`")
     handle: str = Field(description="handle of that furniture")
+    part: str = Field(default="", description="what instructions call the part; default: from the handle's name")
     opened_at: Annotated[float, Field(gt=0, le=1)] = Field(
         default=0.6, description="share of the joint's range from which it counts as opened"
     )

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from robocas_ms3.planning.protocol import Array, Trajectory
-from robocas_ms3.tasks.base import RoboCASEnv
+from robocas_ms3.tasks.transfer import TransferEnv
 
 OPEN, CLOSED = 1.0, -1.0
 
@@ -75,10 +75,10 @@ class Executor:
     seconds: Seconds = field(default_factory=Seconds)
 
     @property
-    def base_env(self) -> RoboCASEnv:
+    def base_env(self) -> TransferEnv:
         """The environment under its wrappers."""
         env = self.env.unwrapped
-        assert isinstance(env, RoboCASEnv)
+        assert isinstance(env, TransferEnv)
         return env
 
     @property

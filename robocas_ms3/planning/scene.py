@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.scenes.placement import transform
-from robocas_ms3.tasks.base import RoboCASEnv
+from robocas_ms3.tasks.transfer import TransferEnv
 
 # Upstream's: samples of the meshes at 5 mm, none farther than 1.5 m from the robot
 SPACING = 0.005
@@ -36,7 +36,7 @@ def inverse(pose: Array) -> Array:
 class PlanningScene:
     """Reads one environment (``num_envs`` = 1) as a planner sees it. All clouds are in the arm's base frame, m."""
 
-    def __init__(self, env: RoboCASEnv) -> None:
+    def __init__(self, env: TransferEnv) -> None:
         self.env = env
 
     def _furniture_in_world(self) -> Array:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import sapien
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Articulation
+from mani_skill.utils.structs.render_camera import RenderCamera
 
 from robocas_ms3.assets.pack import LoadedObject, VisualLevel
 from robocas_ms3.assets.spawn import spawn, spawn_articulation
+from robocas_ms3.config import TaskConfig
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.randomise import draw_camera_shift, draw_finishes, draw_lights
 
 
 @dataclass(frozen=True)
@@ -23,19 +28,72 @@ class Fixtures:
     basket: Actor
 
 
-def build_fixtures(scene: ManiSkillScene, model: SceneModel, level: VisualLevel = "fast") -> Fixtures:
-    """Build room, furniture and basket into every sub-scene; joints of furniture are closed."""
+def build_fixtures(
+    scene: ManiSkillScene, model: SceneModel, level: VisualLevel = "fast", seeds: Sequence[int] = (0,)
+) -> Fixtures:
+    """Build room, furniture and basket into every sub-scene; joints of furniture are closed.
+
+    Args:
+        scene: the ManiSkill scene.
+        model: what to build.
+        level: of detail of what is rendered.
+        seeds: one a sub-scene, of the finishes of its room.
+    """
     furniture: dict[str, Actor | Articulation] = {}
     for name, asset in model.furniture.items():
         build_one = spawn_articulation if asset.links else spawn
         furniture[name] = build_one(scene, asset, name=name, pose=sapien.Pose(model.furniture_poses[name]), level=level)
     return Fixtures(
-        room=spawn(
-            scene, model.room, name="room", pose=sapien.Pose(), level=level, finishes=model.config.room.finishes
-        ),
+        room=_build_room(scene, model, level, seeds),
         furniture=furniture,
         basket=spawn(scene, model.basket, name="basket", pose=sapien.Pose(model.basket_pose), level=level),
     )
+
+
+def _build_room(scene: ManiSkillScene, model: SceneModel, level: VisualLevel, seeds: Sequence[int]) -> Actor:
+    finishes = [draw_finishes(model.config, model.room, seed) for seed in seeds]
+    if all(other == finishes[0] for other in finishes):
+        return spawn(scene, model.room, name="room", pose=sapien.Pose(), level=level, finishes=finishes[0])
+    rooms = [
+        spawn(scene, model.room, name=f"room-env_{i}", pose=sapien.Pose(), level=level, finishes=own, scene_idxs=[i])
+        for i, own in enumerate(finishes)
+    ]
+    return Actor.merge(rooms, name="room")
+
+
+def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int], *, shadow: bool) -> None:
+    """Light every sub-scene.
+
+    Args:
+        scene: the ManiSkill scene.
+        config: the configuration.
+        seeds: one a sub-scene.
+        shadow: let the slanted light cast shadows.
+    """
+    for i, seed in enumerate(seeds):
+        lights = draw_lights(config, seed)
+        scene.sub_scenes[i].ambient_light = [lights.ambient] * 3
+        bright = [lights.directional] * 3
+        scene.add_directional_light(
+            lights.direction.tolist(), bright, shadow=shadow, shadow_scale=5, shadow_map_size=2048, scene_idxs=[i]
+        )
+        scene.add_directional_light([0, 0, -1], bright, scene_idxs=[i])
+
+
+def shift_cameras(cameras: Sequence[RenderCamera], config: TaskConfig, seeds: Sequence[int]) -> None:
+    """Move the cameras of every sub-scene as the configuration's randomisation wants it.
+
+    Args:
+        cameras: in an order that is always the same.
+        config: the configuration.
+        seeds: one a sub-scene.
+    """
+    by = config.randomisation.cameras
+    if by is None:
+        return
+    for number, camera in enumerate(cameras):
+        for part, seed in zip(camera._render_cameras, seeds, strict=True):
+            part.local_pose = part.local_pose * sapien.Pose(draw_camera_shift(by, number, seed))
 
 
 def build_object_slot(
@@ -69,7 +127,7 @@ def build_object_slot(
 
 def build_parking(scene: ManiSkillScene, slots: int) -> Actor:
     """Build the plane, far below the floor, on which slots wait that an episode does not use."""
-    builder = scene.create_actor_builder()
+    builder: Any = scene.create_actor_builder()
     half_size = [(slots + 1) / 2, 1.0, 0.1]
     center = sapien.Pose([(slots - 1) / 4, 0, PARKING_HEIGHT - half_size[2]])
     builder.add_box_collision(half_size=half_size)

@@ -158,10 +158,10 @@ class RoboCASEnv(BaseEnv):
         super()._load_agent(options, sapien.Pose(self.model.robot_pose))
 
     def _load_scene(self, options: dict) -> None:
-        self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level)
-        assert self._episode_seed is not None
-        self._objects_seeds = np.array(self._episode_seed, dtype=np.int64)
-        chosen = [object_set(self.model, int(seed)) for seed in self._objects_seeds]
+        seeds = self._scene_seeds
+        self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level, seeds)
+        self._objects_seeds = np.array(seeds)
+        chosen = [object_set(self.model, seed) for seed in seeds]
         objects = self.model.object_pack.objects
         self.object_assets: list[list[LoadedObject]] = [[objects[i] for i in ids] for ids in chosen]
         self.objects: list[Actor] = [
@@ -189,16 +189,20 @@ class RoboCASEnv(BaseEnv):
         self._basket_high = torch.tensor(inner.max, device=self.device)
 
     def _load_lighting(self, options: dict) -> None:
-        lights = self.task_config.lights
-        self.scene.set_ambient_light([lights.ambient] * 3)
-        self.scene.add_directional_light(
-            list(lights.direction),
-            [lights.directional] * 3,
-            shadow=lights.shadow or self.enable_shadow,
-            shadow_scale=5,
-            shadow_map_size=2048,
-        )
-        self.scene.add_directional_light([0, 0, -1], [lights.directional] * 3)
+        shadow = self.task_config.lights.shadow or self.enable_shadow
+        build.build_lights(self.scene, self.task_config, self._scene_seeds, shadow=shadow)
+
+    def _setup_sensors(self, options: dict) -> None:
+        super()._setup_sensors(options)
+        sensors: dict[str, Any] = dict(self._sensors)
+        cameras = [sensors[name].camera for name in sorted(sensors)]
+        build.shift_cameras(cameras, self.task_config, self._scene_seeds)
+
+    @property
+    def _scene_seeds(self) -> list[int]:
+        """What each sub-scene is built from; looks stay until the scene is built anew."""
+        assert self._episode_seed is not None
+        return [int(seed) for seed in self._episode_seed]
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         layouts = [self._layouts(int(self._objects_seeds[i]), int(self._layout_seeds[i])) for i in env_idx.tolist()]
@@ -225,7 +229,7 @@ class RoboCASEnv(BaseEnv):
         for i, layout in zip(env_idx.tolist(), layouts, strict=True):
             self.layouts[i] = layout
 
-    def _pose(self, matrices: list[Array]) -> Pose:
+    def _pose(self, matrices: list[Array]) -> Any:
         """Batch of poses from 4x4 matrices."""
         return Pose.create(torch.as_tensor(_raw_poses(np.stack(matrices)), device=self.device))
 

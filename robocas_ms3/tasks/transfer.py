@@ -54,7 +54,7 @@ class TransferEnv(RoboCASEnv):
             object=name,
             support=config.support,
             relation=cast("Relation | None", layout.relation or None),
-            part=part_name(config.opening.handle) if config.opening else "",
+            part=config.opening.part or part_name(config.opening.handle) if config.opening else "",
             others=sorted(names - {name}),
             synonyms=config.language.synonyms,
         )

@@ -13,7 +13,7 @@ from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.scene import PlanningScene
 from robocas_ms3.robots.constants import ARM_REST
 from robocas_ms3.scenes.grasping import MAX_WIDTH
-from robocas_ms3.tasks.base import RoboCASEnv
+from robocas_ms3.tasks.transfer import TransferEnv
 
 OPEN_SECONDS, CLOSE_SECONDS = 0.30, 0.45
 
@@ -42,7 +42,7 @@ class Arm:
         self.hold_nothing()
 
     @property
-    def env(self) -> RoboCASEnv:
+    def env(self) -> TransferEnv:
         """The environment under its wrappers: control mode ``pd_joint_pos``, one env."""
         return self.executor.base_env
 

@@ -1,0 +1,71 @@
+"""How a scene looks under a seed: finishes of the room, lights, cameras. Pure draws; nothing here builds anything.
+
+What stands where is drawn in ``sample.py``. Each draw has a stream of its own, so that turning one block on leaves the
+others, and the layouts, as they were.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.assets.pack import LoadedFurniture
+from robocas_ms3.config.task import CameraRandomisation, TaskConfig
+from robocas_ms3.scenes.placement import Array
+
+_ROOM, _LIGHTS, _CAMERAS = range(200, 203)  # streams; those of layouts are in sample.py
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Grey lights; ``direction`` is the unit vector in which the slanted one shines, world."""
+
+    ambient: float
+    directional: float
+    direction: Array
+
+
+def draw_finishes(config: TaskConfig, room: LoadedFurniture, seed: int) -> dict[str, str]:
+    """Finish of each part of the room that has one other than its default."""
+    finishes = dict(config.room.finishes)
+    rng = np.random.default_rng([seed, _ROOM])
+    for part in sorted(config.randomisation.room or ()):
+        known = room.asset.finishes[part]
+        finishes[part] = known[int(rng.integers(len(known)))]
+    return finishes
+
+
+def draw_lights(config: TaskConfig, seed: int) -> Lights:
+    """Brightness and direction of the lights."""
+    lights, by = config.lights, config.randomisation.lights
+    direction = np.array(lights.direction) / np.linalg.norm(lights.direction)
+    if by is None:
+        return Lights(lights.ambient, lights.directional, direction)
+    rng = np.random.default_rng([seed, _LIGHTS])
+    ambient, directional = rng.uniform(*by.ambient), rng.uniform(*by.directional)
+    turn = Rotation.from_rotvec(_in_ball(rng) * np.deg2rad(by.direction_deg))
+    return Lights(float(ambient), float(directional), turn.apply(direction))
+
+
+def draw_camera_shift(by: CameraRandomisation, camera: int, seed: int) -> Array:
+    """4x4 of a camera's new pose in its old one.
+
+    Args:
+        by: how far.
+        camera: its number among the cameras.
+        seed: of the episode.
+    """
+    rng = np.random.default_rng([seed, _CAMERAS, camera])
+    shift = np.eye(4)
+    shift[:3, 3] = rng.uniform(-by.position, by.position, 3)
+    angles = np.deg2rad(rng.uniform(-by.rotation_deg, by.rotation_deg, 3))
+    shift[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+    return shift
+
+
+def _in_ball(rng: np.random.Generator) -> Array:
+    """(3,) of any direction, no longer than 1."""
+    vector = rng.normal(size=3)
+    return vector / np.linalg.norm(vector) * rng.uniform()
