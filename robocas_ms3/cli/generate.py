@@ -16,7 +16,7 @@ class Generate:
     Rendering is not needed: states and actions are recorded, pictures are made by `robocas convert`.
     """
 
-    task: Annotated[Literal["pick"], tyro.conf.Positional]
+    task: Annotated[Literal["pick", "select", "search", "open_pick"], tyro.conf.Positional]
     """Which task."""
     episodes: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 10
     """How many successful episodes to record."""

@@ -34,8 +34,8 @@ def main(cfg: Show) -> int:
     from robocas_ms3.config import load_task_config
     from robocas_ms3.errors import RobocasError
     from robocas_ms3.files import make_folder, replacing
-    from robocas_ms3.tasks.base import RoboCASEnv
     from robocas_ms3.tasks.spec import TASKS
+    from robocas_ms3.tasks.transfer import TransferEnv
 
     config = load_task_config(cfg.config)
     make_folder(cfg.out)
@@ -50,7 +50,7 @@ def main(cfg: Show) -> int:
         human_render_camera_configs=shader,
     )
     base_env = env.unwrapped
-    assert isinstance(base_env, RoboCASEnv)
+    assert isinstance(base_env, TransferEnv)
     if not base_env.scene.can_render():
         raise RobocasError(
             "no render device", fix="Run scripts/setup.sh, or install a Vulkan driver; see robocas doctor."

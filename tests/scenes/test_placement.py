@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes import placement
-from robocas_ms3.scenes.placement import Placeable, Region, choose_objects, choose_target, planar_pose, sample_scattered
+from robocas_ms3.scenes.placement import Placeable, Region, choose_objects, planar_pose, sample_scattered
 
 
 def box(width: float, depth: float, height: float = 0.1) -> Placeable:
@@ -68,20 +68,6 @@ def test_objects_repeat_only_when_there_are_too_few():
     rng = np.random.default_rng(0)
     assert sorted(choose_objects(rng, ["a", "b", "c"], 3)) == ["a", "b", "c"]
     assert sorted(choose_objects(rng, ["a", "b"], 5)).count("a") in (2, 3)
-
-
-def test_target_is_the_nearest_of_its_name():
-    positions = np.array([[0.0, 1.0], [0.0, 0.5], [0.3, 0.5]])
-    names = ["apple", "apple", "mug"]
-    drawn = {
-        choose_target(np.random.default_rng(s), names, positions, np.array([True, True, True]), np.zeros(2))
-        for s in range(30)
-    }
-    assert drawn == {1, 2}
-    # the nearer apple can't be grasped: "the apple" would name it all the same
-    assert (
-        choose_target(np.random.default_rng(0), names, positions, np.array([True, False, False]), np.zeros(2)) is None
-    )
 
 
 def test_where_it_is_tight_objects_are_packed(monkeypatch):

@@ -8,7 +8,7 @@ from mani_skill.utils.structs import Pose
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.errors import ConfigError
-from robocas_ms3.tasks.pick import STAGES
+from robocas_ms3.tasks.transfer import STAGES
 
 STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}
 

@@ -1,0 +1,55 @@
+"""Draws of looks: seeded, within their bounds, independent of each other."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config import TaskConfig, load_task_config
+from robocas_ms3.config.task import CameraRandomisation
+from robocas_ms3.scenes.randomise import draw_camera_shift, draw_finishes, draw_lights
+
+
+def config(**blocks) -> TaskConfig:
+    data = load_task_config("pick_table_scattered").model_dump(mode="json")
+    return load_task_config({**data, "randomisation": blocks})
+
+
+def test_nothing_is_drawn_unless_asked_for():
+    plain = config()
+    room = load_pack("builtin").furniture["room"]
+    for seed in range(5):
+        assert draw_finishes(plain, room, seed) == {}
+        lights = draw_lights(plain, seed)
+        assert (lights.ambient, lights.directional) == (plain.lights.ambient, plain.lights.directional)
+        np.testing.assert_allclose(lights.direction * np.linalg.norm(plain.lights.direction), plain.lights.direction)
+
+
+def test_finishes_of_the_named_parts_vary_with_the_seed():
+    room = load_pack("builtin").furniture["room"]
+    drawn = [draw_finishes(config(room=["floor"]), room, seed) for seed in range(40)]
+    assert {tuple(d) for d in drawn} == {("floor",)}
+    assert {d["floor"] for d in drawn} == set(room.asset.finishes["floor"])
+    assert drawn[3] == draw_finishes(config(room=["floor"], lights={}), room, 3)  # other blocks change nothing
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**31 - 1))
+def test_lights_stay_within_bounds(seed):
+    asked = config(lights={"ambient": [0.2, 0.3], "directional": [1.0, 1.5], "direction_deg": 10.0})
+    lights = draw_lights(asked, seed)
+    assert 0.2 <= lights.ambient <= 0.3
+    assert 1.0 <= lights.directional <= 1.5
+    straight = np.array(asked.lights.direction) / np.linalg.norm(asked.lights.direction)
+    assert np.rad2deg(np.arccos(np.clip(lights.direction @ straight, -1, 1))) <= 10 + 1e-6
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**31 - 1), camera=st.integers(0, 2))
+def test_camera_shifts_are_rigid_and_small(seed, camera):
+    shift = draw_camera_shift(CameraRandomisation(position=0.02, rotation_deg=3), camera, seed)
+    np.testing.assert_allclose(shift[:3, :3] @ shift[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.abs(shift[:3, 3]).max() <= 0.02
+    angle = np.arccos(np.clip((np.trace(shift[:3, :3]) - 1) / 2, -1, 1))
+    assert np.rad2deg(angle) <= 3 * np.sqrt(3) + 1e-6
+    assert not np.allclose(shift, draw_camera_shift(CameraRandomisation(), camera + 1, seed))

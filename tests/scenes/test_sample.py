@@ -1,0 +1,109 @@
+"""From seeds to layouts of the shipped pack."""
+
+import numpy as np
+import pytest
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config import load_task_config
+from robocas_ms3.errors import ConfigError, LayoutError
+from robocas_ms3.scenes.layout import PARKING_HEIGHT
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.sample import object_set, sample_layout
+
+
+def model(name: str = "pick_table_scattered", **changes) -> SceneModel:
+    data = {**load_task_config(name).model_dump(mode="json"), **changes}
+    pack = load_pack("builtin")
+    return SceneModel.load(load_task_config(data), pack, pack)
+
+
+def test_the_same_seeds_give_the_same_layout():
+    scene = model()
+    one, two, other = (sample_layout(scene, seed, seed) for seed in (4, 4, 5))
+    assert one.object_ids == two.object_ids
+    np.testing.assert_array_equal(one.object_poses, two.object_poses)
+    assert one.target == two.target
+    assert one.object_ids != other.object_ids
+
+
+def test_objects_and_their_places_have_seeds_of_their_own():
+    scene = model()
+    one, two = sample_layout(scene, 4, 4), sample_layout(scene, 4, 5)
+    assert one.object_ids == two.object_ids == object_set(scene, 4)
+    assert not np.allclose(one.object_poses, two.object_poses)
+
+
+def test_orderly_objects_come_in_kinds():
+    scene = model(layout={"kind": "orderly", "copies": 3}, objects={"ids": "all", "count": 7})
+    ids = object_set(scene, 0)
+    assert [ids.count(kind) for kind in dict.fromkeys(ids)] == [3, 3, 1]
+
+
+def test_counts_and_distractors_use_some_of_the_slots():
+    fruit = ["apple", "lemon", "peach", "pear", "orange", "plum"]
+    scene = model(
+        objects={"ids": ["mug", "banana", "soap_box", "padlock"], "count": 4},
+        randomisation={"count": [2, 4], "distractors": {"ids": fruit, "count": [1, 3]}},
+    )
+    counts = set()
+    for seed in range(12):
+        layout = sample_layout(scene, seed, seed)
+        assert len(layout.object_ids) == 7
+        own, others = layout.present[:4], layout.present[4:]
+        counts.add((int(own.sum()), int(others.sum())))
+        assert set(layout.object_ids[4:]) <= set(fruit)
+        assert layout.target < own.sum()  # never a distractor, always one that is there
+        waiting = layout.object_poses[~layout.present, 2, 3]
+        assert ((waiting > PARKING_HEIGHT) & (waiting < PARKING_HEIGHT + 0.3)).all()
+    assert {own for own, _ in counts} == {2, 3, 4}
+    assert {others for _, others in counts} == {1, 2, 3}
+
+
+def test_one_of_several_object_sets_is_drawn():
+    sets = [["apple", "lemon", "peach"], ["mug", "banana", "padlock"]]
+    scene = model(objects={"ids": "all", "count": 3}, randomisation={"object_sets": sets})
+    drawn = {frozenset(object_set(scene, seed)) for seed in range(20)}
+    assert drawn == {frozenset(one) for one in sets}
+
+
+def test_robot_and_basket_move_within_bounds_and_leave_the_objects():
+    plain = sample_layout(model(), 3, 3)
+    moved = sample_layout(model(randomisation={"robot": {"position": 0.04, "yaw_deg": 6}, "basket": {}}), 3, 3)
+    np.testing.assert_array_equal(plain.object_poses, moved.object_poses)
+    shift = moved.robot_pose[:3, 3] - plain.robot_pose[:3, 3]
+    assert 0 < np.abs(shift).max() <= 0.04
+    assert shift[2] == 0
+    turn = plain.robot_pose[:3, :3].T @ moved.robot_pose[:3, :3]
+    assert 0 < np.rad2deg(abs(np.arctan2(turn[1, 0], turn[0, 0]))) <= 6
+    assert not np.allclose(plain.basket_pose, moved.basket_pose)
+
+
+def test_no_target_is_an_error_that_says_what_to_change():
+    with pytest.raises(LayoutError, match=r"no object qualifies.*Raise target.max_distance"):
+        sample_layout(model(target={"max_distance": 0.1}), 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"randomisation": {"room": ["roof"]}}, r"randomisation.room: no such part.*found roof"),
+        ({"randomisation": {"object_sets": [["spam"]]}}, r"randomisation.object_sets.0.*found spam"),
+        ({"randomisation": {"distractors": {"ids": ["spam"]}}}, r"distractors.ids.*found spam"),
+        ({"randomisation": {"count": [3, 99]}}, r"randomisation.count \[3, 99\] must rise and end at objects.count 10"),
+        ({"opening": {"furniture": "table", "handle": "door"}}, "`opening` goes with task open_pick"),
+    ],
+)
+def test_blocks_that_cannot_be(changes, words):
+    with pytest.raises(ConfigError, match=words):
+        model(**changes)
+
+
+@pytest.mark.parametrize(
+    ("joints", "words"),
+    [({"flap": 0.1}, r"no such joint.*found flap"), ({"door_slide": 9.0}, r"door_slide: out of its limits.*found 9.0")],
+)
+def test_joints_that_cannot_stand_so(joints, words):
+    furniture = load_task_config("pick_table_scattered").model_dump(mode="json")["furniture"]
+    furniture["box"] = {"asset": "container", "pose": {"position": [-2.0, 0.0, 0.0]}, "joints": joints}
+    with pytest.raises(ConfigError, match=words):
+        model(furniture=furniture)
