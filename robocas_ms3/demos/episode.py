@@ -161,8 +161,12 @@ class EpisodeGenerator:
         env = executor.base_env
         target = env.target_asset().asset
         bounds = [s.first for s in executor.segments] + [len(executor.actions)]
+        said, layout = env.instructions[0], env.layouts[0]
+        assert layout is not None  # there was a reset
         return {
-            "instruction": env.get_language_instruction()[0],
+            "instruction": said.text,
+            "instruction_template": said.template_id,
+            "relation": layout.relation,
             "support": env.task_config.support,
             "target": {"slot": int(env.target_slot[0]), "asset_id": target.id, "name": target.name},
             "objects": [asset.asset.id for asset in env.object_assets[0]],

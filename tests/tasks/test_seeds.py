@@ -1,4 +1,4 @@
-"""Seeds of episodes, layouts and looks; several envs are tested without a simulator, which on a CPU has one env only."""
+"""Seeds of episodes, layouts and looks. Several envs are tested without a simulator, which on a CPU has but one env."""
 
 import gymnasium as gym
 import numpy as np
