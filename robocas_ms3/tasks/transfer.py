@@ -67,11 +67,12 @@ class TransferEnv(RoboCASEnv):
         poses = self.object_poses
         lifted = terms.lifted(poses[..., 2], self.start_poses[..., 2], grasped)
         measures = self.target_measures(touched)
+        self.target_held = terms.of_target(grasped, self.target_slot)
         now = {
             "reached_any": touched.any(dim=1),
             "picked_any": lifted.any(dim=1),
             "reached_target": terms.of_target(touched, self.target_slot),
-            "target_grasped": terms.of_target(grasped, self.target_slot),
+            "target_grasped": self.target_held,
             "target_lifted": terms.of_target(lifted, self.target_slot),
             "target_in_basket": measures["in_basket"],
             **self.task_stages(),
@@ -86,7 +87,7 @@ class TransferEnv(RoboCASEnv):
         }
 
     def task_stages(self) -> dict[str, torch.Tensor]:
-        """What a task adds to the stages: (N,) bool each, of this moment."""
+        """What a task adds to the stages: (N,) bool each, of this moment; ``target_held`` (N,) is known then."""
         return {}
 
     def target_measures(self, touched: torch.Tensor | None = None) -> dict[str, torch.Tensor]:

@@ -1,0 +1,94 @@
+"""Clutter around a target: plates of points at known places."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robocas_ms3.tasks.occlusion import Clutter, clutter, surface_points
+
+
+def plate(x: tuple[float, float], y: tuple[float, float], z: float) -> torch.Tensor:
+    """(1681, 3) points of a level rectangle, at most 2.5 mm apart for one of 0.1 m."""
+    u, v = (torch.linspace(low, high, 41) for low, high in (x, y))
+    return torch.stack([*(g.flatten() for g in torch.meshgrid(u, v, indexing="ij")), torch.full((41 * 41,), z)], dim=1)
+
+
+TARGET = plate((-0.05, 0.05), (-0.05, 0.05), 0.65)
+FAR = plate((0.3, 0.4), (0.0, 0.1), 0.8)
+
+
+def measure(*others: torch.Tensor, present: list[bool] | None = None) -> Clutter:
+    points = torch.stack([TARGET, *others])[None]
+    flags = torch.tensor([present or [True] * points.shape[1]])
+    return clutter(points, flags, torch.tensor([0]))
+
+
+def test_nothing_near_is_clear():
+    found = measure(FAR)
+    assert found.hidden_share.tolist() == [0]
+    assert not found.obstacles.any()
+    assert found.cleared.tolist() == [True]
+
+
+@pytest.mark.parametrize(("edge", "share"), [(0.0, 0.5), (0.03, 0.2), (-0.05, 1.0)])
+def test_hidden_share_is_the_share_of_cells_under_a_plate(edge, share):
+    found = measure(plate((edge, 0.05), (-0.05, 0.05), 0.7))
+    assert found.hidden_share.item() == pytest.approx(share, abs=0.05)  # one row of 20 cells
+    assert found.obstacles.tolist() == [[False, True]]
+
+
+def test_what_lies_under_the_target_hides_nothing():
+    found = measure(plate((-0.05, 0.05), (-0.05, 0.05), 0.62))
+    assert found.hidden_share.item() == 0
+    assert not found.obstacles.any()
+
+
+def test_a_neighbour_within_a_centimetre_and_higher_is_an_obstacle():
+    def beside(gap: float, z: float) -> torch.Tensor:
+        return plate((0.05 + gap, 0.15 + gap), (-0.05, 0.05), z)
+
+    assert measure(beside(0.006, 0.66)).obstacles.tolist() == [[False, True]]
+    assert measure(beside(0.006, 0.64)).obstacles.tolist() == [[False, False]]  # lower
+    assert measure(beside(0.020, 0.66)).obstacles.tolist() == [[False, False]]  # too far
+    assert measure(beside(0.006, 0.66)).hidden_share.item() == 0
+
+
+def test_two_obstacles_are_too_many():
+    right, left = plate((0.055, 0.15), (-0.05, 0.05), 0.7), plate((-0.15, -0.055), (-0.05, 0.05), 0.7)
+    assert measure(right).cleared.tolist() == [True]
+    assert measure(right, left).cleared.tolist() == [False]
+    assert measure(right, left, present=[True, True, False]).cleared.tolist() == [True]
+
+
+def test_an_obstacle_under_another_is_not_seen():
+    low, high = plate((-0.05, 0.05), (-0.05, 0.05), 0.7), plate((-0.06, 0.06), (-0.06, 0.06), 0.75)
+    assert measure(low, high).obstacles.tolist() == [[False, False, True]]
+
+
+def test_envs_do_not_mix():
+    cover = plate((-0.05, 0.05), (-0.05, 0.05), 0.7)
+    points = torch.stack([torch.stack([TARGET, cover]), torch.stack([TARGET, FAR]), torch.stack([TARGET, cover])])
+    found = clutter(points, torch.ones(3, 2, dtype=torch.bool), torch.tensor([0, 0, 1]))
+    assert found.hidden_share.tolist() == pytest.approx([1, 0, 0])
+    assert found.obstacles.tolist() == [[False, True], [False, False], [False, False]]
+
+
+@settings(max_examples=20, deadline=None)
+@given(x=st.floats(-1, 1), y=st.floats(-1, 1), yaw=st.floats(-math.pi, math.pi))
+def test_the_share_hangs_on_the_arrangement_only(x, y, yaw):
+    pose = torch.tensor([x, y, 0.1, math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)])
+    points = torch.stack([TARGET, plate((0.0, 0.05), (-0.05, 0.05), 0.7)])[None]
+    moved = surface_points(pose.expand(1, 2, 7), points)
+    found = clutter(moved, torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]))
+    assert found.hidden_share.item() == pytest.approx(0.5, abs=0.06)
+
+
+def test_points_follow_their_object():
+    half = math.sqrt(0.5)
+    pose = torch.tensor([[[1.0, 2, 3, half, 0, 0, half], [0, 0, 0, half, half, 0, 0]]])  # 90 deg about z; about x
+    points = torch.tensor([[[[0.1, 0, 0]], [[0, 0.1, 0]]]])
+    moved = surface_points(pose, points)
+    assert torch.allclose(moved, torch.tensor([[[[1.0, 2.1, 3]], [[0, 0, 0.1]]]]), atol=1e-6)
