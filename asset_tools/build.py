@@ -12,16 +12,16 @@ import trimesh
 
 from asset_tools.decompose import Decomposition, decompose, is_hollow, volume_iou
 from asset_tools.grasps import sample_grasps
-from asset_tools.inertia import piece_inertia, principal_inertia
+from asset_tools.inertia import moments_of, piece_inertia, principal_inertia, triple
 from asset_tools.physics import Solid
 from asset_tools.quality.furniture import measure_furniture
 from asset_tools.quality.measure import measure_object
 from asset_tools.resting import resting_poses
-from asset_tools.sources import FurnitureSource, LinkSource, ObjectSource
+from asset_tools.sources import FurnitureSource, ObjectSource
 from asset_tools.visual import to_display, write_glb
 from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.hulls import read_hulls, write_hulls
-from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, Link, ObjectAsset
+from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, ObjectAsset
 from robocas_ms3.assets.pack import ANNOTATIONS, FINISHES, HULLS, LINKS, VISUALS, LoadedFurniture, Part, sha256
 from robocas_ms3.errors import AssetError
 
@@ -66,9 +66,9 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
     hulls = [hull.vertices for hull in read_hulls(folder / HULLS)]
 
     # as the manifest has them, so that whoever measures the pack again finds the same
-    center = np.array(_triple(closed.center_mass))
+    center = np.array(triple(closed.center_mass))
     moments, axes = principal_inertia(closed, source.mass)
-    inertia = np.array(_moments(moments))
+    inertia = np.array(moments_of(moments))
     solid = Solid(hulls, source.mass, center, inertia, np.array(axes), source.friction)
     rest = resting_poses(
         hulls,
@@ -108,14 +108,14 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
         source=source.source,
         licence=source.licence,
         attribution=source.attribution,
-        extents=_triple(mesh.extents),
+        extents=triple(mesh.extents),
         friction=source.friction,
         repairs=source.repairs,
         files=_hashes(folder),
         graspnet_id=source.graspnet_id,
         mass=source.mass,
-        center_of_mass=_triple(center),
-        inertia=_moments(inertia),
+        center_of_mass=triple(center),
+        inertia=moments_of(inertia),
         inertia_wxyz=axes,
         grasp_count=len(grasps),
         no_grasps_because=reason,
@@ -137,8 +137,8 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
         center, inertia, axes = piece_inertia(source.pieces, source.mass)
         body = {
             "mass": source.mass,
-            "center_of_mass": _triple(center),
-            "inertia": _moments(inertia),
+            "center_of_mass": triple(center),
+            "inertia": moments_of(inertia),
             "inertia_wxyz": axes,
         }
     asset = FurnitureAsset(
@@ -148,14 +148,14 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
         source=source.source,
         licence=source.licence,
         attribution=source.attribution,
-        extents=_triple(source.mesh.extents),
+        extents=triple(source.mesh.extents),
         friction=source.friction,
         repairs=source.repairs,
         files=_hashes(folder),
         origin_height=source.origin_height,
         surfaces=source.surfaces,
         inner=source.inner,
-        links=tuple(_link(link) for link in source.links),
+        links=tuple(link.facts() for link in source.links),
         handles=source.handles,
         finishes={part: tuple(finishes) for part, finishes in source.finishes.items()},
         quality=FurnitureQuality(hull_count=1, hull_vertices=4, joints_open=None, surfaces_hold=None),
@@ -182,19 +182,6 @@ def _write_body(mesh: trimesh.Trimesh, pieces: list[np.ndarray], folder: Path) -
     write_hulls(folder / HULLS, pieces)
 
 
-def _link(link: LinkSource) -> Link:
-    center, inertia, axes = piece_inertia(link.pieces, link.mass)
-    return Link(
-        name=link.name,
-        parent=link.parent,
-        joint=link.joint,
-        mass=link.mass,
-        center_of_mass=_triple(center),
-        inertia=_moments(inertia),
-        inertia_wxyz=axes,
-    )
-
-
 def _light(values: Any) -> Any:
     """Single precision: half the size on disk, and still a thousandth of a millimetre."""
     return np.asarray(values, dtype=np.float32)
@@ -203,14 +190,3 @@ def _light(values: Any) -> Any:
 def _hashes(folder: Path) -> dict[str, str]:
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {path.relative_to(folder).as_posix(): sha256(path) for path in files}
-
-
-def _triple(values: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = (round(float(value), 9) for value in values)
-    return x, y, z
-
-
-def _moments(values: np.ndarray) -> tuple[float, float, float]:
-    """To nine digits, however small: those of a dice are 4e-10 kg m2."""
-    x, y, z = (float(f"{value:.9g}") for value in values)
-    return x, y, z

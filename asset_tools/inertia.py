@@ -40,3 +40,15 @@ def _principal(tensor: np.ndarray) -> tuple[np.ndarray, tuple[float, float, floa
         vectors[:, 0] *= -1
     x, y, z, w = (float(value) for value in Rotation.from_matrix(vectors).as_quat())
     return moments, (w, x, y, z)
+
+
+def triple(values: np.ndarray) -> tuple[float, float, float]:
+    """To a billionth, as manifests say metres."""
+    x, y, z = (round(float(value), 9) for value in values)
+    return x, y, z
+
+
+def moments_of(values: np.ndarray) -> tuple[float, float, float]:
+    """Moments of inertia to nine digits, however small: those of a dice are 4e-10 kg m2."""
+    x, y, z = (float(f"{value:.9g}") for value in values)
+    return x, y, z

@@ -8,7 +8,8 @@ import numpy as np
 import trimesh
 
 from asset_tools.grasps import Grasps
-from robocas_ms3.assets.manifest import Handle, InnerBox, Joint, Surface
+from asset_tools.inertia import moments_of, piece_inertia, triple
+from robocas_ms3.assets.manifest import Handle, InnerBox, Joint, Link, Surface
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,19 @@ class LinkSource:
     pieces: list[np.ndarray]
     mass: float
     parent: str = ""
+
+    def facts(self) -> Link:
+        """What a pack says of it."""
+        center, inertia, axes = piece_inertia(self.pieces, self.mass)
+        return Link(
+            name=self.name,
+            parent=self.parent,
+            joint=self.joint,
+            mass=self.mass,
+            center_of_mass=triple(center),
+            inertia=moments_of(inertia),
+            inertia_wxyz=axes,
+        )
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,10 @@ def test_configs_and_builtin_pack_travel_in_the_wheel(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     for path in (ROOT / "task_configs").glob("*.yaml"):
         assert f"robocas_ms3/data/task_configs/{path.name}" in names
+    for folder in ("asset_tools/partnet/annotations", "robocas_ms3/language"):
+        data = sorted((ROOT / folder).glob("*.yaml"))
+        assert data
+        assert {f"{folder}/{path.name}" for path in data} <= names
     manifest = ROOT / "robocas_ms3" / "data" / "packs" / "builtin" / "manifest.json"
     for asset in json.loads(manifest.read_text())["assets"]:
         for file in asset["files"]:

@@ -105,8 +105,8 @@ def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> li
         name = object_id(folder.name)
         if name in jobs:
             raise AssetError("two models would get the same id", where=folder, found=name, fix="Rename one.")
-        annotation = find_annotation(folder.name, annotations)
         model = read_urdf(folder)  # says what is missing before anything is made
+        annotation = find_annotation(folder.name, annotations)
         meshes = {
             visual.path.parent for group in (model.body, *(link.visuals for link in model.links)) for visual in group
         }

@@ -9,7 +9,6 @@ import numpy as np
 import sapien
 from sapien import physx
 
-from asset_tools.inertia import piece_inertia
 from asset_tools.physics import add_component, cook, new_scene, pose_matrix
 from asset_tools.sources import FurnitureSource
 from robocas_ms3.assets.kinematics import joint_frame
@@ -46,21 +45,13 @@ def model_of(furniture: FurnitureSource | LoadedFurniture) -> Model:
         pieces = {"": furniture.hulls} | {name: part.hulls for name, part in furniture.links.items()}
         return Model(pieces, facts.links, facts.surfaces, facts.handles, facts.friction)
     pieces = {"": furniture.pieces} | {link.name: link.pieces for link in furniture.links}
-    links = []
-    for link in furniture.links:
-        center, inertia, axes = piece_inertia(link.pieces, link.mass)
-        links.append(
-            Link(
-                name=link.name,
-                parent=link.parent,
-                joint=link.joint,
-                mass=link.mass,
-                center_of_mass=tuple(center),
-                inertia=tuple(inertia),
-                inertia_wxyz=axes,
-            )
-        )
-    return Model(pieces, tuple(links), furniture.surfaces, furniture.handles, furniture.friction)
+    return Model(
+        pieces,
+        tuple(link.facts() for link in furniture.links),
+        furniture.surfaces,
+        furniture.handles,
+        furniture.friction,
+    )
 
 
 class Stage:

@@ -132,7 +132,7 @@ def import_partnet(command: ImportPartNet) -> int:
         from asset_tools.partnet.importer import partnet_jobs
         from asset_tools.partnet.template import template
     if command.template:
-        print(template(command.models[0]))  # noqa: T201
+        print(template(command.models[0]))
         return 0
     return _make(partnet_jobs(command.models, command.annotations), command, command.pack, "PartNet models")
 
