@@ -63,6 +63,7 @@ class Executor:
         gripper: the gripper's command as it stands.
         base: (3,) where the base's joints are told to be: x m, y m, yaw rad.
         seconds: where the time went.
+        facts: what a policy counts since the reset, for the record, e.g. ``pushes``.
     """
 
     env: gym.Env
@@ -73,6 +74,7 @@ class Executor:
     gripper: float = OPEN
     base: Array = field(default_factory=lambda: np.zeros(3))
     seconds: Seconds = field(default_factory=Seconds)
+    facts: dict[str, Any] = field(default_factory=dict)
 
     @property
     def base_env(self) -> TransferEnv:
@@ -91,6 +93,7 @@ class Executor:
         with self.seconds.spent_on("reset"):
             _, self.info = self.env.reset(seed=self.seed)
         self.actions, self.segments, self.gripper, self.base = [], [], OPEN, np.zeros(3)
+        self.facts = {}
 
     def rewind(self, length: int) -> None:
         """Undo all but the first ``length`` actions: reset, then simulate those again exactly."""
