@@ -7,6 +7,7 @@ with another turn of the wrist, so both are candidates.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +17,12 @@ from robocas_ms3.assets.pack import LoadedObject
 
 Array = NDArray[np.float64]
 
+Approach = Literal["top", "front"]  # from above; level, as into a shelf
+
 MAX_WIDTH = 0.08  # m, the gripper's opening
 MAX_CLOSING_TILT_DEG = 60.0  # of the closing axis from the horizontal
 MAX_SIDEWAYS_DEG = 45.0  # of the approach's horizontal direction from that of base -> object
+FRONT_ELEVATION_DEG = (-60.0, 10.0)  # of a front approach above the horizontal
 FREE_LEAN_DEG = 15.0  # an approach this close to straight down has no horizontal direction to speak of
 PREGRASP_DISTANCE = 0.1  # m
 
@@ -49,29 +53,36 @@ class GraspFilter:
         return len(self.index)
 
 
-def directions_ok(tcp_in_world: Array, base_to_object: Array) -> dict[str, NDArray[np.bool_]]:
+def directions_ok(
+    tcp_in_world: Array, base_to_object: Array, approach: Approach = "top"
+) -> dict[str, NDArray[np.bool_]]:
     """Test the directions of grasps against gravity and the robot.
 
     The robot reaches an object from its own side: the approach's horizontal part may deviate at most 45 deg from the
-    horizontal direction base -> object. Approaches within 15 deg of straight down pass, since they come from no side.
+    horizontal direction base -> object. From above, approaches within 15 deg of straight down pass, since they come
+    from no side. From the front, the approach points at most 60 deg down and at most 10 deg up.
 
     Args:
         tcp_in_world: (G, 4, 4).
         base_to_object: (3,) or (2,) in the world; only the horizontal part counts.
+        approach: from where the gripper may come.
 
     Returns:
-        Three tests, each (G,): ``from_above``, ``from_the_robots_side``, ``closing_is_level``.
+        Three tests, each (G,): ``from_above`` or ``from_the_front``, ``from_the_robots_side``, ``closing_is_level``.
     """
-    approach, closing = tcp_in_world[:, :3, 2], tcp_in_world[:, :3, 1]
-    lean = np.linalg.norm(approach[:, :2], axis=1)  # sine of the angle from the vertical
+    axis, closing = tcp_in_world[:, :3, 2], tcp_in_world[:, :3, 1]
+    lean = np.linalg.norm(axis[:, :2], axis=1)  # sine of the angle from the vertical
     forward = base_to_object[:2] / max(np.linalg.norm(base_to_object[:2]), 1e-9)
-    along = approach[:, :2] @ forward
-    return {
-        "from_above": approach[:, 2] < 0,
-        "from_the_robots_side": (lean <= np.sin(np.deg2rad(FREE_LEAN_DEG)))
-        | (along >= lean * np.cos(np.deg2rad(MAX_SIDEWAYS_DEG)) - 1e-9),
-        "closing_is_level": np.abs(closing[:, 2]) <= np.sin(np.deg2rad(MAX_CLOSING_TILT_DEG)) + 1e-9,
-    }
+    along = axis[:, :2] @ forward
+    from_side = along >= lean * np.cos(np.deg2rad(MAX_SIDEWAYS_DEG)) - 1e-9
+    if approach == "top":
+        tests = {"from_above": axis[:, 2] < 0}
+        from_side |= lean <= np.sin(np.deg2rad(FREE_LEAN_DEG))
+    else:
+        lowest, highest = np.sin(np.deg2rad(FRONT_ELEVATION_DEG))
+        tests = {"from_the_front": (axis[:, 2] >= lowest - 1e-9) & (axis[:, 2] <= highest + 1e-9)}
+    closing_is_level = np.abs(closing[:, 2]) <= np.sin(np.deg2rad(MAX_CLOSING_TILT_DEG)) + 1e-9
+    return tests | {"from_the_robots_side": from_side, "closing_is_level": closing_is_level}
 
 
 def gripper_is_clear(
@@ -111,6 +122,7 @@ def filter_grasps(
     scene_points_in_world: Array,
     qualities: Array | None = None,
     sweep: float = PREGRASP_DISTANCE,
+    approach: Approach = "top",
 ) -> GraspFilter:
     """Keep the grasps that a robot standing there could try; the wrist-turned twin of each is added.
 
@@ -122,12 +134,14 @@ def filter_grasps(
         scene_points_in_world: (P, 3) surfaces that the open gripper may not touch, the object itself left out.
         qualities: (G,), more is better; none: all alike.
         sweep: straight way in, m.
+        approach: from where the gripper may come.
     """
     poses = np.asarray(tcp_in_world, dtype=np.float64).reshape(-1, 4, 4)
     widths = np.asarray(widths, dtype=np.float64)
     qualities = np.ones(len(poses)) if qualities is None else np.asarray(qualities, dtype=np.float64)
     tests = {"narrow_enough": widths <= MAX_WIDTH}
-    tests |= directions_ok(poses, np.asarray(object_center_in_world)[:3] - np.asarray(arm_base_in_world)[:3, 3])
+    base_to_object = np.asarray(object_center_in_world)[:3] - np.asarray(arm_base_in_world)[:3, 3]
+    tests |= directions_ok(poses, base_to_object, approach)
     left, rejected = np.ones(len(poses), dtype=bool), {}
     for name, passed in tests.items():
         rejected[name] = int(np.sum(left & ~passed))
@@ -150,11 +164,13 @@ def rank_grasps(
     near: Array,
     rng: np.random.Generator,
     temperature: float = 0.15,
+    approach: Approach = "top",
 ) -> NDArray[np.int_]:
     """Order grasps, good ones first, with some chance so that a retry tries others.
 
     The score adds quality (relative to the best), nearness of the TCP to the object's centre (falls by e every 3 cm),
-    steepness (1 straight down, 0 level), nearness in joint space (falls by e every rad of the joint that turns most).
+    steepness (1 straight down, 0 level; from the front the other way round), nearness in joint space (falls by e every
+    rad of the joint that turns most).
 
     Args:
         tcp: (N, 4, 4) in any upright frame.
@@ -164,6 +180,7 @@ def rank_grasps(
         near: (7,) where the arm is.
         rng: source of chance.
         temperature: 0 gives the plain order; at 0.15 a grasp overtakes one that is 0.15 better about one time in four.
+        approach: from where the gripper comes.
 
     Returns:
         (N,) indices.
@@ -174,13 +191,18 @@ def rank_grasps(
     quality = qualities / max(float(np.abs(qualities).max()), 1e-9)
     distance = np.linalg.norm(tcp[:, :3, 3] - object_center, axis=1)
     turn = np.abs(np.asarray(qpos) - near).max(axis=1)
-    score = quality + np.exp(-distance / 0.03) + 0.7 * -tcp[:, 2, 2] + 0.7 * np.exp(-turn)
+    steep = -tcp[:, 2, 2] if approach == "top" else np.linalg.norm(tcp[:, :2, 2], axis=1)
+    score = quality + np.exp(-distance / 0.03) + 0.7 * steep + 0.7 * np.exp(-turn)
     # Gumbel noise turns scores into draws without replacement, weighted by exp(score / temperature).
     return np.argsort(-(score + temperature * rng.gumbel(size=len(score))), kind="stable")
 
 
 def count_free_grasps(
-    asset: LoadedObject, object_in_world: Array, scene_points_in_world: Array, robot_xy: Array
+    asset: LoadedObject,
+    object_in_world: Array,
+    scene_points_in_world: Array,
+    robot_xy: Array,
+    approach: Approach = "top",
 ) -> int:
     """How many of an object's grasps come from the robot's side and touch nothing else on their way in.
 
@@ -189,6 +211,7 @@ def count_free_grasps(
         object_in_world: 4x4.
         scene_points_in_world: (P, 3) surfaces of everything else.
         robot_xy: (2,) where the arm's base stands, m.
+        approach: from where the gripper may come.
     """
     notes, center = asset.annotations, object_in_world[:3, 3]
     near = scene_points_in_world[np.linalg.norm(scene_points_in_world - center, axis=1) < NEIGHBOURHOOD]
@@ -200,5 +223,6 @@ def count_free_grasps(
         arm_base_in_world=base,
         object_center_in_world=center,
         scene_points_in_world=near,
+        approach=approach,
     )
     return len(kept) // 2

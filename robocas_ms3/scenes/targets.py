@@ -91,6 +91,7 @@ class Arrangement:
             self.opened_poses[slot],
             np.concatenate(points),
             self.robot_pose[:2, 3],
+            rules.approach,
         )
         return free >= rules.min_free_grasps
 

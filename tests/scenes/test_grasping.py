@@ -63,6 +63,28 @@ def test_the_direction_turns_with_the_object():
 
 
 @pytest.mark.parametrize(
+    ("lean", "heading", "from_the_front", "from_the_robots_side"),
+    [
+        (90, 0, True, True),  # level
+        (31, 0, True, True),  # 59 deg down
+        (29, 0, False, True),  # 61 deg down
+        (99, 0, True, True),  # 9 deg up
+        (101, 0, False, True),
+        (90, 44, True, True),
+        (90, 46, True, False),
+        (40, -46, True, False),
+        (90, 180, True, False),  # from behind the object
+        (0, 0, False, True),  # straight down: no side, so none to object to
+        (10, 180, False, False),  # nothing is let pass for leaning little
+    ],
+)
+def test_front_approach_directions(lean, heading, from_the_front, from_the_robots_side):
+    found = directions_ok(grasp(lean, heading)[None], CENTER, "front")
+    assert list(found) == ["from_the_front", "from_the_robots_side", "closing_is_level"]
+    assert (found["from_the_front"][0], found["from_the_robots_side"][0]) == (from_the_front, from_the_robots_side)
+
+
+@pytest.mark.parametrize(
     ("closing", "level"), [(0, True), (59, True), (61, False), (90, False), (119, False), (121, True)]
 )
 def test_the_closing_axis_may_tilt_by_60_degrees(closing, level):
@@ -132,6 +154,23 @@ def test_filter_counts_what_fell_where_and_adds_the_turned_twin():
     np.testing.assert_allclose(kept.tcp_in_world[1][:3, :2], -poses[0][:3, :2])
 
 
+def test_the_filter_knows_the_approach():
+    poses = np.array([grasp(), grasp(91)])
+
+    def index(approach):
+        return filter_grasps(
+            poses,
+            np.array([0.05, 0.05]),
+            arm_base_in_world=BASE,
+            object_center_in_world=CENTER,
+            scene_points_in_world=NO_POINTS,
+            approach=approach,
+        ).index.tolist()
+
+    assert index("front") == [1, 1]
+    assert index("top") == [0, 0]
+
+
 def test_nothing_in_nothing_out():
     kept = filter_grasps(
         np.zeros((0, 4, 4)),
@@ -155,7 +194,7 @@ def test_nothing_in_nothing_out():
 class TestRanking:
     NEAR = np.zeros(7)
 
-    def rank(self, poses, qualities, qpos=None, seed=0, temperature=0.0):
+    def rank(self, poses, qualities, qpos=None, seed=0, temperature=0.0, approach="top"):
         qpos = np.zeros((len(poses), 7)) if qpos is None else qpos
         return rank_grasps(
             np.array(poses),
@@ -165,6 +204,7 @@ class TestRanking:
             near=self.NEAR,
             rng=np.random.default_rng(seed),
             temperature=temperature,
+            approach=approach,
         ).tolist()
 
     def test_quality(self):
@@ -179,6 +219,10 @@ class TestRanking:
 
     def test_steepness(self):
         assert self.rank([grasp(60), grasp(0), grasp(30)], [1, 1, 1]) == [1, 2, 0]
+
+    def test_from_the_front_level_grasps_come_first(self):
+        # sines of 60, 0 and 90 deg times 0.7: 0.61, 0, 0.70
+        assert self.rank([grasp(60), grasp(0), grasp(90)], [1, 1, 1], approach="front") == [2, 0, 1]
 
     def test_joint_space(self):
         qpos = np.zeros((3, 7))

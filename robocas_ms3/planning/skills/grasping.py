@@ -1,4 +1,7 @@
-"""Grasp an object by one of its annotated grasps and lift it."""
+"""Grasp an object by one of its annotated grasps and take it out of its surroundings.
+
+From above: lift it. From the front: lift it a little, then withdraw straight back, so that neighbours stay standing.
+"""
 
 from __future__ import annotations
 
@@ -8,47 +11,51 @@ from dataclasses import dataclass
 import numpy as np
 
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.protocol import Array, Trajectory
+from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import inverse
-from robocas_ms3.planning.skills.arm import Arm, moved_back
-from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, filter_grasps, rank_grasps
+from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
+from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, Approach, filter_grasps, rank_grasps
 from robocas_ms3.scenes.placement import transform
 
 GRASPS_PLANNED = 12  # grasps that motions are planned for before an attempt gives up
+# m; the least makes a stage of the tasks (3 cm), the others go over what stands in front: the first with a way out
+FRONT_LIFTS = (0.04, 0.08, 0.14, 0.2)
+WITHDRAWALS = (0.25, 0.18, 0.12)  # m, straight back; the first one that can be reached
 
 
 @dataclass(frozen=True)
 class GraspPlan:
-    """Motions from where the arm is to a lifted grasp."""
+    """Motions from where the arm is to a grasped object that is clear of its surroundings."""
 
     reach: Trajectory
     approach: Trajectory
-    lift: Trajectory
+    retreat: tuple[Trajectory, ...]
 
 
-def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10) -> None:
-    """Plan a grasp of an object, run it, and lift the object.
+def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, approach: Approach | None = None) -> None:
+    """Plan a grasp of an object, run it, and lift (from the front: lift and withdraw) the object.
 
     Args:
         arm: the attempt's tools.
         slot: of the object.
-        lift_height: m (upstream: 0.10 when picking, 0.15 when searching).
+        lift_height: when grasping from above, m (upstream: 0.10 when picking, 0.15 when searching).
+        approach: from where the gripper comes; default: as the configuration says.
 
     Raises:
         PlanningFailed: no grasp can be planned, or the object was missed or slipped.
     """
     with arm.planning():
-        plan = plan_grasp(arm, slot, lift_height)
+        plan = plan_grasp(arm, slot, lift_height, approach or arm.env.task_config.target.approach)
     arm.follow(plan.reach, plan.approach)
     arm.close_gripper()
     if not arm.holds(slot):
         raise PlanningFailed("grasp", "missed")
-    arm.follow(plan.lift)
+    arm.follow(*plan.retreat)
     if not arm.holds(slot):
         raise PlanningFailed("lift", "slipped")
 
 
-def plan_grasp(arm: Arm, slot: int, lift_height: float) -> GraspPlan:
+def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "top") -> GraspPlan:
     """Plan the best grasp that has a way in and out.
 
     Raises:
@@ -56,11 +63,11 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float) -> GraspPlan:
     """
     everything, others = arm.scene.obstacles_in_base(), arm.scene.obstacles_in_base(without=slot)
     failure = PlanningFailed("grasp_sampling", "no_feasible_grasp")
-    for tcp_in_base in candidates(arm, slot, others):
+    for tcp_in_base in candidates(arm, slot, others, approach):
         try:
             # in and out of the target's surroundings, where the target itself is no obstacle ...
             arm.planner.set_scene(others)
-            entries = _entries(arm, tcp_in_base, lift_height)
+            entries = _entries(arm, slot, tcp_in_base, lift_height, approach)
             # ... and there with the target as one
             arm.planner.set_scene(everything)
             reach = arm.planner.plan_to_qpos(arm.at, [entry[0] for entry in entries], stage="reach")
@@ -72,13 +79,14 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float) -> GraspPlan:
     raise failure
 
 
-def candidates(arm: Arm, slot: int, others: Array) -> Iterator[Array]:
+def candidates(arm: Arm, slot: int, others: Array, approach: Approach = "top") -> Iterator[Array]:
     """Grasps worth planning for, best first: TCP poses 4x4.
 
     Args:
         arm: the attempt's tools.
         slot: of the object.
         others: (P, 3) obstacles without the object.
+        approach: from where the gripper may come.
 
     Raises:
         PlanningFailed: no grasp passes the filters, or none can be reached.
@@ -92,6 +100,7 @@ def candidates(arm: Arm, slot: int, others: Array) -> Iterator[Array]:
         object_center_in_world=(base @ object_in_base)[:3, 3],
         scene_points_in_world=transform(base, others),
         qualities=1.1 - notes.grasp_qualities,  # upstream's scale: more is better
+        approach=approach,
     )
     tcp_in_base = inverse(base) @ kept.tcp_in_world
     if not len(tcp_in_base):
@@ -110,26 +119,65 @@ def candidates(arm: Arm, slot: int, others: Array) -> Iterator[Array]:
         qpos=qpos[reachable],
         near=arm.at,
         rng=arm.rng,
+        approach=approach,
     )
     for index in order[:GRASPS_PLANNED]:
         yield tcp_in_base[reachable][index]
 
 
-def _entries(arm: Arm, tcp_in_base: Array, lift_height: float) -> list[tuple[Array, Trajectory, Trajectory]]:
-    """Pre-grasp configurations from which straight approach and lift are free, nearest first."""
+Entry = tuple[Array, Trajectory, tuple[Trajectory, ...]]
+
+
+def _entries(arm: Arm, slot: int, tcp_in_base: Array, lift_height: float, approach: Approach) -> list[Entry]:
+    """Pre-grasp configurations from which straight approach and way out are free, nearest first."""
     failure = PlanningFailed("approach", "no_ik")
-    entries = []
+    entries: list[Entry] = []
     for qpos in arm.planner.ik(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)[:4]:
         try:
-            approach = arm.planner.plan_straight(qpos, tcp_in_base, stage="approach")
-            lift = arm.first_line(approach.qpos[-1], _ways_up(tcp_in_base, lift_height), stage="lift")
+            inward = arm.planner.plan_straight(qpos, tcp_in_base, stage="approach")
+            if approach == "top":
+                retreat = (arm.first_line(inward.qpos[-1], _ways_up(tcp_in_base, lift_height), stage="lift"),)
+            else:
+                retreat = _plan_withdrawal(arm, slot, inward.qpos[-1], tcp_in_base)
         except PlanningFailed as error:
             failure = error
             continue
-        entries.append((qpos, approach, lift))
+        entries.append((qpos, inward, retreat))
     if not entries:
         raise failure
     return entries
+
+
+def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> tuple[Trajectory, Trajectory]:
+    """Plan straight up, as little as leaves a way out, and from there straight and level back with the object.
+
+    While it is lifted the object is no part of the check, since at first it stands on something; whether it hits what
+    is above shows where the way back begins.
+
+    Raises:
+        PlanningFailed: of the lift that came last.
+    """
+    failure = PlanningFailed("withdraw", "no_way_out")
+    vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
+    held = AttachedBody(vertices, inverse(tcp_in_base) @ arm.scene.object_in_base(slot))
+    back = -tcp_in_base[:2, 2] / np.linalg.norm(tcp_in_base[:2, 2])
+    for height in FRONT_LIFTS:
+        try:
+            lift = arm.planner.plan_straight(start, raised(tcp_in_base, height), stage="lift")
+        except PlanningFailed as error:
+            raise error if height == FRONT_LIFTS[0] else failure from error
+        goals = []
+        for distance in WITHDRAWALS:
+            goals.append(raised(tcp_in_base, height))
+            goals[-1][:2, 3] += distance * back
+        arm.planner.attach(held)
+        try:
+            return lift, arm.first_line(lift.qpos[-1], goals, stage="withdraw")
+        except PlanningFailed as error:
+            failure = error
+        finally:
+            arm.planner.attach(None)
+    raise failure
 
 
 def _ways_up(tcp_in_base: Array, lift_height: float) -> list[Array]:
