@@ -1,0 +1,96 @@
+"""Relations between identical objects, worked out by hand. The robot looks along x; its left is +y."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robocas_ms3.config.relations import RELATIONS
+from robocas_ms3.scenes.relations import MARGIN, related
+
+# y = 0.2 is on the robot's left; distances 0.54, 0.6, 0.81, 0.7 m
+FOUR = np.array([[0.5, 0.2], [0.6, 0.0], [0.8, -0.1], [0.63, -0.3]])
+
+
+@pytest.mark.parametrize(
+    ("relation", "expected"),
+    [
+        ("nearest", 0),
+        ("second_nearest", 1),
+        ("farthest", 2),
+        ("leftmost", 0),
+        ("second_from_left", 1),
+        ("second_from_right", 2),
+        ("rightmost", 3),
+        ("middle", None),  # four have no middle
+    ],
+)
+def test_four_objects(relation, expected):
+    assert related(relation, FOUR) == expected
+
+
+@pytest.mark.parametrize(("order", "expected"), [([0, 1, 3], 1), ([3, 1, 0], 1), ([1, 0, 3], 0), ([0, 3, 1], 2)])
+def test_the_middle_of_three_wherever_it_is_listed(order, expected):
+    assert related("middle", FOUR[order]) == expected
+
+
+def test_of_two_only_the_ends_are_named():
+    two = FOUR[:2]
+    found = {relation: related(relation, two) for relation in RELATIONS}
+    assert {relation for relation, index in found.items() if index is not None} == {
+        "nearest",
+        "farthest",
+        "leftmost",
+        "rightmost",
+    }
+    assert found["nearest"] == found["leftmost"] == 0
+    assert found["farthest"] == found["rightmost"] == 1
+
+
+def test_one_or_none_needs_no_relation():
+    assert all(related(relation, FOUR[:count]) is None for relation in RELATIONS for count in (0, 1))
+
+
+@pytest.mark.parametrize(("gap", "clear"), [(0.029, False), (0.031, True)])
+def test_neighbours_closer_than_3_cm_are_not_told_apart(gap, clear):
+    row = np.array([[0.5, gap], [0.5, 0.0], [0.5, -0.2]])
+    assert (related("leftmost", row) == 0) is clear
+    assert (related("middle", row) == 1) is clear  # it has that neighbour too
+    assert related("rightmost", row) == 2  # it has not
+
+
+def test_a_column_ahead_is_told_apart_by_distance_only():
+    column = np.array([[0.5, 0.0], [0.6, 0.0], [0.7, 0.0]])
+    assert [related(r, column) for r in ("nearest", "second_nearest", "farthest")] == [0, 1, 2]
+    assert [related(r, column) for r in ("leftmost", "middle", "rightmost")] == [None] * 3
+
+
+def test_distance_is_horizontal_and_from_the_robot():
+    # 0.5 ahead and 0.3 aside (0.583) is farther than 0.54 straight ahead
+    assert related("nearest", np.array([[0.5, 0.3], [0.54, 0.0]])) == 1
+
+
+POINTS = st.lists(
+    st.tuples(st.floats(0.2, 1.0), st.floats(-0.5, 0.5)).map(lambda p: (round(p[0], 3), round(p[1], 3))),
+    min_size=2,
+    max_size=7,
+)
+
+
+@given(POINTS)
+def test_left_and_right_swap_in_a_mirror(points):
+    here, mirrored = np.array(points), np.array(points) * [1, -1]
+    for one, other in (("leftmost", "rightmost"), ("second_from_left", "second_from_right"), ("middle", "middle")):
+        assert related(one, here) == related(other, mirrored)
+    assert related("nearest", here) == related("nearest", mirrored)
+
+
+@given(POINTS)
+def test_what_is_named_differs_from_all_others(points):
+    here = np.array(points)
+    for relation, key in (("leftmost", here[:, 1]), ("farthest", np.linalg.norm(here, axis=1))):
+        found = related(relation, here)
+        if found is not None:
+            assert np.delete(key, found).max() <= key[found] - MARGIN + 1e-12
