@@ -71,8 +71,8 @@ class Reachability:
         # Each joint turns about z of its own link, which these fixed transforms lead to.
         self._links = [np.linalg.inv(a) @ b for a, b in zip(at_zero[:-1], at_zero[1:], strict=True)]
         lower, upper = (np.asarray(limit, dtype=np.float64) for limit in chain.get_joint_limits())
-        self._lower, self._upper = lower + LIMIT_MARGIN, upper - LIMIT_MARGIN
-        self._scattered = np.random.default_rng(0).uniform(self._lower, self._upper, (SCATTERED_RESTARTS, 7))
+        self.lower, self.upper = lower + LIMIT_MARGIN, upper - LIMIT_MARGIN
+        self._scattered = np.random.default_rng(0).uniform(self.lower, self.upper, (SCATTERED_RESTARTS, 7))
 
     def reachable(self, tcp_in_base: Array, near: Array) -> tuple[NDArray[np.bool_], Array]:
         """Solve inverse kinematics for many poses at once; collisions do not count.
@@ -123,7 +123,7 @@ class Reachability:
 
     def _descend(self, goals: Array, starts: Array) -> tuple[NDArray[np.bool_], Array]:
         """Iterate from starts (M, 7) to goals (M, 4, 4); give (M,) solved and (M, 7). Solved rows leave the batch."""
-        qpos = np.clip(starts, self._lower, self._upper)
+        qpos = np.clip(starts, self.lower, self.upper)
         solved = np.zeros(len(goals), dtype=bool)
         rows = np.arange(len(goals))
         for _ in range(ITERATIONS):
@@ -140,7 +140,7 @@ class Reachability:
             square = jacobian @ jacobian.transpose(0, 2, 1) + damping[:, None, None] * np.eye(6)
             step = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, error[:, :, None]))[:, :, 0]
             step *= np.minimum(LARGEST_STEP / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12), 1.0)
-            qpos[rows] = np.clip(qpos[rows] + step, self._lower, self._upper)
+            qpos[rows] = np.clip(qpos[rows] + step, self.lower, self.upper)
         return solved, qpos
 
 

@@ -7,6 +7,7 @@ import torch
 from mani_skill.utils.structs import Articulation
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.scenes.placement import transform
 from robocas_ms3.tasks.transfer import TransferEnv
@@ -39,12 +40,15 @@ class PlanningScene:
     def __init__(self, env: TransferEnv) -> None:
         self.env = env
 
-    def _furniture_in_world(self) -> Array:
+    def _furniture_in_world(self, without: tuple[str, str] | None) -> Array:
         """Samples (P, 3) of the surfaces of all furniture, its doors and drawers as they stand."""
         pieces = []
         for name, asset in self.env.model.furniture.items():
-            points = asset.all_surface_points(self.joint_positions(name), SPACING)
-            pieces.append(transform(self.env.model.furniture_poses[name], points))
+            frame = self.env.model.furniture_poses[name]
+            pieces.append(transform(frame, asset.surface_points(SPACING)))
+            for link, pose in link_poses(asset.asset.links, self.joint_positions(name)).items():
+                if (name, link) != without:
+                    pieces.append(transform(frame @ pose, asset.links[link].surface_points(SPACING)))
         return np.concatenate(pieces)
 
     def joint_positions(self, furniture: str) -> dict[str, float]:
@@ -78,15 +82,16 @@ class PlanningScene:
         """4x4 of the basket's frame in the arm's base frame."""
         return inverse(self.arm_base_in_world) @ matrix(self.env.fixtures.basket.pose.raw_pose[0])
 
-    def obstacles_in_base(self, *, without: int | None = None) -> Array:
+    def obstacles_in_base(self, *, without: int | None = None, without_link: tuple[str, str] | None = None) -> Array:
         """Samples (P, 3) of the collision surfaces of furniture, basket and objects.
 
         Args:
             without: slot of an object to leave out.
+            without_link: a piece of furniture and its moving part to leave out.
         """
         to_base = inverse(self.arm_base_in_world)
         pieces = [
-            transform(to_base, self._furniture_in_world()),
+            transform(to_base, self._furniture_in_world(without_link)),
             transform(self.basket_in_base, self.env.model.basket.surface_points(SPACING)),
         ]
         for slot, asset in enumerate(self.env.object_assets[0]):

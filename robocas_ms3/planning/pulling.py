@@ -1,0 +1,87 @@
+"""Arm configurations that move a gripped handle along the motion of its joint. Pure maths.
+
+The handle is a bar along the TCP's x axis. The fingers may turn about it: a hinged door turns by far more than the
+wrist can follow, and friction on a bar a centimetre thick hardly resists.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robocas_ms3.planning.protocol import Array
+from robocas_ms3.planning.reachability import Reachability, twist
+
+MAX_SLIP = np.deg2rad(50)  # of the gripper about the bar, from straight in; further on the palm meets the front
+MAX_JUMP = 0.2  # rad a joint may turn between two poses of the handle
+ITERATIONS = 25
+SETTLING = 6  # iterations in which the free motion is used to leave joint limits
+POSITION_TOLERANCE, ROTATION_TOLERANCE = 2e-4, 2e-3  # m, rad
+
+
+def turned_about_bar(tcp: Array, angle: float) -> Array:
+    """TCP poses (..., 4, 4) turned about their own x axis by an angle, rad."""
+    turn = np.eye(4)
+    turn[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return tcp @ turn
+
+
+def track(reachability: Reachability, starts: Array, goals: Array, *, max_slip: float = MAX_SLIP) -> Array:
+    """Follow poses of a bar with the TCP, free to turn about the bar by up to ``max_slip``.
+
+    Args:
+        reachability: the arm.
+        starts: (N, 7) configurations at (or near) the first pose.
+        goals: (T, 4, 4) TCP poses in the arm's base frame that hold the bar squarely, a centimetre or so apart; or
+            (T, N, 4, 4), each start's own.
+        max_slip: rad.
+
+    Returns:
+        (T, N, 7) rad; NaN from where a start leads no further: out of reach, a joint limit, or a jump.
+    """
+    qpos = np.array(starts, dtype=np.float64)
+    path = np.full((len(goals), len(qpos), 7), np.nan)
+    alive = np.arange(len(qpos))
+    for step, goal in enumerate(goals):
+        wanted = np.broadcast_to(goal, (len(qpos), 4, 4))[alive]
+        found, solved = _solve(reachability, qpos[alive], wanted, max_slip)
+        if step:
+            solved &= np.abs(found - qpos[alive]).max(axis=1) <= MAX_JUMP
+        alive, found = alive[solved], found[solved]
+        qpos[alive] = found
+        path[step, alive] = found
+    return path
+
+
+def reached(path: Array) -> Array:
+    """How many poses (N,) of a ``track`` (T, N, 7) were reached."""
+    return np.isfinite(path[:, :, 0]).sum(axis=0)
+
+
+def _solve(reachability: Reachability, starts: Array, goals: Array, max_slip: float) -> tuple[Array, Array]:
+    """Damped least squares from (M, 7) to (M, 4, 4); gives (M, 7) and (M,) whether it got there."""
+    qpos, lower, upper = starts.copy(), reachability.lower, reachability.upper
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    solved = np.zeros(len(qpos), dtype=bool)
+    bar = goals[:, :3, 0]
+    for iteration in range(ITERATIONS):
+        pose, jacobian = reachability.jacobian(qpos)
+        error = twist(pose, goals)
+        lag = (error[:, 3:] * bar).sum(axis=1)
+        free = np.abs(lag) <= max_slip
+        error[:, 3:] -= bar * np.clip(lag, -max_slip, max_slip)[:, None]
+        along = (bar[:, :, None] * jacobian[:, 3:]).sum(axis=1)  # what the joints add about the bar
+        jacobian[:, 3:] -= np.where(free, 1.0, 0.0)[:, None, None] * bar[:, :, None] * along[:, None]
+        solved = (np.linalg.norm(error[:, :3], axis=1) <= POSITION_TOLERANCE) & (
+            np.linalg.norm(error[:, 3:], axis=1) <= ROTATION_TOLERANCE
+        )
+        if solved.all() and iteration >= SETTLING:
+            break
+        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(6)
+        step = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, error[:, :, None]))[:, :, 0]
+        if iteration < SETTLING:
+            away = -0.02 * ((qpos - middle) / half) ** 3
+            moved = jacobian @ away[:, :, None]
+            step += away - (jacobian.transpose(0, 2, 1) @ np.linalg.solve(square, moved))[:, :, 0]
+        step *= np.minimum(0.3 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12), 1.0)
+        qpos = np.clip(qpos + step, lower, upper)
+    return qpos, solved
