@@ -13,7 +13,6 @@ import trimesh
 from asset_tools.decompose import Decomposition, decompose, is_hollow, volume_iou
 from asset_tools.grasps import sample_grasps
 from asset_tools.inertia import moments_of, piece_inertia, principal_inertia, triple
-from asset_tools.physics import Solid
 from asset_tools.quality.furniture import measure_furniture
 from asset_tools.quality.measure import measure_object
 from asset_tools.resting import resting_poses
@@ -23,6 +22,7 @@ from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.hulls import read_hulls, write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, ObjectAsset
 from robocas_ms3.assets.pack import ANNOTATIONS, FINISHES, HULLS, LINKS, VISUALS, LoadedFurniture, Part, sha256
+from robocas_ms3.assets.physics import Solid
 from robocas_ms3.errors import AssetError
 
 SURFACE_POINTS = 1024

@@ -9,7 +9,16 @@ import numpy as np
 from sapien import physx
 from scipy.spatial import ConvexHull, QhullError
 
-from asset_tools.physics import Solid, add_body, add_ground, cook, engine_settings, new_scene, places, pose_matrix
+from robocas_ms3.assets.physics import (
+    Solid,
+    add_body,
+    add_ground,
+    cook,
+    engine_settings,
+    new_scene,
+    places,
+    pose_matrix,
+)
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray

@@ -10,7 +10,8 @@ from sapien import physx
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from asset_tools.physics import (
+from robocas_ms3.assets.hulls import Hull, convex_faces, sample_surface
+from robocas_ms3.assets.physics import (
     TIME_STEP,
     Solid,
     add_body,
@@ -20,7 +21,6 @@ from asset_tools.physics import (
     places,
     pose_matrix,
 )
-from robocas_ms3.assets.hulls import Hull, convex_faces, sample_surface
 
 Array = np.ndarray
 

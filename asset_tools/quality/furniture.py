@@ -9,7 +9,6 @@ import numpy as np
 import sapien
 from sapien import physx
 
-from asset_tools.physics import TIME_STEP, add_component, cook, engine_settings, pose_matrix
 from asset_tools.quality.overlap import convex, deepest, distances
 from asset_tools.quality.stage import Model, Stage, model_of
 from asset_tools.quality.surfaces import BLOCKED, Probe, clearances, probes
@@ -18,6 +17,7 @@ from robocas_ms3.assets.hulls import convex_faces
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import FurnitureQuality, Handle, Link, Surface
 from robocas_ms3.assets.pack import LoadedFurniture
+from robocas_ms3.assets.physics import TIME_STEP, add_component, cook, engine_settings, pose_matrix
 
 Array = np.ndarray
 

@@ -10,8 +10,17 @@ from numpy.typing import NDArray
 from sapien import physx
 from scipy.spatial.transform import Rotation
 
-from asset_tools.physics import TIME_STEP, Array, Solid, add_body, engine_settings, new_scene, places, pose_matrix
 from robocas_ms3.assets.gripper import GRIPPER_BOXES
+from robocas_ms3.assets.physics import (
+    TIME_STEP,
+    Array,
+    Solid,
+    add_body,
+    engine_settings,
+    new_scene,
+    places,
+    pose_matrix,
+)
 from robocas_ms3.errors import AssetError
 
 # The fingers of robots/mobile_panda.py and robots/urdf.py: drives in N/m and N s/m, N, m, kg, kg m2

@@ -10,13 +10,13 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from asset_tools.physics import Solid
 from asset_tools.quality.drops import DropReport, drop_test
 from asset_tools.quality.holding import hold_test
 from asset_tools.quality.hulls import hull_quality
 from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.manifest import ObjectAsset, ObjectQuality
 from robocas_ms3.assets.pack import LoadedObject
+from robocas_ms3.assets.physics import Solid
 
 TOP_GRASPS = 20
 

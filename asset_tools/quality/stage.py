@@ -9,11 +9,11 @@ import numpy as np
 import sapien
 from sapien import physx
 
-from asset_tools.physics import add_component, cook, new_scene, pose_matrix
 from asset_tools.sources import FurnitureSource
 from robocas_ms3.assets.kinematics import joint_frame
 from robocas_ms3.assets.manifest import Handle, Link, Surface
 from robocas_ms3.assets.pack import LoadedFurniture
+from robocas_ms3.assets.physics import add_component, cook, new_scene, pose_matrix
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray

@@ -10,6 +10,7 @@ import numpy as np
 import sapien
 from sapien import physx
 
+from robocas_ms3.assets.pack import LoadedObject
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray
@@ -82,6 +83,22 @@ def add_body(scene: sapien.Scene, solid: Solid, pose: Array) -> physx.PhysxRigid
     free.linear_damping = free.angular_damping = DAMPING
     add_component(scene, free, sapien.Pose(pose))
     return free
+
+
+def solid_of(asset: LoadedObject) -> Solid:
+    """What the engine has to know of an object of a pack."""
+    facts = asset.asset
+    moments, center, axes = (np.array(v) for v in (facts.inertia, facts.center_of_mass, facts.inertia_wxyz))
+    return Solid(asset.hulls, facts.mass, center, moments, axes, facts.friction)
+
+
+def add_fixed(scene: sapien.Scene, hulls: Sequence[Array], pose: Array, friction: float) -> None:
+    """Add convex pieces (V, 3) that never move, their frame at a pose (4, 4) in the world."""
+    material = physx.PhysxMaterial(friction, friction, 0.0)
+    body = physx.PhysxRigidStaticComponent()
+    for piece in hulls:
+        body.attach(cook(piece, material))
+    add_component(scene, body, sapien.Pose(pose))
 
 
 def add_ground(scene: sapien.Scene, origin: Array) -> None:

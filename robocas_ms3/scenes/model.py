@@ -120,7 +120,7 @@ class SceneModel:
         return opening.opened_at * max(joint.limits, key=abs)
 
     def joint_positions(self, name: str, *, opened: bool) -> dict[str, float]:
-        """Positions of a piece of furniture's joints by name: as at first, or as the task wants them; others are at 0."""
+        """Positions of a piece of furniture's joints by name: as at first or as the task wants them; others 0."""
         positions = dict(self.config.furniture[name].joints)
         joint, opening = self.opened_joint, self.config.opening
         if opened and joint is not None and opening is not None and opening.furniture == name:

@@ -22,9 +22,10 @@ from robocas_ms3.errors import ConfigError
 from robocas_ms3.robots.constants import HAND_LINK
 from robocas_ms3.robots.mobile_panda import RoboCASMobilePanda
 from robocas_ms3.scenes import build
+from robocas_ms3.scenes.bank import layout_bank
 from robocas_ms3.scenes.layout import Array, Layout
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.sample import object_set, sample_layout
+from robocas_ms3.scenes.sample import object_set
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.contacts import contact_forces
 from robocas_ms3.tasks.spec import TaskSpec
@@ -82,7 +83,7 @@ class RoboCASEnv(BaseEnv):
         if visual_level not in VISUALS:
             raise ConfigError("no such visual_level", expected=f"one of {list(VISUALS)}", found=visual_level)
         self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack))
-        self._layouts = lambda objects_seed, seed: sample_layout(self.model, objects_seed, seed)
+        self._layouts = layout_bank(self.model, layouts)
         self._visual_level: VisualLevel = visual_level
         if seeds is not None and not 0 <= seeds[0] <= seeds[1]:
             raise ConfigError("seeds are a range", expected="0 <= first <= last", found=seeds)

@@ -3,7 +3,7 @@ import itertools
 import numpy as np
 import pytest
 
-from asset_tools.physics import Solid
+from robocas_ms3.assets.physics import Solid
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -3,10 +3,10 @@ import pytest
 import trimesh
 from sapien import physx
 
-from asset_tools.physics import Solid
 from asset_tools.quality import drops
 from asset_tools.quality.drops import drop_test
 from asset_tools.resting import resting_poses
+from robocas_ms3.assets.physics import Solid
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 

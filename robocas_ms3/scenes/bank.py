@@ -1,0 +1,134 @@
+"""The layout bank: layouts made ahead or on demand, and kept, so that a reset only sets poses."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import zipfile
+from collections.abc import Callable, Iterable
+from dataclasses import fields
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robocas_ms3.assets.pack import MANIFEST, LoadedFurniture, sha256
+from robocas_ms3.files import make_folder, replacing, write_json
+from robocas_ms3.paths import cache_dir
+from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.sample import sample_layout
+
+LAYOUT_FORMAT = 1  # raised when the same seed gives another layout, or the files change
+_A_FOLDER = 1000  # layouts in one
+_NO_MATTER = ("description", "support", "lights", "language", "base_motion")  # parts of a configuration
+_log = logging.getLogger(__name__)
+
+LayoutSource = Callable[[int, int], Layout]
+"""(objects seed, seed) -> layout."""
+
+
+def layout_bank(model: SceneModel, folder: str | Path | None = "auto") -> LayoutSource:
+    """Where an environment gets its layouts from.
+
+    Args:
+        model: the scene's assets.
+        folder: of all banks; ``auto``: in the cache; None: no bank, every layout is sampled anew.
+    """
+    if folder is None:
+        return partial(sample_layout, model)
+    return LayoutBank(model, folder).get
+
+
+class LayoutBank:
+    """Layouts of one configuration and its packs, one small file each.
+
+    Several processes may use a bank at once: files appear whole, and two that make the same layout make the same file.
+
+    Args:
+        model: the scene's assets.
+        root: of all banks; ``auto``: in the cache.
+    """
+
+    def __init__(self, model: SceneModel, root: str | Path = "auto") -> None:
+        self.model = model
+        self._about = about(model)
+        key = hashlib.sha256(json.dumps(self._about, sort_keys=True).encode()).hexdigest()[:16]
+        self.folder = (cache_dir() / "layouts" if root == "auto" else Path(root)) / f"{model.config.task}-{key}"
+
+    def path(self, objects_seed: int, seed: int) -> Path:
+        """File of a layout."""
+        name = f"{seed:010d}" if seed == objects_seed else f"{seed:010d}-of-{objects_seed:010d}"
+        return self.folder / f"{seed // _A_FOLDER:07d}" / f"{name}.npz"
+
+    def get(self, objects_seed: int, seed: int) -> Layout:
+        """The layout of two seeds (see `sample_layout`), from its file if there is one, else made and kept.
+
+        Raises:
+            LayoutError: there is no such layout. Nothing is kept of that.
+        """
+        path = self.path(objects_seed, seed)
+        if path.is_file():
+            try:
+                return read_layout(path)
+            except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+                _log.warning("%s: damaged, made again (%s)", path, error)
+        layout = sample_layout(self.model, objects_seed, seed)
+        if not (self.folder / "about.json").is_file():
+            make_folder(self.folder)
+            write_json(self.folder / "about.json", self._about)
+        make_folder(path.parent)
+        write_layout(layout, path)
+        return layout
+
+    def missing(self, seeds: Iterable[int]) -> list[int]:
+        """The seeds whose layouts are not there yet, objects and arrangement of one seed."""
+        return [seed for seed in seeds if not self.path(seed, seed).is_file()]
+
+    def count(self) -> int:
+        """How many layouts there are."""
+        return sum(1 for _ in self.folder.glob("*/*.npz"))
+
+
+def about(model: SceneModel) -> dict[str, Any]:
+    """Everything that layouts depend on besides their seeds."""
+    config = model.config.model_dump(mode="json", exclude=set(_NO_MATTER))
+    config["randomisation"] = {
+        k: v for k, v in config["randomisation"].items() if k not in {"room", "lights", "cameras"}
+    }
+    config.pop("room")
+    parts: dict[str, LoadedFurniture] = {**model.furniture, "basket": model.basket}
+    return {
+        "layout_format": LAYOUT_FORMAT,
+        "config": config,
+        "object_pack": {"name": model.object_pack.name, "manifest": sha256(model.object_pack.root / MANIFEST)},
+        "furniture": {name: part.asset.files for name, part in parts.items()},
+        "versions": {name: version(name) for name in ("sapien", "numpy", "shapely", "embreex")},
+    }
+
+
+def write_layout(layout: Layout, path: Path) -> None:
+    """Write a layout as ``.npz``."""
+    with replacing(path) as tmp, tmp.open("wb") as file:
+        np.savez(file, **{f.name: np.asarray(getattr(layout, f.name)) for f in fields(Layout)})
+
+
+def read_layout(path: Path) -> Layout:
+    """Read a layout.
+
+    Raises:
+        ValueError: or OSError, KeyError, BadZipFile: the file is damaged.
+    """
+    with np.load(path, allow_pickle=False) as file:
+        values = {f.name: file[f.name] for f in fields(Layout)}
+    return Layout(
+        **{
+            **values,
+            "object_ids": tuple(values["object_ids"].tolist()),
+            "target": int(values["target"]),
+            "relation": str(values["relation"]),
+        }
+    )

@@ -1,0 +1,145 @@
+"""Heaps: objects dropped one by one between four walls, which are then taken away. Bare PhysX."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import sapien
+from sapien import physx
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.assets.pack import LoadedObject
+from robocas_ms3.assets.physics import (
+    TIME_STEP,
+    add_body,
+    add_component,
+    add_ground,
+    engine_settings,
+    new_scene,
+    pose_matrix,
+    solid_of,
+)
+from robocas_ms3.errors import LayoutError
+from robocas_ms3.scenes.placement import Array, Region, planar_pose, transform
+
+SECONDS_EACH = 1.0  # of simulation before the next object falls (upstream's); less where everything lies still
+SETTLE_SECONDS = 2.0  # after the walls are gone
+SPREAD = 0.05  # m that centres of mass may lie outside the region in the end
+WALL = 0.05  # m, half its thickness
+_LOOK_EVERY = 10  # steps between two looks at whether everything lies still
+_TRIES = 10
+
+
+def drop_heap(
+    rng: np.random.Generator,
+    assets: Sequence[LoadedObject],
+    region: Region,
+    *,
+    drop_height: float = 0.3,
+    tumble_probability: float = 0.6,
+) -> Array:
+    """Drop objects into a frictionless bucket the size of a region, then take the bucket away (upstream's way).
+
+    Args:
+        rng: source of all randomness.
+        assets: K objects, dropped in a random order.
+        region: of a horizontal plane.
+        drop_height: of the object's lowest point above the plane, or above what lies there, m.
+        tumble_probability: of a random orientation; otherwise a resting pose at a random yaw.
+
+    Returns:
+        (K, 4, 4) objects at rest in the region's frame, in the order of ``assets``.
+
+    Raises:
+        LayoutError: heap after heap fell apart over the region's edges.
+    """
+    for _ in range(_TRIES):
+        poses = _drop(rng, assets, region, drop_height, tumble_probability)
+        centers = np.stack(
+            [transform(p, np.array([a.asset.center_of_mass]))[0] for a, p in zip(assets, poses, strict=True)]
+        )
+        inside = (centers[:, :2] >= np.array(region.min_xy) - SPREAD) & (
+            centers[:, :2] <= np.array(region.max_xy) + SPREAD
+        )
+        if inside.all():
+            return poses
+    raise LayoutError(
+        f"{len(assets)} objects make no heap here",
+        where="layout",
+        found=f"{_TRIES} heaps fell apart",
+        fix="Lower objects.count or enlarge the surface.",
+    )
+
+
+def _drop(
+    rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, height: float, tumble: float
+) -> Array:
+    low, high = np.array(region.min_xy), np.array(region.max_xy)
+    middle, half = (low + high) / 2, (high - low) / 2
+    bodies: dict[int, physx.PhysxRigidDynamicComponent] = {}
+    with engine_settings():
+        scene = new_scene()
+        add_ground(scene, np.array([*middle, region.z]))
+        walls = _add_walls(scene, middle, half, region.z)
+        for index in rng.permutation(len(assets)):
+            asset = assets[index]
+            pose = _falling_pose(rng, asset, tumble)
+            points = transform(pose, np.concatenate(asset.hulls))
+            room = np.maximum(half - np.abs(points[:, :2]).max(axis=0), 0)
+            x, y = middle + rng.uniform(-1, 1, 2) * room
+            top = max((_top(b, assets[i]) for i, b in bodies.items()), default=region.z)
+            pose = planar_pose(x, y, top + height - points[:, 2].min(), 0) @ pose
+            bodies[int(index)] = add_body(scene, solid_of(asset), pose)
+            _run(scene, SECONDS_EACH, bodies)
+        for wall in walls:
+            wall.remove_from_scene()
+        for body in bodies.values():
+            body.wake_up()
+        _run(scene, SETTLE_SECONDS, bodies)
+        return np.stack([pose_matrix(bodies[i]) for i in range(len(assets))])
+
+
+def _falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) -> Array:
+    """4x4 about the object's own centre of mass."""
+    notes = asset.annotations
+    if rng.uniform() < tumble:
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat(rng.normal(size=4)).as_matrix()
+        pose[:3, 3] = -pose[:3, :3] @ np.array(asset.asset.center_of_mass)
+        return pose
+    choice = int(rng.choice(len(notes.resting_probabilities), p=notes.resting_probabilities))
+    return planar_pose(0, 0, 0, rng.uniform(-np.pi, np.pi)) @ notes.resting_poses[choice]
+
+
+def _add_walls(scene: sapien.Scene, middle: Array, half: Array, z: float) -> list[sapien.Entity]:
+    """Four frictionless walls around a rectangle."""
+    slippery = physx.PhysxMaterial(0.0, 0.0, 0.0)
+    walls = []
+    for axis, sign in ((0, -1), (0, 1), (1, -1), (1, 1)):
+        size = np.array([*half + 2 * WALL, 1.0])
+        size[axis] = WALL
+        center = np.array([*middle, z + 1.0])
+        center[axis] += sign * (half[axis] + WALL)
+        body = physx.PhysxRigidStaticComponent()
+        body.attach(physx.PhysxCollisionShapeBox(size, slippery))
+        add_component(scene, body, sapien.Pose(center))
+        walls.append(body.entity)
+    return walls
+
+
+def _top(body: physx.PhysxRigidDynamicComponent, asset: LoadedObject) -> float:
+    return float(transform(pose_matrix(body), np.concatenate(asset.hulls))[:, 2].max())
+
+
+def _run(scene: sapien.Scene, seconds: float, bodies: dict[int, physx.PhysxRigidDynamicComponent]) -> None:
+    """Simulate for a while, or until nothing moves."""
+    steps = round(seconds / TIME_STEP)
+    for step in range(steps):
+        scene.step()
+        if step >= 3 * _LOOK_EVERY and step % _LOOK_EVERY == 0:
+            speeds = [
+                np.linalg.norm(b.linear_velocity) + 0.05 * np.linalg.norm(b.angular_velocity) for b in bodies.values()
+            ]
+            if max(speeds) < 0.01:
+                return
