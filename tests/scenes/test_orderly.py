@@ -1,0 +1,77 @@
+"""Rows worked out by hand, and the laws of any of them."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robocas_ms3.errors import LayoutError
+from robocas_ms3.scenes.orderly import sample_orderly
+from robocas_ms3.scenes.placement import Placeable, Region
+
+REGION = Region((0.0, -0.4), (0.3, 0.4), 0.6)
+
+
+def box(width: float, depth: float, height: float = 0.1) -> Placeable:
+    """Its label is on the side at -y, ``width`` wide; the second pose is more probable, the first is upright."""
+    outline = np.array([[-width, -depth], [width, -depth], [width, depth], [-width, depth]]) / 2
+    pose = np.eye(4)
+    pose[2, 3] = height / 2
+    return Placeable("box", np.stack([pose, pose]), np.array([0.1, 0.9]), [outline, outline], display_pose=0)
+
+
+def rows(things, columns, front=(-1.0, 0.0), seed=0, **options):
+    options = {"row_gap": 0.01, **options}
+    return sample_orderly(np.random.default_rng(seed), things, columns, REGION, front=np.array(front), **options)
+
+
+def test_a_column_begins_at_the_front_edge_and_goes_back():
+    poses = rows([box(0.06, 0.04)] * 3, ["a"] * 3)
+    # the front edge is at x = 0; depths of 4 cm with 1 cm between
+    np.testing.assert_allclose(poses[:, 0, 3], [0.02, 0.07, 0.12])
+    assert np.ptp(poses[:, 1, 3]) == pytest.approx(0)
+    np.testing.assert_allclose(poses[:, 2, 3], 0.65)
+
+
+@pytest.mark.parametrize("front", [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)])
+def test_labels_look_out_of_the_front(front):
+    poses = rows([box(0.06, 0.04)], ["a"], front=front)
+    np.testing.assert_allclose(poses[0, :3, :3] @ [0, -1, 0], [*front, 0], atol=1e-12)
+    edge = {(-1.0, 0.0): 0.0, (1.0, 0.0): 0.3, (0.0, -1.0): 0.4, (0.0, 1.0): 0.4}[front]
+    assert abs(poses[0, :2, 3] @ front) == pytest.approx(abs(edge - 0.02 * np.sign(sum(front) + 0.5)), abs=0.021)
+
+
+def test_columns_are_apart_by_their_spacing():
+    poses = rows([box(0.06, 0.04), box(0.10, 0.04)], ["a", "b"], column_spacing=1.5)
+    assert abs(poses[0, 1, 3] - poses[1, 1, 3]) == pytest.approx(1.5 * 0.08)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), jitter=st.floats(0, 0.3), columns=st.integers(1, 4))
+def test_everything_stands_inside_and_apart(seed, jitter, columns):
+    things = [box(0.08, 0.05)] * (2 * columns)
+    names = [f"column {i // 2}" for i in range(2 * columns)]
+    poses = rows(things, names, seed=seed, yaw_jitter=jitter)
+    import shapely
+
+    outlines = []
+    for pose, thing in zip(poses, things, strict=True):
+        corners = thing.footprints[0] @ pose[:2, :2].T + pose[:2, 3]
+        assert (corners >= np.array(REGION.min_xy) - 1e-9).all()
+        assert (corners <= np.array(REGION.max_xy) + 1e-9).all()
+        outlines.append(shapely.Polygon(corners))
+    for i, one in enumerate(outlines):
+        for other in outlines[i + 1 :]:
+            assert one.distance(other) > 0.009
+
+
+@pytest.mark.parametrize(
+    ("things", "columns", "words"),
+    [
+        ([box(0.3, 0.04)] * 3, ["a", "b", "c"], "3 columns side by side take 1.08 m of 0.80 m"),
+        ([box(0.05, 0.12)] * 3, ["a"] * 3, "3 objects in a column take 0.38 m of 0.30 m"),
+    ],
+)
+def test_what_does_not_fit_is_said(things, columns, words):
+    with pytest.raises(LayoutError, match=words):
+        rows(things, columns)
