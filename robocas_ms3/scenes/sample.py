@@ -9,7 +9,10 @@ from robocas_ms3.config.task import OrderlyLayout, PoseRandomisation, ScatteredL
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout
 from robocas_ms3.scenes.model import SceneModel, placeable, resolve_ids
+from robocas_ms3.scenes.orderly import sample_orderly
 from robocas_ms3.scenes.placement import Array, choose_objects, planar_pose, sample_scattered
+from robocas_ms3.scenes.settle import settle
+from robocas_ms3.scenes.stacked import drop_heap
 from robocas_ms3.scenes.targets import Arrangement, Choice, choose_target
 
 # Every random decision of a scene has a stream of its own, so that a new one never shifts the others.
@@ -66,15 +69,17 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
     robot_pose = _moved(model.robot_pose, config.randomisation.robot, rng(_ROBOT))
     basket_pose = _moved(model.basket_pose, config.randomisation.basket, rng(_BASKET))
     layout_rng, target_rng = rng(_LAYOUT), rng(_TARGET)
+    used = [asset for asset, there in zip(assets, present, strict=True) if there]
     unsettled = 0
     choice: Choice | None = None
     for _ in range(_TRIES):
         poses = np.stack([_parked(slot, asset) for slot, asset in enumerate(assets)])
-        poses[present] = (
-            model.support_pose
-            @ model.support_motion(opened=False)
-            @ _arrange(layout_rng, model, [a for a, p in zip(assets, present, strict=True) if p])
-        )
+        placed = model.support_pose @ model.support_motion(opened=False) @ _arrange(layout_rng, model, used)
+        settled = settle(used, placed, model, basket_pose)
+        if not settled.stable:
+            unsettled += 1
+            continue
+        poses[present] = settled.poses
         choice = choose_target(
             target_rng, Arrangement(model, assets, poses, present, candidate, robot_pose, basket_pose)
         )
@@ -97,8 +102,6 @@ def _arrange(rng: np.random.Generator, model: SceneModel, assets: list[LoadedObj
         placeables = [placeable(asset) for asset in assets]
         return sample_scattered(rng, placeables, region, min_gap=layout.min_gap, max_tries=layout.max_tries)
     if isinstance(layout, OrderlyLayout):
-        from robocas_ms3.scenes.orderly import sample_orderly
-
         return sample_orderly(
             rng,
             [placeable(asset) for asset in assets],
@@ -109,8 +112,6 @@ def _arrange(rng: np.random.Generator, model: SceneModel, assets: list[LoadedObj
             column_spacing=layout.column_spacing,
             yaw_jitter=np.deg2rad(layout.yaw_jitter_deg),
         )
-    from robocas_ms3.scenes.stacked import drop_heap
-
     return drop_heap(rng, assets, region, drop_height=layout.drop_height, tumble_probability=layout.tumble_probability)
 
 

@@ -14,6 +14,7 @@ from robocas_ms3.scenes.grasping import count_free_grasps
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array, transform
 from robocas_ms3.scenes.relations import related
+from robocas_ms3.scenes.visibility import object_mesh, top_down_camera, visible_shares
 
 
 @dataclass(frozen=True)
@@ -133,8 +134,6 @@ def _by_relation(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
 
 def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
     """A hidden object, near ones more often: weight 1 / distance to the robot (upstream's)."""
-    from robocas_ms3.scenes.visibility import object_mesh, top_down_camera, visible_shares
-
     model, slots = scene.model, np.flatnonzero(scene.present)
     region = model.region
     middle = np.append(np.add(region.min_xy, region.max_xy) / 2, region.z)

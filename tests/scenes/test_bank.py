@@ -1,0 +1,96 @@
+"""The bank gives back what was made, makes what is missing, and knows what layouts depend on."""
+
+from dataclasses import fields
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config import load_task_config
+from robocas_ms3.errors import LayoutError
+from robocas_ms3.scenes import bank as module
+from robocas_ms3.scenes.bank import LayoutBank, layout_bank
+from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.sample import sample_layout
+
+
+def model(**changes) -> SceneModel:
+    pack = load_pack("builtin")
+    data = {**load_task_config("pick_table_scattered").model_dump(mode="json"), **changes}
+    return SceneModel.load(load_task_config(data), pack, pack)
+
+
+def assert_same(one: Layout, two: Layout) -> None:
+    for field in fields(Layout):
+        a, b = getattr(one, field.name), getattr(two, field.name)
+        assert type(a) is type(b), field.name
+        np.testing.assert_array_equal(a, b, err_msg=field.name)
+
+
+def test_a_layout_is_made_once_and_comes_back_the_same(tmp_path, monkeypatch):
+    scene = model()
+    bank = LayoutBank(scene, tmp_path)
+    assert bank.missing(range(3)) == [0, 1, 2]
+    made = bank.get(1, 1)
+    assert_same(made, sample_layout(scene, 1, 1))
+    monkeypatch.setattr(module, "sample_layout", None)  # making it again would fail
+    assert_same(LayoutBank(scene, tmp_path).get(1, 1), made)
+    assert bank.missing(range(3)) == [0, 2]
+    assert bank.count() == 1
+
+
+def test_objects_of_one_seed_and_arrangement_of_another_are_kept_apart(tmp_path):
+    bank = LayoutBank(model(), tmp_path)
+    assert not np.allclose(bank.get(1, 1).object_poses, bank.get(1, 2).object_poses)
+    assert bank.get(1, 2).object_ids == bank.get(1, 1).object_ids
+    assert bank.missing([2]) == [2]
+
+
+def test_reading_takes_about_a_millisecond(tmp_path):
+    bank = LayoutBank(model(), tmp_path)
+    bank.get(0, 0)
+    seconds = []
+    for _ in range(20):
+        start = perf_counter()
+        bank.get(0, 0)
+        seconds.append(perf_counter() - start)
+    assert min(seconds) < 0.005
+
+
+def test_a_damaged_file_is_made_again(tmp_path, caplog):
+    bank = LayoutBank(model(), tmp_path)
+    made = bank.get(0, 0)
+    path = bank.path(0, 0)
+    path.write_bytes(path.read_bytes()[:200])
+    assert_same(bank.get(0, 0), made)
+    assert "damaged, made again" in caplog.text
+    assert_same(LayoutBank(model(), tmp_path).get(0, 0), made)
+
+
+def test_a_seed_without_a_layout_leaves_nothing_behind(tmp_path):
+    bank = LayoutBank(model(target={"max_distance": 0.1}), tmp_path)
+    with pytest.raises(LayoutError):
+        bank.get(0, 0)
+    assert bank.count() == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "same"),
+    [
+        ({"lights": {"ambient": 0.1}}, True),
+        ({"description": "other words"}, True),
+        ({"randomisation": {"cameras": {}, "room": ["wall"]}}, True),
+        ({"randomisation": {"robot": {}}}, False),
+        ({"layout": {"kind": "scattered", "min_gap": 0.02}}, False),
+        ({"objects": {"ids": "all", "count": 9}}, False),
+    ],
+)
+def test_what_layouts_depend_on_is_in_the_name(tmp_path, changes, same):
+    assert (LayoutBank(model(**changes), tmp_path).folder == LayoutBank(model(), tmp_path).folder) is same
+
+
+def test_no_bank_gives_the_same_layouts(tmp_path):
+    scene = model()
+    assert_same(layout_bank(scene, None)(2, 2), layout_bank(scene, tmp_path)(2, 2))

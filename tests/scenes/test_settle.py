@@ -1,0 +1,52 @@
+"""What stays, what falls, and that the same comes out each time."""
+
+import numpy as np
+import pytest
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config import load_task_config
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.placement import planar_pose
+from robocas_ms3.scenes.settle import settle
+
+
+@pytest.fixture(scope="module")
+def model() -> SceneModel:
+    pack = load_pack("builtin")
+    return SceneModel.load(load_task_config("pick_table_scattered"), pack, pack)
+
+
+def on_table(model, name: str, x: float, y: float, lift: float = 0.0) -> np.ndarray:
+    notes = model.object_pack.objects[name].annotations
+    stands = notes.resting_poses[max(notes.display_pose, 0)]
+    return planar_pose(x, y, 0.61 + lift, 0.3) @ stands
+
+
+def run(model, names, poses):
+    return settle([model.object_pack.objects[n] for n in names], np.stack(poses), model, model.basket_pose)
+
+
+def test_objects_in_resting_poses_stay(model):
+    names = ["sugar_box", "mug"]
+    poses = [on_table(model, "sugar_box", 0.9, 0.9), on_table(model, "mug", 1.0, 1.1)]
+    settled = run(model, names, poses)
+    assert settled.stable
+    assert np.abs(settled.poses - poses).max() < 0.003
+
+
+def test_an_object_that_is_dropped_settles_first(model):
+    settled = run(model, ["sugar_box"], [on_table(model, "sugar_box", 0.9, 0.9, lift=0.02)])
+    assert settled.stable
+    assert settled.poses[0, 2, 3] == pytest.approx(on_table(model, "sugar_box", 0.9, 0.9)[2, 3], abs=0.002)
+
+
+def test_an_object_beside_the_table_does_not_stay(model):
+    settled = run(model, ["sugar_box"], [on_table(model, "sugar_box", 0.9, 2.5)])
+    assert not settled.stable
+    assert settled.shift[0] > 1
+
+
+def test_the_same_comes_out_bit_for_bit(model):
+    poses = [on_table(model, "mug", 0.9, 0.9, lift=0.05), on_table(model, "mug", 0.92, 0.91, lift=0.2)]
+    one, two = (run(model, ["mug", "mug"], poses) for _ in range(2))
+    np.testing.assert_array_equal(one.poses, two.poses)

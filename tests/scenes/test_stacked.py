@@ -1,0 +1,48 @@
+"""Heaps of shipped objects: they lie on the plane, in each other's way, in the region, and repeat."""
+
+import numpy as np
+import pytest
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.errors import LayoutError
+from robocas_ms3.scenes.placement import Region, transform
+from robocas_ms3.scenes.stacked import SPREAD, drop_heap
+from robocas_ms3.scenes.visibility import object_mesh, top_down_camera, visible_shares
+
+REGION = Region((-0.05, -0.25), (0.25, 0.15), 0.61)
+
+
+def heap(seed: int, count: int = 12):
+    pack = load_pack("builtin")
+    rng = np.random.default_rng(seed)
+    assets = [pack.objects[i] for i in rng.choice(sorted(pack.objects), count, replace=False)]
+    return assets, drop_heap(rng, assets, REGION)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_objects_lie_on_the_plane_and_on_each_other(seed):
+    assets, poses = heap(seed)
+    low = [transform(p, np.concatenate(a.hulls))[:, 2].min() for a, p in zip(assets, poses, strict=True)]
+    assert min(low) > REGION.z - 0.002  # nothing has sunk in
+    assert max(low) > REGION.z + 0.01  # something lies on something
+    for asset, pose in zip(assets, poses, strict=True):
+        center = transform(pose, np.array([asset.asset.center_of_mass]))[0, :2]
+        assert (center >= np.array(REGION.min_xy) - SPREAD).all()
+        assert (center <= np.array(REGION.max_xy) + SPREAD).all()
+    camera = top_down_camera(np.array([0.1, -0.05]), REGION.z, size=128)
+    shares = visible_shares(camera, [object_mesh(a) for a in assets], poses)
+    assert (shares < 0.9).sum() >= 2  # something is hidden
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_heap_bit_for_bit():
+    np.testing.assert_array_equal(heap(3, 6)[1], heap(3, 6)[1])
+
+
+def test_a_heap_that_runs_over_is_an_error():
+    pack = load_pack("builtin")
+    with pytest.raises(LayoutError, match="2 objects make no heap here"):
+        tiny = Region((0.0, 0.0), (0.001, 0.001), 0.0)
+        assets = [pack.objects["power_drill"], pack.objects["sugar_box"]]
+        drop_heap(np.random.default_rng(0), assets, tiny)
