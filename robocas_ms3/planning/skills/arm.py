@@ -16,6 +16,7 @@ from robocas_ms3.scenes.grasping import MAX_WIDTH
 from robocas_ms3.tasks.transfer import TransferEnv
 
 OPEN_SECONDS, CLOSE_SECONDS = 0.30, 0.45
+RISE, RISES = 0.04, 4  # m a step, steps
 
 
 @dataclass
@@ -96,6 +97,24 @@ class Arm:
     def plan_home(self, start: Array) -> Trajectory:
         """Plan to the rest configuration."""
         return self.planner.plan_to_qpos(start, [np.array(ARM_REST)], stage="home")
+
+    def rise_clear(self, *, without: int | None = None) -> None:
+        """Rise in small steps, through whatever is touched, until arm and held object touch nothing.
+
+        Args:
+            without: slot of the held object.
+
+        Raises:
+            PlanningFailed: the arm can't rise any further.
+        """
+        for _ in range(RISES):
+            with self.planning():
+                self.planner.set_scene(self.scene.obstacles_in_base(without=without))
+                if not self.planner.collisions(self.at, self.planner.finger_width):
+                    return
+                goal = raised(self.planner.tcp(self.at), RISE)
+                motion = self.planner.plan_straight(self.at, goal, stage="rise", check_collisions=False)
+            self.follow(motion)
 
     def back_out(self) -> None:
         """After a failed attempt that stays in the record: open the gripper and rise out of whatever is there."""

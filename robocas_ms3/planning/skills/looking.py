@@ -1,0 +1,112 @@
+"""Look at a place with the gripper's camera."""
+
+from __future__ import annotations
+
+import numpy as np
+from mani_skill.sensors.camera import CameraConfig
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.protocol import Array, Trajectory
+from robocas_ms3.planning.scene import inverse, matrix
+from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh
+
+CAMERA = "gripper_camera"
+FAR, NEAR = (0.4, 0.5), (0.2, 0.3)  # m from the camera to what it looks at: at first; between two removals (upstream's)
+ELEVATION_DEG = (60.0, 90.0)  # of the camera above what it looks at (upstream's)
+VIEWS_SAMPLED, VIEWS_PLANNED = 96, 6
+
+
+def look_at(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> None:
+    """Move the gripper's camera to where it looks at a point from above.
+
+    Args:
+        arm: the attempt's tools.
+        point_in_base: (3,) m.
+        distance: least and greatest, m.
+
+    Raises:
+        PlanningFailed: no such view can be reached.
+    """
+    arm.rise_clear()
+    with arm.planning():
+        motion = plan_look(arm, point_in_base, distance)
+    arm.follow(motion)
+
+
+def plan_look(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> Trajectory:
+    """Plan to one of the nearest views of a point; arguments as in `look_at`.
+
+    Raises:
+        PlanningFailed: no such view can be reached.
+    """
+    camera_in_tcp = inverse(arm.scene.tcp_in_base) @ camera_in_base(arm)
+    views = sample_views(arm.rng, point_in_base, distance, count=VIEWS_SAMPLED)
+    solved, qpos = arm.reachability.reachable(views @ inverse(camera_in_tcp), arm.at)
+    if not solved.any():
+        raise PlanningFailed("look", "unreachable")
+    qpos = qpos[solved]
+    arm.planner.set_scene(arm.scene.obstacles_in_base())
+    near = qpos[np.argsort(np.abs(qpos - arm.at).max(axis=1), kind="stable")]
+    goals = [q for q in near[: 4 * VIEWS_PLANNED] if not arm.planner.collisions(q, arm.planner.finger_width)]
+    return arm.planner.plan_to_qpos(arm.at, goals[:VIEWS_PLANNED], stage="look")
+
+
+def hidden_share(arm: Arm, slot: int) -> float:
+    """Share of an object that other objects hide from the gripper's camera, as it stands; 1 where it is out of view.
+
+    By ray casting, so that no renderer is needed; the robot is left out.
+    """
+    env = arm.env
+    config = _camera_config(arm)
+    scale = 2  # half the camera's resolution is enough
+    pose = arm.scene.arm_base_in_world @ camera_in_base(arm)
+    camera = PinholeCamera(pose, config.width // scale, config.height // scale, float(config.fov or np.pi / 2))
+    slots = np.flatnonzero(env.present[0].cpu().numpy()).tolist()
+    poses = np.stack([arm.scene.arm_base_in_world @ arm.scene.object_in_base(s) for s in slots])
+    scenery = Scenery([object_mesh(env.object_assets[0][s]) for s in slots], poses)
+    share = scenery.visible_share(camera, slots.index(slot))
+    return 1.0 if np.isnan(share) else 1.0 - share
+
+
+def camera_in_base(arm: Arm) -> Array:
+    """4x4 of the gripper's camera in the arm's base frame: x forward, y left, z up."""
+    config = _camera_config(arm)
+    link = arm.env.agent.robot.links_map[str(config.entity_uid)]
+    camera_in_link = matrix(config.pose.raw_pose[0])
+    return inverse(arm.scene.arm_base_in_world) @ matrix(link.pose.raw_pose[0]) @ camera_in_link
+
+
+def _camera_config(arm: Arm) -> CameraConfig:
+    return next(config for config in arm.env.agent._sensor_configs if config.uid == CAMERA)
+
+
+def sample_views(
+    rng: np.random.Generator,
+    point: Array,
+    distance: tuple[float, float],
+    *,
+    elevation_deg: tuple[float, float] = ELEVATION_DEG,
+    count: int,
+) -> Array:
+    """Camera poses that look at a point from above, turned freely about the line of sight.
+
+    Args:
+        rng: source of all randomness.
+        point: (3,) in an upright frame, m.
+        distance: least and greatest, m.
+        elevation_deg: least and greatest angle of the camera above the point.
+        count: how many.
+
+    Returns:
+        (count, 4, 4) in the same frame: x forward, y left, z up.
+    """
+    elevation = np.deg2rad(rng.uniform(*elevation_deg, count))
+    azimuth, roll = rng.uniform(-np.pi, np.pi, (2, count))
+    # forward = x: turned down by the elevation, about the vertical by the azimuth
+    turn = Rotation.from_euler("ZYX", np.column_stack([azimuth, elevation, roll]))
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = turn.as_matrix()
+    poses[:, :3, 3] = point - rng.uniform(*distance, (count, 1)) * poses[:, :3, 0]
+    return poses

@@ -1,0 +1,240 @@
+"""Push an object aside with the closed gripper, tool pointing down."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.executor import CLOSED
+from robocas_ms3.planning.protocol import Array, Trajectory
+from robocas_ms3.planning.scene import SPACING, inverse
+from robocas_ms3.planning.skills.arm import Arm, raised
+from robocas_ms3.scenes.placement import transform
+
+STAND_OFF = 0.02  # m between the tool and the object before the push (upstream's)
+TOOL_RADIUS = 0.012  # m, half the width of the closed fingers
+TIP_BELOW_TCP = 0.0085  # m, by which the pads reach beyond the TCP
+TIP_CLEARANCE = 0.012  # m kept between the finger tips and the surface
+ABOVE = 0.08  # m above the start of the push, from where the tool comes straight down
+LIFT = 0.05  # m after the push (upstream's)
+PUSH_LENGTH = (0.06, 0.16)  # m, least and greatest way of the tool once it touches
+EDGE_MARGIN = 0.08  # m that a pushed object keeps from the surface's edge
+ON_TOP = 0.01  # m; an object whose centre is closer than this to the target's has no direction of its own (upstream's)
+TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 65.0, -65.0)  # directions tried, off the paper's one
+YAWS = 4  # turns of the tool about the vertical, of half a turn
+SPEED = 0.6  # of the arm's limits while pushing: what is pushed neither rolls far nor jumps
+PUSHES_TRIED, PUSHES_PLANNED = 20, 6
+SETTLE_SECONDS = 0.3
+
+
+@dataclass(frozen=True)
+class Push:
+    """A push to try, in the arm's base frame.
+
+    Attributes:
+        start: 4x4 of the TCP beside the object.
+        direction: (3,) unit, level.
+        length: m, the tool's way.
+    """
+
+    start: Array
+    direction: Array
+    length: float
+
+    @property
+    def end(self) -> Array:
+        """4x4 of the TCP at the end."""
+        pose = self.start.copy()
+        pose[:3, 3] += self.length * self.direction
+        return pose
+
+
+@dataclass(frozen=True)
+class PushPlan:
+    """Motions from where the arm is to clear of the pushed object."""
+
+    reach: Trajectory
+    down: Trajectory
+    push: Trajectory
+    lift: Trajectory
+
+
+def push_away(arm: Arm, slot: int, target: int) -> None:
+    """Push an object away from the target, run to clear of it.
+
+    Raises:
+        PlanningFailed: no push can be planned.
+    """
+    arm.rise_clear()
+    with arm.planning():
+        plan = plan_push(arm, slot, target)
+    arm.executor.gripper = CLOSED  # it closes on the way
+    arm.follow(plan.reach, plan.down, plan.push, plan.lift)
+    arm.executor.move_gripper(CLOSED, arm.at, seconds=SETTLE_SECONDS)
+
+
+def plan_push(arm: Arm, slot: int, target: int) -> PushPlan:
+    """Plan the first push that has a way in.
+
+    Raises:
+        PlanningFailed: of the push that came last.
+    """
+    planner, everything = arm.planner, arm.scene.obstacles_in_base()
+    others = arm.scene.obstacles_in_base(without=slot)
+    failure = PlanningFailed("push", "no_room")
+    width, planner.finger_width = planner.finger_width, 0.0
+    try:
+        planner.set_scene(everything)
+        begun: list[tuple[Push, Array, Trajectory]] = []
+        for push, qpos in reachable_pushes(arm, slot, target, others):
+            try:
+                begun.append((push, qpos, planner.plan_straight(qpos, push.start, stage="push")))
+            except PlanningFailed as error:
+                failure = error
+            if len(begun) == PUSHES_PLANNED:
+                break
+        planner.set_scene(others)  # the object pushed is no obstacle on the way along; everything else is
+        ways: list[tuple[Array, Trajectory, Trajectory, Trajectory]] = []
+        first = np.zeros(3)
+        for push, qpos, down in begun:
+            if ways and push.direction @ first < 1 - 1e-6:
+                break
+            try:
+                along = planner.plan_straight(down.qpos[-1], push.end, stage="push", speed=SPEED)
+                back = push.end.copy()
+                back[:3, 3] -= STAND_OFF * push.direction
+                lift = planner.plan_straight(along.qpos[-1], raised(back, LIFT), stage="push", check_collisions=False)
+                ways.append((qpos, down, along, lift))
+                first = push.direction
+            except PlanningFailed as error:
+                failure = error
+        planner.set_scene(everything)
+        if ways:
+            # one direction, several turns of the tool: the one that is nearest
+            reach = planner.plan_to_qpos(arm.at, [way[0] for way in ways], stage="push")
+            _, *way = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
+            return PushPlan(reach, *way)
+    finally:
+        planner.finger_width = width
+    raise failure
+
+
+def reachable_pushes(arm: Arm, slot: int, target: int, others: Array) -> Iterator[tuple[Push, Array]]:
+    """Pushes that the arm can reach, the paper's direction first, then those near where the arm is.
+
+    Each comes with a configuration (7,) above its start.
+    """
+    points, own = (
+        transform(arm.scene.object_in_base(s), arm.env.object_assets[0][s].surface_points(SPACING))
+        for s in (slot, target)
+    )
+    pushes = list(candidates(arm.rng, points, own.mean(axis=0), others, surface_in_base(arm)))
+    if not pushes:
+        return
+    starts, ends = np.stack([push.start for push in pushes]), np.stack([push.end for push in pushes])
+    above = starts.copy()
+    above[:, 2, 3] += ABOVE
+    reachable, qpos = arm.reachability.reachable(above, arm.at)
+    for poses in (starts, ends):
+        reachable[reachable] = arm.reachability.reachable(poses[reachable], arm.at)[0]
+    turn = np.repeat(np.arange(len(pushes) // YAWS), YAWS)
+    order = np.lexsort((np.abs(qpos - arm.at).max(axis=1), turn))
+    yield from [(pushes[i], qpos[i]) for i in order if reachable[i]][:PUSHES_TRIED]
+
+
+def candidates(
+    rng: np.random.Generator, points: Array, target: Array, others: Array, surface: tuple[Array, Array]
+) -> Iterator[Push]:
+    """Pushes of an object that begin clear of everything else and end on the surface; the paper's direction first.
+
+    The tool touches at the target's height, or at the nearest height above it at which there is room for it.
+
+    Args:
+        rng: source of all randomness.
+        points: (P, 3) surface of the object, upright frame, m.
+        target: (3,) middle of the target.
+        others: (Q, 3) surfaces of everything else.
+        surface: of `surface_in_base`.
+    """
+    frame, half = surface
+    center = points.mean(axis=0)
+    ahead = push_direction(rng, center, target)
+    lowest = frame[2, 3] + TIP_CLEARANCE + TIP_BELOW_TCP
+    top = points[:, 2].max()
+    heights = [h for h in np.arange(max(target[2], points[:, 2].min(), lowest), top - 0.005, 0.015)]
+    if not heights and top - 0.01 >= lowest:
+        heights = [top - 0.01]
+    near = others[np.linalg.norm(others[:, :2] - center[:2], axis=1) < 0.3]
+    for turn in TURNS_DEG:
+        direction = Rotation.from_euler("z", turn, degrees=True).apply(ahead)
+        for height in heights:
+            extent = extent_behind(points, center, direction, height)
+            if extent is None:
+                continue
+            tool = np.array([*center[:2], height]) - (extent + STAND_OFF + TOOL_RADIUS) * direction
+            if not _tool_fits(tool, near):
+                continue
+            length = STAND_OFF + float(np.clip(2 * extent, *PUSH_LENGTH))
+            if not _ends_on(points + (length - STAND_OFF) * direction, frame, half):
+                continue
+            yaw = np.arctan2(direction[1], direction[0])
+            for k in range(YAWS):
+                start = np.eye(4)
+                start[:3, :3] = (Rotation.from_euler("z", yaw + k * np.pi / YAWS) * _DOWN).as_matrix()
+                start[:3, 3] = tool
+                yield Push(start, direction, length)
+            break  # higher up it would tip rather than slide
+
+
+_DOWN = Rotation.from_euler("x", np.pi)
+
+
+def push_direction(rng: np.random.Generator, center: Array, target: Array) -> Array:
+    """The paper's v_push: (3,) level unit vector from the target to the obstacle.
+
+    Where they are less than 1 cm apart: within 30 deg of towards the robot, which stands at the origin.
+    """
+    away = np.append((center - target)[:2], 0.0)
+    if np.linalg.norm(away) < ON_TOP:
+        home = np.append(-center[:2], 0.0)
+        away = Rotation.from_euler("z", rng.uniform(-30, 30), degrees=True).apply(home)
+    return away / np.linalg.norm(away)
+
+
+def extent_behind(points: Array, center: Array, direction: Array, height: float) -> float | None:
+    """The paper's d_ext: how far an object reaches from its middle against the push, at a height; none: not there.
+
+    Only what the tool would meet counts: points within its width of the line, 1 cm above or below the height.
+    """
+    relative = points - center
+    across = np.abs(relative[:, :2] @ np.array([-direction[1], direction[0]]))
+    slice_ = (across <= TOOL_RADIUS) & (np.abs(points[:, 2] - height) <= 0.01)
+    if not slice_.any():
+        return None
+    return float(np.max(-relative[slice_, :2] @ direction[:2]))
+
+
+def surface_in_base(arm: Arm) -> tuple[Array, Array]:
+    """The whole surface that objects are on: 4x4 of its middle in the arm's base frame, and its half size (2,) m."""
+    model = arm.env.model
+    config = model.config.surface
+    surface = model.furniture[config.furniture].asset.surfaces[config.name]
+    low, high = np.array(surface.min_xy), np.array(surface.max_xy)
+    frame = inverse(arm.scene.arm_base_in_world) @ model.support_pose @ model.support_motion(opened=True)
+    frame[:3, 3] += frame[:3, :3] @ np.append((low + high) / 2, surface.z)
+    return frame, (high - low) / 2
+
+
+def _ends_on(points: Array, frame: Array, half: Array) -> bool:
+    local = (points - frame[:3, 3]) @ frame[:3, :3]
+    return bool(np.all(np.abs(local[:, :2]) <= half - EDGE_MARGIN))
+
+
+def _tool_fits(tool: Array, points: Array) -> bool:
+    """Whether the closed fingers at a place, and straight above it, meet no point."""
+    above = points[points[:, 2] > tool[2] - TIP_BELOW_TCP - 0.002]
+    return not np.any(np.linalg.norm(above[:, :2] - tool[:2], axis=1) < TOOL_RADIUS + 0.003)

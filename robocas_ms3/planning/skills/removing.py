@@ -1,0 +1,180 @@
+"""Lift an object and put it down on a free place of the surface."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import ConvexHull, KDTree
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
+from robocas_ms3.planning.scene import SPACING, inverse
+from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
+from robocas_ms3.planning.skills.grasping import grasp
+from robocas_ms3.planning.skills.pushing import surface_in_base
+from robocas_ms3.scenes.grasping import MAX_WIDTH, directions_ok, gripper_is_clear
+from robocas_ms3.scenes.placement import transform
+
+GRID = 0.03  # m between places tried
+TURNS = 8  # of the object about the vertical
+ROOM = 0.03  # m kept to everything else, seen from above
+EDGE_MARGIN = 0.03  # m kept from the surface's edge
+RELEASE_HEIGHT = 0.012  # m of the object's lowest point above the surface when let go
+COME_DOWN = 0.06  # m above that, from where it comes straight down
+RETREAT = 0.08  # m
+LIFTS = (0.08, 0.2)  # m, least and greatest
+GRASPS_LOOKED_AT = 150
+PLACES_PLANNED = 12
+
+
+def remove(arm: Arm, slot: int) -> None:
+    """Grasp an object, put it down on a free place of the surface, step back.
+
+    Raises:
+        PlanningFailed: it can't be grasped, there is no place for it, or it was lost on the way.
+    """
+    grasp(arm, slot, lift_height=lift_height(arm, slot))
+    hang_clear(arm, slot)
+    with arm.planning():
+        carry, down = plan_place(arm, slot)
+    arm.follow(carry)
+    if not arm.holds(slot):
+        raise PlanningFailed("remove", "dropped")
+    arm.follow(down)
+    arm.open_gripper()
+    with arm.planning():
+        arm.hold_nothing()
+        retreat = _plan_retreat(arm)
+    arm.follow(retreat)
+
+
+def hang_clear(arm: Arm, slot: int) -> None:
+    """Raise a held object until it touches nothing."""
+    object_in_tcp = inverse(arm.scene.tcp_in_base) @ arm.scene.object_in_base(slot)
+    arm.planner.attach(AttachedBody(np.concatenate(arm.env.object_assets[0][slot].hulls), object_in_tcp))
+    arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
+    arm.rise_clear(without=slot)
+
+
+def lift_height(arm: Arm, slot: int) -> float:
+    """How far to lift an object so that it hangs above all that stands around it, m."""
+    points = transform(arm.scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
+    middle = points.mean(axis=0)
+    radius = float(np.linalg.norm((points - middle)[:, :2], axis=1).max())
+    others = arm.scene.obstacles_in_base(without=slot)
+    near = others[np.linalg.norm((others - middle)[:, :2], axis=1) <= radius + ROOM]
+    return float(np.clip(near[:, 2].max(initial=0.0) + 0.02 - points[:, 2].min(), *LIFTS))
+
+
+def blockers(arm: Arm, slot: int) -> list[int]:
+    """Objects in the way of an object's grasps from above, those first that alone block most of them.
+
+    Args:
+        arm: the attempt's tools.
+        slot: of the object to be grasped.
+    """
+    notes, frame = arm.env.object_assets[0][slot].annotations, arm.scene.object_in_base(slot)
+    grasps = frame @ notes.grasps_tcp_in_object
+    passed = np.logical_and.reduce(list(directions_ok(grasps, frame[:3, 3]).values()))
+    grasps = grasps[passed & (notes.grasp_widths <= MAX_WIDTH)]
+    grasps = grasps[arm.rng.permutation(len(grasps))[:GRASPS_LOOKED_AT]]
+    in_the_way = {}
+    for other, used in enumerate(arm.env.present[0].tolist()):
+        if used and other != slot:
+            points = transform(arm.scene.object_in_base(other), arm.env.object_assets[0][other].surface_points(SPACING))
+            in_the_way[other] = ~gripper_is_clear(grasps, points)
+    count = np.sum(list(in_the_way.values()), axis=0)
+    score = {other: float(np.sum(blocked / np.maximum(count, 1) ** 2)) for other, blocked in in_the_way.items()}
+    return sorted((other for other in score if score[other] > 0), key=lambda other: -score[other])
+
+
+def plan_place(arm: Arm, slot: int) -> tuple[Trajectory, Trajectory]:
+    """Plan to above a free place and down to it.
+
+    Raises:
+        PlanningFailed: of the place that came last.
+    """
+    scene, start = arm.scene, arm.at
+    asset = arm.env.object_assets[0][slot]
+    tcp, object_in_base = scene.tcp_in_base, scene.object_in_base(slot)
+    vertices = np.concatenate(asset.hulls)
+    others = scene.obstacles_in_base(without=slot)
+    places = free_places(transform(object_in_base, vertices), others, *surface_in_base(arm)) @ tcp
+    if not len(places):
+        raise PlanningFailed("remove", "no_free_place")
+    above = places.copy()
+    above[:, 2, 3] += COME_DOWN
+    solved, qpos = arm.reachability.reachable(above, start)
+    solved[solved] = arm.reachability.reachable(places[solved], start)[0]
+    if not solved.any():
+        raise PlanningFailed("remove", "unreachable")
+    places, above, qpos = places[solved], above[solved], qpos[solved]
+    arm.planner.set_scene(others)
+    arm.planner.attach(AttachedBody(vertices, inverse(tcp) @ object_in_base))
+    arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
+    failure = PlanningFailed("remove", "no_plan")
+    for index in np.argsort(np.abs(qpos - start).max(axis=1), kind="stable")[:PLACES_PLANNED]:
+        try:
+            carry = arm.planner.plan_to_pose(start, above[index], stage="remove")
+            return carry, arm.planner.plan_straight(carry.qpos[-1], places[index], stage="remove", speed=0.6)
+        except PlanningFailed as error:
+            failure = error
+    raise failure
+
+
+def free_places(vertices: Array, others: Array, frame: Array, half: Array) -> Array:
+    """Motions that bring a held object above a free place of a surface, turned about the vertical.
+
+    Args:
+        vertices: (V, 3) of the object where it is held, upright frame, m.
+        others: (P, 3) surfaces of everything else.
+        frame: 4x4 of the surface's middle in the same frame.
+        half: (2,) its half size, m.
+
+    Returns:
+        (n, 4, 4) motions in that frame.
+    """
+    middle = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
+    outline = (vertices - middle)[:, :2]
+    limit = half - EDGE_MARGIN
+    axes = [np.arange(-extent, extent + 1e-9, GRID) for extent in limit]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    spots = grid @ frame[:2, :2].T + frame[:2, 3]
+    standing = others[others[:, 2] > frame[2, 3] + 0.005]
+    tree = KDTree(standing[:, :2])
+    distance, _ = tree.query(spots)
+    spots = spots[distance >= ROOM]  # nothing stands in the middle of the place at least
+    rise = frame[2, 3] + RELEASE_HEIGHT - vertices[:, 2].min()
+    motions = []
+    for turn in np.arange(TURNS) * 2 * np.pi / TURNS:
+        rotation = Rotation.from_euler("z", turn).as_matrix()
+        corners = spots[:, None] + _rim(outline @ rotation[:2, :2].T)  # (n, V, 2)
+        local = (corners - frame[:2, 3]) @ frame[:2, :2]
+        inside = np.all(np.abs(local) <= limit, axis=(1, 2))
+        free = np.zeros(len(spots), dtype=bool)
+        free[inside] = tree.query(corners[inside])[0].min(axis=1) >= ROOM
+        for spot in spots[free]:
+            motion = np.eye(4)
+            motion[:3, :3] = rotation
+            motion[:3, 3] = np.append(spot, middle[2] + rise) - rotation @ middle
+            motions.append(motion)
+    return np.array(motions).reshape(-1, 4, 4)
+
+
+def _rim(outline: Array, spacing: float = 0.015) -> Array:
+    """Points (n, 2) along the convex hull of an outline (V, 2), and its middle."""
+    corners = outline[ConvexHull(outline).vertices]
+    points = [np.zeros((1, 2))]
+    for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        points.append(
+            a + np.linspace(0, 1, 1 + int(np.linalg.norm(b - a) / spacing), endpoint=False)[:, None] * (b - a)
+        )
+    return np.concatenate(points)
+
+
+def _plan_retreat(arm: Arm) -> Trajectory:
+    arm.planner.set_scene(arm.scene.obstacles_in_base())
+    tcp = arm.planner.tcp(arm.at)
+    back = moved_back(tcp, RETREAT)
+    goals = [raised(tcp, RETREAT), raised(back, RETREAT / 2), back, raised(tcp, RETREAT / 2)]
+    return arm.first_line(arm.at, goals, stage="retreat", check_collisions=False)

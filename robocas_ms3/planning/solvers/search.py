@@ -1,0 +1,176 @@
+"""Scripted policy of search: look, clear what covers and surrounds the target, grasp it, carry it to the basket."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.language.templates import subgoal
+from robocas_ms3.planning.executor import OPEN
+from robocas_ms3.planning.protocol import Array
+from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.grasping import grasp
+from robocas_ms3.planning.skills.looking import FAR, NEAR, hidden_share, look_at
+from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
+from robocas_ms3.planning.skills.pushing import push_away, surface_in_base
+from robocas_ms3.planning.skills.removing import blockers, hang_clear, remove
+from robocas_ms3.scenes.placement import transform
+from robocas_ms3.tasks.search import RoboCASSearchEnv
+
+REMOVALS = 8  # pushes and removals an attempt may make
+LIFT_HEIGHT = 0.15  # m, upstream's
+FALLEN = 0.05  # m below the surface at which an object counts as pushed off it
+HIDDEN_SHARE = 0.2  # of the target, up to which it counts as found (the paper's)
+SMALL_MOVE = 100  # control steps, up to which a skill that failed has only freed the arm
+HORIZON_SHARE = 0.85  # of the horizon, at which an attempt that still clears is given up
+
+
+def attempt(arm: Arm) -> None:
+    """Try once, from wherever the episode stands; returns when the task has succeeded.
+
+    Raises:
+        PlanningFailed: with the stage that could not be done.
+    """
+    slot = int(arm.env.target_slot[0])
+    words = arm.env.target_asset().asset.name, arm.env.task_config.support
+    find, take = subgoal("find the object", *words), subgoal("move and grasp", *words)
+    clearing = _Clearing(arm, slot)
+    arm.executor.label(**find)
+    look_at(arm, clearing.middle(slot), FAR)
+    while True:
+        obstacles = clearing.obstacles()
+        if not obstacles or (clearing.stuck and clearing.visible):
+            try:
+                arm.executor.label(**take)
+                _grasp(arm, slot)
+                break
+            except _NoWayIn:
+                arm.executor.label(**find)
+                obstacles = [*obstacles, *blockers(arm, slot)]
+        if clearing.clear_one(obstacles):
+            look_at(arm, clearing.middle(slot), NEAR)
+            clearing.check()
+    hang_clear(arm, slot)
+    arm.executor.label(**subgoal("transfer object", *words))
+    carry_to_basket(arm, slot)
+    release_into_basket(arm, slot)
+
+
+class _NoWayIn(Exception):
+    """No grasp of the target can be planned as things stand; nothing has moved yet."""
+
+
+def _grasp(arm: Arm, slot: int) -> None:
+    """Grasp the target and lift it.
+
+    Raises:
+        _NoWayIn: no grasp can be planned.
+        PlanningFailed: it was missed or slipped.
+    """
+    done = len(arm.executor.actions)
+    try:
+        arm.executor.gripper = OPEN  # it opens on the way
+        grasp(arm, slot, lift_height=LIFT_HEIGHT)
+    except PlanningFailed as error:
+        if len(arm.executor.actions) > done:
+            raise
+        raise _NoWayIn from error
+
+
+class _Clearing:
+    """Makes room around the target, one object at a time; remembers what did not help.
+
+    Args:
+        arm: the attempt's tools.
+        target: slot of the target.
+    """
+
+    def __init__(self, arm: Arm, target: int) -> None:
+        assert isinstance(arm.env, RoboCASSearchEnv)
+        self._arm, self._env, self._target = arm, arm.env, target
+        self._tried: Counter[int] = Counter()
+        self.stuck = False
+        self._on_table = self._above_surface()
+        arm.executor.facts.update(pushes=0, removals=0)
+
+    def obstacles(self) -> list[int]:
+        """What has to go, the highest first; empty: the target is free, by the paper's rule."""
+        found = self._env.clutter()
+        slots = np.flatnonzero(found.obstacles[0].cpu().numpy()).tolist()
+        if bool(found.cleared[0]) and self.visible:
+            return []
+        return sorted(slots, key=lambda slot: -self._points(slot)[:, 2].max())
+
+    @property
+    def visible(self) -> bool:
+        """Whether the gripper's camera sees most of the target."""
+        return hidden_share(self._arm, self._target) <= HIDDEN_SHARE
+
+    def clear_one(self, obstacles: list[int]) -> bool:
+        """Push an object aside or lift it away: the first one of a list that can be moved.
+
+        Returns:
+            Whether one was moved. If none can be, though most of the target is to be seen, this is `stuck`, and a grasp
+            may be tried as things stand.
+
+        Raises:
+            PlanningFailed: none can be moved, one was lost on the way, or enough has been moved.
+        """
+        if self._tried.total() >= REMOVALS:
+            raise PlanningFailed("clear", "too_many_obstacles")
+        order = list(dict.fromkeys(obstacles))
+        if self.stuck:
+            order += [slot for first in obstacles[:2] for slot in blockers(self._arm, first) if slot not in order]
+        failure = PlanningFailed("clear", "nothing_to_move")
+        for slot in sorted(set(order) - {self._target}, key=lambda slot: (self._tried[slot], order.index(slot))):
+            # what a push did not move is lifted next time
+            skills = ("removals", "pushes") if self._tried[slot] else ("pushes", "removals")
+            for skill in skills:
+                done = len(self._arm.executor.actions)
+                try:
+                    self._use(skill, slot)
+                    self.stuck = False
+                    return True
+                except PlanningFailed as error:
+                    failure = error
+                    if len(self._arm.executor.actions) > done + SMALL_MOVE:
+                        raise  # it failed on the way, not in planning
+        if self.stuck:
+            raise failure
+        self.stuck = True
+        return False
+
+    def _use(self, skill: str, slot: int) -> None:
+        arm = self._arm
+        if skill == "pushes":
+            push_away(arm, slot, self._target)
+        else:
+            arm.executor.gripper = OPEN  # it opens on the way
+            remove(arm, slot)
+        arm.executor.facts[skill] += 1
+        self._tried[slot] += 1
+
+    def check(self) -> None:
+        """See that nothing has been pushed off the table, and that there is time left.
+
+        Raises:
+            PlanningFailed: otherwise.
+        """
+        if self._on_table - self._above_surface():
+            raise PlanningFailed("push", "fell_off_table")
+        if len(self._arm.executor.actions) > HORIZON_SHARE * self._env.SPEC.max_episode_steps:
+            raise PlanningFailed("horizon", "clearing_takes_too_long")
+
+    def middle(self, slot: int) -> Array:
+        """(3,) middle of an object's surface, in the arm's base frame, m."""
+        return self._points(slot).mean(axis=0)
+
+    def _points(self, slot: int) -> Array:
+        return transform(self._arm.scene.object_in_base(slot), self._env.object_assets[0][slot].surface_points())
+
+    def _above_surface(self) -> set[int]:
+        frame, _ = surface_in_base(self._arm)
+        present = np.flatnonzero(self._env.present[0].cpu().numpy()).tolist()
+        return {slot for slot in present if self._arm.scene.object_in_base(slot)[2, 3] > frame[2, 3] - FALLEN}
