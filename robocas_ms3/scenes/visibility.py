@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import trimesh
@@ -17,6 +18,9 @@ from robocas_ms3.assets.pack import Part, VisualLevel
 from robocas_ms3.scenes.placement import Array, transform
 
 PixelBox = tuple[slice, slice]  # rows, columns
+
+_FAR = 1e30  # embree's distance of a miss is greater
+_scenes: WeakKeyDictionary[trimesh.Trimesh, EmbreeScene] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -41,11 +45,11 @@ class PinholeCamera:
         return self.height / 2 / np.tan(self.fov_y / 2)
 
     def rays(self, box: PixelBox) -> Array:
-        """(rows, columns, 3) directions in the world through the centres of pixels; x in the camera's frame is 1."""
+        """(rows, columns, 3) directions through the centres of pixels, in the camera's frame; their x is 1."""
         rows, columns = np.mgrid[box]
         left = (self.width / 2 - columns - 0.5) / self.focal_length
         up = (self.height / 2 - rows - 0.5) / self.focal_length
-        return np.stack([np.ones(rows.shape), left, up], axis=-1) @ self.pose[:3, :3].T
+        return np.stack([np.ones(rows.shape), left, up], axis=-1)
 
     def pixel_box(self, points: Array) -> PixelBox:
         """Rows and columns within which points (P, 3) in the world appear; empty where they don't."""
@@ -92,54 +96,36 @@ def object_mesh(asset: Part, level: VisualLevel = "fast") -> trimesh.Trimesh:
 
 
 class Scenery:
-    """Meshes where they stand, ready for rays from any number of cameras.
+    """Meshes where they stand, for rays from any number of cameras.
 
     Args:
         meshes: K meshes.
-        poses: (K, 4, 4) in the world.
+        poses: (K, 4, 4) in the world, rigid.
         occluders: further meshes with their poses, which only hide.
     """
 
     def __init__(
         self, meshes: Sequence[trimesh.Trimesh], poses: Array, occluders: Sequence[tuple[trimesh.Trimesh, Array]] = ()
     ) -> None:
-        placed = [*zip(meshes, poses, strict=True), *occluders]
-        self._vertices = [transform(pose, mesh.vertices) for mesh, pose in placed]
-        self._faces = [np.asarray(mesh.faces) for mesh, _ in placed]
+        self._placed = [*zip(meshes, poses, strict=True), *occluders]
         self._count = len(meshes)
-        self._owner = np.repeat(np.arange(len(placed)), [len(faces) for faces in self._faces])
-        # embree computes in single precision: near the meshes that is far finer than a pixel, wherever the world's origin
-        self._origin = np.concatenate(self._vertices).mean(axis=0) if placed else np.zeros(3)
-        self._all: EmbreeScene | None = None
-        self._single: dict[int, EmbreeScene] = {}
 
     def hit_ids(self, camera: PinholeCamera) -> NDArray[np.int_]:
         """(height, width) index of the mesh that each pixel shows; K and above: occluders; -1: none."""
-        ids = np.full((camera.height, camera.width), -1)
-        if len(self._owner):
-            if self._all is None:
-                self._all = self._scene_of(range(len(self._faces)))
-            box = camera.pixel_box(np.concatenate(self._vertices))
-            hits = self._cast(self._all, camera, box)
-            ids[box] = np.where(hits >= 0, self._owner[hits], -1)
-        return ids
+        return self._look(camera)[0]
 
     def full_mask(self, camera: PinholeCamera, index: int) -> NDArray[np.bool_]:
         """(height, width) pixels that one mesh would fill with everything else hidden."""
-        if index not in self._single:
-            self._single[index] = self._scene_of([index])
         mask = np.zeros((camera.height, camera.width), dtype=bool)
-        box = camera.pixel_box(self._vertices[index])
-        mask[box] = self._cast(self._single[index], camera, box) >= 0
+        box, depths = _depths(camera, *self._placed[index])
+        mask[box] = depths < np.inf
         return mask
 
     def visible_pixels(self, camera: PinholeCamera) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """(K,) pixels in which each mesh is seen, and (K,) pixels it would fill with everything else hidden."""
-        ids, counts = self.hit_ids(camera), np.zeros((2, self._count), dtype=int)
-        for index in range(self._count):
-            full = self.full_mask(camera, index)
-            counts[:, index] = (full & (ids == index)).sum(), full.sum()
-        return counts[0], counts[1]
+        ids, full = self._look(camera)
+        visible = np.bincount(ids[ids >= 0], minlength=len(full))
+        return visible[: self._count], full[: self._count]
 
     def visible_shares(self, camera: PinholeCamera) -> Array:
         """(K,) p_vis of each mesh, in 0..1; NaN where the camera would not see it at all."""
@@ -147,25 +133,20 @@ class Scenery:
         return visible / np.where(full > 0, full, np.nan)
 
     def visible_share(self, camera: PinholeCamera, index: int) -> float:
-        """p_vis of one mesh; 1 minus it is the hidden share."""
-        full = self.full_mask(camera, index)
-        seen = full & (self.hit_ids(camera) == index)
-        return float(seen.sum() / full.sum()) if full.any() else np.nan
+        """p_vis of one mesh; 1 minus it is its hidden share."""
+        return float(self.visible_shares(camera)[index])
 
-    def _scene_of(self, indices: Sequence[int]) -> EmbreeScene:
-        triangles = np.concatenate([self._vertices[i][self._faces[i]] for i in indices])
-        scene = EmbreeScene(robust=True)  # no ray slips through between two triangles
-        TriangleMesh(scene, (triangles - self._origin).astype(np.float32))
-        return scene
-
-    def _cast(self, scene: EmbreeScene, camera: PinholeCamera, box: PixelBox) -> NDArray[np.int_]:
-        """Index of the first triangle met by the ray through each pixel of a box; -1: none."""
-        directions = camera.rays(box)
-        if directions.size == 0:
-            return np.full(directions.shape[:2], -1)
-        rays = directions.reshape(-1, 3).astype(np.float32)
-        origins = np.tile((camera.pose[:3, 3] - self._origin).astype(np.float32), (len(rays), 1))
-        return scene.run(origins, rays).astype(int).reshape(directions.shape[:2])
+    def _look(self, camera: PinholeCamera) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """`hit_ids`, and the pixels that each mesh, occluders too, would fill alone."""
+        nearest = np.full((camera.height, camera.width), np.inf)
+        ids, full = np.full(nearest.shape, -1), np.zeros(len(self._placed), dtype=int)
+        for i, (mesh, pose) in enumerate(self._placed):
+            box, depths = _depths(camera, mesh, pose)
+            closer = depths < nearest[box]
+            nearest[box][closer] = depths[closer]
+            ids[box][closer] = i
+            full[i] = (depths < np.inf).sum()
+        return ids, full
 
 
 def visible_shares(
@@ -187,3 +168,27 @@ def visible_shares(
         (K,) in 0..1; NaN where the camera would not see a mesh at all.
     """
     return Scenery(meshes, poses, occluders).visible_shares(camera)
+
+
+def _depths(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[PixelBox, Array]:
+    """Depth, m, of the first surface of a mesh behind each pixel of the box it appears in; infinite: none."""
+    box = camera.pixel_box(transform(pose, mesh.vertices))
+    # rays go into the mesh's frame: its search tree is built once, and single precision is plenty there
+    to_mesh = pose[:3, :3].T
+    position = to_mesh @ (camera.pose[:3, 3] - pose[:3, 3])
+    directions = camera.rays(box) @ (to_mesh @ camera.pose[:3, :3]).T
+    shape = directions.shape[:2]
+    if 0 in shape:
+        return box, np.full(shape, np.inf)
+    directions = directions.reshape(-1, 3).astype(np.float32)
+    origins = np.tile(position.astype(np.float32), (len(directions), 1))
+    depths = _scene_of(mesh).run(origins, directions, query="DISTANCE").astype(float)
+    return box, np.where(depths < _FAR, depths, np.inf).reshape(shape)
+
+
+def _scene_of(mesh: trimesh.Trimesh) -> EmbreeScene:
+    if mesh not in _scenes:
+        scene = EmbreeScene(robust=True)  # no ray slips through between two triangles
+        TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
+        _scenes[mesh] = scene
+    return _scenes[mesh]

@@ -1,10 +1,11 @@
-"""p_vis: areas worked out by hand, laws, and SAPIEN's own segmentation."""
+"""p_vis: areas worked out by hand, and laws."""
 
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, top_down_camera, visible_shares
@@ -52,55 +53,82 @@ def test_the_selection_camera_looks_down_with_the_worlds_x_up():
     assert camera.focal_length == pytest.approx(256)
 
 
+def test_pixels_name_what_they_show():
+    ids = Scenery([PLATE, PLATE], np.stack([at(0, 0, 0), at(0, 0.075, 0.01)]), [(PLATE, at(0.05, 0, 0.02))]).hit_ids(
+        HIGH
+    )
+    # 0.1 m are 85 pixels; the world's x is up, y left: the occluder (2) covers the upper halves of both plates in part
+    assert ids[128 + 20, 128 + 20] == 0
+    assert ids[128 + 20, 128 - 64] == 1
+    assert ids[128 - 43, 128] == 2
+    assert ids[2, 2] == -1
+
+
+def test_an_empty_scene_shows_nothing():
+    nothing = Scenery([], np.zeros((0, 4, 4)))
+    assert (nothing.hit_ids(HIGH) == -1).all()
+    assert nothing.visible_shares(HIGH).shape == (0,)
+
+
+def test_the_hidden_share_depends_on_where_the_camera_is():
+    wall = trimesh.creation.box((0.01, 1.0, 1.0))
+    scenery = Scenery([PLATE, wall], np.stack([at(0, 0, 0), at(0.3, 0, 0)]))
+    behind, above = np.eye(4), top_down_camera(np.zeros(2), 0.0)
+    behind[:3, :3] = np.diag([-1.0, -1.0, 1.0])  # looks along -x, at the wall
+    behind[:3, 3] = 1.0, 0, 0.2
+    assert scenery.visible_share(PinholeCamera(behind, 128, 128), 0) == 0
+    assert scenery.visible_share(above, 0) == 1
+
+
+def test_a_mesh_that_is_changed_is_seen_as_it_is_now():
+    plate = PLATE.copy()
+    before = Scenery([plate], np.eye(4)[None]).visible_pixels(HIGH)[1][0]
+    plate.apply_scale(0.5)
+    assert Scenery([plate], np.eye(4)[None]).visible_pixels(HIGH)[1][0] == pytest.approx(before / 4, rel=0.05)
+
+
+def test_meshes_are_in_the_assets_frame():
+    asset = load_pack("builtin").objects["drink"]
+    hulls = np.concatenate(asset.hulls)
+    np.testing.assert_allclose(object_mesh(asset).bounds, [hulls.min(axis=0), hulls.max(axis=0)], atol=0.003)
+    assert object_mesh(asset) is object_mesh(asset)
+
+
+POSES = st.integers(0, 10_000).map(lambda seed: random_poses(np.random.default_rng(seed), 5))
+
+
+def random_poses(rng: np.random.Generator, count: int) -> np.ndarray:
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.random(count, random_state=rng).as_matrix()
+    poses[:, :3, 3] = rng.uniform([-0.1, -0.1, 0], [0.1, 0.1, 0.2], (count, 3))
+    return poses
+
+
 @settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 10_000))
-def test_shares_are_shares_and_more_cover_shows_no_more(seed):
-    rng = np.random.default_rng(seed)
-    poses = np.stack([at(*p) for p in rng.uniform([-0.1, -0.1, 0], [0.1, 0.1, 0.2], (4, 3))])
+@given(poses=POSES)
+def test_shares_are_shares_and_more_cover_shows_no_more(poses):
     camera = top_down_camera(np.zeros(2), 0.0, size=128)
-    few = visible_shares(camera, [PLATE] * 3, poses[:3])
-    more = visible_shares(camera, [PLATE] * 3, poses[:3], occluders=[(PLATE, poses[3])])
+    few = visible_shares(camera, [PLATE] * 4, poses[:4])
+    more = visible_shares(camera, [PLATE] * 4, poses[:4], occluders=[(PLATE, poses[4])])
     assert ((few >= 0) & (few <= 1)).all()
-    assert (more <= few + 1e-12).all()
+    assert (more <= few).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_agrees_with_sapiens_segmentation(seed, needs_renderer):
-    import sapien
+@settings(max_examples=20, deadline=None)
+@given(poses=POSES)
+def test_what_stands_alone_is_whole(poses):
+    camera = top_down_camera(np.zeros(2), 0.0, size=128)
+    for pose in poses:
+        assert visible_shares(camera, [PLATE], pose[None]) == 1
 
-    pack = load_pack("builtin")
-    rng = np.random.default_rng(seed)
-    assets = [pack.objects[i] for i in rng.choice(sorted(pack.objects), 8, replace=False)]
-    poses = np.stack([at(*p) for p in rng.uniform([-0.1, -0.1, 0.0], [0.1, 0.1, 0.15], (8, 3))])
-    camera = top_down_camera(np.zeros(2), 0.0, height=0.35, size=256)
 
-    scene = sapien.Scene()
-    scene.set_ambient_light([1, 1, 1])
-    actors = []
-    for asset, pose in zip(assets, poses, strict=True):
-        builder = scene.create_actor_builder()
-        builder.add_visual_from_file(str(asset.visual("fast")))
-        builder.initial_pose = sapien.Pose(pose)
-        actors.append(builder.build_kinematic())
-    eye = scene.add_camera("eye", 256, 256, np.pi / 2, 0.01, 5)
-    eye.entity.set_pose(sapien.Pose(camera.pose))
-
-    def areas() -> np.ndarray:
-        scene.update_render()
-        eye.take_picture()
-        ids = eye.get_picture("Segmentation")[..., 1]
-        return np.array([(ids == actor.per_scene_id).sum() for actor in actors])
-
-    visible = areas()
-    full = []
-    for actor, pose in zip(actors, poses, strict=True):
-        for other in actors:
-            other.set_pose(sapien.Pose([0, 0, -50]))
-        actor.set_pose(sapien.Pose(pose))
-        full.append(areas()[actors.index(actor)])
-    shares = visible_shares(camera, [object_mesh(asset) for asset in assets], poses)
-    difference = np.abs(shares - visible / np.array(full))
-    assert min(full) > 200
-    assert difference.max() <= 0.02
-    assert shares.min() < 0.8  # something is hidden
+@settings(max_examples=10, deadline=None)
+@given(poses=POSES)
+def test_each_pixel_shows_the_nearest_of_those_that_would_fill_it(poses):
+    camera = top_down_camera(np.zeros(2), 0.0, size=128)
+    scenery = Scenery([PLATE] * 5, poses)
+    ids, full = scenery.hit_ids(camera), np.stack([scenery.full_mask(camera, i) for i in range(5)])
+    np.testing.assert_array_equal(ids >= 0, full.any(axis=0))
+    for i in range(5):
+        assert full[i][ids == i].all()
+    np.testing.assert_array_equal(scenery.visible_pixels(camera)[1], full.sum(axis=(1, 2)))

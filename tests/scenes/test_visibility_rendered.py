@@ -1,0 +1,93 @@
+"""Rays against SAPIEN's own segmentation: every object of a heap, from above and from the side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.assets.pack import LoadedObject, load_pack
+from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, top_down_camera
+
+pytestmark = pytest.mark.slow
+
+SIZE = 256
+
+
+@dataclass
+class Rendered:
+    """Eight objects in a scene of SAPIEN's, and its camera."""
+
+    assets: list[LoadedObject]
+    actors: list[Any]
+    scene: Any
+    eye: Any
+
+    def segmentation(self, camera: PinholeCamera, poses: np.ndarray, shown: list[int]) -> np.ndarray:
+        """(SIZE, SIZE) index of the object that each pixel shows, -1: none; those not shown are out of sight."""
+        import sapien
+
+        for i, actor in enumerate(self.actors):
+            actor.set_pose(sapien.Pose(poses[i]) if i in shown else sapien.Pose([0, 0, -50]))
+        self.eye.entity.set_pose(sapien.Pose(camera.pose))
+        self.scene.update_render()
+        self.eye.take_picture()
+        numbers = self.eye.get_picture("Segmentation")[..., 1]
+        ids = np.full(numbers.shape, -1)
+        for i, actor in enumerate(self.actors):
+            ids[numbers == actor.per_scene_id] = i
+        return ids
+
+
+@pytest.fixture(scope="module")
+def rendered(needs_renderer) -> Rendered:
+    import sapien
+
+    pack = load_pack("builtin")
+    assets = [pack.objects[i] for i in np.random.default_rng(0).choice(sorted(pack.objects), 8, replace=False)]
+    scene = sapien.Scene()
+    scene.set_ambient_light([1, 1, 1])
+    actors = []
+    for asset in assets:
+        builder = scene.create_actor_builder()
+        builder.add_visual_from_file(str(asset.visual("fast")))
+        builder.initial_pose = sapien.Pose()
+        actors.append(builder.build_kinematic())
+    return Rendered(assets, actors, scene, scene.add_camera("eye", SIZE, SIZE, np.pi / 2, 0.01, 5))
+
+
+def heap(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (8, 1, 1))
+    poses[:, :3, :3] = Rotation.random(8, random_state=rng).as_matrix()
+    poses[:, :3, 3] = rng.uniform([-0.08, -0.08, 0.0], [0.08, 0.08, 0.15], (8, 3))
+    return poses
+
+
+def slanted_camera() -> PinholeCamera:
+    """As the gripper's camera looks at a heap: from 0.45 m, 60 degrees above it."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("ZYX", [40, 60, 25], degrees=True).as_matrix()
+    pose[:3, 3] = [0, 0, 0.08] - 0.45 * pose[:3, 0]
+    return PinholeCamera(pose, SIZE, SIZE, np.pi / 2)
+
+
+@pytest.mark.parametrize(
+    "camera", [top_down_camera(np.zeros(2), 0.0, size=SIZE), slanted_camera()], ids=["top", "side"]
+)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_shares_agree_with_the_segmentation(rendered, seed, camera):
+    poses = heap(seed)
+    together = rendered.segmentation(camera, poses, list(range(8)))
+    visible = np.array([(together == i).sum() for i in range(8)])
+    full = np.array([(rendered.segmentation(camera, poses, [i]) == i).sum() for i in range(8)])
+    scenery = Scenery([object_mesh(asset) for asset in rendered.assets], poses)
+    large = full >= 200
+    shares = scenery.visible_shares(camera)
+    assert large.sum() >= 6
+    assert shares[large] == pytest.approx(visible[large] / full[large], abs=0.02)
+    assert shares[large].min() < 0.6  # something is hidden
+    assert (scenery.hit_ids(camera) != together).mean() < 0.002  # the same pixels, edges aside
