@@ -25,6 +25,8 @@ from robocas_ms3.scenes.placement import Array, Region, planar_pose, transform
 
 SECONDS_EACH = 1.0  # of simulation before the next object falls (upstream's); less where everything lies still
 SETTLE_SECONDS = 2.0  # after the walls are gone
+ORDER_NOISE = 0.5  # of the logarithm of an object's size
+BUCKET = 0.8  # of the region's sides: narrower buckets make higher heaps, which spread when the walls are gone
 SPREAD = 0.05  # m that centres of mass may lie outside the region in the end
 WALL = 0.05  # m, half its thickness
 _LOOK_EVERY = 10  # steps between two looks at whether everything lies still
@@ -39,11 +41,14 @@ def drop_heap(
     drop_height: float = 0.3,
     tumble_probability: float = 0.6,
 ) -> Array:
-    """Drop objects into a frictionless bucket the size of a region, then take the bucket away (upstream's way).
+    """Drop objects into a frictionless bucket on a plane, then take the bucket away (upstream's way).
+
+    Other than upstream's, the bucket is a little smaller than the region, and small objects rather fall first: this
+    buries more of them (docs/layouts.md has figures).
 
     Args:
         rng: source of all randomness.
-        assets: K objects, dropped in a random order.
+        assets: K objects.
         region: of a horizontal plane.
         drop_height: of the object's lowest point above the plane, or above what lies there, m.
         tumble_probability: of a random orientation; otherwise a resting pose at a random yaw.
@@ -76,13 +81,13 @@ def _drop(
     rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, height: float, tumble: float
 ) -> Array:
     low, high = np.array(region.min_xy), np.array(region.max_xy)
-    middle, half = (low + high) / 2, (high - low) / 2
+    middle, half = (low + high) / 2, BUCKET * (high - low) / 2
     bodies: dict[int, physx.PhysxRigidDynamicComponent] = {}
     with engine_settings():
         scene = new_scene()
         add_ground(scene, np.array([*middle, region.z]))
         walls = _add_walls(scene, middle, half, region.z)
-        for index in rng.permutation(len(assets)):
+        for index in falling_order(rng, assets):
             asset = assets[index]
             pose = _falling_pose(rng, asset, tumble)
             points = transform(pose, np.concatenate(asset.hulls))
@@ -98,6 +103,12 @@ def _drop(
             body.wake_up()
         _run(scene, SETTLE_SECONDS, bodies)
         return np.stack([pose_matrix(bodies[i]) for i in range(len(assets))])
+
+
+def falling_order(rng: np.random.Generator, assets: Sequence[LoadedObject]) -> Array:
+    """Indices in the order of falling: small ones rather first, each one's size times a random factor."""
+    sizes = np.array([np.prod(asset.asset.extents) for asset in assets])
+    return np.argsort(np.log(sizes) + rng.normal(scale=ORDER_NOISE, size=len(assets)))
 
 
 def _falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) -> Array:

@@ -5,6 +5,7 @@ import pytest
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.errors import LayoutError
+from robocas_ms3.scenes import stacked
 from robocas_ms3.scenes.placement import Region, transform
 from robocas_ms3.scenes.stacked import SPREAD, drop_heap
 from robocas_ms3.scenes.visibility import object_mesh, top_down_camera, visible_shares
@@ -46,3 +47,10 @@ def test_a_heap_that_runs_over_is_an_error():
         tiny = Region((0.0, 0.0), (0.001, 0.001), 0.0)
         assets = [pack.objects["power_drill"], pack.objects["sugar_box"]]
         drop_heap(np.random.default_rng(0), assets, tiny)
+
+
+def test_small_objects_rather_fall_first():
+    assets = [load_pack("builtin").objects[i] for i in ("power_drill", "soap", "padlock")]
+    firsts = [int(stacked.falling_order(np.random.default_rng(seed), assets)[0]) for seed in range(300)]
+    shares = np.bincount(firsts, minlength=3) / 300
+    assert shares[2] > 0.6 and shares[1] > 0.02 and shares[0] < 0.02
