@@ -14,6 +14,9 @@ from robocas_ms3.tasks.transfer import TransferEnv
 
 # Upstream's: samples of the meshes at 5 mm, none farther than 1.5 m from the robot
 SPACING = 0.005
+# Of furniture, which is large: a cupboard has a million points at 5 mm, half a second for each of a plan's many clouds;
+# no link fits between two points a centimetre apart.
+FURNITURE_SPACING = 0.01
 RADIUS = 1.5
 
 
@@ -45,10 +48,10 @@ class PlanningScene:
         pieces = []
         for name, asset in self.env.model.furniture.items():
             frame = self.env.model.furniture_poses[name]
-            pieces.append(transform(frame, asset.surface_points(SPACING)))
+            pieces.append(transform(frame, asset.surface_points(FURNITURE_SPACING)))
             for link, pose in link_poses(asset.asset.links, self.joint_positions(name)).items():
                 if (name, link) != without:
-                    pieces.append(transform(frame @ pose, asset.links[link].surface_points(SPACING)))
+                    pieces.append(transform(frame @ pose, asset.links[link].surface_points(FURNITURE_SPACING)))
         return np.concatenate(pieces)
 
     def joint_positions(self, furniture: str) -> dict[str, float]:

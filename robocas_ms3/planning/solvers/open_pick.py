@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.driving import drive_back, drive_to_reach
 from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.handles import open_part
 from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
@@ -21,7 +22,9 @@ def attempt(arm: Arm) -> None:
         arm.executor.label(**subgoal("operate the target", *words))
         open_part(arm)
     arm.executor.label(**subgoal("move and grasp", *words))
+    drive_to_reach(arm, slot)
     grasp(arm, slot)
     arm.executor.label(**subgoal("transfer object", *words))
+    drive_back(arm)
     carry_to_basket(arm, slot)
     release_into_basket(arm, slot)
