@@ -35,9 +35,7 @@ def object_set(model: SceneModel, objects_seed: int) -> tuple[str, ...]:
         ids = resolve_ids(model.object_pack, wanted, key="randomisation.object_sets")
     count = config.objects.count
     if isinstance(config.layout, OrderlyLayout):
-        copies = config.layout.copies
-        kinds = choose_objects(rng, ids, -(-count // copies))
-        chosen = [kind for kind in kinds for _ in range(copies)][:count]
+        chosen = _kinds_that_fit(rng, model, ids, config.layout.copies)
     else:
         chosen = choose_objects(rng, ids, count)
     distractors = config.randomisation.distractors
@@ -74,7 +72,13 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
     choice: Choice | None = None
     for _ in range(_TRIES):
         poses = np.stack([_parked(slot, asset) for slot, asset in enumerate(assets)])
-        placed = model.support_pose @ model.support_motion(opened=False) @ _arrange(layout_rng, model, used)
+        try:
+            arranged = _arrange(layout_rng, model, used)
+        except LayoutError:
+            if not isinstance(config.layout, OrderlyLayout):
+                raise  # it has tried often enough
+            continue  # in another order the columns may fit
+        placed = model.support_pose @ model.support_motion(opened=False) @ arranged
         settled = settle(used, placed, model, basket_pose)
         if not settled.stable:
             unsettled += 1
@@ -93,6 +97,22 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
         found=f"{_TRIES} layouts tried, {unsettled} of which did not come to rest",
         fix="Raise target.max_distance, lower target.min_grasps or min_free_grasps, or use other objects.",
     )
+
+
+def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str], copies: int) -> list[str]:
+    """Draw kinds that stand upright, until their columns fit on the surface."""
+    objects, count = model.object_pack.objects, model.config.objects.count
+    failure = LayoutError("no kinds to choose from", where="objects.ids")
+    standing = [i for i in ids if objects[i].annotations.display_pose >= 0] or ids
+    for attempt in range(_TRIES):
+        kinds = choose_objects(rng, standing, -(-count // copies))
+        chosen = [kind for kind in kinds for _ in range(copies)][:count]
+        try:
+            _arrange(np.random.default_rng(attempt), model, [objects[i] for i in chosen])
+            return chosen
+        except LayoutError as error:
+            failure = error
+    raise failure
 
 
 def _arrange(rng: np.random.Generator, model: SceneModel, assets: list[LoadedObject]) -> Array:

@@ -104,8 +104,15 @@ class RoboCASEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
-        eye = sapien_utils.look_at([2.2, -0.1, 1.7], [0.85, 0.75, 0.6])
-        return CameraConfig("render_camera", eye, 640, 480, np.pi / 3, 0.01, 20)
+        # over the robot's shoulder, from its right, at what stands on the support
+        region, robot = self.model.region, self.model.robot_pose[:3, 3]
+        middle = np.array([*np.add(region.min_xy, region.max_xy) / 2, region.z, 1.0])
+        target = (self.model.support_pose @ middle)[:3]
+        back = (robot - target)[:2] / np.linalg.norm((robot - target)[:2])
+        aside = np.array([-back[1], back[0]])
+        eye = target + np.append(1.05 * back + 1.2 * aside, 0.0) + [0, 0, max(1.1, 1.5 - target[2])]
+        pose = sapien_utils.look_at(eye.tolist(), (target + [0, 0, 0.05]).tolist())
+        return CameraConfig("render_camera", pose, 640, 480, np.pi / 3, 0.01, 20)
 
     # ------------------------------------------------------------------ seeds
 
