@@ -15,6 +15,7 @@ from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 
 SETTLE_SECONDS, CHECK_SECONDS = 1.0, 1.0
+MAX_MOVE = 0.05  # m, while settling: what goes farther has fallen off, or rolled into something
 MAX_SHIFT, MAX_TURN_DEG = 0.003, 2.0  # in CHECK_SECONDS, of an object that stays
 MAX_LINEAR, MAX_ANGULAR = 0.02, 0.2  # m/s, rad/s, of an object at rest
 
@@ -25,20 +26,27 @@ class Settled:
 
     Attributes:
         poses: (K, 4, 4) in the world, after everything.
+        moved: (K,) m, how far each moved in all.
         shift: (K,) m, how far each moved in the last ``CHECK_SECONDS``.
         turn: (K,) rad, how far it turned.
         at_rest: (K,) whether it has stopped.
     """
 
     poses: Array
+    moved: Array
     shift: Array
     turn: Array
     at_rest: np.ndarray
 
     @property
     def stable(self) -> bool:
-        """Whether all objects stay where they are."""
-        still = (self.shift <= MAX_SHIFT) & (self.turn <= np.deg2rad(MAX_TURN_DEG)) & self.at_rest
+        """Whether all objects stay where they are, which is about where they were put."""
+        still = (
+            (self.moved <= MAX_MOVE)
+            & (self.shift <= MAX_SHIFT)
+            & (self.turn <= np.deg2rad(MAX_TURN_DEG))
+            & self.at_rest
+        )
         return bool(still.all())
 
 
@@ -69,6 +77,7 @@ def settle(assets: Sequence[LoadedObject], poses: Array, model: SceneModel, bask
     cosine = (np.einsum("kij,kij->k", before[:, :3, :3], after[:, :3, :3]) - 1) / 2
     return Settled(
         poses=after,
+        moved=np.linalg.norm(after[:, :3, 3] - poses[:, :3, 3], axis=1),
         shift=np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1),
         turn=np.arccos(np.clip(cosine, -1, 1)),
         at_rest=(speed <= MAX_LINEAR) & (spin <= MAX_ANGULAR),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import sapien
+from numpy.typing import NDArray
 from sapien import physx
 from scipy.spatial.transform import Rotation
 
@@ -105,7 +106,7 @@ def _drop(
         return np.stack([pose_matrix(bodies[i]) for i in range(len(assets))])
 
 
-def falling_order(rng: np.random.Generator, assets: Sequence[LoadedObject]) -> Array:
+def falling_order(rng: np.random.Generator, assets: Sequence[LoadedObject]) -> NDArray[np.intp]:
     """Indices in the order of falling: small ones rather first, each one's size times a random factor."""
     sizes = np.array([np.prod(asset.asset.extents) for asset in assets])
     return np.argsort(np.log(sizes) + rng.normal(scale=ORDER_NOISE, size=len(assets)))

@@ -50,3 +50,10 @@ def test_the_same_comes_out_bit_for_bit(model):
     poses = [on_table(model, "mug", 0.9, 0.9, lift=0.05), on_table(model, "mug", 0.92, 0.91, lift=0.2)]
     one, two = (run(model, ["mug", "mug"], poses) for _ in range(2))
     np.testing.assert_array_equal(one.poses, two.poses)
+
+
+def test_an_object_that_comes_to_rest_elsewhere_did_not_stay(model):
+    settled = run(model, ["sugar_box"], [on_table(model, "sugar_box", 0.9, 0.9, lift=0.08)])
+    assert settled.moved[0] == pytest.approx(0.08, abs=0.005)
+    assert settled.at_rest.all() and settled.shift[0] < 0.001
+    assert not settled.stable
