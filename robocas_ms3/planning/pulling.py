@@ -7,6 +7,7 @@ wrist can follow, and friction on a bar a centimetre thick hardly resists.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.reachability import Reachability, twist
@@ -52,12 +53,12 @@ def track(reachability: Reachability, starts: Array, goals: Array, *, max_slip: 
     return path
 
 
-def reached(path: Array) -> Array:
+def reached(path: Array) -> NDArray[np.int_]:
     """How many poses (N,) of a ``track`` (T, N, 7) were reached."""
     return np.isfinite(path[:, :, 0]).sum(axis=0)
 
 
-def _solve(reachability: Reachability, starts: Array, goals: Array, max_slip: float) -> tuple[Array, Array]:
+def _solve(reachability: Reachability, starts: Array, goals: Array, max_slip: float) -> tuple[Array, NDArray[np.bool_]]:
     """Damped least squares from (M, 7) to (M, 4, 4); gives (M, 7) and (M,) whether it got there."""
     qpos, lower, upper = starts.copy(), reachability.lower, reachability.upper
     middle, half = (lower + upper) / 2, (upper - lower) / 2

@@ -11,7 +11,9 @@ from mani_skill.utils.structs import Actor, Link
 from sapien.physx import PhysxCpuSystem
 
 
-def contact_forces(scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor]) -> torch.Tensor:
+def contact_forces(
+    scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor | Link]
+) -> torch.Tensor:
     """Force that each object exerts on each body, summed over their contact points, in the last physics step.
 
     ManiSkill asks for one pair at a time and, on a CPU, walks over all contacts again for each.

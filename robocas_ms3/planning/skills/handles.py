@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from mani_skill.utils.structs import Articulation
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.kinematics import joint_motion
@@ -79,7 +81,9 @@ class Part:
     def pressed(self, arm: Arm) -> bool:
         """Whether both fingers press on the part."""
         env = arm.env
-        link = env.fixtures.furniture[self.furniture].links_map[self.handle.link]
+        furniture = env.fixtures.furniture[self.furniture]
+        assert isinstance(furniture, Articulation)
+        link = furniture.links_map[self.handle.link]
         left, right = env.agent.finger1_link, env.agent.finger2_link
         forces = contact_forces(env.scene, [left, right], [link])
         closing = left.pose.to_transformation_matrix()[:, :3, 1]
@@ -167,7 +171,7 @@ def plan_pull(arm: Arm, part: Part) -> PullPlan:
     raise failure
 
 
-def _paths(arm: Arm, part: Part, positions: Array) -> tuple[Array, Array]:
+def _paths(arm: Arm, part: Part, positions: Array) -> tuple[Array, NDArray[np.int_]]:
     """Configurations (T, N, 7) for many ways to hold the handle, and how many of the T poses (N,) each reaches."""
     frames, goals, starts = part.in_base(arm, positions), [], []
     for shift in SHIFTS:
