@@ -28,6 +28,8 @@ TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 65.0, -65.0)  # directions tried, of
 YAWS = 4  # turns of the tool about the vertical, of half a turn
 SPEED = 0.6  # of the arm's limits while pushing: what is pushed neither rolls far nor jumps
 PUSHES_TRIED, PUSHES_PLANNED = 20, 6
+MAX_FORCE = 30.0  # N; pushed harder, objects wedged against others are shot out of the heap
+STEPS_RESISTED = 2  # control steps of more than that after which a push is cut short
 SETTLE_SECONDS = 0.3
 
 
@@ -61,10 +63,11 @@ class PushPlan:
     down: Trajectory
     push: Trajectory
     lift: Trajectory
+    direction: Array
 
 
 def push_away(arm: Arm, slot: int, target: int) -> None:
-    """Push an object away from the target, run to clear of it.
+    """Push an object away from the target until it has gone far enough or resists, then rise.
 
     Raises:
         PlanningFailed: no push can be planned.
@@ -73,8 +76,28 @@ def push_away(arm: Arm, slot: int, target: int) -> None:
     with arm.planning():
         plan = plan_push(arm, slot, target)
     arm.executor.gripper = CLOSED  # it closes on the way
-    arm.follow(plan.reach, plan.down, plan.push, plan.lift)
+    arm.follow(plan.reach, plan.down)
+    lift = plan.lift if _push_on(arm, plan.push) else _plan_lift(arm, plan.direction)
+    arm.follow(lift)
     arm.executor.move_gripper(CLOSED, arm.at, seconds=SETTLE_SECONDS)
+
+
+def _push_on(arm: Arm, push: Trajectory) -> bool:
+    """Run a push step by step; False where it was cut short, since what was pushed resisted."""
+    resisted = 0
+    for qpos in push.qpos:
+        arm.follow(Trajectory(qpos[None], push.dt))
+        force = float(arm.env.gripper_forces()[0].sum(dim=(0, 1)).norm())
+        resisted = resisted + 1 if force > MAX_FORCE else 0
+        if resisted == STEPS_RESISTED:
+            return False
+    return True
+
+
+def _plan_lift(arm: Arm, direction: Array) -> Trajectory:
+    back = arm.planner.tcp(arm.at)
+    back[:3, 3] -= STAND_OFF * direction
+    return arm.planner.plan_straight(arm.at, raised(back, LIFT), stage="push", check_collisions=False)
 
 
 def plan_push(arm: Arm, slot: int, target: int) -> PushPlan:
@@ -117,7 +140,7 @@ def plan_push(arm: Arm, slot: int, target: int) -> PushPlan:
             # one direction, several turns of the tool: the one that is nearest
             reach = planner.plan_to_qpos(arm.at, [way[0] for way in ways], stage="push")
             _, *way = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
-            return PushPlan(reach, *way)
+            return PushPlan(reach, *way, direction=first)
     finally:
         planner.finger_width = width
     raise failure

@@ -19,7 +19,9 @@ from robocas_ms3.planning.skills.removing import blockers, hang_clear, remove
 from robocas_ms3.scenes.placement import transform
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 
-REMOVALS = 8  # pushes and removals an attempt may make
+REMOVALS = 6  # pushes and removals an attempt may make
+FAILED_REMOVALS = 1  # obstacles that an attempt may lose hold of
+LIFT_FIRST = 0.3  # how often an obstacle is lifted though it might be pushed
 LIFT_HEIGHT = 0.15  # m, upstream's
 FALLEN = 0.05  # m below the surface at which an object counts as pushed off it
 HIDDEN_SHARE = 0.2  # of the target, up to which it counts as found (the paper's)
@@ -93,7 +95,7 @@ class _Clearing:
         self._tried: Counter[int] = Counter()
         self.stuck = False
         self._on_table = self._above_surface()
-        arm.executor.facts.update(pushes=0, removals=0)
+        arm.executor.facts.update(pushes=0, removals=0, failed_removals=0)
 
     def obstacles(self) -> list[int]:
         """What has to go, the highest first; empty: the target is free, by the paper's rule."""
@@ -124,9 +126,10 @@ class _Clearing:
         if self.stuck:
             order += [slot for first in obstacles[:2] for slot in blockers(self._arm, first) if slot not in order]
         failure = PlanningFailed("clear", "nothing_to_move")
-        for slot in sorted(set(order) - {self._target}, key=lambda slot: (self._tried[slot], order.index(slot))):
-            # what a push did not move is lifted next time
-            skills = ("removals", "pushes") if self._tried[slot] else ("pushes", "removals")
+        for slot in sorted(set(order) - {self._target}, key=lambda slot: (self._tried[slot] > 1, order.index(slot))):
+            # what a push did not move is lifted next time; where pushing went wrong, another attempt may lift first
+            lift_first = self._tried[slot] or self._arm.rng.uniform() < LIFT_FIRST
+            skills = ("removals", "pushes") if lift_first else ("pushes", "removals")
             for skill in skills:
                 done = len(self._arm.executor.actions)
                 try:
@@ -135,12 +138,26 @@ class _Clearing:
                     return True
                 except PlanningFailed as error:
                     failure = error
-                    if len(self._arm.executor.actions) > done + SMALL_MOVE:
-                        raise  # it failed on the way, not in planning
+                    if len(self._arm.executor.actions) > done + SMALL_MOVE:  # it failed on the way, not in planning
+                        self._go_on(slot, failure)
+                        return True
         if self.stuck:
             raise failure
         self.stuck = True
         return False
+
+    def _go_on(self, slot: int, failure: PlanningFailed) -> None:
+        """Let go of an obstacle that could not be put down elsewhere, and rise; the demonstration goes on from there.
+
+        Raises:
+            PlanningFailed: that has happened too often.
+        """
+        facts = self._arm.executor.facts
+        if facts["failed_removals"] == FAILED_REMOVALS:
+            raise failure
+        self._arm.back_out()
+        facts["failed_removals"] += 1
+        self._tried[slot] += 1
 
     def _use(self, skill: str, slot: int) -> None:
         arm = self._arm
