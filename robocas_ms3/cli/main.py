@@ -19,7 +19,7 @@ from robocas_ms3 import __version__
 from robocas_ms3.errors import RobocasError
 
 # Each names a module beside this one, with a dataclass called as the command and `main(cfg) -> int`.
-COMMANDS = ("doctor", "list", "show", "generate", "replay", "convert", "validate", "video", "assets")
+COMMANDS = ("doctor", "list", "show", "generate", "replay", "convert", "validate", "video", "assets", "layouts")
 DESCRIPTION = (
     "RoboCAS for ManiSkill3: demonstrations and datasets of manipulation in complex object arrangements. "
     "`robocas COMMAND --help` explains a command; --debug with any of them shows tracebacks."

@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import multiprocessing
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import fields
 from functools import partial
 from importlib.metadata import version
@@ -16,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.assets.pack import MANIFEST, LoadedFurniture, sha256
+from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import make_folder, replacing, write_json
 from robocas_ms3.paths import cache_dir
 from robocas_ms3.scenes.layout import Layout
@@ -23,6 +26,7 @@ from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
 
 LAYOUT_FORMAT = 1  # raised when the same seed gives another layout, or the files change
+ABOUT = "about.json"  # in the folder of a bank: all that its layouts depend on
 _A_FOLDER = 1000  # layouts in one
 _NO_MATTER = ("description", "support", "lights", "language", "base_motion")  # parts of a configuration
 _log = logging.getLogger(__name__)
@@ -43,6 +47,11 @@ def layout_bank(model: SceneModel, folder: str | Path | None = "auto") -> Layout
     return LayoutBank(model, folder).get
 
 
+def banks_folder(root: str | Path = "auto") -> Path:
+    """Folder of all banks; ``auto``: in the cache."""
+    return cache_dir() / "layouts" if root == "auto" else Path(root)
+
+
 class LayoutBank:
     """Layouts of one configuration and its packs, one small file each.
 
@@ -57,7 +66,7 @@ class LayoutBank:
         self.model = model
         self._about = about(model)
         key = hashlib.sha256(json.dumps(self._about, sort_keys=True).encode()).hexdigest()[:16]
-        self.folder = (cache_dir() / "layouts" if root == "auto" else Path(root)) / f"{model.config.task}-{key}"
+        self.folder = banks_folder(root) / f"{model.config.task}-{key}"
 
     def path(self, objects_seed: int, seed: int) -> Path:
         """File of a layout."""
@@ -74,12 +83,12 @@ class LayoutBank:
         if path.is_file():
             try:
                 return read_layout(path)
-            except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
                 _log.warning("%s: damaged, made again (%s)", path, error)
         layout = sample_layout(self.model, objects_seed, seed)
-        if not (self.folder / "about.json").is_file():
+        if not (self.folder / ABOUT).is_file():
             make_folder(self.folder)
-            write_json(self.folder / "about.json", self._about)
+            write_json(self.folder / ABOUT, self._about)
         make_folder(path.parent)
         write_layout(layout, path)
         return layout
@@ -90,7 +99,53 @@ class LayoutBank:
 
     def count(self) -> int:
         """How many layouts there are."""
-        return sum(1 for _ in self.folder.glob("*/*.npz"))
+        return count_layouts(self.folder)
+
+
+def count_layouts(folder: Path) -> int:
+    """How many layouts a bank's folder holds."""
+    return sum(1 for path in folder.glob("*/*.npz") if not path.name.startswith("."))
+
+
+def fill(bank: LayoutBank, seeds: Iterable[int], jobs: int = 1) -> Generator[tuple[int, str], None, None]:
+    """Make the layouts of seeds that a bank lacks, objects and arrangement of one seed.
+
+    Args:
+        bank: to fill.
+        seeds: those wanted.
+        jobs: processes; the outcome does not depend on it.
+
+    Yields:
+        Each seed when it is done, in any order, and why there is no layout, or an empty text.
+    """
+    missing = bank.missing(seeds)
+    if jobs <= 1 or len(missing) < 2:
+        for seed in missing:
+            yield seed, _make(bank, seed)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(jobs, len(missing)), context, _start_worker, (bank,)) as pool:
+        for done in as_completed([pool.submit(_make_in_worker, seed) for seed in missing]):
+            yield done.result()
+
+
+def _make(bank: LayoutBank, seed: int) -> str:
+    try:
+        bank.get(seed, seed)
+    except LayoutError as error:
+        return str(error)
+    return ""
+
+
+_worker_bank: list[LayoutBank] = []
+
+
+def _start_worker(bank: LayoutBank) -> None:
+    _worker_bank.append(bank)
+
+
+def _make_in_worker(seed: int) -> tuple[int, str]:
+    return seed, _make(_worker_bank[0], seed)
 
 
 def about(model: SceneModel) -> dict[str, Any]:

@@ -1,0 +1,131 @@
+"""``robocas layouts build | info``: banks of layouts, made ahead."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass
+class Build:
+    """Make the layouts of a range of seeds ahead, so that a reset only sets poses.
+
+    What is there already is kept: the same command goes on where one was interrupted.
+    """
+
+    config: Annotated[str, tyro.conf.Positional]
+    """Name of a shipped task configuration, or a YAML file."""
+    pack: str = "builtin"
+    """Object pack: its name, or its folder."""
+    furniture_pack: str = "builtin"
+    """Pack of the furniture: its name, or its folder."""
+    seeds: str = "0:100"
+    """First seed, and the one after the last."""
+    jobs: int | None = None
+    """Processes. Default: one for each CPU core."""
+    out: Path | None = None
+    """Folder of all banks. Default: in the cache, where environments look for them."""
+
+
+@dataclass
+class Info:
+    """List the banks that are there."""
+
+    folder: Path | None = None
+    """Folder of all banks. Default: in the cache."""
+
+
+@dataclass
+class Layouts:
+    """Make layouts ahead, and see which there are."""
+
+    command: Annotated[Build, tyro.conf.subcommand("build")] | Annotated[Info, tyro.conf.subcommand("info")]
+    """What to do."""
+
+
+def main(cfg: Layouts) -> int:
+    """Run the command; 1 where a seed has no layout."""
+    return build(cfg.command) if isinstance(cfg.command, Build) else info(cfg.command)
+
+
+def build(command: Build) -> int:
+    """Run ``build``."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.config import load_task_config
+    from robocas_ms3.scenes.bank import LayoutBank, fill
+    from robocas_ms3.scenes.model import SceneModel
+
+    seeds = seed_range(command.seeds)
+    model = SceneModel.load(
+        load_task_config(command.config), load_pack(command.pack), load_pack(command.furniture_pack)
+    )
+    bank = LayoutBank(model, command.out or "auto")
+    there = len(seeds) - len(bank.missing(seeds))
+    failures: dict[int, str] = {}
+    columns = (TextColumn("layouts"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        bar = progress.add_task("", total=len(seeds), completed=there)
+        for seed, problem in fill(bank, seeds, command.jobs or os.cpu_count() or 1):
+            progress.advance(bar)
+            if problem:
+                failures[seed] = problem
+                progress.console.print(f"seed {seed}: {problem}", highlight=False)
+    console = Console(highlight=False, soft_wrap=True)
+    made = len(seeds) - there - len(failures)
+    console.print(f"{made} layouts made, {there} were there already, {len(failures)} seeds have none")
+    console.print(f"bank: {bank.folder}")
+    return 1 if failures else 0
+
+
+def info(command: Info) -> int:
+    """Run ``info``."""
+    import json
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from robocas_ms3.scenes.bank import ABOUT, banks_folder, count_layouts
+
+    root = banks_folder(command.folder or "auto")
+    table = Table("bank", "layouts", "task", "layout", "objects", "object pack", "furniture")
+    for path in sorted(root.glob(f"*/{ABOUT}")):
+        about = json.loads(path.read_text(encoding="utf-8"))
+        config = about["config"]
+        furniture = ", ".join(sorted(about["furniture"]))
+        cells = (config["task"], config["layout"]["kind"], str(config["objects"]["count"]))
+        table.add_row(
+            path.parent.name, str(count_layouts(path.parent)), *cells, about["object_pack"]["name"], furniture
+        )
+    console = Console()
+    console = console if console.is_terminal else Console(width=180)
+    console.print(table if table.row_count else f"no banks in {root}", soft_wrap=not table.row_count, highlight=False)
+    return 0
+
+
+def seed_range(text: str) -> range:
+    """Seeds of ``FIRST:END``.
+
+    Raises:
+        ConfigError: it isn't one, or it is empty.
+    """
+    from robocas_ms3.errors import ConfigError
+
+    match = re.fullmatch(r"(\d+):(\d+)", text)
+    if match is None or int(match[1]) >= int(match[2]):
+        raise ConfigError("no range of seeds", where="--seeds", expected="FIRST:END such as 0:100", found=text)
+    return range(int(match[1]), int(match[2]))

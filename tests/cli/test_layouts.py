@@ -1,0 +1,60 @@
+import pytest
+
+from robocas_ms3.cli import layouts
+from robocas_ms3.cli.layouts import Build, Info, Layouts, main, seed_range
+from robocas_ms3.cli.main import run
+from robocas_ms3.errors import ConfigError, LayoutError
+from robocas_ms3.scenes import bank
+from robocas_ms3.scenes.sample import sample_layout
+
+
+def build(folder, seeds):
+    return main(Layouts(Build("pick_table_scattered", seeds=seeds, jobs=1, out=folder)))
+
+
+def test_layouts_are_made_once_and_a_later_run_goes_on(tmp_path, monkeypatch, capsys):
+    made = []
+    monkeypatch.setattr(bank, "sample_layout", lambda model, o, s: made.append((o, s)) or sample_layout(model, o, s))
+    assert build(tmp_path, "0:2") == 0
+    assert build(tmp_path, "0:3") == 0
+    assert made == [(0, 0), (1, 1), (2, 2)]
+    assert "1 layouts made, 2 were there already, 0 seeds have none" in capsys.readouterr().out
+    main(Layouts(Info(tmp_path)))
+    listed = capsys.readouterr().out
+    assert "scattered" in listed and "builtin" in listed and " 3 " in listed
+
+
+def test_seeds_without_a_layout_are_named_and_the_others_made(tmp_path, monkeypatch, capsys):
+    def fussy(model, objects_seed, seed):
+        if seed == 1:
+            raise LayoutError("no object qualifies as the target", where="target")
+        return sample_layout(model, objects_seed, seed)
+
+    monkeypatch.setattr(bank, "sample_layout", fussy)
+    assert build(tmp_path, "0:3") == 1
+    captured = capsys.readouterr()
+    assert "2 layouts made, 0 were there already, 1 seeds have none" in captured.out
+    assert "seed 1: target: no object qualifies" in captured.err
+
+
+@pytest.mark.slow
+def test_processes_make_the_same_files(tmp_path):
+    for jobs in (1, 2):
+        main(Layouts(Build("pick_table_scattered", seeds="0:3", jobs=jobs, out=tmp_path / str(jobs))))
+    one, two = (sorted((tmp_path / jobs).glob("*/*/*.npz")) for jobs in "12")
+    assert [path.name for path in one] == [path.name for path in two]
+    for a, b in zip(one, two, strict=True):
+        first, second = bank.read_layout(a), bank.read_layout(b)
+        assert (first.object_poses == second.object_poses).all() and first.target == second.target
+
+
+@pytest.mark.parametrize("text", ["", "5", "3:3", "4:1", "-1:2", "a:b"])
+def test_what_is_no_range_of_seeds(text):
+    with pytest.raises(ConfigError, match="--seeds: no range of seeds"):
+        seed_range(text)
+
+
+def test_no_banks_is_said(tmp_path, capsys):
+    assert run(["layouts", "info", "--folder", str(tmp_path)]) == 0
+    assert "no banks in" in capsys.readouterr().out
+    assert layouts.seed_range("2:4") == range(2, 4)
