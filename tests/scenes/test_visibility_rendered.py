@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +36,7 @@ class Rendered:
         self.eye.entity.set_pose(sapien.Pose(camera.pose))
         self.scene.update_render()
         self.eye.take_picture()
-        numbers = self.eye.get_picture("Segmentation")[..., 1]
+        numbers = self.eye.get_picture("PositionSegmentation")[..., 3]
         ids = np.full(numbers.shape, -1)
         for i, actor in enumerate(self.actors):
             ids[numbers == actor.per_scene_id] = i
@@ -43,9 +44,13 @@ class Rendered:
 
 
 @pytest.fixture(scope="module")
-def rendered(needs_renderer) -> Rendered:
+def rendered(needs_renderer) -> Iterator[Rendered]:
     import sapien
+    from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 
+    set_shader_pack(
+        PREBUILT_SHADER_CONFIGS["minimal"]
+    )  # of the whole process; the one that data sets are rendered with
     pack = load_pack("builtin")
     assets = [pack.objects[i] for i in np.random.default_rng(0).choice(sorted(pack.objects), 8, replace=False)]
     scene = sapien.Scene()
@@ -56,7 +61,8 @@ def rendered(needs_renderer) -> Rendered:
         builder.add_visual_from_file(str(asset.visual("fast")))
         builder.initial_pose = sapien.Pose()
         actors.append(builder.build_kinematic())
-    return Rendered(assets, actors, scene, scene.add_camera("eye", SIZE, SIZE, np.pi / 2, 0.01, 5))
+    yield Rendered(assets, actors, scene, scene.add_camera("eye", SIZE, SIZE, np.pi / 2, 0.01, 5))
+    set_shader_pack(PREBUILT_SHADER_CONFIGS["default"])
 
 
 def heap(seed: int) -> np.ndarray:
@@ -90,4 +96,4 @@ def test_shares_agree_with_the_segmentation(rendered, seed, camera):
     assert large.sum() >= 6
     assert shares[large] == pytest.approx(visible[large] / full[large], abs=0.02)
     assert shares[large].min() < 0.6  # something is hidden
-    assert (scenery.hit_ids(camera) != together).mean() < 0.002  # the same pixels, edges aside
+    assert (scenery.hit_ids(camera) != together).mean() < 0.0005  # the same pixels, edges aside
