@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import sapien
+from sapien import physx
 
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.pack import LoadedObject
@@ -25,7 +26,7 @@ class Settled:
     """What became of objects that were put somewhere. K objects.
 
     Attributes:
-        poses: (K, 4, 4) in the world, after everything.
+        poses: (K, 4, 4) in the world, once settled.
         moved: (K,) m, how far each moved in all.
         shift: (K,) m, how far each moved in the last ``CHECK_SECONDS``.
         turn: (K,) rad, how far it turned.
@@ -60,28 +61,36 @@ def settle(assets: Sequence[LoadedObject], poses: Array, model: SceneModel, bask
         basket_pose: 4x4 in the world.
     """
     with engine_settings():
-        scene = new_scene()
-        for name, asset in model.furniture.items():
-            frame = model.furniture_poses[name]
-            add_fixed(scene, asset.hulls, frame, asset.asset.friction)
-            for link, motion in link_poses(asset.asset.links, model.joint_positions(name, opened=False)).items():
-                add_fixed(scene, asset.links[link].hulls, frame @ motion, asset.asset.friction)
-        add_fixed(scene, model.basket.hulls, basket_pose, model.basket.asset.friction)
-        bodies = [add_body(scene, solid_of(asset), pose) for asset, pose in zip(assets, poses, strict=True)]
+        scene, bodies = _build(assets, poses, model, basket_pose)
         _run(scene, SETTLE_SECONDS)
         before = np.stack([pose_matrix(body) for body in bodies])
+        # whether they stay is asked of a fresh scene, as an environment will put them into one
+        scene, bodies = _build(assets, before, model, basket_pose)
         _run(scene, CHECK_SECONDS)
         after = np.stack([pose_matrix(body) for body in bodies])
         speed = np.array([np.linalg.norm(body.linear_velocity) for body in bodies])
         spin = np.array([np.linalg.norm(body.angular_velocity) for body in bodies])
     cosine = (np.einsum("kij,kij->k", before[:, :3, :3], after[:, :3, :3]) - 1) / 2
     return Settled(
-        poses=after,
-        moved=np.linalg.norm(after[:, :3, 3] - poses[:, :3, 3], axis=1),
+        poses=before,
+        moved=np.linalg.norm(before[:, :3, 3] - poses[:, :3, 3], axis=1),
         shift=np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1),
         turn=np.arccos(np.clip(cosine, -1, 1)),
         at_rest=(speed <= MAX_LINEAR) & (spin <= MAX_ANGULAR),
     )
+
+
+def _build(
+    assets: Sequence[LoadedObject], poses: Array, model: SceneModel, basket_pose: Array
+) -> tuple[sapien.Scene, list[physx.PhysxRigidDynamicComponent]]:
+    scene = new_scene()
+    for name, asset in model.furniture.items():
+        frame = model.furniture_poses[name]
+        add_fixed(scene, asset.hulls, frame, asset.asset.friction)
+        for link, motion in link_poses(asset.asset.links, model.joint_positions(name, opened=False)).items():
+            add_fixed(scene, asset.links[link].hulls, frame @ motion, asset.asset.friction)
+    add_fixed(scene, model.basket.hulls, basket_pose, model.basket.asset.friction)
+    return scene, [add_body(scene, solid_of(asset), pose) for asset, pose in zip(assets, poses, strict=True)]
 
 
 def _run(scene: sapien.Scene, seconds: float) -> None:

@@ -82,7 +82,9 @@ def test_layouts_are_settled_and_as_their_kind_says(env, seed):
     for _ in range(10):  # 0.5 s
         env.step(hold(env))
     moved = (base.object_poses[0, :, :3] - before).norm(dim=1)
-    assert moved.max() < 0.002
+    # rows stand and heaps lie as they did in a bare scene; with a robot in it, a bottle may tip onto its next facet
+    assert moved.max() < (0.002 if kind == "scattered" else 0.005)
+    assert torch.stack([actor.linear_velocity for actor in base.objects]).norm(dim=-1).max() < 0.02
     ids = {o._bodies[0].entity.per_scene_id: i for i, o in enumerate(base.objects)}
     for contact in base.scene.px.get_contacts():
         pair = [body.entity.per_scene_id for body in contact.bodies]
