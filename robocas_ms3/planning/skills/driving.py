@@ -31,6 +31,7 @@ COMFORTABLE = 0.4  # share of them that has to be within reach
 ARM_LENGTH = 1.2  # m from its base to the tips, hand and what it holds included
 THINNED = 3  # every third point of the clouds will do: nothing thinner than 2 cm could slip between them
 DISTANCES = (0.45, 0.80)  # m from the arm's base to what it reaches for, level
+BEST_DISTANCE = 0.6
 DETOURS = (0.15, 0.30)  # m straight back first
 
 
@@ -141,11 +142,11 @@ def _best_route(arm: Arm, slot: int, cloud: Array, others: Array) -> list[Array]
     distance = np.linalg.norm((frames[:, :2, 3] - center[:2]), axis=1)
     ahead = np.einsum("ni,ni->n", frames[:, :2, 0], center[:2] - frames[:, :2, 3]) / distance
     possible = (distance > DISTANCES[0]) & (distance < DISTANCES[1]) & (ahead > 0.7)
-    order = [i for i in np.argsort(np.linalg.norm(goals - start, axis=1)) if possible[i]]
+    order = np.argsort(np.abs(distance - BEST_DISTANCE) + 0.2 * np.linalg.norm(goals - start, axis=1))
     best: tuple[float, list[Array]] = (0.0, [])
     tried = 0
     for i in order:
-        if not body_is_free(frames[i], cloud):
+        if not possible[i] or not body_is_free(frames[i], cloud):
             continue
         tried += 1
         if tried > TRIED:

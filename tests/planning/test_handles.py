@@ -1,0 +1,98 @@
+"""Pulls about a joint, and what driving checks: pure maths, against values worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from planning_scenes import REST
+
+from robocas_ms3.assets.kinematics import joint_motion
+from robocas_ms3.assets.manifest import Joint
+from robocas_ms3.planning.pulling import reached, track, turned_about_bar
+from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.planning.skills.driving import _routes, body_is_free
+
+SLIDE = Joint(name="slide", kind="prismatic", axis=(-1.0, 0.0, 0.0), limits=(0.0, 0.6), friction=0, damping=0)
+# 0.4 m to the right of the upright bar of the pull
+HINGE = Joint(
+    name="hinge", kind="revolute", axis=(0, 0, 1), origin=(0.7, -0.3, 0), limits=(0.0, 2.0), friction=0, damping=0
+)
+
+
+@pytest.fixture(scope="module")
+def reachability(panda_files) -> Reachability:
+    return Reachability(panda_files.arm_urdf)
+
+
+def level_hold(x: float, y: float, z: float) -> np.ndarray:
+    """TCP that points ahead (+x) and holds an upright bar: its x is down, its closing direction level."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([(0, 0, -1), (0, 1, 0), (1, 0, 0)])
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def angle_about_bar(found: np.ndarray, goal: np.ndarray) -> float:
+    turn = goal[:3, :3].T @ found[:3, :3]
+    return float(np.arctan2(turn[2, 1], turn[1, 1]))
+
+
+def test_a_turn_about_the_bar_keeps_the_bar_and_its_place():
+    hold = level_hold(0.7, 0.1, 0.3)
+    turned = turned_about_bar(hold, np.pi / 2)
+    assert turned[:3, 3] == pytest.approx([0.7, 0.1, 0.3])
+    assert turned[:3, 0] == pytest.approx(hold[:3, 0])
+    assert turned[:3, 1] == pytest.approx(hold[:3, 2])  # a quarter turn takes closing to approach
+
+
+@pytest.mark.parametrize(("joint", "end"), [(SLIDE, 0.25), (HINGE, 0.9)])
+def test_every_pose_of_a_pull_holds_the_bar_where_the_joint_has_it(reachability, joint, end):
+    hold = level_hold(0.7, 0.1, 0.5)
+    goals = np.array([joint_motion(joint, q) @ hold for q in np.linspace(0, end, 25)])
+    solved, start = reachability.reachable(goals[:1], np.array(REST))
+    assert solved.all()
+    limit = np.deg2rad(30)
+    path = track(reachability, start, goals, max_slip=limit)[:, 0]
+    assert reached(path[:, None])[0] == 25
+    assert np.abs(np.diff(path, axis=0)).max() <= 0.2
+    assert (path >= reachability.lower).all()
+    assert (path <= reachability.upper).all()
+    found, _ = reachability.jacobian(path)
+    assert found[:, :3, 3] == pytest.approx(goals[:, :3, 3], abs=1e-3)
+    assert found[:, :3, 0] == pytest.approx(goals[:, :3, 0], abs=5e-3)  # the bar stays across the fingers
+    slips = [abs(angle_about_bar(a, b)) for a, b in zip(found, goals, strict=True)]
+    assert max(slips) <= limit + 5e-3
+
+
+def test_a_pull_ends_where_the_arm_does(reachability):
+    hold = level_hold(0.6, 0.1, 0.5)
+    away = Joint(name="away", kind="prismatic", axis=(1, 0, 0), limits=(0, 2), friction=0, damping=0)
+    goals = np.array([joint_motion(away, q) @ hold for q in np.arange(0, 1.0, 0.02)])
+    _, start = reachability.reachable(goals[:1], np.array(REST))
+    path = track(reachability, start, goals)
+    count = int(reached(path)[0])
+    assert 0.6 + 0.02 * count < 1.2  # the Panda's reach, long fingers included
+    assert count > 3
+    assert np.isnan(path[count:]).all()
+    assert np.isfinite(path[:count]).all()
+
+
+def test_the_body_is_free_where_no_point_is_inside_it():
+    frame = np.eye(4)
+    frame[:3, 3] = 1.0, 2.0, 0.49  # the arm's base, 0.49 m above the floor
+    beside = np.array([[1.3, 2.0, 0.2], [1.0, 2.24, 0.2], [1.2, 2.0, 0.31], [1.14, 2.0, 0.5]])
+    assert body_is_free(frame, beside)
+    for hit in ([1.27, 2.0, 0.2], [1.0, 1.78, 0.2], [1.14, 2.0, 0.4]):
+        assert not body_is_free(frame, np.array([hit]))
+
+
+def test_a_detour_backs_out_of_the_narrow_end_against_its_heading():
+    narrow, wide = np.array([0.4, 0.0, np.pi / 2]), np.array([0.0, 0.5, 0.0])
+    straight, *detours = _routes(narrow, wide, leaving=True)
+    assert len(straight) == 1
+    via, goal = detours[0]
+    assert via == pytest.approx([0.4, -0.15, np.pi / 2])
+    assert goal == pytest.approx(wide)
+    arriving = list(_routes(wide, narrow, leaving=False))[1]
+    assert arriving[0] == pytest.approx([0.4, -0.15, np.pi / 2])
+    assert arriving[1] == pytest.approx(narrow)

@@ -1,0 +1,132 @@
+"""Stage ``furniture_opened``, pulls that are felt by both fingers, and base motion in actions and records."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import robocas_ms3  # noqa: F401
+from robocas_ms3.config import shipped_configs
+from robocas_ms3.datasets.episode import Frames, episode_arrays, planar_base, sample_states, sample_subgoals
+from robocas_ms3.datasets.trajectory import TrajectoryFile
+from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.demos.replay import replay
+from robocas_ms3.language.templates import subgoal
+from robocas_ms3.planning.skills.driving import drive
+from robocas_ms3.planning.skills.handles import Part, plan_pull
+
+pytestmark = pytest.mark.slow
+
+STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}
+CONFIGS = ["open_pick_container", "open_pick_refrigerator"]  # sliding and hinged
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_it_is_opened_from_the_configured_share_on(name):
+    assert name in shipped_configs()
+    env = gym.make("RoboCASOpenPick-v1", config=name, **STATE_ONLY)
+    env.reset(seed=0)
+    base = env.unwrapped
+    assert not bool(base.evaluate()["furniture_opened"][0])
+    furniture = base.fixtures.furniture[base.task_config.opening.furniture]
+    index = [joint.name for joint in furniture.active_joints].index(base.model.opened_joint.name)
+    share = base.task_config.opening.opened_at
+    assert share >= 0.5
+    for factor, opened in ((0.98, False), (1.02, True)):
+        qpos = furniture.get_qpos()
+        qpos[:, index] = factor * share * max(base.model.opened_joint.limits, key=abs)
+        furniture.set_qpos(qpos)
+        assert bool(base.task_stages()["furniture_opened"][0]) is opened
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory):
+    """A record in which the base goes 0.2 m ahead, 0.1 m to the right, and turns by 0.3 rad; and what was seen then."""
+    folder = tmp_path_factory.mktemp("driven")
+    generator = EpisodeGenerator(EpisodeSettings("open_pick", "open_pick_cabinet_door", "builtin", max_attempts=1))
+    seen = {}
+
+    def policy(arm) -> None:
+        arm.executor.label(**subgoal("operate the target", "object", "cabinet"))
+        drive(arm, np.array([0.2, -0.1, 0.3]))
+        seen["arm"], seen["base"] = arm.scene.arm_qpos - arm.at, arm.scene.arm_base_in_world
+
+    generator.policy = policy
+    result = generator.generate(0, folder, "driven")
+    assert result.success
+    seen["root"] = generator.env.unwrapped.model.robot_pose
+    generator.close()
+    return folder / "driven.h5", seen
+
+
+def test_a_drive_is_in_the_actions_and_the_arm_stands_still(driven):
+    import h5py
+
+    path, seen = driven
+    with h5py.File(path) as file:
+        actions = np.array(file["traj_0"]["actions"])
+    assert actions.shape[1] == 11
+    base = actions[:, 8:]
+    assert base[-1] == pytest.approx([0.2, -0.1, 0.3], abs=1e-6)
+    assert np.abs(np.diff(base, axis=0)).max() <= 0.5 / 20  # m or rad a step of 20 Hz
+    assert np.ptp(actions[:, :7], axis=0) == pytest.approx(0, abs=1e-6)
+    assert np.abs(seen["arm"]).max() < 0.02
+    # the root is turned by half a turn: ahead is -x in the world, right is +y
+    moved = (np.linalg.inv(seen["root"]) @ seen["base"])[:2, 3]
+    assert moved == pytest.approx([0.2, -0.1], abs=0.01)
+
+
+def test_a_drive_is_in_the_datasets_base_motion(driven):
+    path, seen = driven
+    with TrajectoryFile(path) as file:
+        recording = file.recording(0)
+    samples = sample_states(recording.control_steps, 4)
+    joints = recording.joints(samples)
+    x, y, yaw = planar_base(joints).T
+    base = np.tile(np.eye(4), (len(x), 1, 1))  # what rendering reads from the arm's base link
+    base[:, 0, 0] = base[:, 1, 1] = np.cos(yaw)
+    base[:, 1, 0] = np.sin(yaw)
+    base[:, 0, 1] = -base[:, 1, 0]
+    base[:, :3, 3] = np.column_stack([x, y, np.full(len(x), 0.49)])
+    assert base[-1] == pytest.approx(seen["base"], abs=0.02)
+    closed = np.zeros(len(x), dtype=bool)
+    arrays = episode_arrays(Frames(base, base), joints, closed, "", sample_subgoals(recording.subgoals, samples))
+    steps = np.linalg.norm(arrays["base_rel_pos"], axis=1)
+    assert steps.max() > 0.02
+    assert steps.sum() == pytest.approx(np.hypot(0.2, 0.1), abs=0.02)
+
+
+def test_a_drive_replays_exactly(driven):
+    path, _ = driven
+    (again,) = replay(path)
+    assert again.state_error == 0.0
+
+
+class Planned(Exception):
+    """Ends an attempt that was only to plan."""
+
+
+def test_a_pull_is_planned_to_the_far_end(tmp_path):
+    generator = EpisodeGenerator(EpisodeSettings("open_pick", "open_pick_container", "builtin", max_attempts=1))
+    seen = []
+
+    def policy(arm) -> None:
+        part = Part.of(arm)
+        plan = plan_pull(arm, part)
+        assert not part.pressed(arm)
+        held = [arm.planner.tcp(motion.qpos[-1]) for motion in (plan.approach, plan.pull)]
+        seen.append((part, part.in_base(arm, np.array([0.0, 0.95 * part.end])), held))
+        raise Planned
+
+    generator.policy = policy
+    with pytest.raises(Planned):
+        generator.generate(0, tmp_path, "planned")
+    generator.close()
+    part, (closed, opened), (first, last) = seen[0]
+    along_the_bar = (first - closed @ part.hold)[:3, 3] @ (closed @ part.hold)[:3, :3]
+    assert along_the_bar[1:] == pytest.approx(0, abs=1e-3)
+    assert abs(along_the_bar[0]) < 0.05
+    assert (last - first)[:3, 3] == pytest.approx((opened - closed)[:3, 3], abs=2e-3)
+    assert np.linalg.norm((opened - closed)[:3, 3]) == pytest.approx(0.95 * 0.55, abs=1e-6)
