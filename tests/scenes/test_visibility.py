@@ -28,6 +28,7 @@ def test_a_plate_half_covered_is_half_visible():
 def test_of_two_plates_the_upper_is_whole():
     poses = np.stack([at(0, 0, 0), at(0, 0.075, 0.01)])
     assert visible_shares(HIGH, [PLATE, PLATE], poses) == pytest.approx([0.75, 1.0], abs=0.01)
+    assert visible_shares(HIGH, [PLATE, PLATE], poses[::-1]) == pytest.approx([1.0, 0.75], abs=0.01)
 
 
 def test_what_the_camera_cannot_see_has_no_share():
@@ -131,4 +132,6 @@ def test_each_pixel_shows_the_nearest_of_those_that_would_fill_it(poses):
     np.testing.assert_array_equal(ids >= 0, full.any(axis=0))
     for i in range(5):
         assert full[i][ids == i].all()
+    other_way = Scenery([PLATE] * 5, poses[::-1]).hit_ids(camera)  # the order of meshes doesn't matter
+    np.testing.assert_array_equal(np.where(other_way >= 0, 4 - other_way, -1), ids)
     np.testing.assert_array_equal(scenery.visible_pixels(camera)[1], full.sum(axis=(1, 2)))
