@@ -26,7 +26,18 @@ LAYERS = (
     ("cli",),
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
-SIMULATOR_FREE = ("config", "scenes.placement", "tasks.terms", "datasets.schema", "planning.protocol", "language")
+SIMULATOR_FREE = (
+    "config",
+    *(
+        f"scenes.{name}"
+        for name in ("model", "placement", "orderly", "relations", "targets", "randomise", "visibility")
+    ),
+    "tasks.terms",
+    "tasks.occlusion",
+    "datasets.schema",
+    "planning.protocol",
+    "language",
+)
 SIMULATORS = {"sapien", "mani_skill"}
 
 
