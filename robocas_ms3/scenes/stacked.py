@@ -31,7 +31,7 @@ BUCKET = 0.8  # of the region's sides: narrower buckets make higher heaps, which
 SPREAD = 0.05  # m that centres of mass may lie outside the region in the end
 WALL = 0.05  # m, half its thickness
 _LOOK_EVERY = 10  # steps between two looks at whether everything lies still
-_TRIES = 10
+_TRIES = 40
 
 
 def drop_heap(

@@ -57,3 +57,14 @@ def test_an_object_that_comes_to_rest_elsewhere_did_not_stay(model):
     assert settled.moved[0] == pytest.approx(0.08, abs=0.005)
     assert settled.at_rest.all() and settled.shift[0] < 0.001
     assert not settled.stable
+
+
+def test_an_object_that_tips_over_did_not_stay(model):
+    pose = on_table(model, "drink", 0.9, 0.9)
+    lean = np.eye(4)
+    lean[:3, :3] = [[np.cos(0.5), 0, np.sin(0.5)], [0, 1, 0], [-np.sin(0.5), 0, np.cos(0.5)]]
+    leaning = pose.copy()
+    leaning[:3, :3] = lean[:3, :3] @ pose[:3, :3]
+    settled = run(model, ["drink"], [leaning])
+    assert settled.tilted[0] > 0.1
+    assert not settled.stable

@@ -1,0 +1,86 @@
+"""How high heaps are, how much of them is hidden, and what they take to make; prints JSON.
+
+python benchmarks/heaps.py --seeds 50
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import tyro
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config import load_task_config
+from robocas_ms3.errors import LayoutError
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.placement import transform
+from robocas_ms3.scenes.sample import sample_layout
+
+
+@dataclass
+class Benchmark:
+    """Make heaps and measure them."""
+
+    config: str = "search_table_stacked"
+    """Task configuration."""
+    pack: str = "builtin"
+    """Object pack."""
+    seeds: int = 50
+    """How many, from 0 on."""
+
+
+def main(cfg: Benchmark) -> None:
+    """Run it."""
+    pack = load_pack(cfg.pack)
+    model = SceneModel.load(load_task_config(cfg.config), pack, load_pack("builtin"))
+    support = transform(model.support_pose, np.array([[0, 0, model.region.z]]))[0, 2]
+    for asset in pack.objects.values():  # read once a process, and not part of what a layout takes
+        _ = asset.hulls, asset.annotations, asset.surface_points()
+    heights, shares, targets, seconds, failures = [], [], [], [], []
+    for seed in range(cfg.seeds):
+        start = time.process_time()
+        try:
+            layout = sample_layout(model, seed, seed)
+        except LayoutError as error:
+            failures.append(f"{seed}: {error}")
+            continue
+        seconds.append(time.process_time() - start)
+        assets = [pack.objects[i] for i in layout.object_ids]
+        tops = [
+            transform(p, np.concatenate(a.hulls))[:, 2].max() for a, p in zip(assets, layout.object_poses, strict=True)
+        ]
+        heights.append(max(tops) - support)
+        shares.append(layout.visible_shares)
+        targets.append(layout.visible_shares[layout.target])
+    visible, target = np.concatenate(shares), np.array(targets)
+    print(
+        json.dumps(
+            {
+                "config": cfg.config,
+                "pack": cfg.pack,
+                "heaps": len(heights),
+                "failures": failures,
+                "height_m": _spread(heights),
+                "objects_p_vis_below": {str(limit): _share(visible < limit) for limit in (0.9, 0.8, 0.5, 0.1)},
+                "target_p_vis": _spread(targets),
+                "targets_p_vis_below": {str(limit): _share(target < limit) for limit in (0.8, 0.5, 0.1)},
+                "cpu_seconds": _spread(seconds),
+            },
+            indent=2,
+        )
+    )
+
+
+def _spread(values: list[float]) -> dict[str, float]:
+    return {f"p{q}": round(float(np.percentile(values, q)), 3) for q in (5, 50, 95)}
+
+
+def _share(mask: np.ndarray) -> float:
+    return round(float(np.mean(mask)), 3)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Benchmark))
