@@ -31,7 +31,7 @@ COMFORTABLE = 0.4  # share of them that has to be within reach
 ARM_LENGTH = 1.2  # m from its base to the tips, hand and what it holds included
 THINNED = 3  # every third point of the clouds will do: nothing thinner than 2 cm could slip between them
 DISTANCES = (0.45, 0.80)  # m from the arm's base to what it reaches for, level
-BEST_DISTANCE = 0.6
+BEST_DISTANCE = 0.58
 DETOURS = (0.15, 0.30)  # m straight back first
 
 
@@ -64,8 +64,13 @@ def drive(arm: Arm, *goals: Array) -> None:
             raise PlanningFailed("drive", "held_up")
 
 
-def drive_to_reach(arm: Arm, slot: int) -> None:
-    """Drive to where an object is within comfortable reach, unless it is already, or the base may not move.
+def drive_to_reach(arm: Arm, slot: int, *, elsewhere: bool = False) -> None:
+    """Fold the arm and drive to where an object is within comfortable reach, unless it is already.
+
+    Args:
+        arm: the attempt's tools.
+        slot: of the object.
+        elsewhere: drive even so, since no grasp could be planned from here.
 
     Raises:
         PlanningFailed: there is no such place, or no straight way there.
@@ -73,10 +78,15 @@ def drive_to_reach(arm: Arm, slot: int) -> None:
     if not arm.executor.drives:
         return
     with arm.planning():
-        cloud = transform(arm.scene.arm_base_in_world, arm.scene.obstacles_in_base())
+        in_base = arm.scene.obstacles_in_base()
+        cloud = transform(arm.scene.arm_base_in_world, in_base)
         others = transform(arm.scene.arm_base_in_world, arm.scene.obstacles_in_base(without=slot))
-        if reach_share(arm, base_at(arm), slot, others) >= COMFORTABLE:
+        if not elsewhere and reach_share(arm, base_at(arm), slot, others) >= COMFORTABLE:
             return
+        arm.planner.set_scene(in_base)
+        home = arm.plan_home(arm.at)
+    arm.follow(home)
+    with arm.planning():
         route = _best_route(arm, slot, cloud, others)
     drive(arm, *route)
 
