@@ -27,7 +27,7 @@ LIMIT_MARGIN = 0.01
 BODY_BOXES = ((0.28, 0.23, 0.30), (0.15, 0.13, 0.49))
 SAMPLES, TRIED = 400, 14  # base poses drawn; those of them for which inverse kinematics is solved
 GRASPS = 10  # grasps that stand for all when reach is judged
-COMFORTABLE = 0.4  # share of them that has to be within reach
+COMFORTABLE = 0.3  # share of them that has to be within reach
 ARM_LENGTH = 1.2  # m from its base to the tips, hand and what it holds included
 THINNED = 3  # every third point of the clouds will do: nothing thinner than 2 cm could slip between them
 DISTANCES = (0.45, 0.80)  # m from the arm's base to what it reaches for, level
@@ -110,7 +110,7 @@ def drive_back(arm: Arm) -> None:
 
 
 def reach_share(arm: Arm, base: Array, slot: int, others: Array) -> float:
-    """Share of an object's clear grasps that the arm reaches from a base pose, pre-grasps included.
+    """Share of an object's grasps that the arm reaches from a base pose without touching anything, pre-grasps included.
 
     Args:
         arm: the attempt's tools.
@@ -137,9 +137,12 @@ def reach_share(arm: Arm, base: Array, slot: int, others: Array) -> float:
     poses = inverse(frame) @ np.concatenate([kept.tcp_in_world[chosen], kept.tcp_in_world[chosen + half]])
     before = poses.copy()
     before[:, :3, 3] -= PREGRASP_DISTANCE * before[:, :3, 2]
-    solved, _ = arm.reachability.reachable(np.concatenate([poses, before]), arm.at)
-    both = solved[: len(poses)] & solved[len(poses) :]
-    return float((both[: len(chosen)] | both[len(chosen) :]).mean())
+    solved, qpos = arm.reachability.reachable(np.concatenate([poses, before]), arm.at)
+    local = transform(inverse(frame), others[::THINNED])
+    arm.planner.set_scene(local[np.linalg.norm(local, axis=1) < ARM_LENGTH])
+    free = [bool(ok) and not arm.planner.collisions(q) for ok, q in zip(solved, qpos, strict=True)]
+    grasps, entries = np.array(free).reshape(2, 2, -1)  # grasp or pre-grasp; as annotated or its twin; which
+    return float((grasps & entries).any(axis=0).mean())
 
 
 def _best_route(arm: Arm, slot: int, cloud: Array, others: Array) -> list[Array]:
