@@ -1,0 +1,122 @@
+"""Where pushes begin and end, and where objects are put down: geometry at known places. No simulator."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import KDTree
+
+from robocas_ms3.planning.skills import pushing
+from robocas_ms3.planning.skills.looking import sample_views
+from robocas_ms3.planning.skills.removing import free_places
+from robocas_ms3.scenes.placement import transform
+
+SURFACE = 0.1  # height of the table, in the arm's base frame
+TABLE = np.eye(4)
+TABLE[:3, 3] = 0.6, 0, SURFACE
+HALF = np.array([0.3, 0.5])
+
+
+def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], step: float = 0.005) -> np.ndarray:
+    """Points (P, 3) throughout an upright box."""
+    axes = [np.linspace(a, b, round((b - a) / step) + 1) for a, b in (x, y, z)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+OBSTACLE = box((0.57, 0.63), (0.07, 0.13), (0.1, 0.2))  # 6 cm wide around (0.6, 0.1), 10 cm high
+TARGET = np.array([0.6, 0.0, 0.13])
+NOTHING = np.zeros((0, 3))
+
+
+def pushes(target=TARGET, others=NOTHING, points=OBSTACLE, half=HALF) -> list[pushing.Push]:
+    return list(pushing.candidates(np.random.default_rng(0), points, target, others, (TABLE, half)))
+
+
+def test_the_direction_leads_from_target_to_obstacle_and_is_level():
+    direction = pushing.push_direction(np.random.default_rng(0), np.array([0.5, 0.3, 0.9]), np.array([0.5, 0.1, 0.1]))
+    assert direction == pytest.approx([0, 1, 0])
+
+
+def test_right_above_the_target_the_push_goes_towards_the_robot():
+    above = np.array([0.6, 0.005, 0.2])
+    angles = []
+    for seed in range(40):
+        x, y, z = pushing.push_direction(np.random.default_rng(seed), above, np.array([0.6, 0, 0.1]))
+        assert z == 0
+        angles.append(np.rad2deg(np.arctan2(-y, -x)))
+    assert -30.5 <= min(angles) < -15
+    assert 15 < max(angles) <= 30.5
+
+
+def test_extent_behind_is_the_reach_against_the_push_at_that_height():
+    center = OBSTACLE.mean(axis=0)
+    assert pushing.extent_behind(OBSTACLE, center, np.array([0, 1.0, 0]), 0.13) == pytest.approx(0.03)
+    # across a corner: 3 cm * sqrt(2), less half of what the tool is wide
+    diagonal = np.array([1.0, 1.0, 0]) / np.sqrt(2)
+    assert pushing.extent_behind(OBSTACLE, center, diagonal, 0.13) == pytest.approx(0.0424, abs=0.006)
+    assert pushing.extent_behind(OBSTACLE, center, diagonal, 0.3) is None
+
+
+def test_the_first_push_is_the_papers():
+    push = pushes()[0]
+    assert push.direction == pytest.approx([0, 1, 0])
+    # 2 cm clear of the object's side at y = 0.07, at the target's height
+    assert push.start[:3, 3] == pytest.approx([0.6, 0.07 - pushing.STAND_OFF - pushing.TOOL_RADIUS, 0.13])
+    assert push.length == pytest.approx(pushing.STAND_OFF + 2 * 0.03)
+    assert push.start[:3, 2] == pytest.approx([0, 0, -1])  # tool down
+    assert push.end[:3, 3] - push.start[:3, 3] == pytest.approx(push.length * push.direction)
+
+
+def test_the_tool_stays_above_the_surface():
+    low = pushes(target=np.array([0.6, 0, 0.05]))[0]
+    assert low.start[2, 3] - pushing.TIP_BELOW_TCP == pytest.approx(SURFACE + pushing.TIP_CLEARANCE)
+
+
+def test_where_something_stands_the_tool_does_not_come_down():
+    standing = box((0.58, 0.62), (0.0, 0.06), (0.1, 0.15))
+    assert all(push.start[2, 3] > 0.15 for push in pushes(others=standing) if push.direction[1] > 0.99)
+    wall = box((0.4, 0.8), (-0.1, 0.06), (0.1, 0.3))
+    assert pushes(others=wall) == []
+
+
+def test_no_push_goes_over_the_edge():
+    assert pushes(half=np.array([0.3, 0.2])) == []
+    assert pushes(half=np.array([0.3, 0.3])) != []
+
+
+@settings(max_examples=30, deadline=None)
+@given(x=st.floats(0.4, 0.8), y=st.floats(-0.3, 0.3), seed=st.integers(0, 99))
+def test_every_push_ends_on_the_surface(x, y, seed):
+    points = OBSTACLE - OBSTACLE.mean(axis=0) + [x, y, 0.15]
+    rng = np.random.default_rng(seed)
+    for push in pushing.candidates(rng, points, np.array([0.6, 0.0, 0.12]), NOTHING, (TABLE, HALF)):
+        moved = points + (push.length - pushing.STAND_OFF) * push.direction
+        assert np.all(np.abs(moved[:, :2] - TABLE[:2, 3]) <= HALF - pushing.EDGE_MARGIN)
+        assert push.start[2, 3] - pushing.TIP_BELOW_TCP >= SURFACE + pushing.TIP_CLEARANCE - 1e-9
+
+
+def test_free_places_are_on_the_surface_and_clear_of_everything():
+    held = box((0.5, 0.6), (0.0, 0.04), (0.4, 0.45))
+    standing = box((0.55, 0.65), (-0.2, 0.2), (SURFACE, 0.2))
+    motions = free_places(held, standing, TABLE, HALF)
+    assert len(motions) > 20
+    tree = KDTree(standing[:, :2])
+    for motion in motions[:: len(motions) // 20]:
+        placed = transform(motion, held)
+        assert placed[:, 2].min() == pytest.approx(SURFACE + 0.012)
+        assert np.all(np.abs(placed[:, :2] - TABLE[:2, 3]) <= HALF - 0.03 + 1e-9)
+        assert tree.query(placed[:, :2])[0].min() >= 0.02
+        assert motion[2, :3] == pytest.approx([0, 0, 1])  # it keeps standing as it was held
+    full = box((0.3, 0.9), (-0.5, 0.5), (SURFACE, 0.2), step=0.02)
+    assert len(free_places(held, full, TABLE, HALF)) == 0
+
+
+def test_views_look_at_the_point_from_above():
+    point = np.array([0.5, 0.1, 0.2])
+    views = sample_views(np.random.default_rng(1), point, (0.4, 0.5), count=200)
+    line = point - views[:, :3, 3]
+    distance = np.linalg.norm(line, axis=1)
+    assert np.all((distance >= 0.4) & (distance <= 0.5))
+    assert np.allclose(line / distance[:, None], views[:, :3, 0])  # x is forward
+    elevation = np.rad2deg(np.arcsin(-line[:, 2] / distance))
+    assert np.all((elevation >= 60 - 1e-6) & (elevation <= 90))
