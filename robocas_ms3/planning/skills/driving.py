@@ -15,7 +15,7 @@ from robocas_ms3.planning.scene import inverse, matrix
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.timing import stopping
 from robocas_ms3.robots.constants import ARM_BASE_ABOVE_BASE_LINK, BASE_LIMITS, BASE_LINK_HEIGHT
-from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, filter_grasps
+from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, directions_ok, gripper_is_clear
 from robocas_ms3.scenes.placement import planar_pose, transform
 
 SPEED, ACCELERATION = 0.25, 0.4  # m/s and rad/s; m/s^2 and rad/s^2
@@ -27,6 +27,8 @@ LIMIT_MARGIN = 0.01
 BODY_BOXES = ((0.28, 0.23, 0.30), (0.15, 0.13, 0.49))
 SAMPLES, TRIED = 400, 14  # base poses drawn; those of them for which inverse kinematics is solved
 GRASPS = 10  # grasps that stand for all when reach is judged
+GRASPS_LOOKED_AT = 250
+SIDE = "from_the_robots_side"
 COMFORTABLE = 0.3  # share of them that has to be within reach
 ARM_LENGTH = 1.2  # m from its base to the tips, hand and what it holds included
 THINNED = 3  # every third point of the clouds will do: nothing thinner than 2 cm could slip between them
@@ -81,13 +83,14 @@ def drive_to_reach(arm: Arm, slot: int, *, elsewhere: bool = False) -> None:
         in_base = arm.scene.obstacles_in_base()
         cloud = transform(arm.scene.arm_base_in_world, in_base)
         others = transform(arm.scene.arm_base_in_world, arm.scene.obstacles_in_base(without=slot))
-        if not elsewhere and reach_share(arm, base_at(arm), slot, others) >= COMFORTABLE:
+        grasps = clear_grasps(arm, slot, others)
+        if not elsewhere and reach_share(arm, base_at(arm), grasps, others) >= COMFORTABLE:
             return
         arm.planner.set_scene(in_base)
         home = arm.plan_home(arm.at)
     arm.follow(home)
     with arm.planning():
-        route = _best_route(arm, slot, cloud, others)
+        route = _best_route(arm, slot, grasps, cloud, others)
     drive(arm, *route)
 
 
@@ -109,43 +112,55 @@ def drive_back(arm: Arm) -> None:
     drive(arm, *route)
 
 
-def reach_share(arm: Arm, base: Array, slot: int, others: Array) -> float:
-    """Share of an object's grasps that the arm reaches from a base pose without touching anything, pre-grasps included.
+def clear_grasps(arm: Arm, slot: int, others: Array) -> Array:
+    """An object's grasps (G, 4, 4) in the world, whichever side they come from, whose way in is clear.
+
+    Args:
+        arm: the attempt's tools.
+        slot: of the object.
+        others: (P, 3) surfaces of everything else, world, m.
+    """
+    object_in_world = arm.scene.arm_base_in_world @ arm.scene.object_in_base(slot)
+    notes = arm.env.object_assets[0][slot].annotations
+    poses = object_in_world @ notes.grasps_tcp_in_object[:: max(1, len(notes.grasp_widths) // GRASPS_LOOKED_AT)]
+    tests = directions_ok(poses, np.ones(3), arm.env.task_config.target.approach)
+    poses = poses[np.all([passed for name, passed in tests.items() if name != SIDE], axis=0)]
+    near = others[np.linalg.norm(others - object_in_world[:3, 3], axis=1) < 0.5]
+    return poses[gripper_is_clear(poses, near)]
+
+
+def reach_share(arm: Arm, base: Array, grasps: Array, others: Array) -> float:
+    """Share of grasps that the arm reaches from a base pose without touching anything, pre-grasps included.
 
     Args:
         arm: the attempt's tools.
         base: (3,).
-        slot: of the object.
-        others: (P, 3) surfaces of everything else, world, m.
+        grasps: (G, 4, 4) from ``clear_grasps``; those that come from the far side count as out of reach.
+        others: (P, 3) surfaces of everything but the object, world, m.
     """
     frame = arm_base_in_world(arm, base)
-    object_in_world = arm.scene.arm_base_in_world @ arm.scene.object_in_base(slot)
-    notes = arm.env.object_assets[0][slot].annotations
-    near = others[np.linalg.norm(others - object_in_world[:3, 3], axis=1) < 0.5]
-    kept = filter_grasps(
-        object_in_world @ notes.grasps_tcp_in_object[:: max(1, len(notes.grasp_widths) // 200)],
-        notes.grasp_widths[:: max(1, len(notes.grasp_widths) // 200)],
-        arm_base_in_world=frame,
-        object_center_in_world=object_in_world[:3, 3],
-        scene_points_in_world=near,
-        approach=arm.env.task_config.target.approach,
-    )
-    half = len(kept) // 2  # the second half are the first one's twins
-    if not half:
+    chosen = _from_here(arm, frame, grasps)
+    if not len(chosen):
         return 0.0
-    chosen = np.linspace(0, half - 1, min(GRASPS, half)).round().astype(int)
-    poses = inverse(frame) @ np.concatenate([kept.tcp_in_world[chosen], kept.tcp_in_world[chosen + half]])
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(GRASPS, len(chosen))).round().astype(int)]
+    poses = inverse(frame) @ np.concatenate([chosen, chosen @ np.diag([-1.0, -1, 1, 1])])  # and their twins
     before = poses.copy()
     before[:, :3, 3] -= PREGRASP_DISTANCE * before[:, :3, 2]
     solved, qpos = arm.reachability.reachable(np.concatenate([poses, before]), arm.at)
     local = transform(inverse(frame), others[::THINNED])
     arm.planner.set_scene(local[np.linalg.norm(local, axis=1) < ARM_LENGTH])
     free = [bool(ok) and not arm.planner.collisions(q) for ok, q in zip(solved, qpos, strict=True)]
-    grasps, entries = np.array(free).reshape(2, 2, -1)  # grasp or pre-grasp; as annotated or its twin; which
-    return float((grasps & entries).any(axis=0).mean())
+    held, entered = np.array(free).reshape(2, 2, -1)  # grasp or pre-grasp; as annotated or its twin; which
+    return float((held & entered).any(axis=0).mean())
 
 
-def _best_route(arm: Arm, slot: int, cloud: Array, others: Array) -> list[Array]:
+def _from_here(arm: Arm, frame: Array, grasps: Array) -> Array:
+    """Those of the grasps (G, 4, 4) that come from where the arm's base (4x4, world) stands."""
+    center = grasps[:, :3, 3].mean(axis=0) if len(grasps) else np.zeros(3)
+    return grasps[directions_ok(grasps, center - frame[:3, 3], arm.env.task_config.target.approach)[SIDE]]
+
+
+def _best_route(arm: Arm, slot: int, grasps: Array, cloud: Array, others: Array) -> list[Array]:
     low, high = np.array(BASE_LIMITS).T + np.array([[LIMIT_MARGIN], [-LIMIT_MARGIN]])
     high[2], low[2] = 0.6, -0.6
     center = (arm.scene.arm_base_in_world @ arm.scene.object_in_base(slot))[:3, 3]
@@ -156,15 +171,18 @@ def _best_route(arm: Arm, slot: int, cloud: Array, others: Array) -> list[Array]
     ahead = np.einsum("ni,ni->n", frames[:, :2, 0], center[:2] - frames[:, :2, 3]) / distance
     possible = (distance > DISTANCES[0]) & (distance < DISTANCES[1]) & (ahead > 0.7)
     order = np.argsort(np.abs(distance - BEST_DISTANCE) + 0.2 * np.linalg.norm(goals - start, axis=1))
+    enough = (
+        max(1, 0.3 * max(len(_from_here(arm, frame, grasps)) for frame in frames[possible])) if any(possible) else 1
+    )
     best: tuple[float, list[Array]] = (0.0, [])
     tried = 0
     for i in order:
-        if not possible[i] or not body_is_free(frames[i], cloud):
+        if not possible[i] or len(_from_here(arm, frames[i], grasps)) < enough or not body_is_free(frames[i], cloud):
             continue
         tried += 1
         if tried > TRIED:
             break
-        share = reach_share(arm, goals[i], slot, others)
+        share = reach_share(arm, goals[i], grasps, others)
         if share > best[0] and (route := free_route(arm, start, goals[i], cloud, leaving=False)):
             best = share, route
             if share >= 2 * COMFORTABLE:
