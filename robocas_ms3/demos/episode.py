@@ -178,7 +178,7 @@ class EpisodeGenerator:
                 }
                 for segment, after in zip(executor.segments, bounds[1:], strict=True)
             ],
-            "facts": dict(executor.facts),
+            "facts": {"disturbed": int(executor.info["disturbed"][0]), **executor.facts},
             "seconds": {part: round(value, 3) for part, value in asdict(executor.seconds).items()},
         }
 

@@ -108,7 +108,7 @@ def candidates(arm: Arm, slot: int, others: Array, approach: Approach = "top") -
     pregrasp = tcp_in_base.copy()
     pregrasp[:, :3, 3] -= PREGRASP_DISTANCE * pregrasp[:, :3, 2]
     solved, qpos = arm.reachability.reachable(tcp_in_base, arm.at)
-    solved_before, _ = arm.reachability.reachable(pregrasp, arm.at)
+    solved_before, qpos_before = arm.reachability.reachable(pregrasp, arm.at)
     reachable = solved & solved_before
     if not reachable.any():
         raise PlanningFailed("grasp_sampling", "unreachable")
@@ -121,7 +121,11 @@ def candidates(arm: Arm, slot: int, others: Array, approach: Approach = "top") -
         rng=arm.rng,
         approach=approach,
     )
-    for index in order[:GRASPS_PLANNED]:
+    # where it is narrow, first those whose arm is free as inverse kinematics happened to find it
+    arm.planner.set_scene(others)
+    ways = np.stack([qpos_before[reachable], qpos[reachable]], axis=1)[order]
+    blocked = [any(arm.planner.collisions(ends) for ends in way) for way in ways]
+    for index in order[np.argsort(blocked, kind="stable")][:GRASPS_PLANNED]:
         yield tcp_in_base[reachable][index]
 
 

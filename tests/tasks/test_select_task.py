@@ -1,0 +1,90 @@
+"""The shipped configurations: each finds its assets; select and front-approach ones are laid out and solved."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config import load_task_config
+from robocas_ms3.config.load import shipped_configs
+from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.errors import AssetError
+from robocas_ms3.planning.executor import Executor
+from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.grasping import plan_grasp
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.relations import MARGIN
+from robocas_ms3.scenes.sample import sample_layout
+
+
+def load(name):
+    pack = load_pack("builtin")
+    return SceneModel.load(load_task_config(name), pack, pack)
+
+
+@pytest.mark.parametrize("name", sorted(shipped_configs()))
+def test_every_shipped_configuration_finds_its_assets(name):
+    try:
+        model = load(name)
+    except AssetError:
+        asked = [item.asset for item in load_task_config(name).furniture.values()]
+        assert any("/" in asset for asset in asked)  # of a pack that is made from the user's own files
+        return
+    robot, inside = model.robot_pose[:2, 3], model.region
+    middle = np.append(np.add(inside.min_xy, inside.max_xy) / 2, [inside.z, 1.0])
+    target = (model.support_pose @ middle)[:2]
+    assert np.linalg.norm(target - robot) < 1.5  # the robot stands there and looks that way
+    assert model.robot_pose[:2, 0] @ (target - robot) > 0
+
+
+@pytest.mark.parametrize("name", sorted(name for name in shipped_configs() if name.startswith("select_")))
+def test_the_named_one_is_told_apart(name):
+    model = load(name)
+    layout = sample_layout(model, 3, 3)
+    target = layout.object_ids[layout.target]
+    alike = [i for i, object_id in enumerate(layout.object_ids) if object_id == target and i != layout.target]
+    assert alike
+    xy = (np.linalg.inv(layout.robot_pose) @ layout.object_poses)[:, :2, 3]
+    by_distance = layout.relation in {"nearest", "second_nearest", "farthest"}
+    key = np.linalg.norm(xy, axis=1) if by_distance else xy[:, 1]
+    assert np.abs(key[alike] - key[layout.target]).min() >= MARGIN
+    side = {"nearest": -1, "farthest": 1, "leftmost": 1, "rightmost": -1}.get(layout.relation)
+    if side is not None:
+        assert np.all(side * (key[layout.target] - key[alike]) > 0)
+
+
+@pytest.mark.slow
+class TestOnAShelf:
+    @pytest.fixture(scope="class")
+    def generator(self):
+        generator = EpisodeGenerator(EpisodeSettings("select", "select_shelf_orderly", "builtin", max_attempts=6))
+        yield generator
+        generator.close()
+
+    def test_the_way_out_goes_up_a_little_then_straight_back(self, generator):
+        executor = Executor(generator.env, 1)
+        executor.reset()
+        generator.planner.seed(1)
+        arm = Arm(generator.planner, generator.reachability, executor, np.random.default_rng(1))
+        slot = int(arm.env.target_slot[0])
+        plan = plan_grasp(arm, slot, 0.1, "front")
+        lift, withdraw = plan.retreat
+        grasp = arm.planner.tcp(plan.approach.qpos[-1])
+        lifted, out = arm.planner.tcp(lift.qpos[-1]), arm.planner.tcp(withdraw.qpos[-1])
+        np.testing.assert_allclose((lifted - grasp)[:2], 0, atol=1e-3)  # turned nowhere, moved up
+        assert 0.03 < lifted[2, 3] - grasp[2, 3] < 0.21
+        way = np.array([arm.planner.tcp(qpos)[:3, 3] - lifted[:3, 3] for qpos in withdraw.qpos])
+        back = -grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
+        assert 0.11 < way[-1, :2] @ back < 0.26
+        across = way - np.outer(way[:, :2] @ back, [*back, 0.0])
+        assert np.abs(across).max() < 2e-3  # level and straight, all the way
+        np.testing.assert_allclose(out[:3, :3], grasp[:3, :3], atol=1e-3)
+
+    def test_an_episode_leaves_the_neighbours_standing(self, generator, tmp_path):
+        result = generator.generate(1, tmp_path, "episode")
+        assert result.success, result.failures
+        episode = json.loads((tmp_path / "episode.json").read_text())["episodes"][0]
+        assert episode["robocas"]["facts"]["disturbed"] == 0
