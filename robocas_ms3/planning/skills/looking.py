@@ -41,10 +41,13 @@ def plan_look(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> 
     Raises:
         PlanningFailed: no such view can be reached.
     """
-    camera_in_tcp = inverse(arm.scene.tcp_in_base) @ camera_in_base(arm)
-    views = sample_views(arm.rng, point_in_base, distance, count=VIEWS_SAMPLED)
-    solved, qpos = arm.reachability.reachable(views @ inverse(camera_in_tcp), arm.at)
-    if not solved.any():
+    tcp_in_camera = inverse(inverse(arm.scene.tcp_in_base) @ camera_in_base(arm))
+    for least, greatest in (distance, (NEAR[0], FAR[1])):  # where a high table leaves no such view, any other
+        views = sample_views(arm.rng, point_in_base, (least, greatest), count=VIEWS_SAMPLED)
+        solved, qpos = arm.reachability.reachable(views @ tcp_in_camera, arm.at)
+        if solved.any():
+            break
+    else:
         raise PlanningFailed("look", "unreachable")
     qpos = qpos[solved]
     arm.planner.set_scene(arm.scene.obstacles_in_base())

@@ -22,6 +22,7 @@ from robocas_ms3.tasks.search import RoboCASSearchEnv
 REMOVALS = 6  # pushes and removals an attempt may make
 FAILED_REMOVALS = 1  # obstacles that an attempt may lose hold of
 LIFT_FIRST = 0.3  # how often an obstacle is lifted though it might be pushed
+HEIGHT_NOISE = 0.01  # m, so that another attempt may begin with another of two that are about as high
 LIFT_HEIGHT = 0.15  # m, upstream's
 FALLEN = 0.05  # m below the surface at which an object counts as pushed off it
 HIDDEN_SHARE = 0.2  # of the target, up to which it counts as found (the paper's)
@@ -103,7 +104,8 @@ class _Clearing:
         slots = np.flatnonzero(found.obstacles[0].cpu().numpy()).tolist()
         if bool(found.cleared[0]) and self.visible:
             return []
-        return sorted(slots, key=lambda slot: -self._points(slot)[:, 2].max())
+        height = {slot: self._points(slot)[:, 2].max() + self._arm.rng.normal(0, HEIGHT_NOISE) for slot in slots}
+        return sorted(slots, key=lambda slot: -height[slot])
 
     @property
     def visible(self) -> bool:

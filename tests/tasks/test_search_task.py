@@ -1,0 +1,102 @@
+"""The stage that search adds, and its scripted policy, in a small heap."""
+
+import json
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from mani_skill.utils.structs import Pose
+
+import robocas_ms3.tasks  # noqa: F401
+from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+
+pytestmark = pytest.mark.slow
+
+CONFIG = "search_table_small_heap"
+STATE_ONLY: dict[str, Any] = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = gym.make("RoboCASSearch-v1", config=CONFIG, **STATE_ONLY)
+    yield env
+    env.close()
+
+
+def hold(env) -> bool:
+    """Step once with the arm held still; give `obstacles_cleared`."""
+    qpos = env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy()
+    *_, info = env.step(np.append(qpos, 1.0).astype(np.float32))
+    return bool(info["obstacles_cleared"][0])
+
+
+def take_away_the_others(base) -> None:
+    for slot, actor in enumerate(base.objects):
+        if slot != int(base.target_slot[0]):
+            actor.set_pose(Pose.create_from_pq(torch.tensor([[-2.0, slot * 0.3 - 2.0, 0.1]]), actor.pose.q))
+
+
+def covered_seed(env) -> int:
+    """A seed whose target is not clear at the beginning."""
+    for seed in range(20):
+        _, info = env.reset(seed=seed)
+        if not bool(info["obstacles_cleared"][0]):
+            return seed
+    raise AssertionError("every target is clear at once")
+
+
+def test_the_target_of_a_heap_is_hidden_in_part(env):
+    env.reset(seed=0)
+    base = env.unwrapped
+    layout = base.layouts[0]
+    assert layout.visible_shares[layout.target] < base.task_config.target.max_visible_share
+    found = base.clutter()
+    assert found.hidden_share.shape == (1,)
+    assert found.obstacles.shape == (1, 8)
+    assert not bool(found.obstacles[0, layout.target])
+
+
+def test_taking_the_others_away_clears_the_target_until_the_next_reset(env):
+    seed = covered_seed(env)
+    base = env.unwrapped
+    before = base.get_state()
+    assert not hold(env)
+    take_away_the_others(base)
+    assert hold(env)
+    base.set_state(before)
+    assert hold(env)  # sticky
+    _, info = env.reset(seed=seed)
+    assert not bool(info["obstacles_cleared"][0])
+
+
+def test_a_target_that_was_pulled_out_has_not_been_cleared(env):
+    env.reset(seed=covered_seed(env))
+    base = env.unwrapped
+    base._stages["target_lifted"][:] = True
+    take_away_the_others(base)
+    assert not hold(env)
+
+
+def test_a_target_on_the_floor_has_not_been_cleared(env):
+    env.reset(seed=covered_seed(env))
+    base = env.unwrapped
+    target = base.objects[int(base.target_slot[0])]
+    target.set_pose(Pose.create_from_pq(torch.tensor([[-1.0, -1.0, 0.1]]), target.pose.q))
+    assert not hold(env)
+
+
+def test_the_policy_finds_the_target_and_says_what_it_moved(tmp_path):
+    generator = EpisodeGenerator(EpisodeSettings("search", CONFIG, "builtin", max_attempts=6))
+    try:
+        result = next(r for s in range(3) if (r := generator.generate(s, tmp_path, f"episode_{s}")).success)
+    finally:
+        generator.close()
+    episode = json.loads((tmp_path / f"episode_{result.seed}.json").read_text())
+    record = episode["episodes"][0]["robocas"]
+    assert {"pushes", "removals", "failed_removals"} <= set(record["facts"])
+    kinds = [part["goal_type"] for part in record["subgoals"]]
+    assert kinds[0] == "find the object"
+    assert kinds[-2:] == ["move and grasp", "transfer object"]
+    assert result.steps < 2400
