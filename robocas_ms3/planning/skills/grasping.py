@@ -17,10 +17,14 @@ from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
 from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, Approach, filter_grasps, rank_grasps
 from robocas_ms3.scenes.placement import transform
 
+GRASPS_CHECKED = 48  # grasps of which a check of collisions says whether to try them early
 GRASPS_PLANNED = 12  # grasps that motions are planned for before an attempt gives up
 # m; the least makes a stage of the tasks (3 cm), the others go over what stands in front: the first with a way out
 FRONT_LIFTS = (0.04, 0.08, 0.14, 0.2)
 WITHDRAWALS = (0.25, 0.18, 0.12)  # m, straight back; the first one that can be reached
+
+
+Entry = tuple[Array, Trajectory, tuple[Trajectory, ...]]  # pre-grasp configuration, way in, way out
 
 
 @dataclass(frozen=True)
@@ -121,15 +125,14 @@ def candidates(arm: Arm, slot: int, others: Array, approach: Approach = "top") -
         rng=arm.rng,
         approach=approach,
     )
-    # where it is narrow, first those whose arm is free as inverse kinematics happened to find it
-    arm.planner.set_scene(others)
-    ways = np.stack([qpos_before[reachable], qpos[reachable]], axis=1)[order]
-    blocked = [any(arm.planner.collisions(ends) for ends in way) for way in ways]
-    for index in order[np.argsort(blocked, kind="stable")][:GRASPS_PLANNED]:
+    if approach == "front":  # where it is narrow, first those whose arm is free as inverse kinematics found it
+        order = order[:GRASPS_CHECKED]
+        arm.planner.set_scene(others)
+        ways = np.stack([qpos_before[reachable], qpos[reachable]], axis=1)[order]
+        blocked = [any(arm.planner.collisions(ends) for ends in way) for way in ways]
+        order = order[np.argsort(blocked, kind="stable")]
+    for index in order[:GRASPS_PLANNED]:
         yield tcp_in_base[reachable][index]
-
-
-Entry = tuple[Array, Trajectory, tuple[Trajectory, ...]]
 
 
 def _entries(arm: Arm, slot: int, tcp_in_base: Array, lift_height: float, approach: Approach) -> list[Entry]:
