@@ -95,6 +95,7 @@ class _Clearing:
         self._arm, self._env, self._target = arm, arm.env, target
         self._tried: Counter[int] = Counter()
         self.stuck = False
+        self._hopeless: set[tuple[str, int]] = set()  # what can't be planned as things stand
         self._on_table = self._above_surface()
         arm.executor.facts.update(pushes=0, removals=0, failed_removals=0)
 
@@ -133,16 +134,21 @@ class _Clearing:
             lift_first = self._tried[slot] or self._arm.rng.uniform() < LIFT_FIRST
             skills = ("removals", "pushes") if lift_first else ("pushes", "removals")
             for skill in skills:
+                if (skill, slot) in self._hopeless:
+                    continue
                 done = len(self._arm.executor.actions)
                 try:
                     self._use(skill, slot)
                     self.stuck = False
+                    self._hopeless.clear()
                     return True
                 except PlanningFailed as error:
                     failure = error
                     if len(self._arm.executor.actions) > done + SMALL_MOVE:  # it failed on the way, not in planning
                         self._go_on(slot, failure)
+                        self._hopeless.clear()
                         return True
+                    self._hopeless.add((skill, slot))
         if self.stuck:
             raise failure
         self.stuck = True
