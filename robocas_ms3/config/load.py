@@ -94,11 +94,11 @@ def parse_task_config(data: Any, *, where: str) -> TaskConfig:
 def _config_error(error: ValidationError, where: str) -> ConfigError:
     mistakes = error.errors(include_url=False)
     first = mistakes[0]
-    key = ".".join(str(part) for part in first["loc"]) or "(top level)"
+    key = ".".join(_place(first["loc"])[0]) or "(top level)"
     kind = first["type"]
     more = f"{len(mistakes) - 1} more after this one." if len(mistakes) > 1 else ""
     if kind == "extra_forbidden":
-        known = _known_keys(first["loc"][:-1])
+        known = _place(first["loc"][:-1])[1]
         return ConfigError(
             f"unknown key {key!r}",
             where=where,
@@ -113,24 +113,29 @@ def _config_error(error: ValidationError, where: str) -> ConfigError:
     return ConfigError(f"wrong value for {key!r}", where=where, expected=expected, found=found, fix=more)
 
 
-def _known_keys(location: tuple[int | str, ...]) -> list[str]:
-    """Keys allowed at a place of the configuration, for messages; empty when the place isn't a model."""
+def _place(location: tuple[int | str, ...]) -> tuple[list[str], list[str]]:
+    """Where a mistake is, for messages.
+
+    Returns:
+        The keys that lead there, as the file has them (pydantic adds the kind where a block comes in several), and the
+        keys allowed there; none where the place isn't a model.
+    """
     schema = TaskConfig.model_json_schema()
     node: dict = schema
+    keys: list[str] = []
     for part in location:
-        if part in node.get("properties", {}):
-            node = node["properties"][part]
-        elif part in node.get("discriminator", {}).get("mapping", {}):
-            node = {"$ref": node["discriminator"]["mapping"][part]}
-        elif isinstance(node.get("additionalProperties"), dict):
-            node = node["additionalProperties"]
+        kinds = node.get("discriminator", {}).get("mapping", {})
+        if part in kinds:
+            node = {"$ref": kinds[part]}
         else:
-            return []
+            keys.append(str(part))
+            node = node.get("properties", {}).get(part) or node.get("additionalProperties") or {}
+            node = node if isinstance(node, dict) else {}
         for choice in node.get("anyOf", ()):  # X | None
             node = choice if "$ref" in choice else node
         if "$ref" in node:
             node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
-    return sorted(node.get("properties", {}))
+    return keys, sorted(node.get("properties", {}))
 
 
 def _find(config: str | Path) -> Path:
