@@ -39,7 +39,11 @@ def track(reachability: Reachability, starts: Array, goals: Array, *, max_slip: 
     Returns:
         (T, N, 7) rad; NaN from where a start leads no further: out of reach, a joint limit, or a jump.
     """
-    qpos = np.array(starts, dtype=np.float64)
+    with reachability.one_thread():
+        return _track(reachability, np.array(starts, dtype=np.float64), goals, max_slip)
+
+
+def _track(reachability: Reachability, qpos: Array, goals: Array, max_slip: float) -> Array:
     path = np.full((len(goals), len(qpos), 7), np.nan)
     alive = np.arange(len(qpos))
     for step, goal in enumerate(goals):

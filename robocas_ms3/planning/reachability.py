@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.planning.collision import ARM_JOINTS, BASE_LINK, TCP_LINK
@@ -72,6 +74,8 @@ class Reachability:
         self._links = [np.linalg.inv(a) @ b for a, b in zip(at_zero[:-1], at_zero[1:], strict=True)]
         lower, upper = (np.asarray(limit, dtype=np.float64) for limit in chain.get_joint_limits())
         self.lower, self.upper = lower + LIMIT_MARGIN, upper - LIMIT_MARGIN
+        # OpenBLAS starts threads even for 6 x 6 matrices: ten times slower, and the last bits hang on their number.
+        self._blas = ThreadpoolController()
         self._scattered = np.random.default_rng(0).uniform(self.lower, self.upper, (SCATTERED_RESTARTS, 7))
 
     def reachable(self, tcp_in_base: Array, near: Array) -> tuple[NDArray[np.bool_], Array]:
@@ -84,8 +88,14 @@ class Reachability:
         Returns:
             (N,) whether a configuration inside the joint limits was found, and (N, 7) that one, NaN where none.
         """
-        goals = np.asarray(tcp_in_base, dtype=np.float64).reshape(-1, 4, 4)
-        near = np.asarray(near, dtype=np.float64)
+        with self.one_thread():
+            return self._reachable(np.asarray(tcp_in_base, dtype=np.float64).reshape(-1, 4, 4), np.asarray(near, float))
+
+    def one_thread(self) -> AbstractContextManager:
+        """Context in which linear algebra runs in one thread."""
+        return self._blas.limit(limits=1, user_api="blas")
+
+    def _reachable(self, goals: Array, near: Array) -> tuple[NDArray[np.bool_], Array]:
         qpos = np.full((len(goals), 7), np.nan)
         for starts in (near[None], *map(np.array, RESTARTS), self._scattered):
             left = np.flatnonzero(np.isnan(qpos[:, 0]))
