@@ -66,7 +66,7 @@ class TransferEnv(RoboCASEnv):
         touched = terms.touched(forces)
         poses = self.object_poses
         lifted = terms.lifted(poses[..., 2], self.start_poses[..., 2], grasped)
-        measures = self.target_measures(touched)
+        measures = self.target_measures(touched, poses)
         self.target_held = terms.of_target(grasped, self.target_slot)
         now = {
             "reached_any": touched.any(dim=1),
@@ -90,16 +90,20 @@ class TransferEnv(RoboCASEnv):
         """What a task adds to the stages: (N,) bool each, of this moment; ``target_held`` (N,) is known then."""
         return {}
 
-    def target_measures(self, touched: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+    def target_measures(
+        self, touched: torch.Tensor | None = None, poses: torch.Tensor | None = None
+    ) -> dict[str, torch.Tensor]:
         """What has to hold at the same moment for success, besides the target having been lifted: (N,) bool each.
 
         Args:
             touched: (N, K) bool, which objects the gripper touches, if that is known already.
+            poses: (N, K, 7) of the objects, likewise.
         """
         if touched is None:
             touched = terms.touched(self.gripper_forces())
+        poses = self.object_poses if poses is None else poses
         basket, start, slot = self.fixtures.basket.pose, self.basket_at_start, self.target_slot
-        pose = terms.of_target(self.object_poses, slot)
+        pose = terms.of_target(poses, slot)
         center = pose[:, :3] + terms.rotate(pose[:, 3:], terms.of_target(self._centers_of_mass, slot))
         linear = torch.stack([actor.linear_velocity for actor in self.objects], dim=1)
         angular = torch.stack([actor.angular_velocity for actor in self.objects], dim=1)
