@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictInt, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictInt, model_validator
 
 from robocas_ms3.config.relations import RELATIONS, Relation
 
@@ -159,7 +159,18 @@ class LanguageConfig(StrictModel):
     synonyms: bool = Field(default=True, description="with train or held_out: also call things by their synonyms")
 
 
-Range = Annotated[tuple[float, float], Field(description="least and greatest")]
+def _rising(values: tuple[float, float]) -> tuple[float, float]:
+    if values[0] > values[1]:
+        raise ValueError(f"{list(values)} is no range: the least comes first")
+    return values
+
+
+Range = Annotated[
+    tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]],
+    Field(description="least and greatest"),
+    AfterValidator(_rising),
+]
+Ids = Annotated[list[str | StrictInt], Field(min_length=1)]
 
 
 class LightRandomisation(StrictModel):
@@ -187,8 +198,10 @@ class PoseRandomisation(StrictModel):
 class DistractorConfig(StrictModel):
     """Further objects that are never the target."""
 
-    ids: list[str | StrictInt]
-    count: tuple[Annotated[int, Field(ge=0, le=16)], Annotated[int, Field(ge=0, le=16)]] = (1, 3)
+    ids: Ids
+    count: Annotated[
+        tuple[Annotated[int, Field(ge=0, le=16)], Annotated[int, Field(ge=0, le=16)]], AfterValidator(_rising)
+    ] = (1, 3)
 
 
 class RandomisationConfig(StrictModel):
@@ -201,7 +214,9 @@ class RandomisationConfig(StrictModel):
     cameras: CameraRandomisation | None = None
     robot: PoseRandomisation | None = None
     basket: PoseRandomisation | None = None
-    object_sets: list[list[str | StrictInt]] | None = Field(default=None, description="one of them in place of `ids`")
+    object_sets: Annotated[list[Ids], Field(min_length=1)] | None = Field(
+        default=None, description="one of them in place of `ids`"
+    )
     count: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = Field(
         default=None, description="number of objects, at most objects.count"
     )

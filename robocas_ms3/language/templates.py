@@ -36,7 +36,7 @@ def subgoal(goal_type: GoalType, object: str, support: str) -> dict[str, str]:
 
     Args:
         goal_type: one of ``GOAL_TYPES``.
-        object: the target's name, plain: synonyms are for instructions. In search also an obstacle's.
+        object: the target's name, plain: synonyms are for instructions.
         support: what the objects are on, or the furniture that is opened.
 
     Returns:

@@ -25,7 +25,7 @@ from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
 
-LAYOUT_FORMAT = 3  # raised when the same seed gives another layout, or the files change
+LAYOUT_FORMAT = 4  # raised when the same seed gives another layout, or the files change
 ABOUT = "about.json"  # in the folder of a bank: all that its layouts depend on
 _A_FOLDER = 1000  # layouts in one
 _NO_MATTER = ("description", "support", "lights", "language", "base_motion")  # parts of a configuration
@@ -160,8 +160,8 @@ def about(model: SceneModel) -> dict[str, Any]:
         "layout_format": LAYOUT_FORMAT,
         "config": config,
         "object_pack": {"name": model.object_pack.name, "manifest": sha256(model.object_pack.root / MANIFEST)},
-        "furniture": {name: part.asset.files for name, part in parts.items()},
-        "versions": {name: version(name) for name in ("sapien", "numpy", "shapely", "embreex")},
+        "furniture": {name: part.asset.model_dump(mode="json", exclude={"quality"}) for name, part in parts.items()},
+        "versions": {name: version(name) for name in ("sapien", "numpy", "scipy", "shapely", "trimesh", "embreex")},
     }
 
 

@@ -68,16 +68,17 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
     basket_pose = _moved(model.basket_pose, config.randomisation.basket, rng(_BASKET))
     layout_rng, target_rng = rng(_LAYOUT), rng(_TARGET)
     used = [asset for asset, there in zip(assets, present, strict=True) if there]
-    unsettled = 0
+    unsettled, unarranged = 0, []
     choice: Choice | None = None
     for _ in range(_TRIES):
         poses = np.stack([_parked(slot, asset) for slot, asset in enumerate(assets)])
         try:
             arranged = _arrange(layout_rng, model, used)
-        except LayoutError:
+        except LayoutError as error:
             if not isinstance(config.layout, OrderlyLayout):
                 raise  # it has tried often enough
-            continue  # in another order the columns may fit
+            unarranged.append(error)  # in another order the columns may fit
+            continue
         placed = model.support_pose @ model.support_motion(opened=False) @ arranged
         settled = settle(used, placed, model, basket_pose)
         if not settled.stable:
@@ -91,12 +92,19 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
             return Layout(
                 ids, poses, robot_pose, basket_pose, choice.slot, choice.relation, present, choice.visible_shares
             )
-    raise LayoutError(
-        "no object qualifies as the target",
-        where="target",
-        found=f"{_TRIES} layouts tried, {unsettled} of which did not come to rest",
-        fix="Raise target.max_distance, lower target.min_grasps or min_free_grasps, or use other objects.",
-    )
+    raise _failure(unarranged, unsettled)
+
+
+def _failure(unarranged: list[LayoutError], unsettled: int) -> LayoutError:
+    """What to say of a layout that could not be made; the commonest cause names the cure."""
+    if len(unarranged) == _TRIES:
+        return unarranged[-1]
+    found = f"{_TRIES} layouts tried: {len(unarranged)} did not fit, {unsettled} did not come to rest"
+    if unsettled > _TRIES // 2:
+        fix = "Lower objects.count, enlarge the surface, or use objects that stand firmly."
+        return LayoutError("the objects don't come to rest", where="layout", found=found, fix=fix)
+    fix = "Raise target.max_distance, lower target.min_grasps or min_free_grasps, or use other objects."
+    return LayoutError("no object qualifies as the target", where="target", found=found, fix=fix)
 
 
 def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str], copies: int) -> list[str]:

@@ -21,8 +21,8 @@ class RoboCASSearchEnv(TransferEnv):
 
     The stages add ``obstacles_cleared``: at most a fifth of the target is hidden from straight above, and fewer than
     two other objects stick out next to it (`occlusion.clutter`). What counts is the heap while the target lies in it:
-    from the moment the gripper holds the target, nothing is cleared any more, so pulling it out from under the heap
-    does not reach this stage.
+    from the moment the gripper has held the target, nothing is cleared any more, so pulling or dragging it out from
+    under the heap does not reach this stage.
     """
 
     SPEC = SEARCH
@@ -45,7 +45,7 @@ class RoboCASSearchEnv(TransferEnv):
         env = torch.arange(self.num_envs, device=self.device)
         surface = float(self.model.support_pose[2, 3]) + self.model.region.z
         lies = self.object_poses[env, self.target_slot, 2] > surface - _FALLEN
-        lies &= ~(self.target_held | self._stages["target_lifted"])
+        lies &= ~(self.target_held | self._stages["target_grasped"])
         return {"obstacles_cleared": self.clutter().cleared & lies}
 
 

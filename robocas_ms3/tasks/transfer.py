@@ -61,7 +61,8 @@ class TransferEnv(RoboCASEnv):
 
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Stages and success of each env, (N,) bool each; ``disturbed`` (N,) int."""
-        forces = self.gripper_forces()
+        # right after a reset the engine still tells the contacts of before
+        forces = self.gripper_forces() * (self.elapsed_steps > 0)[:, None, None, None]
         grasped = self.grasped(forces)
         touched = terms.touched(forces)
         poses = self.object_poses

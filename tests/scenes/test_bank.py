@@ -1,6 +1,6 @@
 """The bank gives back what was made, makes what is missing, and knows what layouts depend on."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from time import perf_counter
 
 import numpy as np
@@ -94,3 +94,12 @@ def test_what_layouts_depend_on_is_in_the_name(tmp_path, changes, same):
 def test_no_bank_gives_the_same_layouts(tmp_path):
     scene = model()
     assert_same(layout_bank(scene, None)(2, 2), layout_bank(scene, tmp_path)(2, 2))
+
+
+def test_furniture_that_is_made_anew_has_layouts_of_its_own(tmp_path):
+    scene = model()
+    table = scene.furniture["table"]
+    top = table.asset.surfaces["top"]
+    higher = table.asset.model_copy(update={"surfaces": {"top": top.model_copy(update={"z": top.z + 0.05})}})
+    changed = replace(scene, furniture={"table": replace(table, asset=higher)})
+    assert LayoutBank(changed, tmp_path).folder != LayoutBank(scene, tmp_path).folder

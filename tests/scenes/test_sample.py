@@ -59,6 +59,16 @@ def test_counts_and_distractors_use_some_of_the_slots():
     assert {others for _, others in counts} == {1, 2, 3}
 
 
+def test_rows_that_do_not_fit_say_so():
+    scene = model(
+        layout={"kind": "orderly", "copies": 1},
+        objects={"ids": ["mug"], "count": 1},
+        randomisation={"distractors": {"ids": ["power_drill", "sugar_box"], "count": [9, 9]}},
+    )
+    with pytest.raises(LayoutError, match=r"columns side by side don't fit"):
+        sample_layout(scene, 0, 0)
+
+
 def test_one_of_several_object_sets_is_drawn():
     sets = [["apple", "lemon", "peach"], ["mug", "banana", "padlock"]]
     scene = model(objects={"ids": "all", "count": 3}, randomisation={"object_sets": sets})
@@ -89,6 +99,10 @@ def test_no_target_is_an_error_that_says_what_to_change():
         ({"randomisation": {"room": ["roof"]}}, r"randomisation.room: no such part.*found roof"),
         ({"randomisation": {"object_sets": [["spam"]]}}, r"randomisation.object_sets.0.*found spam"),
         ({"randomisation": {"distractors": {"ids": ["spam"]}}}, r"distractors.ids.*found spam"),
+        ({"randomisation": {"distractors": {"ids": []}}}, r"randomisation.distractors.ids"),
+        ({"randomisation": {"object_sets": [[]]}}, r"randomisation.object_sets.0"),
+        ({"randomisation": {"distractors": {"ids": ["mug"], "count": [3, 1]}}}, r"count: \[3, 1\] is no range"),
+        ({"randomisation": {"lights": {"ambient": [0.6, 0.2]}}}, r"lights.ambient: \[0.6, 0.2\] is no range"),
         ({"randomisation": {"count": [3, 99]}}, r"randomisation.count \[3, 99\] must rise and end at objects.count 10"),
         ({"opening": {"furniture": "table", "handle": "door"}}, "`opening` goes with task open_pick"),
     ],

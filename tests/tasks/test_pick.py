@@ -83,6 +83,16 @@ def test_stages_are_sticky_until_the_next_reset(env):
     assert not any(bool(info[stage][0]) for stage in STAGES)
 
 
+def test_a_reset_forgets_the_contacts_of_before(env, monkeypatch):
+    """Until the first step after a reset the engine tells the contacts of the last episode, where nothing is rebuilt."""
+    base = env.unwrapped
+    forces = torch.full((1, 3, len(base.objects), 3), 5.0)
+    monkeypatch.setattr(base, "gripper_forces", lambda: forces)
+    _, info = env.reset(seed=0)
+    assert not any(bool(info[stage][0]) for stage in STAGES)
+    assert settle(env, 1)["reached_target"]
+
+
 def test_the_instruction_names_the_target(env):
     env.reset(seed=0)
     name = env.unwrapped.target_asset().asset.name

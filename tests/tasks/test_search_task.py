@@ -74,7 +74,7 @@ def test_taking_the_others_away_clears_the_target_until_the_next_reset(env):
 def test_a_target_that_was_pulled_out_has_not_been_cleared(env):
     env.reset(seed=covered_seed(env))
     base = env.unwrapped
-    base._stages["target_lifted"][:] = True
+    base._stages["target_grasped"][:] = True  # and let go of since: dragged out, not cleared
     take_away_the_others(base)
     assert not hold(env)
 
