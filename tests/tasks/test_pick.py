@@ -84,7 +84,7 @@ def test_stages_are_sticky_until_the_next_reset(env):
 
 
 def test_a_reset_forgets_the_contacts_of_before(env, monkeypatch):
-    """Until the first step after a reset the engine tells the contacts of the last episode, where nothing is rebuilt."""
+    """Until the first step the engine tells the contacts of the last episode, where nothing is built anew."""
     base = env.unwrapped
     forces = torch.full((1, 3, len(base.objects), 3), 5.0)
     monkeypatch.setattr(base, "gripper_forces", lambda: forces)
