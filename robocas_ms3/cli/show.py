@@ -38,7 +38,6 @@ def main(cfg: Show) -> int:
     from robocas_ms3.tasks.transfer import TransferEnv
 
     config = load_task_config(cfg.config)
-    make_folder(cfg.out)
     shader = {"shader_pack": cfg.shader}
     env = gym.make(
         TASKS[config.task].env_id,
@@ -58,6 +57,7 @@ def main(cfg: Show) -> int:
     from PIL import Image
 
     obs, _ = env.reset(seed=cfg.seed)
+    make_folder(cfg.out)
     pictures = {name: data["rgb"][0] for name, data in obs["sensor_data"].items()}
     overview = base_env.render_rgb_array()
     assert overview is not None  # there is a render device, and the environment has a camera for it

@@ -240,6 +240,10 @@ class TaskConfig(StrictModel):
     target: TargetConfig = TargetConfig()
     opening: OpeningConfig | None = Field(default=None, description="open_pick: what is opened")
     language: LanguageConfig = LanguageConfig()
+    static_camera: Literal["upstream", "overview"] = Field(
+        default="upstream",
+        description="upstream: at (1, 1.5, 1.5), which looks at a table; overview: from aside, wherever the task is",
+    )
     base_motion: bool = Field(default=False, description="scripted policies may drive the base; actions then hold it")
     randomisation: RandomisationConfig = RandomisationConfig()
 

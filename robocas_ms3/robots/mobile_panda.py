@@ -89,6 +89,9 @@ class RoboCASMobilePanda(BaseAgent):
     base_stiffness, base_damping, base_force_limit = 4e5, 2e4, 4e3
     base_max_speed = 0.5  # m/s and rad/s
 
+    static_camera_pose: sapien.Pose | None = None
+    """World pose of ``static_camera``; none: upstream's, which looks at a table before the robot."""
+
     @property
     def _controller_configs(self) -> dict[str, dict[str, Any]]:
         arm: dict[str, Any] = dict(
@@ -151,10 +154,13 @@ class RoboCASMobilePanda(BaseAgent):
 
     @property
     def _sensor_configs(self) -> list[CameraConfig]:
+        static = _camera("static_camera", (1, 1.5, 1.5), (0, np.pi / 3, -np.pi / 2), near=0.05, far=10, link=None)
+        if self.static_camera_pose is not None:
+            static.pose = Pose.create(self.static_camera_pose)
         return [
             _camera("base_camera", (0, -0.3, 1.2), (0, 0.43633, 0), near=0.005, far=5, link=c.BASE_LINK),
             _camera("gripper_camera", (0.05, 0, 0.05), (np.pi, -np.pi / 2, 0), near=0.001, far=5, link=c.HAND_LINK),
-            _camera("static_camera", (1, 1.5, 1.5), (0, np.pi / 3, -np.pi / 2), near=0.05, far=10, link=None),
+            static,
         ]
 
     def _after_init(self) -> None:

@@ -28,7 +28,14 @@ from robocas_ms3.scenes.sample import sample_layout
 LAYOUT_FORMAT = 4  # raised when the same seed gives another layout, or the files change
 ABOUT = "about.json"  # in the folder of a bank: all that its layouts depend on
 _A_FOLDER = 1000  # layouts in one
-_NO_MATTER = ("description", "support", "lights", "language", "base_motion")  # parts of a configuration
+_NO_MATTER = (
+    "description",
+    "support",
+    "lights",
+    "language",
+    "base_motion",
+    "static_camera",
+)  # parts of a configuration
 _log = logging.getLogger(__name__)
 
 LayoutSource = Callable[[int, int], Layout]
@@ -125,8 +132,12 @@ def fill(bank: LayoutBank, seeds: Iterable[int], jobs: int = 1) -> Generator[tup
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(missing)), context, _start_worker, (bank,)) as pool:
-        for done in as_completed([pool.submit(_make_in_worker, seed) for seed in missing]):
-            yield done.result()
+        try:
+            for done in as_completed([pool.submit(_make_in_worker, seed) for seed in missing]):
+                yield done.result()
+        except BaseException:  # an interruption too: only what is under way is waited for
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
 
 
 def _make(bank: LayoutBank, seed: int) -> str:

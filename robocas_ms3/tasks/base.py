@@ -31,6 +31,7 @@ from robocas_ms3.tasks.contacts import contact_forces
 from robocas_ms3.tasks.spec import TaskSpec
 
 _RESETS_PER_COLLECTION = 20
+_STATIC_CAMERA_SHARE = 0.75  # of the render camera's distance, as it sees 90 deg instead of 60
 
 
 class RoboCASEnv(BaseEnv):
@@ -104,15 +105,20 @@ class RoboCASEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
+        eye, target = self.overview()
+        pose = sapien_utils.look_at(eye.tolist(), target.tolist())
+        return CameraConfig("render_camera", pose, 640, 480, np.pi / 3, 0.01, 20)
+
+    def overview(self) -> tuple[Array, Array]:
+        """Where to look at the task from, and at what: points (3,) in the world, m."""
         # over the robot's shoulder, from its right, at what stands on the support
         region, robot = self.model.region, self.model.robot_pose[:3, 3]
         middle = np.array([*np.add(region.min_xy, region.max_xy) / 2, region.z, 1.0])
         target = (self.model.support_pose @ middle)[:3]
         back = (robot - target)[:2] / np.linalg.norm((robot - target)[:2])
         aside = np.array([-back[1], back[0]])
-        eye = target + np.append(1.05 * back + 1.2 * aside, 0.0) + [0, 0, max(1.1, 1.5 - target[2])]
-        pose = sapien_utils.look_at(eye.tolist(), (target + [0, 0, 0.05]).tolist())
-        return CameraConfig("render_camera", pose, 640, 480, np.pi / 3, 0.01, 20)
+        eye = target + np.append(1.05 * back + 1.2 * aside, max(1.1, 1.5 - target[2]))
+        return eye, target + [0, 0, 0.05]
 
     # ------------------------------------------------------------------ seeds
 
@@ -164,6 +170,10 @@ class RoboCASEnv(BaseEnv):
 
     def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
         super()._load_agent(options, sapien.Pose(self.model.robot_pose))
+        if self.task_config.static_camera == "overview":
+            eye, target = self.overview()
+            near = target + _STATIC_CAMERA_SHARE * (eye - target)
+            self.agent.static_camera_pose = sapien_utils.look_at(near.tolist(), target.tolist()).sp
 
     def _load_scene(self, options: dict) -> None:
         seeds = self._scene_seeds

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils import sapien_utils
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Articulation
 
@@ -23,8 +21,7 @@ class RoboCASOpenPickEnv(TransferEnv):
     SPEC = OPEN_PICK
     STAGES = ("furniture_opened", *STAGES)
 
-    @property
-    def _default_human_render_camera_configs(self) -> CameraConfig:
+    def overview(self) -> tuple[np.ndarray, np.ndarray]:
         """From above the basket's side, where an opening door does not hide the gripper."""
         model, opening = self.model, self.task_config.opening
         assert opening is not None  # the configuration saw to it
@@ -37,7 +34,7 @@ class RoboCASOpenPickEnv(TransferEnv):
             side = -side
         eye = np.append(held[:2] + 0.9 * out + 1.4 * side, held[2] + 0.9)
         middle = np.append(held[:2] + 0.3 * out, held[2] + 0.1)
-        return CameraConfig("render_camera", sapien_utils.look_at(eye, middle), 640, 480, np.pi / 3, 0.01, 20)
+        return eye, middle
 
     def opening_position(self) -> torch.Tensor:
         """(N,) m or rad, where the joint stands that has to be opened."""
