@@ -26,6 +26,10 @@ class Build:
     """Pack of the furniture: its name, or its folder."""
     seeds: str = "0:100"
     """First seed, and the one after the last."""
+    objects: str | None = None
+    """Seeds of objects, 0:4 or 3,7: each goes with all of --seeds. Default: objects and arrangement of one seed, as one
+    env has them. Several envs are built with the objects of seeds 0, 1, ... and keep them, so that num_envs=4 wants
+    --objects 0:4 --seeds 0:100."""
     jobs: int | None = None
     """Processes. Default: one for each CPU core."""
     out: Path | None = None
@@ -67,27 +71,29 @@ def build(command: Build) -> int:
 
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.config import load_task_config
-    from robocas_ms3.scenes.bank import LayoutBank, fill
+    from robocas_ms3.scenes.bank import LayoutBank, fill, pairs_of
     from robocas_ms3.scenes.model import SceneModel
 
-    seeds = seed_range(command.seeds)
+    objects = None if command.objects is None else objects_seeds(command.objects)
+    pairs = pairs_of(seed_range(command.seeds), objects)
     model = SceneModel.load(
         load_task_config(command.config), load_pack(command.pack), load_pack(command.furniture_pack)
     )
     bank = LayoutBank(model, command.out or "auto")
-    there = len(seeds) - len(bank.missing(seeds))
-    failures: dict[int, str] = {}
+    there = len(pairs) - len(bank.missing(pairs))
+    failures = 0
     columns = (TextColumn("layouts"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as progress:
-        bar = progress.add_task("", total=len(seeds), completed=there)
-        for seed, problem in fill(bank, seeds, command.jobs or os.cpu_count() or 1):
+        bar = progress.add_task("", total=len(pairs), completed=there)
+        for (chosen, seed), problem in fill(bank, pairs, command.jobs or os.cpu_count() or 1):
             progress.advance(bar)
             if problem:
-                failures[seed] = problem
-                progress.console.print(f"seed {seed}: {problem}", highlight=False)
+                failures += 1
+                which = f"seed {seed}" if objects is None else f"objects {chosen}, seed {seed}"
+                progress.console.print(f"{which}: {problem}", highlight=False)
     console = Console(highlight=False, soft_wrap=True)
-    made = len(seeds) - there - len(failures)
-    console.print(f"{made} layouts made, {there} were there already, {len(failures)} seeds have none")
+    made = len(pairs) - there - failures
+    console.print(f"{made} layouts made, {there} were there already, {failures} seeds have none")
     console.print(f"bank: {bank.folder}")
     return 1 if failures else 0
 
@@ -129,3 +135,19 @@ def seed_range(text: str) -> range:
     if match is None or int(match[1]) >= int(match[2]):
         raise ConfigError("no range of seeds", where="--seeds", expected="FIRST:END such as 0:100", found=text)
     return range(int(match[1]), int(match[2]))
+
+
+def objects_seeds(text: str) -> list[int]:
+    """Seeds of ``FIRST:END`` or ``SEED,SEED``.
+
+    Raises:
+        ConfigError: they aren't any.
+    """
+    from robocas_ms3.errors import ConfigError
+
+    if re.fullmatch(r"\d+(,\d+)*", text):
+        return list(dict.fromkeys(int(seed) for seed in text.split(",")))
+    match = re.fullmatch(r"(\d+):(\d+)", text)
+    if match is None or int(match[1]) >= int(match[2]):
+        raise ConfigError("no seeds of objects", where="--objects", expected="0:4, or 3,7", found=text)
+    return list(range(int(match[1]), int(match[2])))

@@ -38,6 +38,9 @@ _NO_MATTER = (
 )  # parts of a configuration
 _log = logging.getLogger(__name__)
 
+Pair = tuple[int, int]
+"""Objects seed, seed."""
+
 LayoutSource = Callable[[int, int], Layout]
 """(objects seed, seed) -> layout."""
 
@@ -100,9 +103,9 @@ class LayoutBank:
         write_layout(layout, path)
         return layout
 
-    def missing(self, seeds: Iterable[int]) -> list[int]:
-        """The seeds whose layouts are not there yet, objects and arrangement of one seed."""
-        return [seed for seed in seeds if not self.path(seed, seed).is_file()]
+    def missing(self, pairs: Iterable[Pair]) -> list[Pair]:
+        """Those of some pairs of seeds whose layouts are not there yet."""
+        return [pair for pair in pairs if not self.path(*pair).is_file()]
 
     def count(self) -> int:
         """How many layouts there are."""
@@ -114,35 +117,49 @@ def count_layouts(folder: Path) -> int:
     return sum(1 for path in folder.glob("*/*.npz") if not path.name.startswith("."))
 
 
-def fill(bank: LayoutBank, seeds: Iterable[int], jobs: int = 1) -> Generator[tuple[int, str], None, None]:
-    """Make the layouts of seeds that a bank lacks, objects and arrangement of one seed.
+def pairs_of(seeds: Iterable[int], objects: Iterable[int] | None = None) -> list[Pair]:
+    """Pairs of seeds whose layouts environments ask for.
+
+    Args:
+        seeds: of layouts.
+        objects: seeds of objects, as several envs have them: each goes with all ``seeds``, and first with itself, which
+            is the layout its env is built with. None: as one env has it, objects and layout of one seed.
+    """
+    if objects is None:
+        return [(seed, seed) for seed in seeds]
+    seeds = list(seeds)
+    return [(chosen, seed) for chosen in objects for seed in dict.fromkeys([chosen, *seeds])]
+
+
+def fill(bank: LayoutBank, pairs: Iterable[Pair], jobs: int = 1) -> Generator[tuple[Pair, str], None, None]:
+    """Make the layouts that a bank lacks.
 
     Args:
         bank: to fill.
-        seeds: those wanted.
+        pairs: of seeds, those wanted.
         jobs: processes; the outcome does not depend on it.
 
     Yields:
-        Each seed when it is done, in any order, and why there is no layout, or an empty text.
+        Each pair when it is done, in any order, and why there is no layout, or an empty text.
     """
-    missing = bank.missing(seeds)
+    missing = bank.missing(pairs)
     if jobs <= 1 or len(missing) < 2:
-        for seed in missing:
-            yield seed, _make(bank, seed)
+        for pair in missing:
+            yield pair, _make(bank, pair)
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(missing)), context, _start_worker, (bank,)) as pool:
         try:
-            for done in as_completed([pool.submit(_make_in_worker, seed) for seed in missing]):
+            for done in as_completed([pool.submit(_make_in_worker, pair) for pair in missing]):
                 yield done.result()
         except BaseException:  # an interruption too: only what is under way is waited for
             pool.shutdown(wait=True, cancel_futures=True)
             raise
 
 
-def _make(bank: LayoutBank, seed: int) -> str:
+def _make(bank: LayoutBank, pair: Pair) -> str:
     try:
-        bank.get(seed, seed)
+        bank.get(*pair)
     except LayoutError as error:
         return str(error)
     return ""
@@ -155,8 +172,8 @@ def _start_worker(bank: LayoutBank) -> None:
     _worker_bank.append(bank)
 
 
-def _make_in_worker(seed: int) -> tuple[int, str]:
-    return seed, _make(_worker_bank[0], seed)
+def _make_in_worker(pair: Pair) -> tuple[Pair, str]:
+    return pair, _make(_worker_bank[0], pair)
 
 
 def about(model: SceneModel) -> dict[str, Any]:

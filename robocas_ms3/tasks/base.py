@@ -8,8 +8,6 @@ from typing import Any, ClassVar
 import numpy as np
 import sapien
 import torch
-from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Actor, Articulation, Pose
@@ -28,18 +26,19 @@ from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import object_set
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.contacts import contact_forces
+from robocas_ms3.tasks.seeds import SeededEnv
 from robocas_ms3.tasks.spec import TaskSpec
 
 _RESETS_PER_COLLECTION = 20
 _STATIC_CAMERA_SHARE = 0.75  # of the render camera's distance, as it sees 90 deg instead of 60
 
 
-class RoboCASEnv(BaseEnv):
+class RoboCASEnv(SeededEnv):
     """Base of the RoboCAS environments.
 
     Every env has its own objects and target. On a CPU (one env a process) the scene is built anew at each reset, so
     that each seed has its own objects; with several envs on a GPU the objects are drawn once, from the seeds the envs
-    were made with, and each reset draws a new layout and target (``reconfiguration_freq`` changes either).
+    are built with, and each reset draws a new layout and target (``reconfiguration_freq`` changes either).
 
     Args:
         config: name, path or content of a task configuration; default: the task's own.
@@ -48,7 +47,8 @@ class RoboCASEnv(BaseEnv):
         visual_level: ``fast`` or ``full`` meshes to render.
         layouts: folder of the layout bank; default: in the cache, filled as layouts are asked for; None: no bank,
             every layout is sampled anew (the same ones, only slower).
-        seeds: least and greatest seed that unseeded resets draw from, such as those of a bank built ahead.
+        seeds: least and greatest seed that unseeded resets draw from, such as those of a bank built ahead; default: any
+            seed, with several envs 0 to 99.
         robot_uids: the robot; only RoboCAS's mobile Panda is supported.
         reconfiguration_freq: see ``BaseEnv``; default 1 for one env, 0 for several.
         kwargs: passed to ``BaseEnv``.
@@ -84,19 +84,16 @@ class RoboCASEnv(BaseEnv):
         if visual_level not in VISUALS:
             raise ConfigError("no such visual_level", expected=f"one of {list(VISUALS)}", found=visual_level)
         self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack))
-        self._layouts = layout_bank(self.model, layouts)
         self._visual_level: VisualLevel = visual_level
-        if seeds is not None and not 0 <= seeds[0] <= seeds[1]:
-            raise ConfigError("seeds are a range", expected="0 <= first <= last", found=seeds)
-        self._seed_range = seeds
-        self._resets_seeded = True
-        self._layout_seeds = np.zeros(num_envs, dtype=np.int64)
-        self._objects_seeds = np.zeros(num_envs, dtype=np.int64)
         self._resets = 0
-        if reconfiguration_freq is None:
-            reconfiguration_freq = 1 if num_envs == 1 else 0
         super().__init__(
-            *args, robot_uids=robot_uids, num_envs=num_envs, reconfiguration_freq=reconfiguration_freq, **kwargs
+            *args,
+            layouts=layout_bank(self.model, layouts),
+            seeds=seeds,
+            robot_uids=robot_uids,
+            num_envs=num_envs,
+            reconfiguration_freq=reconfiguration_freq,
+            **kwargs,
         )
 
     @property
@@ -120,35 +117,7 @@ class RoboCASEnv(BaseEnv):
         eye = target + np.append(1.05 * back + 1.2 * aside, max(1.1, 1.5 - target[2]))
         return eye, target + [0, 0, 0.05]
 
-    # ------------------------------------------------------------------ seeds
-
-    def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
-        """Reset; see ``BaseEnv``. The same seed gives the same layout, whichever envs are reset."""
-        self._resets_seeded = seed is not None
-        return super().reset(seed, options)
-
-    def _set_episode_rng(self, seed: Any, env_idx: torch.Tensor) -> None:
-        """Seed the episodes of some envs and no others; ManiSkill's own forgets the others' seeds."""
-        index = env_idx.cpu().numpy()
-        if seed is not None:
-            seed = np.atleast_1d(np.asarray(seed, dtype=np.int64))
-            if not self._resets_seeded and self._seed_range is not None:
-                low, high = self._seed_range
-                seed = np.where((seed >= low) & (seed <= high), seed, low + seed % (high - low + 1))
-        if seed is None or self._batched_episode_rng is None or len(index) == self.num_envs:
-            super()._set_episode_rng(seed, env_idx)
-        else:
-            if len(seed) == 1 and len(index) > 1:
-                seed = np.concatenate([seed, np.random.RandomState(seed[0]).randint(2**31, size=len(index) - 1)])
-            self._episode_seed[index] = seed
-            self._batched_episode_rng[index] = BatchedRNG.from_seeds(seed, backend=self._batched_rng_backend)
-        for i in index:
-            if seed is not None:
-                self._layout_seeds[i] = self._episode_seed[i]
-            else:  # the episode's generator goes on
-                drawn = int(self._batched_episode_rng[i].randint(2**31))
-                low, high = self._seed_range or (0, 2**31 - 1)
-                self._layout_seeds[i] = low + drawn % (high - low + 1)
+    # ------------------------------------------------------------------ scene
 
     def _clear(self) -> None:
         """Forget the scene. ManiSkill collects garbage each time, 0.14 s; here only now and then."""
@@ -166,8 +135,6 @@ class RoboCASEnv(BaseEnv):
         self._resets = -1
         super().close()
 
-    # ------------------------------------------------------------------ scene
-
     def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
         super()._load_agent(options, sapien.Pose(self.model.robot_pose))
         if self.task_config.static_camera == "overview":
@@ -176,10 +143,8 @@ class RoboCASEnv(BaseEnv):
             self.agent.static_camera_pose = sapien_utils.look_at(near.tolist(), target.tolist()).sp
 
     def _load_scene(self, options: dict) -> None:
-        seeds = self._scene_seeds
-        self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level, seeds)
-        self._objects_seeds = np.array(seeds)
-        chosen = [object_set(self.model, seed) for seed in seeds]
+        chosen = self._choose_objects(lambda seed: object_set(self.model, seed))
+        self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level, self._scene_seeds)
         objects = self.model.object_pack.objects
         self.object_assets: list[list[LoadedObject]] = [[objects[i] for i in ids] for ids in chosen]
         self.objects: list[Actor] = [
@@ -216,14 +181,8 @@ class RoboCASEnv(BaseEnv):
         cameras = [sensors[name].camera for name in sorted(sensors)]
         build.shift_cameras(cameras, self.task_config, self._scene_seeds)
 
-    @property
-    def _scene_seeds(self) -> list[int]:
-        """What each sub-scene is built from; looks stay until the scene is built anew."""
-        assert self._episode_seed is not None
-        return [int(seed) for seed in self._episode_seed]
-
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        layouts = [self._layouts(int(self._objects_seeds[i]), int(self._layout_seeds[i])) for i in env_idx.tolist()]
+        layouts = [self._find_layout(env) for env in env_idx.tolist()]
         with torch.device(self.device):
             count = len(env_idx)
             rest = torch.as_tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32)

@@ -1,7 +1,7 @@
 import pytest
 
 from robocas_ms3.cli import layouts
-from robocas_ms3.cli.layouts import Build, Info, Layouts, main, seed_range
+from robocas_ms3.cli.layouts import Build, Info, Layouts, main, objects_seeds, seed_range
 from robocas_ms3.cli.main import run
 from robocas_ms3.errors import ConfigError, LayoutError
 from robocas_ms3.scenes import bank
@@ -52,6 +52,14 @@ def test_processes_make_the_same_files(tmp_path):
 def test_what_is_no_range_of_seeds(text):
     with pytest.raises(ConfigError, match="--seeds: no range of seeds"):
         seed_range(text)
+
+
+def test_seeds_of_objects():
+    assert objects_seeds("2:5") == [2, 3, 4]
+    assert objects_seeds("7,3,7") == [7, 3]
+    for text in ("", "a", "3:3", "1,", "-1"):
+        with pytest.raises(ConfigError, match="--objects: no seeds of objects"):
+            objects_seeds(text)
 
 
 def test_no_banks_is_said(tmp_path, capsys):

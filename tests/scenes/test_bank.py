@@ -10,7 +10,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import load_task_config
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes import bank as module
-from robocas_ms3.scenes.bank import LayoutBank, layout_bank
+from robocas_ms3.scenes.bank import LayoutBank, layout_bank, pairs_of
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
@@ -32,12 +32,12 @@ def assert_same(one: Layout, two: Layout) -> None:
 def test_a_layout_is_made_once_and_comes_back_the_same(tmp_path, monkeypatch):
     scene = model()
     bank = LayoutBank(scene, tmp_path)
-    assert bank.missing(range(3)) == [0, 1, 2]
+    assert bank.missing(pairs_of(range(3))) == [(0, 0), (1, 1), (2, 2)]
     made = bank.get(1, 1)
     assert_same(made, sample_layout(scene, 1, 1))
     monkeypatch.setattr(module, "sample_layout", None)  # making it again would fail
     assert_same(LayoutBank(scene, tmp_path).get(1, 1), made)
-    assert bank.missing(range(3)) == [0, 2]
+    assert bank.missing(pairs_of(range(3))) == [(0, 0), (2, 2)]
     assert bank.count() == 1
 
 
@@ -45,7 +45,7 @@ def test_objects_of_one_seed_and_arrangement_of_another_are_kept_apart(tmp_path)
     bank = LayoutBank(model(), tmp_path)
     assert not np.allclose(bank.get(1, 1).object_poses, bank.get(1, 2).object_poses)
     assert bank.get(1, 2).object_ids == bank.get(1, 1).object_ids
-    assert bank.missing([2]) == [2]
+    assert bank.missing([(2, 2), (1, 2)]) == [(2, 2)]
 
 
 def test_reading_takes_about_a_millisecond(tmp_path):
@@ -103,3 +103,8 @@ def test_furniture_that_is_made_anew_has_layouts_of_its_own(tmp_path):
     higher = table.asset.model_copy(update={"surfaces": {"top": top.model_copy(update={"z": top.z + 0.05})}})
     changed = replace(scene, furniture={"table": replace(table, asset=higher)})
     assert LayoutBank(changed, tmp_path).folder != LayoutBank(scene, tmp_path).folder
+
+
+def test_several_envs_want_each_objects_with_every_seed_and_their_own():
+    assert pairs_of([0, 1]) == [(0, 0), (1, 1)]
+    assert pairs_of([0, 1], [1, 7]) == [(1, 1), (1, 0), (7, 7), (7, 0), (7, 1)]

@@ -1,26 +1,34 @@
 """Seeds of episodes, layouts and looks. Several envs are tested without a simulator, which on a CPU has but one env."""
 
+from time import perf_counter
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 
-import robocas_ms3  # noqa: F401
+from robocas_ms3 import tasks
+from robocas_ms3.cli.layouts import Build, Layouts, main
 from robocas_ms3.config import load_task_config
-from robocas_ms3.errors import ConfigError
-from robocas_ms3.tasks.base import RoboCASEnv
+from robocas_ms3.errors import ConfigError, LayoutError
+from robocas_ms3.scenes import bank
+from robocas_ms3.scenes.sample import object_set
+from robocas_ms3.tasks import RoboCASPickEnv
+from robocas_ms3.tasks.seeds import SEVERAL_ENVS_SEEDS, SeededEnv
 
 STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}
 
 
-class FourEnvs(RoboCASEnv):
-    """Four envs' seeds, and nothing else of an environment."""
+class FourEnvs(SeededEnv):
+    """Four envs' seeds and layouts, and nothing else of an environment."""
 
-    def __init__(self, seed_range=None) -> None:
+    def __init__(self, seed_range=None, layouts=None) -> None:
         self.num_envs, self._enhanced_determinism, self._batched_rng_backend = 4, False, "numpy:random_state"
-        self._resets_seeded, self._seed_range = True, seed_range
-        self._layout_seeds = np.zeros(4, dtype=np.int64)
+        self._resets_seeded, self._seed_range, self._made = True, seed_range, True
+        self._layouts, self._failed, self._other_seeds = layouts, {}, 2
+        self._layout_seeds, self._objects_seeds = np.zeros(4, dtype=np.int64), np.zeros(4, dtype=np.int64)
         self._episode_seed, self._batched_episode_rng = None, None
 
     def seed(self, seeds, envs=(0, 1, 2, 3)) -> None:
@@ -85,6 +93,119 @@ def test_an_unseeded_reset_of_one_env_draws_its_episode_seed_from_the_range():
 def test_a_range_that_is_none():
     with pytest.raises(ConfigError, match="seeds are a range"):
         gym.make("RoboCASPick-v1", seeds=(4, 3), **STATE_ONLY)
+
+
+def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEnv, list]:
+    """An environment of several envs, made as `gym.make` does, but for the simulator; and the layouts it asked for."""
+    asked = []
+
+    def resets(env, seed=None, options=None):
+        index = torch.as_tensor((options or {}).get("env_idx", range(num_envs)))
+        env._set_episode_rng(seed, index)
+        if (options or {}).get("reconfigure"):
+            env.ids = env._choose_objects(lambda seed: object_set(env.model, seed))
+            env._set_episode_rng(env._episode_seed, index)
+        env.layouts = [env._find_layout(i) for i in index.tolist()]
+        asked.append([(int(env._objects_seeds[i]), int(env._layout_seeds[i])) for i in index])
+        return {}, {}
+
+    def makes(env, *args, num_envs, **rest):
+        env.num_envs, env._enhanced_determinism, env._batched_rng_backend = num_envs, False, "numpy:random_state"
+        env._episode_seed, env._batched_episode_rng = None, None
+        env.reset([2022 + i for i in range(num_envs)], {"reconfigure": True})  # as ManiSkill does
+
+    monkeypatch.setattr(BaseEnv, "__init__", makes)
+    monkeypatch.setattr(BaseEnv, "reset", resets)
+    return RoboCASPickEnv(num_envs=num_envs, layouts=folder, **arguments), asked
+
+
+def test_several_envs_reset_from_a_bank_built_for_them(tmp_path, monkeypatch):
+    command = Build("pick_table_scattered", objects="0:2", seeds="0:2", jobs=1, out=tmp_path)
+    assert main(Layouts(command)) == 0
+    assert bank.count_layouts(next(tmp_path.iterdir())) == 4
+    monkeypatch.setattr(bank, "sample_layout", None)  # making one would fail
+    env, asked = several(tmp_path, monkeypatch, seeds=(0, 1))
+    assert asked == [[(0, 0), (1, 1), (0, 0), (1, 1)]]
+    start = perf_counter()
+    for _ in range(20):
+        env.reset()
+    assert (perf_counter() - start) / 20 < 0.05
+    assert {seed for one in asked for _, seed in one} == {0, 1}
+    assert all([objects for objects, _ in one] == [0, 1, 0, 1] for one in asked)
+    env.reset(options={"env_idx": torch.tensor([2])})
+    assert [objects for objects, _ in asked[-1]] == [0]
+    assert env.layouts[0].object_ids == env.ids[2] == env.ids[0] != env.ids[1]
+
+
+def test_several_envs_draw_from_a_range_without_being_told_and_beyond_it_share_objects(monkeypatch):
+    low, high = SEVERAL_ENVS_SEEDS
+    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: lambda objects, seed: (objects, seed))
+    env, asked = several(None, monkeypatch, num_envs=high - low + 3)
+    assert asked[0] == [(i, i) for i in [*range(low, high + 1), low, low + 1]]
+    assert env.ids[0] == env.ids[high - low + 1] != env.ids[1]
+    env.reset()
+    assert all(low <= seed <= high for _, seed in asked[-1])
+    env.reset(list(range(1000, 1000 + env.num_envs)))
+    assert asked[-1][5] == (5, 1005)
+
+
+def without(*pairs):
+    """A source that has no layout for some pairs of seeds, and the pairs it was asked for."""
+    asked = []
+
+    def source(objects, seed):
+        asked.append((objects, seed))
+        if (objects, seed) in pairs:
+            raise LayoutError("no object qualifies as the target")
+        return objects, seed
+
+    return source, asked
+
+
+def test_an_unseeded_reset_goes_on_to_a_seed_that_has_a_layout(monkeypatch, caplog):
+    bad = [(objects, seed) for objects in (1, 2) for seed in range(100) if seed % 2]
+    source, asked = without(*bad)
+    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: source)
+    env, chosen = several(None, monkeypatch)
+    for _ in range(30):
+        env.reset()
+    assert not set(bad) & {pair for one in chosen for pair in one}
+    assert {objects for one in chosen for objects, _ in one} == {0, 1, 2, 3}  # objects stay
+    assert len(asked) - len(set(asked)) == sum(len(one) for one in chosen) - len({p for one in chosen for p in one})
+    assert "env 1: no layout for seed" in caplog.text
+    with pytest.raises(LayoutError, match="no object qualifies"):  # asked for: an error
+        env.reset([0, 1, 2, 3])
+
+
+def test_that_there_is_no_layout_at_all_is_said_soon(monkeypatch):
+    source, asked = without(*((0, seed) for seed in range(100)))
+    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: source)
+    with pytest.raises(LayoutError, match="no object qualifies"):
+        several(None, monkeypatch)
+    assert len([pair for pair in asked if pair[0] == 0]) <= 3
+
+
+def test_one_env_starts_over_with_another_seed_unless_it_was_asked_for(monkeypatch, caplog):
+    sample, failed = bank.sample_layout, []
+
+    def fussy(model, objects, seed):
+        if len(failed) < 2 or seed == 5:
+            failed.append(seed)
+            raise LayoutError("no object qualifies as the target")
+        return sample(model, objects, seed)
+
+    monkeypatch.setattr(bank, "sample_layout", fussy)
+    env = gym.make("RoboCASPick-v1", layouts=None, **STATE_ONLY)
+    assert failed[0] == 2022 and "another is drawn" in caplog.text
+    failed.clear()
+    env.reset()
+    base = env.unwrapped
+    assert len(failed) == 2 and base._episode_seed[0] not in failed
+    assert base._episode_seed[0] == base._objects_seeds[0] == base._layout_seeds[0]
+    with pytest.raises(LayoutError):
+        env.reset(seed=5)
+    env.reset(seed=6)
+    env.close()
 
 
 @pytest.mark.slow

@@ -1,0 +1,158 @@
+"""Which seed an env's objects, layout and looks come from, and what happens where a seed has no layout."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
+
+from robocas_ms3.errors import ConfigError, LayoutError
+from robocas_ms3.scenes.bank import LayoutSource, Pair
+from robocas_ms3.scenes.layout import Layout
+
+SEVERAL_ENVS_SEEDS = (0, 99)  # least and greatest seed of several envs' unseeded resets
+_OTHER_SEEDS = 20  # tried where a seed has no layout
+_FIRST_SEEDS = 2  # the same before any had one: that a configuration can't be laid out should not take long to find
+_T = TypeVar("_T")
+_log = logging.getLogger(__name__)
+
+
+class SeededEnv(BaseEnv):
+    """Environment whose episodes follow from seeds, each env's from its own.
+
+    An env's objects and looks come from the seed it was built with, its layout from the seed of its episode. One env
+    is built anew at each reset, so that both are the same. Several envs are built with the seeds of their range, one
+    after the other, and keep their objects.
+
+    A seed without a layout is an error where it was asked for; a reset without a seed goes on to another one.
+
+    Args:
+        layouts: where layouts come from.
+        seeds: least and greatest seed of resets without one; default: any, for several envs `SEVERAL_ENVS_SEEDS`.
+        num_envs: see ``BaseEnv``.
+        reconfiguration_freq: see ``BaseEnv``; default 1 for one env, 0 for several.
+        kwargs: passed to ``BaseEnv``.
+
+    Raises:
+        ConfigError: ``seeds`` is no range.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        layouts: LayoutSource,
+        seeds: tuple[int, int] | None,
+        num_envs: int,
+        reconfiguration_freq: int | None,
+        **kwargs: Any,
+    ) -> None:
+        if seeds is not None and not 0 <= seeds[0] <= seeds[1]:
+            raise ConfigError("seeds are a range", expected="0 <= first <= last", found=seeds)
+        self._layouts = layouts
+        self._seed_range = seeds or (SEVERAL_ENVS_SEEDS if num_envs > 1 else None)
+        self._resets_seeded = False
+        self._layout_seeds = np.zeros(num_envs, dtype=np.int64)
+        self._objects_seeds = np.zeros(num_envs, dtype=np.int64)
+        if reconfiguration_freq is None:
+            reconfiguration_freq = 1 if num_envs == 1 else 0
+        self._failed: dict[Pair, LayoutError] = {}
+        self._other_seeds = _FIRST_SEEDS
+        self._made = False
+        super().__init__(*args, num_envs=num_envs, reconfiguration_freq=reconfiguration_freq, **kwargs)
+        self._made = True
+
+    def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
+        """Reset; see ``BaseEnv``. The same seed gives the same layout, whichever envs are reset.
+
+        Raises:
+            LayoutError: there is no layout for a seed that was asked for, or for many that were drawn.
+        """
+        self._resets_seeded = self._made and seed is not None
+        if self.num_envs > 1:
+            return super().reset(seed if self._made else self._first_seeds(), options)
+        for _ in range(self._other_seeds):
+            try:
+                return super().reset(seed, options)
+            except LayoutError as error:
+                if self._resets_seeded:
+                    raise
+                _log.warning("no layout for the seed of this reset, another is drawn: %s", error)
+                seed = None
+        return super().reset(seed, options)
+
+    def _first_seeds(self) -> list[int]:
+        """What several envs are built with; ManiSkill's own lie outside the range."""
+        low, high = self._seed_range or SEVERAL_ENVS_SEEDS
+        return [low + env % (high - low + 1) for env in range(self.num_envs)]
+
+    def _set_episode_rng(self, seed: Any, env_idx: torch.Tensor) -> None:
+        """Seed the episodes of some envs and no others; ManiSkill's own forgets the others' seeds."""
+        index = env_idx.cpu().numpy()
+        if seed is not None:
+            seed = np.atleast_1d(np.asarray(seed, dtype=np.int64))
+            if not self._resets_seeded and self._seed_range is not None:
+                low, high = self._seed_range
+                seed = np.where((seed >= low) & (seed <= high), seed, low + seed % (high - low + 1))
+        if seed is None or self._batched_episode_rng is None or len(index) == self.num_envs:
+            super()._set_episode_rng(seed, env_idx)
+        else:
+            if len(seed) == 1 and len(index) > 1:
+                seed = np.concatenate([seed, np.random.RandomState(seed[0]).randint(2**31, size=len(index) - 1)])
+            self._episode_seed[index] = seed
+            self._batched_episode_rng[index] = BatchedRNG.from_seeds(seed, backend=self._batched_rng_backend)
+        for i in index:
+            self._layout_seeds[i] = self._draw_seed(i) if seed is None else self._episode_seed[i]
+
+    def _draw_seed(self, env: int) -> int:
+        """A seed of the range; the env's generator goes on."""
+        assert self._batched_episode_rng is not None
+        drawn = int(self._batched_episode_rng[env].randint(2**31))
+        low, high = self._seed_range or (0, 2**31 - 1)
+        return low + drawn % (high - low + 1)
+
+    @property
+    def _scene_seeds(self) -> list[int]:
+        """What each sub-scene is built from; looks stay until the scene is built anew."""
+        assert self._episode_seed is not None
+        return [int(seed) for seed in self._episode_seed]
+
+    def _choose_objects(self, choose: Callable[[int], _T]) -> list[_T]:
+        """What ``choose`` makes of each env's seed, as the scene is built; these seeds decide objects and looks."""
+        assert self._episode_seed is not None
+        chosen = [self._first_possible(choose, env, self._episode_seed) for env in range(self.num_envs)]
+        self._objects_seeds = np.array(self._episode_seed)
+        return chosen
+
+    def _find_layout(self, env: int) -> Layout:
+        """The layout of an env's episode."""
+        objects_seed = int(self._objects_seeds[env])
+        return self._first_possible(lambda seed: self._layout((objects_seed, seed)), env, self._layout_seeds)
+
+    def _layout(self, pair: Pair) -> Layout:
+        """A layout; that there is none takes long to find out, and is remembered."""
+        if pair in self._failed:
+            raise self._failed[pair]
+        try:
+            layout = self._layouts(*pair)
+        except LayoutError as error:
+            self._failed[pair] = error
+            raise
+        self._other_seeds = _OTHER_SEEDS
+        return layout
+
+    def _first_possible(self, make: Callable[[int], _T], env: int, seeds: np.ndarray) -> _T:
+        """What ``make`` makes of an env's seed; where that can't be and nobody asked for the seed, of another one."""
+        for _ in range(self._other_seeds):
+            try:
+                return make(int(seeds[env]))
+            except LayoutError as error:
+                if self._resets_seeded or self.num_envs == 1:  # one env starts over, as its objects change too
+                    raise
+                _log.warning("env %d: no layout for seed %d, another is drawn: %s", env, seeds[env], error)
+                seeds[env] = self._draw_seed(env)
+        return make(int(seeds[env]))
