@@ -180,7 +180,8 @@ def load_pack(name_or_path: str | Path) -> Pack:
                 "no such asset pack",
                 where=name_or_path,
                 expected=f"one of {', '.join(available_packs()) or '(none)'}, or a folder with a {MANIFEST}",
-                fix="See `robocas assets list`, or make one with `robocas assets import-scans`.",
+                fix="See `robocas assets list`, or make one: `robocas assets import-scans` for objects, "
+                "`robocas assets import-partnet` for furniture.",
             )
     folder = folder.resolve()
     path = folder / MANIFEST

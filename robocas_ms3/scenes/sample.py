@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+from functools import lru_cache
+
 import numpy as np
 
 from robocas_ms3.assets.pack import LoadedObject
 from robocas_ms3.config.task import OrderlyLayout, PoseRandomisation, ScatteredLayout
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout
-from robocas_ms3.scenes.model import SceneModel, placeable, resolve_ids
+from robocas_ms3.scenes.lookup import resolve_ids
+from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.orderly import sample_orderly
-from robocas_ms3.scenes.placement import Array, choose_objects, planar_pose, sample_scattered
+from robocas_ms3.scenes.placement import Array, Placeable, choose_objects, planar_pose, sample_scattered, transform
 from robocas_ms3.scenes.settle import settle
 from robocas_ms3.scenes.stacked import drop_heap
 from robocas_ms3.scenes.targets import Arrangement, Choice, choose_target
@@ -18,6 +22,7 @@ from robocas_ms3.scenes.targets import Arrangement, Choice, choose_target
 # Every random decision of a scene has a stream of its own, so that a new one never shifts the others.
 _OBJECTS, _LAYOUT, _TARGET, _ROBOT, _BASKET, _COUNT = range(6)
 _TRIES = 50
+_log = logging.getLogger(__name__)
 
 
 def object_set(model: SceneModel, objects_seed: int) -> tuple[str, ...]:
@@ -26,6 +31,9 @@ def object_set(model: SceneModel, objects_seed: int) -> tuple[str, ...]:
     Args:
         model: the scene's assets.
         objects_seed: decides them, and nothing else does.
+
+    Raises:
+        LayoutError: no object fits on the surface, or no columns of them do.
     """
     config = model.config
     rng = np.random.default_rng([objects_seed, _OBJECTS])
@@ -35,12 +43,12 @@ def object_set(model: SceneModel, objects_seed: int) -> tuple[str, ...]:
         ids = resolve_ids(model.object_pack, wanted, key="randomisation.object_sets")
     count = config.objects.count
     if isinstance(config.layout, OrderlyLayout):
-        chosen = _kinds_that_fit(rng, model, ids, config.layout.copies)
+        chosen = _kinds_that_fit(rng, model, _usable(model, ids, columns=True), config.layout.copies)
     else:
-        chosen = choose_objects(rng, ids, count)
+        chosen = choose_objects(rng, _usable(model, ids), count)
     distractors = config.randomisation.distractors
     if distractors is not None:
-        others = resolve_ids(model.object_pack, distractors.ids, key="randomisation.distractors.ids")
+        others = _usable(model, resolve_ids(model.object_pack, distractors.ids, key="randomisation.distractors.ids"))
         chosen += choose_objects(rng, [i for i in others if i not in chosen] or others, distractors.count[1])
     return tuple(chosen)
 
@@ -108,12 +116,11 @@ def _failure(unarranged: list[LayoutError], unsettled: int) -> LayoutError:
 
 
 def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str], copies: int) -> list[str]:
-    """Draw kinds that stand upright, until their columns fit on the surface."""
+    """Draw kinds until their columns fit on the surface."""
     objects, count = model.object_pack.objects, model.config.objects.count
     failure = LayoutError("no kinds to choose from", where="objects.ids")
-    standing = [i for i in ids if objects[i].annotations.display_pose >= 0] or ids
     for attempt in range(_TRIES):
-        kinds = choose_objects(rng, standing, -(-count // copies))
+        kinds = choose_objects(rng, ids, -(-count // copies))
         chosen = [kind for kind in kinds for _ in range(copies)][:count]
         try:
             _arrange(np.random.default_rng(attempt), model, [objects[i] for i in chosen])
@@ -123,16 +130,61 @@ def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str],
     raise failure
 
 
+def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list[str]:
+    """Those of some ids that fit under what is above; for columns only those with a display pose, if any has one.
+
+    Raises:
+        LayoutError: none fits.
+    """
+    if not columns and model.headroom == np.inf:
+        return ids
+    things = {i: placeable(model.object_pack.objects[i], model.headroom) for i in ids}
+    usable = [i for i in ids if len(things[i].resting_poses)]
+    if not usable:
+        room = f"objects lower than {model.headroom:.3f} m"
+        raise LayoutError("every object is too high for the surface", where="objects.ids", expected=room)
+    if columns:
+        usable = [i for i in usable if things[i].display_pose >= 0] or usable
+    if model.config.objects.ids != "all" and len(usable) < len(ids):
+        _tell_left_out(tuple(i for i in ids if i not in usable))
+    return usable
+
+
+@lru_cache  # once each
+def _tell_left_out(ids: tuple[str, ...]) -> None:
+    _log.warning(
+        "objects left out, since no resting pose fits under what is above the surface, or, in an orderly layout, "
+        "since they have no display pose that does: %s",
+        ", ".join(ids),
+    )
+
+
+def placeable(asset: LoadedObject, headroom: float = np.inf) -> Placeable:
+    """What a layout has to know of an object: its resting poses that are lower than ``headroom``, m."""
+    notes = asset.annotations
+    low = np.arange(len(notes.resting_poses))
+    if np.isfinite(headroom):
+        points = np.concatenate(asset.hulls)
+        low = low[[transform(pose, points)[:, 2].max() < headroom for pose in notes.resting_poses]]
+    return Placeable(
+        asset.asset.id,
+        notes.resting_poses[low],
+        notes.resting_probabilities[low],
+        [notes.footprint(i) for i in low],
+        int(np.flatnonzero(low == notes.display_pose)[0]) if notes.display_pose in low else -1,
+    )
+
+
 def _arrange(rng: np.random.Generator, model: SceneModel, assets: list[LoadedObject]) -> Array:
     """(K, 4, 4) objects in the support's frame."""
     layout, region = model.config.layout, model.region
     if isinstance(layout, ScatteredLayout):
-        placeables = [placeable(asset) for asset in assets]
+        placeables = [placeable(asset, model.headroom) for asset in assets]
         return sample_scattered(rng, placeables, region, min_gap=layout.min_gap, max_tries=layout.max_tries)
     if isinstance(layout, OrderlyLayout):
         return sample_orderly(
             rng,
-            [placeable(asset) for asset in assets],
+            [placeable(asset, model.headroom) for asset in assets],
             _columns([asset.asset.id for asset in assets], layout.rows),
             region,
             front=model.front,
@@ -140,7 +192,14 @@ def _arrange(rng: np.random.Generator, model: SceneModel, assets: list[LoadedObj
             column_spacing=layout.column_spacing,
             yaw_jitter=np.deg2rad(layout.yaw_jitter_deg),
         )
-    return drop_heap(rng, assets, region, drop_height=layout.drop_height, tumble_probability=layout.tumble_probability)
+    return drop_heap(
+        rng,
+        assets,
+        region,
+        headroom=model.headroom,
+        drop_height=layout.drop_height,
+        tumble_probability=layout.tumble_probability,
+    )
 
 
 def _columns(ids: list[str], rows: int) -> list[str]:

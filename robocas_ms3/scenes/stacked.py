@@ -39,6 +39,7 @@ def drop_heap(
     assets: Sequence[LoadedObject],
     region: Region,
     *,
+    headroom: float = np.inf,
     drop_height: float = 0.3,
     tumble_probability: float = 0.6,
 ) -> Array:
@@ -51,6 +52,7 @@ def drop_heap(
         rng: source of all randomness.
         assets: K objects.
         region: of a horizontal plane.
+        headroom: that the heap has to stay below, m.
         drop_height: of the object's lowest point above the plane, or above what lies there, m.
         tumble_probability: of a random orientation; otherwise a resting pose at a random yaw.
 
@@ -58,7 +60,7 @@ def drop_heap(
         (K, 4, 4) objects at rest in the region's frame, in the order of ``assets``.
 
     Raises:
-        LayoutError: heap after heap fell apart over the region's edges.
+        LayoutError: heap after heap fell apart over the region's edges, or was too high.
     """
     for _ in range(_TRIES):
         poses = _drop(rng, assets, region, drop_height, tumble_probability)
@@ -68,12 +70,13 @@ def drop_heap(
         inside = (centers[:, :2] >= np.array(region.min_xy) - SPREAD) & (
             centers[:, :2] <= np.array(region.max_xy) + SPREAD
         )
-        if inside.all():
+        top = max(transform(p, np.concatenate(a.hulls))[:, 2].max() for a, p in zip(assets, poses, strict=True))
+        if inside.all() and top - region.z < headroom:
             return poses
     raise LayoutError(
         f"{len(assets)} objects make no heap here",
         where="layout",
-        found=f"{_TRIES} heaps fell apart",
+        found=f"{_TRIES} heaps fell apart" + (f" or rose above {headroom:.3f} m" if np.isfinite(headroom) else ""),
         fix="Lower objects.count or enlarge the surface.",
     )
 

@@ -143,11 +143,13 @@ def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | Non
     shares[slots] = visible_shares(camera, [object_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
     unique = np.array([scene.names.count(name) == 1 for name in scene.names])
     hidden = scene.eligible & unique & (shares < model.config.target.max_visible_share)
-    if not hidden.any():
-        return None
     weight = np.where(hidden, 1 / np.linalg.norm(scene.xy_in_robot, axis=1), 0)
-    slot = int(rng.choice(len(weight), p=weight / weight.sum()))
-    return Choice(slot, visible_shares=shares)
+    while weight.any():
+        slot = int(rng.choice(len(weight), p=weight / weight.sum()))
+        if model.config.target.min_free_grasps == 0 or scene.has_free_grasps(slot):
+            return Choice(slot, visible_shares=shares)
+        weight[slot] = 0
+    return None
 
 
 _RULES: dict[str, Callable[[np.random.Generator, Arrangement], Choice | None]] = {

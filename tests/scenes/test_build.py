@@ -10,7 +10,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import TaskConfig
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.paths import task_configs_dir
-from robocas_ms3.scenes.model import find_objects, furniture_pose
+from robocas_ms3.scenes.lookup import find_objects, furniture_pose
 
 
 def pick_config(**changes):

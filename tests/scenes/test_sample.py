@@ -1,5 +1,7 @@
 """From seeds to layouts of the shipped pack."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from robocas_ms3.config import load_task_config
 from robocas_ms3.errors import ConfigError, LayoutError
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.placement import transform
 from robocas_ms3.scenes.sample import object_set, sample_layout
 
 
@@ -37,6 +40,54 @@ def test_orderly_objects_come_in_kinds():
     scene = model(layout={"kind": "orderly", "copies": 3}, objects={"ids": "all", "count": 7})
     ids = object_set(scene, 0)
     assert [ids.count(kind) for kind in dict.fromkeys(ids)] == [3, 3, 1]
+
+
+def test_columns_leave_out_what_has_no_display_pose_and_say_so_once(caplog):
+    objects = load_pack("builtin").objects
+    lying = [i for i in ("banana", "scissors", "apple") if objects[i].annotations.display_pose < 0]
+    assert lying
+    ids = ["mug", "soap_box", "sugar_box", *lying]
+    scene = model(layout={"kind": "orderly", "copies": 2, "rows": 2}, objects={"ids": ids, "count": 6})
+    drawn = {i for seed in range(6) for i in object_set(scene, seed)}
+    assert drawn == {"mug", "soap_box", "sugar_box"}
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == 1 and told[0].endswith(": " + ", ".join(lying))
+    caplog.clear()
+    object_set(model(layout={"kind": "orderly"}), 0)  # all that can stand: nothing to tell
+    assert not caplog.records
+
+
+def under(height: float, **changes) -> SceneModel:
+    """The table, under something that leaves so much room."""
+    scene = model(**changes)
+    table = scene.furniture["table"]
+    surfaces = {"top": table.asset.surfaces["top"].model_copy(update={"headroom": height})}
+    return replace(
+        scene, furniture={"table": replace(table, asset=table.asset.model_copy(update={"surfaces": surfaces}))}
+    )
+
+
+def height_of(scene: SceneModel, layout) -> float:
+    """Of the highest object, above the surface, m."""
+    objects = scene.object_pack.objects
+    parts = [
+        transform(pose, np.concatenate(objects[i].hulls))
+        for i, pose in zip(layout.object_ids, layout.object_poses, strict=True)
+    ]
+    return np.concatenate(parts)[:, 2].max() - (scene.support_pose[2, 3] + scene.region.z)
+
+
+@pytest.mark.parametrize(("kind", "room"), [("scattered", 0.07), ("orderly", 0.12)])
+def test_nothing_stands_higher_than_the_headroom(kind, room):
+    changes = {"layout": {"kind": kind}, "objects": {"ids": ["mustard_bottle", "sugar_box", "mug"], "count": 6}}
+    free, low = model(**changes), under(room, **changes)
+    assert max(height_of(free, sample_layout(free, seed, seed)) for seed in range(3)) > room + 0.02
+    for seed in range(3):
+        layout = sample_layout(low, seed, seed)
+        assert height_of(low, layout) < room + 0.003
+        assert kind == "scattered" or set(layout.object_ids) == {"mug"}  # the others don't fit standing
+    with pytest.raises(LayoutError, match=r"too high for the surface.*lower than 0.020 m"):
+        sample_layout(under(0.02, **changes), 0, 0)
 
 
 def test_counts_and_distractors_use_some_of_the_slots():
@@ -121,3 +172,32 @@ def test_joints_that_cannot_stand_so(joints, words):
     furniture["box"] = {"asset": "container", "pose": {"position": [-2.0, 0.0, 0.0]}, "joints": joints}
     with pytest.raises(ConfigError, match=words):
         model(furniture=furniture)
+
+
+@pytest.mark.parametrize(
+    ("name", "opening", "joints", "words"),
+    [
+        ("open_pick_container", {"opened_at": 0.95}, {}, r"opening.opened_at: .* 'door_slide' no further than 0.95"),
+        ("open_pick_refrigerator", {"opened_at": 0.85}, {}, r"opened_at: .*revolute.*below 0.8, found 0.85.*Lower"),
+        # 0.8 of 0.55 m
+        (
+            "open_pick_container",
+            {},
+            {"door_slide": 0.45},
+            r"door_slide: open at first.*0.44, found 0.45.*Leave the joint",
+        ),
+    ],
+)
+def test_openings_that_cannot_be(name, opening, joints, words):
+    data = load_task_config(name).model_dump(mode="json")
+    part = data["opening"]["furniture"]
+    data["furniture"][part]["joints"] = joints
+    with pytest.raises(ConfigError, match=words):
+        model(name, furniture=data["furniture"], opening={**data["opening"], **opening})
+
+
+def test_openings_that_can_be():
+    data = load_task_config("open_pick_container").model_dump(mode="json")
+    data["furniture"][data["opening"]["furniture"]]["joints"] = {"door_slide": 0.43}
+    scene = model("open_pick_container", furniture=data["furniture"], opening={**data["opening"], "opened_at": 0.8})
+    assert scene.opened_position == pytest.approx(0.44)

@@ -65,6 +65,20 @@ def test_search_wants_a_hidden_object_whose_name_is_its_own(monkeypatch):
     np.testing.assert_array_equal(choice.visible_shares, shares)
 
 
+def test_search_wants_free_grasps_where_the_configuration_does(monkeypatch):
+    names, places = ["soap", "mug"], [(0.2, 0.0), (0.6, 0.0)]
+    scene = arrangement("search", names, places, monkeypatch=monkeypatch, blocked=[0], max_visible_share=0.9)
+    scene.model.region = SimpleNamespace(min_xy=(0.0, 0.0), max_xy=(0.2, 0.2), z=0.6)
+    monkeypatch.setattr(targets, "object_mesh", lambda asset: asset)
+    monkeypatch.setattr(targets, "visible_shares", lambda camera, meshes, poses: np.zeros(2))
+    assert drawn(scene) == {(1, "")}
+    scene.model.config.target.min_free_grasps = 0
+    assert drawn(scene) == {(0, ""), (1, "")}
+    everything = arrangement("search", names, places, monkeypatch=monkeypatch, blocked=[0, 1], max_visible_share=0.9)
+    everything.model.region = scene.model.region
+    assert drawn(everything) == {None}
+
+
 def test_search_prefers_near_objects(monkeypatch):
     scene = arrangement(
         "search", ["mug", "pear"], [(0.2, 0.0), (0.6, 0.0)], monkeypatch=monkeypatch, max_visible_share=0.9

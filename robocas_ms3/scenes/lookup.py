@@ -1,0 +1,184 @@
+"""Look up what a configuration names in the packs; every mistake is a `ConfigError`. No simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robocas_ms3.assets.manifest import Joint
+from robocas_ms3.assets.pack import LoadedFurniture, Pack, load_pack
+from robocas_ms3.config.task import PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
+from robocas_ms3.errors import ConfigError
+from robocas_ms3.scenes.placement import Array, Region, planar_pose
+
+OPENED_AT_MOST = {"prismatic": 0.95, "revolute": 0.8}  # share of a joint's range that scripted pulls aim at
+
+
+def fixture_pose(config: PoseConfig) -> Array:
+    """4x4 of a pose in the configuration."""
+    return planar_pose(*config.position, np.deg2rad(config.yaw_deg))
+
+
+def furniture_pose(config: PlacedConfig, furniture: LoadedFurniture) -> Array:
+    """4x4 of a piece of furniture's frame: the configuration says where its lowest point stands."""
+    pose = fixture_pose(config.pose)
+    pose[2, 3] += furniture.asset.origin_height
+    return pose
+
+
+def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
+    """Look up a piece of furniture: an id of the pack, or ``pack/id`` of another one.
+
+    Raises:
+        ConfigError: the pack has no such furniture.
+        AssetError: there is no such pack.
+    """
+    other, _, name = asset_id.rpartition("/")
+    if other:
+        pack = load_pack(other)
+    if name not in pack.furniture:
+        raise ConfigError(
+            f"{key}: no such furniture in pack {pack.name!r}", expected=f"one of {sorted(pack.furniture)}", found=name
+        )
+    return pack.furniture[name]
+
+
+def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
+    """Look up the room, with its finishes.
+
+    Raises:
+        ConfigError: there is no such room, part or finish.
+    """
+    room = find_furniture(pack, config.room.asset, key="room.asset")
+    for part, finish in config.room.finishes.items():
+        known = room.asset.finishes.get(part, ())
+        if finish not in known:
+            expected = f"one of {list(known)}" if known else f"a part among {sorted(room.asset.finishes)}"
+            raise ConfigError(f"room.finishes.{part}: no such finish", expected=expected, found=finish)
+    for part in config.randomisation.room or ():
+        if part not in room.asset.finishes:
+            expected = f"one of {sorted(room.asset.finishes)}"
+            raise ConfigError("randomisation.room: no such part of the room", expected=expected, found=part)
+    return room
+
+
+def find_container(pack: Pack, config: PlacedConfig) -> LoadedFurniture:
+    """Look up the basket.
+
+    Raises:
+        ConfigError: no such furniture, or it isn't a movable container.
+    """
+    basket = find_furniture(pack, config.asset, key="basket.asset")
+    if basket.asset.inner is None or basket.asset.mass is None:
+        raise ConfigError("basket.asset: this furniture is no movable container", found=config.asset)
+    return basket
+
+
+def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
+    """Ids of the configuration's objects; it may name them by the numbers they have in GraspNet-1Billion.
+
+    Raises:
+        ConfigError: an id is not in the pack, or the pack has no objects.
+    """
+    wanted = sorted(pack.objects) if config.objects.ids == "all" else config.objects.ids
+    ids = resolve_ids(pack, wanted, key="objects.ids")
+    if not ids:
+        raise ConfigError(f"objects.ids: pack {pack.name!r} has no objects to choose from")
+    for number, names in enumerate(config.randomisation.object_sets or ()):
+        resolve_ids(pack, names, key=f"randomisation.object_sets.{number}")
+    if config.randomisation.distractors:
+        resolve_ids(pack, config.randomisation.distractors.ids, key="randomisation.distractors.ids")
+    return ids
+
+
+def resolve_ids(pack: Pack, wanted: list[str | int] | list[str], *, key: str) -> list[str]:
+    """Ids of a pack's objects, from ids or GraspNet-1Billion's numbers.
+
+    Raises:
+        ConfigError: one is not in the pack.
+    """
+    numbers = {
+        loaded.asset.graspnet_id: i for i, loaded in pack.objects.items() if loaded.asset.graspnet_id is not None
+    }
+    ids = [numbers.get(i, str(i)) if isinstance(i, int) else i for i in wanted]
+    unknown = [i for i in ids if i not in pack.objects]
+    if unknown:
+        expected = f"one of {sorted(pack.objects)}" + (
+            f", or a GraspNet number of {sorted(numbers)}" if numbers else ""
+        )
+        raise ConfigError(f"{key}: no such object in pack {pack.name!r}", expected=expected, found=", ".join(unknown))
+    return ids
+
+
+def find_region(config: SurfaceConfig, furniture: LoadedFurniture) -> Region:
+    """Rectangle that objects are placed on, in the furniture's frame.
+
+    Raises:
+        ConfigError: the furniture has no such surface, or the rectangle sticks out of it.
+    """
+    surfaces = furniture.asset.surfaces
+    if config.name not in surfaces:
+        raise ConfigError("surface.name: no such surface", expected=f"one of {sorted(surfaces)}", found=config.name)
+    whole = surfaces[config.name]
+    if config.min_xy is None or config.max_xy is None:
+        return Region(whole.min_xy, whole.max_xy, whole.z)
+    inside = all(
+        low <= a and b <= high
+        for low, a, b, high in zip(whole.min_xy, config.min_xy, config.max_xy, whole.max_xy, strict=True)
+    )
+    if not inside:
+        raise ConfigError(
+            f"surface: the rectangle lies outside surface {config.name!r} of {furniture.asset.id!r}",
+            expected=f"within {whole.min_xy}..{whole.max_xy}",
+            found=f"{config.min_xy}..{config.max_xy}",
+        )
+    return Region(config.min_xy, config.max_xy, whole.z)
+
+
+def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> None:
+    """Check where doors and drawers stand at first, and that there is one to open, not open yet, which a pull can open.
+
+    Raises:
+        ConfigError: no such joint or handle, or a position or share that can't be.
+    """
+    for name, item in config.furniture.items():
+        known = {link.joint.name: link.joint.limits for link in furniture[name].asset.links}
+        for joint, position in item.joints.items():
+            if joint not in known:
+                where = f"furniture.{name}.joints: no such joint"
+                raise ConfigError(where, expected=f"one of {sorted(known)}", found=joint)
+            low, high = known[joint]
+            if not low <= position <= high:
+                where = f"furniture.{name}.joints.{joint}: out of its limits"
+                raise ConfigError(where, expected=f"{low}..{high}", found=position)
+    opening = config.opening
+    if opening is None:
+        return
+    handles = furniture[opening.furniture].asset.handles
+    if opening.handle not in handles:
+        raise ConfigError("opening.handle: no such handle", expected=f"one of {sorted(handles)}", found=opening.handle)
+    joint = find_opened_joint(config, furniture)
+    limit = OPENED_AT_MOST[joint.kind]
+    if opening.opened_at >= limit:
+        raise ConfigError(
+            f"opening.opened_at: scripted pulls open the {joint.kind} joint {joint.name!r} no further than {limit}",
+            expected=f"below {limit}",
+            found=opening.opened_at,
+            fix="Lower opening.opened_at.",
+        )
+    end = max(joint.limits, key=abs)
+    position = config.furniture[opening.furniture].joints.get(joint.name, 0.0)
+    if position / end >= opening.opened_at:
+        raise ConfigError(
+            f"furniture.{opening.furniture}.joints.{joint.name}: open at first, so that there is nothing to open",
+            expected=f"less than opening.opened_at of its range, {opening.opened_at * end:g}",
+            found=position,
+            fix="Leave the joint out, which closes it, or make the task pick.",
+        )
+
+
+def find_opened_joint(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> Joint:
+    """The joint of the configuration's handle."""
+    opening = config.opening
+    assert opening is not None
+    asset = furniture[opening.furniture].asset
+    return next(link.joint for link in asset.links if link.name == asset.handles[opening.handle].link)
