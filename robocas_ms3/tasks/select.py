@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import torch
 from mani_skill.utils.registration import register_env
 
+from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.spec import SELECT
 from robocas_ms3.tasks.transfer import TransferEnv
 
@@ -12,7 +14,21 @@ from robocas_ms3.tasks.transfer import TransferEnv
 class RoboCASSelectEnv(TransferEnv):
     """Select: "the nearest soap", "the second soda can from the left", seen from the robot. The others are wrong.
 
-    The relation is clear: what it compares differs from every other such object by at least 3 cm.
+    The relation is clear: what it compares differs from every other such object by at least 3 cm. Success asks for the
+    named one alone: none of the others may lie in the basket too.
     """
 
     SPEC = SELECT
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        names = [[asset.asset.name for asset in row] for row in self.object_assets]
+        self._kinds = torch.tensor([[row.index(name) for name in row] for row in names], device=self.device)
+
+    def target_measures(
+        self, touched: torch.Tensor | None = None, poses: torch.Tensor | None = None
+    ) -> dict[str, torch.Tensor]:
+        """As of `TransferEnv`, and ``others_out``: no other object of the target's name is in the basket."""
+        poses = self.object_poses if poses is None else poses
+        others_in = terms.another_of_its_kind(self.in_basket(poses), self._kinds, self.target_slot)
+        return {**super().target_measures(touched, poses), "others_out": ~others_in}

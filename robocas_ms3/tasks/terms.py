@@ -23,15 +23,17 @@ def inside_box(points: Tensor, box_position: Tensor, box_quaternion: Tensor, low
     """Whether points lie in a box fixed to a moving frame.
 
     Args:
-        points: (N, 3) world.
+        points: (N, 3) or (N, K, 3) world.
         box_position: (N, 3) world, origin of the frame.
         box_quaternion: (N, 4) of the frame.
-        low: (3,) or (N, 3) least corner in the frame.
+        low: (3,) least corner in the frame.
         high: the same, greatest corner.
 
     Returns:
-        (N,) bool.
+        (N,) or (N, K) bool.
     """
+    if points.ndim == 3:
+        box_position, box_quaternion = box_position[:, None], box_quaternion[:, None]
     local = rotate_inverse(box_quaternion, points - box_position)
     return ((local >= low) & (local <= high)).all(dim=-1)
 
@@ -128,6 +130,22 @@ def stands(
 def of_target(values: Tensor, target: Tensor) -> Tensor:
     """Pick the target's entry of per-object values: (N, K, ...) and (N,) indices -> (N, ...)."""
     return values[torch.arange(len(target), device=values.device), target]
+
+
+def another_of_its_kind(marked: Tensor, kinds: Tensor, target: Tensor) -> Tensor:
+    """Whether an object of the target's kind, other than the target, is marked.
+
+    Args:
+        marked: (N, K) bool.
+        kinds: (N, K) numbers; objects of a kind share theirs.
+        target: (N,) indices.
+
+    Returns:
+        (N,) bool.
+    """
+    slots = torch.arange(kinds.shape[1], device=kinds.device)
+    alike = (kinds == of_target(kinds, target)[:, None]) & (slots != target[:, None])
+    return (marked & alike).any(dim=1)
 
 
 def disturbed(

@@ -104,16 +104,20 @@ class TransferEnv(RoboCASEnv):
             touched = terms.touched(self.gripper_forces())
         poses = self.object_poses if poses is None else poses
         basket, start, slot = self.fixtures.basket.pose, self.basket_at_start, self.target_slot
-        pose = terms.of_target(poses, slot)
-        center = pose[:, :3] + terms.rotate(pose[:, 3:], terms.of_target(self._centers_of_mass, slot))
         linear = torch.stack([actor.linear_velocity for actor in self.objects], dim=1)
         angular = torch.stack([actor.angular_velocity for actor in self.objects], dim=1)
         return {
-            "in_basket": terms.inside_box(center, basket.p, basket.q, self._basket_low, self._basket_high),
+            "in_basket": terms.of_target(self.in_basket(poses), slot),
             "untouched": ~terms.of_target(touched, slot),
             "at_rest": terms.at_rest(terms.of_target(linear, slot), terms.of_target(angular, slot)),
             "basket_stands": terms.stands(basket.p, basket.q, start[:, :3], start[:, 3:]),
         }
+
+    def in_basket(self, poses: torch.Tensor) -> torch.Tensor:
+        """(N, K) bool: whose centre of mass is in the basket's inner volume, from poses (N, K, 7)."""
+        basket = self.fixtures.basket.pose
+        centers = poses[..., :3] + terms.rotate(poses[..., 3:], self._centers_of_mass)
+        return terms.inside_box(centers, basket.p, basket.q, self._basket_low, self._basket_high)
 
     def _disturbed(self, poses: torch.Tensor) -> torch.Tensor:
         """(N,) how many objects other than the target no longer stand as they stood."""

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch
+from mani_skill.utils.structs import Pose
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import load_task_config
@@ -54,6 +58,32 @@ def test_the_named_one_is_told_apart(name):
     side = {"nearest": -1, "farthest": 1, "leftmost": 1, "rightmost": -1}.get(layout.relation)
     if side is not None:
         assert np.all(side * (key[layout.target] - key[alike]) > 0)
+
+
+def test_the_wrong_instance_in_the_basket_spoils_it():
+    env = gym.make("RoboCASSelect-v1", render_backend="none", control_mode="pd_joint_pos", obs_mode="none")
+    env.reset(seed=3)
+    base: Any = env.unwrapped
+    target, ids = int(base.target_slot[0]), [asset.asset.id for asset in base.object_assets[0]]
+    alike = next(i for i, one in enumerate(ids) if one == ids[target] and i != target)
+    other = next(i for i, one in enumerate(ids) if one != ids[target])
+    inside = base.fixtures.basket.pose.p + torch.tensor([[0, 0, 0.05]])
+
+    def put(slot: int) -> None:
+        base.objects[slot].set_pose(Pose.create_from_pq(inside, base.objects[slot].pose.q))
+
+    put(target)
+    base._stages["target_lifted"][:] = True
+    for actor in base.objects:
+        actor.set_linear_velocity(torch.zeros(1, 3))
+    assert bool(base.evaluate()["success"][0])
+    put(other)  # clutter does no harm
+    assert bool(base.evaluate()["success"][0])
+    put(alike)
+    found = base.evaluate()
+    assert not bool(found["success"][0]) and bool(found["target_in_basket"][0])
+    assert [name for name, holds in base.target_measures().items() if not bool(holds[0])] == ["others_out"]
+    env.close()
 
 
 @pytest.mark.slow

@@ -25,6 +25,21 @@ def test_inside_box_follows_the_frame():
     assert terms.inside_box(points, position, quaternion, low, high).tolist() == [True, False, True, False]
 
 
+def test_inside_box_of_several_objects_an_env():
+    low, high = torch.tensor([-0.2, -0.1, 0.0]), torch.tensor([0.2, 0.1, 0.3])
+    points = torch.tensor([[[1.15, 0, 0.1], [1.0, 0.15, 0.1], [0.85, 0.05, 0.2]]] * 2)
+    position, quaternion = torch.tensor([[1.0, 0, 0]] * 2), torch.tensor([UPRIGHT, YAW_90])
+    inside = terms.inside_box(points, position, quaternion, low, high)
+    assert inside.tolist() == [[True, False, True], [False, True, False]]
+
+
+def test_another_of_its_kind_is_neither_the_target_nor_of_another_kind():
+    kinds = torch.tensor([[0, 0, 2, 2], [0, 1, 0, 1], [0, 0, 2, 2]])
+    marked = torch.tensor([[True, False, True, True], [False, True, True, False], [True, False, False, True]])
+    target = torch.tensor([0, 0, 1])
+    assert terms.another_of_its_kind(marked, kinds, target).tolist() == [False, True, True]
+
+
 def test_finger_grasps_needs_both_fingers_pressed_apart():
     closing = torch.tensor([[0.0, 1, 0]])
     left = torch.tensor([[[0, 2.0, 0], [0, 2.0, 0], [0, 0.4, 0], [0, -2.0, 0]]])
