@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.config import TaskConfig, load_task_config
@@ -78,6 +79,8 @@ class EpisodeGenerator:
 
     def __init__(self, settings: EpisodeSettings) -> None:
         self.settings = settings
+        # On a busy machine the threads of torch's small operations wait for each other, 25 times longer than they work.
+        torch.set_num_threads(1)
         config = load_task_config(settings.config)
         self.env = gym.make(
             TASKS[settings.task].env_id,
@@ -140,7 +143,7 @@ class EpisodeGenerator:
             if len(executor.actions) == first:
                 continue  # it failed in planning: nothing to undo
             if not self.settings.keep_recoveries or last.stage == "horizon":
-                executor.rewind(0)
+                executor.reset()
                 recoveries = []
                 continue
             try:
@@ -149,7 +152,7 @@ class EpisodeGenerator:
                     {"range": [first, len(executor.actions) - 1], "stage": last.stage, "reason": last.reason}
                 )
             except PlanningFailed:
-                executor.rewind(0)
+                executor.reset()
                 recoveries = []
         return recoveries
 

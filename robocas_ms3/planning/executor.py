@@ -1,4 +1,4 @@
-"""Run planned motions in an environment, keep what was done, and undo it by simulating again from the reset."""
+"""Run planned motions in an environment and keep what was done since the reset."""
 
 from __future__ import annotations
 
@@ -94,14 +94,6 @@ class Executor:
             _, self.info = self.env.reset(seed=self.seed)
         self.actions, self.segments, self.gripper, self.base = [], [], OPEN, np.zeros(3)
         self.facts = {}
-
-    def rewind(self, length: int) -> None:
-        """Undo all but the first ``length`` actions: reset, then simulate those again exactly."""
-        kept, segments = self.actions[:length], [s for s in self.segments if s.first < length]
-        self.reset()
-        for action in kept:
-            self._step(action)
-        self.segments = segments
 
     def follow(self, trajectory: Trajectory, *, until: str | None = None) -> bool:
         """Send a trajectory's rows to the arm, the gripper's command held.

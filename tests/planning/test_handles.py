@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch
 from planning_scenes import REST
 
 from robocas_ms3.assets.kinematics import joint_motion
-from robocas_ms3.assets.manifest import Joint
+from robocas_ms3.assets.manifest import Handle, Joint
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.protocol import AttachedBody
 from robocas_ms3.planning.pulling import reached, track, turned_about_bar
 from robocas_ms3.planning.reachability import Reachability
-from robocas_ms3.planning.skills.driving import _routes, body_is_free
+from robocas_ms3.planning.skills.driving import _routes, body_is_free, free_route
+from robocas_ms3.planning.skills.part import Part
 
 SLIDE = Joint(name="slide", kind="prismatic", axis=(-1.0, 0.0, 0.0), limits=(0.0, 0.6), friction=0, damping=0)
 # 0.4 m to the right of the upright bar of the pull
@@ -80,9 +86,9 @@ def test_a_pull_ends_where_the_arm_does(reachability):
 def test_the_body_is_free_where_no_point_is_inside_it():
     frame = np.eye(4)
     frame[:3, 3] = 1.0, 2.0, 0.49  # the arm's base, 0.49 m above the floor
-    beside = np.array([[1.3, 2.0, 0.2], [1.0, 2.24, 0.2], [1.2, 2.0, 0.31], [1.14, 2.0, 0.5]])
+    beside = np.array([[1.3, 2.0, 0.2], [1.0, 2.24, 0.2], [1.2, 2.0, 0.31], [1.14, 2.0, 0.65]])
     assert body_is_free(frame, beside)
-    for hit in ([1.27, 2.0, 0.2], [1.0, 1.78, 0.2], [1.14, 2.0, 0.4]):
+    for hit in ([1.27, 2.0, 0.2], [1.0, 1.78, 0.2], [1.14, 2.0, 0.4], [1.08, 2.0, 0.6]):
         assert not body_is_free(frame, np.array([hit]))
 
 
@@ -96,3 +102,38 @@ def test_a_detour_backs_out_of_the_narrow_end_against_its_heading():
     arriving = list(_routes(wide, narrow, leaving=False))[1]
     assert arriving[0] == pytest.approx([0.4, -0.15, np.pi / 2])
     assert arriving[1] == pytest.approx(narrow)
+
+
+def test_a_drive_keeps_what_is_held_clear(planner):
+    robot = SimpleNamespace(pose=SimpleNamespace(raw_pose=torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]])))
+    arm = SimpleNamespace(env=SimpleNamespace(agent=SimpleNamespace(robot=robot)), planner=planner, at=np.array(REST))
+    start, goal = np.zeros(3), np.array([0.24, 0.0, 0.0])
+    planner.finger_width = 0.04
+    beyond = planner.tcp(arm.at) @ np.array(
+        [0, 0, 0.10, 1]
+    )  # 0.10 m beyond the tips, where the base stands at the goal
+    spot = beyond[:3] + [0.24, 0, 0.49] + np.random.default_rng(0).uniform(-0.01, 0.01, (600, 3))
+    assert len(free_route(arm, start, goal, spot, leaving=False)) == 1
+    corners = np.stack(np.meshgrid((-0.02, 0.02), (-0.02, 0.02), (-0.02, 0.15)), axis=-1).reshape(-1, 3)
+    planner.attach(AttachedBody(corners, np.eye(4)))
+    assert free_route(arm, start, goal, spot, leaving=False) is None
+
+
+def standing_at(position, joint, monkeypatch):
+    monkeypatch.setattr(Part, "position", lambda self, arm: position)
+    handle = Handle(link="door", position=(0, 0, 0), wxyz=(1, 0, 0, 0), width=0.02)
+    return Part("cabinet", handle, joint)
+
+
+@pytest.mark.parametrize("towards", [1, -1])
+def test_a_pull_goes_on_from_where_the_joint_stands(towards, monkeypatch):
+    limits = tuple(sorted((0.0, towards * 0.4)))
+    joint = Joint(name="slide", kind="prismatic", axis=(1, 0, 0), limits=limits, friction=0, damping=0)
+    way = standing_at(towards * 0.1, joint, monkeypatch).way(None)
+    assert way[[0, -1]] == pytest.approx([towards * 0.1, towards * 0.38])  # 0.95 of the range
+    assert len(way) == 20  # 0.28 m in steps of at most 0.015 m
+    part = standing_at(towards * 0.35, joint, monkeypatch)
+    assert part.least(None) == pytest.approx(0.03)  # a quarter of the range is more than what is left
+    for position in (0.37, 0.38, 0.4):
+        with pytest.raises(PlanningFailed, match="at_the_end"):
+            standing_at(towards * position, joint, monkeypatch).way(None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gymnasium as gym
 import numpy as np
 import pytest
+import yaml
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.config import shipped_configs
@@ -12,9 +13,13 @@ from robocas_ms3.datasets.episode import Frames, episode_arrays, planar_base, sa
 from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
 from robocas_ms3.demos.replay import replay
+from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.language.templates import subgoal
-from robocas_ms3.planning.skills.driving import drive
-from robocas_ms3.planning.skills.handles import Part, plan_pull
+from robocas_ms3.planning.skills.driving import base_at, drive
+from robocas_ms3.planning.skills.grasping import plan_grasp
+from robocas_ms3.planning.skills.handles import open_part, plan_pull, pull_share
+from robocas_ms3.planning.skills.part import Part
+from robocas_ms3.planning.skills.stance import drive_to_handle
 
 pytestmark = pytest.mark.slow
 
@@ -130,3 +135,101 @@ def test_a_pull_is_planned_to_the_far_end(tmp_path):
     assert abs(along_the_bar[0]) < 0.05
     assert (last - first)[:3, 3] == pytest.approx((opened - closed)[:3, 3], abs=2e-3)
     assert np.linalg.norm((opened - closed)[:3, 3]) == pytest.approx(0.95 * 0.55, abs=1e-6)
+
+
+def watch(arm) -> dict[str, float]:
+    """What the robot touches from now on, and how deep it overlaps with it at most, m: filled step by step."""
+    touched: dict[str, float] = {}
+    step = arm.executor._step
+    robot = {link._objs[0].entity.name for link in arm.env.agent.robot.links}
+
+    def watched(action) -> None:
+        step(action)
+        for contact in arm.env.scene.get_contacts():
+            names = {body.entity.name for body in contact.bodies}
+            depths = [-point.separation for point in contact.points if np.linalg.norm(point.impulse) > 0]
+            if depths and len(names & robot) == 1:
+                (other,) = names - robot
+                touched[other] = max(*depths, touched.get(other, 0.0), 0.0)
+
+    arm.executor._step = watched
+    return touched
+
+
+def test_a_pull_opens_by_contact_and_leaves_the_handle(tmp_path):
+    generator = EpisodeGenerator(EpisodeSettings("open_pick", "open_pick_container", "builtin", max_attempts=1))
+
+    def policy(arm) -> None:
+        part, touched = Part.of(arm), watch(arm)
+        assert part.position(arm) == pytest.approx(0, abs=1e-3)
+        open_part(arm)
+        assert set(touched) == {part.handle.link}  # and nothing else in the scene
+        assert touched[part.handle.link] < 0.002
+        assert part.position(arm) == pytest.approx(0.95 * part.end, abs=0.01)
+        assert bool(arm.env.task_stages()["furniture_opened"][0])
+        # the gripper is open and off the handle
+        bar = part.in_base(arm, np.array([part.position(arm)]))[0] @ part.hold
+        assert (np.linalg.inv(bar) @ arm.scene.tcp_in_base)[2, 3] < -0.05
+        arm.planner.set_scene(arm.scene.obstacles_in_base())
+        assert arm.planner.collisions(arm.scene.arm_qpos) == []
+        assert int(arm.env.evaluate()["disturbed"][0]) == 0
+
+    generator.policy = policy
+    assert generator.generate(0, tmp_path, "pulled").success
+    generator.close()
+
+
+def farther_back(name: str, distance: float) -> dict:
+    """A shipped configuration with the robot farther from everything, and allowed to drive."""
+    config = yaml.safe_load(shipped_configs()[name].read_text(encoding="utf-8"))
+    robot = config["robot"]
+    yaw = np.deg2rad(robot.get("yaw_deg", 0.0))
+    ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    robot["position"] = (np.array(robot["position"]) - distance * ahead).tolist()
+    config["target"]["max_distance"] = 1.5
+    return config | {"base_motion": True}
+
+
+def test_it_drives_to_a_handle_that_is_out_of_reach(tmp_path):
+    config = farther_back("open_pick_container", 0.5)
+    generator = EpisodeGenerator(EpisodeSettings("open_pick", config, "builtin", max_attempts=1))
+
+    def share(arm) -> float:
+        part = Part.of(arm)
+        others = arm.scene.obstacles_in_base(without_link=(part.furniture, part.handle.link))
+        return pull_share(arm, part, arm.scene.arm_base_in_world, others)
+
+    def policy(arm) -> None:
+        assert share(arm) < 0.5
+        drive_to_handle(arm)
+        assert base_at(arm)[0] > 0.1
+        stands = base_at(arm)  # where it is within comfortable reach: it drives no further
+        drive_to_handle(arm)
+        assert (base_at(arm) == stands).all()
+
+    generator.policy = policy
+    assert generator.generate(0, tmp_path, "driven").success
+    generator.close()
+
+
+def test_pick_drives_to_a_target_that_is_out_of_reach(tmp_path):
+    config = farther_back("pick_table_scattered", 0.3)
+    settings = EpisodeSettings("pick", config, "builtin", max_attempts=4)
+    generator = EpisodeGenerator(settings)
+    pick = generator.policy
+
+    def policy(arm) -> None:
+        with pytest.raises(PlanningFailed):
+            plan_grasp(arm, int(arm.env.target_slot[0]), 0.1)
+        pick(arm)
+
+    generator.policy = policy
+    assert generator.generate(3, tmp_path, "far").success
+    generator.close()
+    with TrajectoryFile(tmp_path / "far.h5") as file:
+        actions = file.recording(0).actions
+    base = actions[:, 8:]
+    assert base[-1, 0] > 0.1
+    driving = np.flatnonzero(np.abs(np.diff(base, axis=0)).max(axis=1) > 0)
+    assert len(driving) > 10
+    assert np.abs(np.diff(actions[:, :7], axis=0))[driving].max() == 0  # the arm stands still meanwhile

@@ -8,27 +8,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from mani_skill.utils.structs import Articulation
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from robocas_ms3.assets.kinematics import joint_motion
-from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.pulling import reached, track, turned_about_bar
-from robocas_ms3.planning.scene import SPACING, inverse
+from robocas_ms3.planning.scene import inverse
 from robocas_ms3.planning.skills.arm import Arm, moved_back
+from robocas_ms3.planning.skills.part import Part
+from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.planning.timing import through, timed
 from robocas_ms3.robots.constants import ARM_ACCELERATION_LIMIT, ARM_VELOCITY_LIMIT
 from robocas_ms3.scenes.placement import transform
-from robocas_ms3.tasks import terms
-from robocas_ms3.tasks.contacts import contact_forces
 
 PULLS = 3  # with a new hold each, where one doesn't open far enough
-FAR_SHARE = {"prismatic": 0.95, "revolute": 0.8}  # of the joint's range, where a pull ends at most
-LEAST_SHARE = 0.25  # of the range; a pull that can't even do this is not worth it
-STEP = {"prismatic": 0.015, "revolute": 0.03}  # m, rad between poses of a pull
+COMFORT = 0.3  # of the way from where it counts as opened to where a pull ends at most
+JUDGED = 4  # ways to hold the handle that are checked for collisions where only reach is judged
 SHIFTS = (0.0, -0.03, 0.03)  # m along the bar
 TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
 STANDOFF = 0.08  # m that the gripper comes in straight
@@ -37,57 +32,6 @@ CUT = 0.06  # m around the place held, within which the gripper may be near the 
 PULLS_PLANNED = 8  # ways to hold the handle that motions are planned for
 CHECKED = 6  # positions of the part at which the arm is checked against it
 SPEED = 0.8  # share of the arm's limits
-
-
-@dataclass(frozen=True)
-class Part:
-    """What is opened: a moving part of a piece of furniture."""
-
-    furniture: str
-    handle: Handle
-    joint: Joint
-
-    @classmethod
-    def of(cls, arm: Arm) -> Part:
-        """The part that the task wants opened."""
-        model = arm.env.model
-        opening, joint = model.config.opening, model.opened_joint
-        assert opening is not None  # the task has one
-        assert joint is not None
-        return cls(opening.furniture, model.furniture[opening.furniture].asset.handles[opening.handle], joint)
-
-    @property
-    def end(self) -> float:
-        """Limit of the joint that it opens towards, m or rad."""
-        return max(self.joint.limits, key=abs)
-
-    def position(self, arm: Arm) -> float:
-        """Where the joint stands, m or rad."""
-        return arm.scene.joint_positions(self.furniture)[self.joint.name]
-
-    def in_base(self, arm: Arm, positions: Array) -> Array:
-        """4x4 poses (T, 4, 4) of the part's frame in the arm's base frame, at joint positions (T,)."""
-        frame = inverse(arm.scene.arm_base_in_world) @ arm.env.model.furniture_poses[self.furniture]
-        return np.array([frame @ joint_motion(self.joint, float(q)) for q in positions])
-
-    @property
-    def hold(self) -> Array:
-        """4x4 TCP that holds the handle squarely, in the part's frame."""
-        w, x, y, z = self.handle.wxyz
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), self.handle.position
-        return pose
-
-    def pressed(self, arm: Arm) -> bool:
-        """Whether both fingers press on the part."""
-        env = arm.env
-        furniture = env.fixtures.furniture[self.furniture]
-        assert isinstance(furniture, Articulation)
-        link = furniture.links_map[self.handle.link]
-        left, right = env.agent.finger1_link, env.agent.finger2_link
-        forces = contact_forces(env.scene, [left, right], [link])
-        closing = left.pose.to_transformation_matrix()[:, :3, 1]
-        return bool(terms.finger_grasps(forces[:, 0], forces[:, 1], closing)[0, 0])
 
 
 @dataclass(frozen=True)
@@ -121,18 +65,20 @@ def pull(arm: Arm, part: Part) -> None:
     """
     with arm.planning():
         plan = plan_pull(arm, part)
-    before = part.position(arm)
+        before, least = part.position(arm), 0.5 * part.least(arm)
     arm.follow(plan.reach, plan.approach)
     arm.close_gripper()
     if not part.pressed(arm):
         raise PlanningFailed("handle", "missed")
     arm.follow(plan.pull)
-    if abs(part.position(arm) - before) < 0.5 * LEAST_SHARE * abs(part.end):
+    if abs(part.position(arm) - before) < least:
         raise PlanningFailed("pull", "slipped")
     arm.open_gripper()
     with arm.planning():
         arm.hold_nothing()
-        back = _plan_retreat(arm)
+        arm.planner.set_scene(arm.scene.obstacles_in_base())
+        tcp = arm.planner.tcp(arm.at)
+        back = plan_step_back(arm, arm.at, [moved_back(tcp, distance) for distance in RETREATS], try_free=True)
     arm.follow(back)
 
 
@@ -142,15 +88,13 @@ def plan_pull(arm: Arm, part: Part) -> PullPlan:
     Raises:
         PlanningFailed: of the hold that came last.
     """
-    start = part.position(arm)
-    far = FAR_SHARE[part.joint.kind] * part.end
-    count = max(2, int(np.ceil(abs(far - start) / STEP[part.joint.kind])) + 1)
-    positions = np.linspace(start, far, count)
-    paths, ends = _paths(arm, part, positions)
-    least = LEAST_SHARE * abs(part.end) / abs(far - start) * count
+    positions = part.way(arm)
+    frames = part.in_base(arm, positions)
+    paths, ends = _paths(arm, part, frames)
+    least = part.least(arm) / abs(positions[-1] - positions[0]) * len(positions)
     # the furthest first, in coarse steps; of those the nearest to where the arm is
     order = np.lexsort((np.abs(paths[0] - arm.at).max(axis=1) + arm.rng.uniform(0, 0.5, len(ends)), -ends // 5))
-    order = [i for i in order if ends[i] >= min(least, count)]
+    order = [i for i in order if ends[i] >= least]
     if not order:
         raise PlanningFailed("pull", "unreachable")
     everything = arm.scene.obstacles_in_base()
@@ -159,7 +103,7 @@ def plan_pull(arm: Arm, part: Part) -> PullPlan:
     for index in order[:PULLS_PLANNED]:
         path = paths[: ends[index], index]
         try:
-            free = _free_length(arm, part, path, positions, others)
+            free = _free_length(arm, part, path, frames, others)
             if free < least:
                 raise PlanningFailed("pull", "blocked")
             arm.planner.set_scene(everything)
@@ -171,9 +115,34 @@ def plan_pull(arm: Arm, part: Part) -> PullPlan:
     raise failure
 
 
-def _paths(arm: Arm, part: Part, positions: Array) -> tuple[Array, NDArray[np.int_]]:
-    """Configurations (T, N, 7) for many ways to hold the handle, and how many of the T poses (N,) each reaches."""
-    frames, goals, starts = part.in_base(arm, positions), [], []
+def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: Array) -> float:
+    """How far towards open the arm could pull a part in one go if its base stood elsewhere; 1: comfortably open.
+
+    Args:
+        arm: the attempt's tools.
+        part: what is opened.
+        arm_base_in_world: 4x4.
+        others: (P, 3) surfaces of all but the part, in that base's frame, m.
+    """
+    positions = part.way(arm)
+    opened = arm.env.model.opened_position
+    enough = 1 + int(np.sum(np.abs(positions) < abs(opened + COMFORT * (positions[-1] - opened))))
+    frames = inverse(arm_base_in_world) @ part.in_world(arm, positions)
+    try:
+        paths, ends = _paths(arm, part, frames)
+    except PlanningFailed:
+        return 0.0
+    share = 0.0
+    for index in np.argsort(-ends, kind="stable")[:JUDGED]:
+        path = paths[: ends[index], index]
+        if len(path) and share < 1:
+            share = max(share, min(1.0, _free_length(arm, part, path, frames, others) / enough))
+    return share
+
+
+def _paths(arm: Arm, part: Part, frames: Array) -> tuple[Array, NDArray[np.int_]]:
+    """Configurations (T, N, 7) for many ways to hold the handle; how many of the part's T poses (N,) each reaches."""
+    goals, starts = [], []
     for shift in SHIFTS:
         for half_turn in (False, True):
             hold = part.hold @ np.diag([-1.0, -1, 1, 1]) if half_turn else part.hold
@@ -189,8 +158,8 @@ def _paths(arm: Arm, part: Part, positions: Array) -> tuple[Array, NDArray[np.in
     return path, reached(path)
 
 
-def _free_length(arm: Arm, part: Part, path: Array, positions: Array, others: Array) -> int:
-    """How many configurations of a path (T, 7) keep clear, of everything else and of the part itself."""
+def _free_length(arm: Arm, part: Part, path: Array, frames: Array, others: Array) -> int:
+    """How many configurations of a path (T, 7) keep clear of everything else and of the part at its poses (T, 4, 4)."""
     planner, width = arm.planner, part.handle.width
     planner.set_scene(others)
     length = len(path)
@@ -198,10 +167,9 @@ def _free_length(arm: Arm, part: Part, path: Array, positions: Array, others: Ar
         if planner.collisions(path[i], width):
             length = i
             break
-    points = arm.env.model.furniture[part.furniture].links[part.handle.link].surface_points(SPACING)
+    points = part.surface(arm)
     for i in np.linspace(0, length - 1, CHECKED).round().astype(int) if length else ():
-        frame = part.in_base(arm, positions[i : i + 1])[0]
-        cloud = transform(frame, points)
+        cloud = transform(frames[i], points)
         planner.set_scene(cloud[np.linalg.norm(cloud - planner.tcp(path[i])[:3, 3], axis=1) > CUT])
         if planner.collisions(path[i], width):
             return int(i * (1 - 1 / CHECKED))
@@ -220,14 +188,3 @@ def _timed(path: Array, dt: float) -> Trajectory:
 def _reversed(motion: Trajectory, start: Array) -> Trajectory:
     """A motion that began at ``start``, run backwards."""
     return Trajectory(np.concatenate([motion.qpos[-2::-1], start[None]]), motion.dt)
-
-
-def _plan_retreat(arm: Arm) -> Trajectory:
-    """Plan straight back from the handle, free of everything if possible."""
-    arm.planner.set_scene(arm.scene.obstacles_in_base())
-    tcp = arm.planner.tcp(arm.at)
-    goals = [moved_back(tcp, distance) for distance in RETREATS]
-    try:
-        return arm.first_line(arm.at, goals, stage="retreat")
-    except PlanningFailed:
-        return arm.first_line(arm.at, goals, stage="retreat", check_collisions=False)

@@ -7,8 +7,9 @@ import numpy as np
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.drops import overhangs, sample_drops
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
-from robocas_ms3.planning.scene import inverse
+from robocas_ms3.planning.scene import inverse, matrix
 from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
+from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.scenes.placement import transform
 
 DROPS_SAMPLED, DROPS_PLANNED = 192, 10
@@ -39,7 +40,7 @@ def release_into_basket(arm: Arm, slot: int) -> None:
     with arm.planning():
         arm.hold_nothing()
         arm.planner.set_scene(arm.scene.obstacles_in_base(without=slot))
-        retreat = _plan_retreat(arm, start, arm.planner.tcp(start))
+        retreat = plan_step_back(arm, start, _ways_off(arm.planner.tcp(start)))
         home = arm.plan_home(retreat.qpos[-1])
     arm.follow(retreat)
     # The object settles while the arm goes home; the demonstration ends as soon as it lies still.
@@ -54,47 +55,72 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
         PlanningFailed: of the pose that came last.
     """
     scene, start = arm.scene, arm.at
-    asset = arm.env.object_assets[0][slot]
-    object_in_tcp = inverse(scene.tcp_in_base) @ scene.object_in_base(slot)
-    vertices = np.concatenate(asset.hulls)
-    vertices_in_tcp = transform(object_in_tcp, vertices)
-    inner = arm.env.model.basket.asset.inner
-    assert inner is not None  # the environment saw to it
-    drops = sample_drops(
-        arm.rng,
-        count=DROPS_SAMPLED,
-        container_in_base=scene.basket_in_base,
-        inner_low=np.array(inner.min),
-        inner_high=np.array(inner.max),
-        vertices_in_tcp=vertices_in_tcp,
-        center_in_tcp=transform(object_in_tcp, np.array([asset.asset.center_of_mass]))[0],
-    )
+    drops = drop_poses(arm, slot, scene.arm_base_in_world)
     solved, qpos = arm.reachability.reachable(drops, start)
     if not solved.any():
         raise PlanningFailed("transfer", "unreachable")
     drops, qpos = drops[solved], qpos[solved]
     # first those in which the object fits through the opening, then those that are near
-    overhang = overhangs(drops, scene.basket_in_base, np.array(inner.min), np.array(inner.max), vertices_in_tcp)
+    overhang = overhangs(drops, scene.basket_in_base, *_inner_box(arm), transform(*held_object(arm, slot)))
     order = np.lexsort((np.abs(qpos - start).max(axis=1), np.ceil(overhang / 0.02)))
     arm.planner.set_scene(scene.obstacles_in_base(without=slot))
-    arm.planner.attach(AttachedBody(vertices, object_in_tcp))
-    arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
+    attach_held(arm, slot)
     failure = PlanningFailed("transfer", "no_plan")
     for index in order[:DROPS_PLANNED]:
         try:
             carry = arm.planner.plan_to_pose(start, drops[index], stage="transfer")
-            _plan_retreat(arm, carry.qpos[-1], drops[index])  # no way up from there: no place to let go
+            plan_step_back(arm, carry.qpos[-1], _ways_off(drops[index]))  # no way up from there: no place to let go
             return carry
         except PlanningFailed as error:
             failure = error
     raise failure
 
 
-def _plan_retreat(arm: Arm, start: Array, tcp_in_base: Array) -> Trajectory:
-    back = moved_back(tcp_in_base, RETREAT_HEIGHT)
-    up = RETREAT_HEIGHT
-    goals = [raised(tcp_in_base, up), back, raised(back, up / 2), raised(tcp_in_base, up / 2)]
-    return arm.first_line(start, goals, stage="retreat", check_collisions=False)
+def held_object(arm: Arm, slot: int) -> tuple[Array, Array]:
+    """4x4 of an object in the frame of the TCP that holds it, and the vertices (V, 3) of its hulls in its own, m."""
+    vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
+    return inverse(arm.scene.tcp_in_base) @ arm.scene.object_in_base(slot), vertices
+
+
+def attach_held(arm: Arm, slot: int) -> None:
+    """Tell the planner what the gripper holds, as it holds it right now."""
+    object_in_tcp, vertices = held_object(arm, slot)
+    arm.planner.attach(AttachedBody(vertices, object_in_tcp))
+    arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
+
+
+def drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
+    """Poses (N, 4, 4) of the TCP that bring the object it holds above the basket.
+
+    Args:
+        arm: the attempt's tools.
+        slot: of the held object.
+        arm_base_in_world: 4x4, in whose frame the poses are: where the arm's base is, or might be.
+    """
+    object_in_tcp, vertices = held_object(arm, slot)
+    low, high = _inner_box(arm)
+    return sample_drops(
+        arm.rng,
+        count=DROPS_SAMPLED,
+        container_in_base=inverse(arm_base_in_world) @ matrix(arm.env.fixtures.basket.pose.raw_pose[0]),
+        inner_low=low,
+        inner_high=high,
+        vertices_in_tcp=transform(object_in_tcp, vertices),
+        center_in_tcp=transform(object_in_tcp, np.array([arm.env.object_assets[0][slot].asset.center_of_mass]))[0],
+    )
+
+
+def _inner_box(arm: Arm) -> tuple[Array, Array]:
+    """Least and greatest corner (3,) of the room inside the basket, in its frame, m."""
+    inner = arm.env.model.basket.asset.inner
+    assert inner is not None  # the environment saw to it
+    return np.array(inner.min), np.array(inner.max)
+
+
+def _ways_off(tcp_in_base: Array) -> list[Array]:
+    """Where to step back to above the basket: up, back, or between."""
+    back, up = moved_back(tcp_in_base, RETREAT_HEIGHT), RETREAT_HEIGHT
+    return [raised(tcp_in_base, up), back, raised(back, up / 2), raised(tcp_in_base, up / 2)]
 
 
 def _why_not(arm: Arm) -> str:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
+from robocas_ms3.planning.skills.stance import drive_to_basket, grasp_from_reach
 
 
 def attempt(arm: Arm) -> None:
@@ -17,7 +17,8 @@ def attempt(arm: Arm) -> None:
     slot = int(arm.env.target_slot[0])
     words = arm.env.target_asset().asset.name, arm.env.task_config.support
     arm.executor.label(**subgoal("move and grasp", *words))
-    grasp(arm, slot)
+    grasp_from_reach(arm, slot)
     arm.executor.label(**subgoal("transfer object", *words))
+    drive_to_basket(arm, slot)
     carry_to_basket(arm, slot)
     release_into_basket(arm, slot)

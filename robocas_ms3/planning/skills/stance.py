@@ -1,0 +1,225 @@
+"""Where the mobile base stands: to reach an object, to pull at a handle, to let go above the basket.
+
+Every function does nothing unless the configuration lets policies drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.protocol import Array
+from robocas_ms3.planning.scene import inverse
+from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.driving import (
+    ARM_LENGTH,
+    THINNED,
+    arm_base_in_world,
+    base_at,
+    best_route,
+    body_is_free,
+    drive,
+    free_route,
+    places_before,
+)
+from robocas_ms3.planning.skills.grasping import grasp
+from robocas_ms3.planning.skills.handles import open_part, pull_share
+from robocas_ms3.planning.skills.part import Part
+from robocas_ms3.planning.skills.placing import attach_held, drop_poses
+from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, directions_ok, gripper_is_clear
+from robocas_ms3.scenes.placement import transform
+
+PLACES = 3  # to do one thing from
+GRASPS = 10  # grasps that stand for all when reach is judged
+GRASPS_LOOKED_AT = 250
+SIDE = "from_the_robots_side"
+# shares that are comfortable: of an object's grasps, of the way of a pull, of poses above the basket
+COMFORTABLE, PULLED, ABOVE_BASKET = 0.3, 1.0, 0.1
+
+
+def grasp_from_reach(arm: Arm, slot: int) -> None:
+    """Grasp an object from where it is within comfortable reach, from another place if no grasp can be planned there.
+
+    Raises:
+        PlanningFailed: no place to grasp from, or the object was missed or slipped.
+    """
+    _from_some_place(arm, lambda elsewhere: drive_to_object(arm, slot, elsewhere=elsewhere), lambda: grasp(arm, slot))
+
+
+def open_from_reach(arm: Arm) -> None:
+    """Open what the task wants opened, from where its handle is within comfortable reach all the way.
+
+    Raises:
+        PlanningFailed: no place to pull from, or the handle was missed or lost.
+    """
+    _from_some_place(arm, lambda elsewhere: drive_to_handle(arm, elsewhere=elsewhere), lambda: open_part(arm))
+
+
+def _from_some_place(arm: Arm, go: Callable[[bool], None], act: Callable[[], None]) -> None:
+    """Go and act; where acting fails before anything moves, go elsewhere and act again."""
+    for place in range(PLACES):
+        go(place > 0)
+        length = len(arm.executor.actions)
+        try:
+            act()
+            return
+        except PlanningFailed:
+            if len(arm.executor.actions) > length or not arm.executor.drives or place == PLACES - 1:
+                raise
+
+
+def drive_to_object(arm: Arm, slot: int, *, elsewhere: bool = False) -> None:
+    """Fold the arm and drive to where an object is within comfortable reach, unless it is already.
+
+    Args:
+        arm: the attempt's tools.
+        slot: of the object.
+        elsewhere: drive even so, since no grasp could be planned from here.
+
+    Raises:
+        PlanningFailed: there is no such place, or no free way there.
+    """
+    if not arm.executor.drives:
+        return
+    with arm.planning():
+        others = transform(arm.scene.arm_base_in_world, arm.scene.obstacles_in_base(without=slot))
+        grasps = clear_grasps(arm, slot, others)
+        if not elsewhere and reach_share(arm, base_at(arm), grasps, others) >= COMFORTABLE:
+            return
+    cloud = _fold(arm)
+    with arm.planning():
+        center = (arm.scene.arm_base_in_world @ arm.scene.object_in_base(slot))[:3, 3]
+        goals = places_before(arm, center)
+        seen = np.array([len(_from_here(arm, arm_base_in_world(arm, goal), grasps)) for goal in goals])
+        goals = goals[seen >= max(1, 0.3 * seen.max(initial=0))]
+        route = best_route(
+            arm, goals, cloud, lambda goal: reach_share(arm, goal, grasps, others), enough=2 * COMFORTABLE
+        )
+    drive(arm, *route)
+
+
+def drive_to_handle(arm: Arm, *, elsewhere: bool = False) -> None:
+    """Fold the arm and drive to where it can pull what the task wants opened far enough, unless it stands there.
+
+    Args:
+        arm: the attempt's tools.
+        elsewhere: drive even so, since no pull could be planned from here.
+
+    Raises:
+        PlanningFailed: there is no such place, or no free way there.
+    """
+    if not arm.executor.drives:
+        return
+    part = Part.of(arm)
+
+    def share(goal: Array) -> float:
+        frame = arm_base_in_world(arm, goal)
+        if not body_is_free(frame, swept):  # what opens would run into it
+            return 0.0
+        return pull_share(arm, part, frame, transform(inverse(frame), others))
+
+    with arm.planning():
+        base = arm.scene.arm_base_in_world
+        others = transform(base, arm.scene.obstacles_in_base(without_link=(part.furniture, part.handle.link)))
+        moved = part.in_world(arm, part.way(arm))
+        swept = np.concatenate([transform(frame, part.surface(arm)[::THINNED]) for frame in moved[::THINNED]])
+        if not elsewhere and share(base_at(arm)) >= PULLED:
+            return
+    cloud = _fold(arm)
+    with arm.planning():
+        center = (moved @ part.hold)[:, :3, 3].mean(axis=0)
+        route = best_route(arm, places_before(arm, center), cloud, share, enough=PULLED)
+    drive(arm, *route)
+
+
+def drive_to_basket(arm: Arm, slot: int) -> None:
+    """Drive back to where the episode began, an object in the gripper.
+
+    Where there is no free way, or the basket is out of reach from there, stay if it is in reach, else drive to where it
+    is.
+
+    Raises:
+        PlanningFailed: no such place, no free way there, or the object was lost.
+    """
+    if not arm.executor.drives:
+        return
+
+    def share(goal: Array) -> float:
+        poses = drop_poses(arm, slot, arm_base_in_world(arm, goal))
+        return float(arm.reachability.reachable(poses, arm.at)[0].mean())
+
+    with arm.planning():
+        attach_held(arm, slot)
+        cloud = transform(arm.scene.arm_base_in_world, arm.scene.obstacles_in_base(without=slot))
+        start, here = np.zeros(3), base_at(arm)
+        route = None
+        if np.any(here) and share(start) >= ABOVE_BASKET:
+            route = free_route(arm, here, start, cloud, leaving=True)
+        if route is None and share(here) >= ABOVE_BASKET:
+            return
+        if route is None:
+            center = arm.env.fixtures.basket.pose.p[0].cpu().numpy()
+            route = best_route(arm, places_before(arm, center), cloud, share, enough=ABOVE_BASKET)
+    drive(arm, *route)
+    if not arm.holds(slot):
+        raise PlanningFailed("drive", "dropped")
+
+
+def _fold(arm: Arm) -> Array:
+    """Go to the rest configuration; gives the surfaces (P, 3) of all obstacles, world, m."""
+    with arm.planning():
+        in_base = arm.scene.obstacles_in_base()
+        arm.planner.set_scene(in_base)
+        home = arm.plan_home(arm.at)
+    arm.follow(home)
+    return transform(arm.scene.arm_base_in_world, in_base)
+
+
+def clear_grasps(arm: Arm, slot: int, others: Array) -> Array:
+    """An object's grasps (G, 4, 4) in the world, whichever side they come from, whose way in is clear.
+
+    Args:
+        arm: the attempt's tools.
+        slot: of the object.
+        others: (P, 3) surfaces of everything else, world, m.
+    """
+    object_in_world = arm.scene.arm_base_in_world @ arm.scene.object_in_base(slot)
+    notes = arm.env.object_assets[0][slot].annotations
+    poses = object_in_world @ notes.grasps_tcp_in_object[:: max(1, len(notes.grasp_widths) // GRASPS_LOOKED_AT)]
+    tests = directions_ok(poses, np.ones(3), arm.env.task_config.target.approach)
+    poses = poses[np.all([passed for name, passed in tests.items() if name != SIDE], axis=0)]
+    near = others[np.linalg.norm(others - object_in_world[:3, 3], axis=1) < 0.5]
+    return poses[gripper_is_clear(poses, near)]
+
+
+def reach_share(arm: Arm, base: Array, grasps: Array, others: Array) -> float:
+    """Share of grasps that the arm reaches from a base pose without touching anything, pre-grasps included.
+
+    Args:
+        arm: the attempt's tools.
+        base: (3,).
+        grasps: (G, 4, 4) from ``clear_grasps``; those that come from the far side count as out of reach.
+        others: (P, 3) surfaces of everything but the object, world, m.
+    """
+    frame = arm_base_in_world(arm, base)
+    chosen = _from_here(arm, frame, grasps)
+    if not len(chosen):
+        return 0.0
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(GRASPS, len(chosen))).round().astype(int)]
+    poses = inverse(frame) @ np.concatenate([chosen, chosen @ np.diag([-1.0, -1, 1, 1])])  # and their twins
+    before = poses.copy()
+    before[:, :3, 3] -= PREGRASP_DISTANCE * before[:, :3, 2]
+    solved, qpos = arm.reachability.reachable(np.concatenate([poses, before]), arm.at)
+    local = transform(inverse(frame), others[::THINNED])
+    arm.planner.set_scene(local[np.linalg.norm(local, axis=1) < ARM_LENGTH])
+    free = [bool(ok) and not arm.planner.collisions(q) for ok, q in zip(solved, qpos, strict=True)]
+    held, entered = np.array(free).reshape(2, 2, -1)  # grasp or pre-grasp; as annotated or its twin; which
+    return float((held & entered).any(axis=0).mean())
+
+
+def _from_here(arm: Arm, frame: Array, grasps: Array) -> Array:
+    """Those of the grasps (G, 4, 4) that come from where the arm's base (4x4, world) stands."""
+    center = grasps[:, :3, 3].mean(axis=0) if len(grasps) else np.zeros(3)
+    return grasps[directions_ok(grasps, center - frame[:3, 3], arm.env.task_config.target.approach)[SIDE]]
