@@ -146,7 +146,8 @@ class OpeningConfig(StrictModel):
     handle: str = Field(description="handle of that furniture")
     part: str = Field(default="", description="what instructions call the part; default: from the handle's name")
     opened_at: Annotated[float, Field(gt=0, le=1)] = Field(
-        default=0.6, description="share of the joint's range from which it counts as opened"
+        default=0.6,
+        description="share of the joint's range from which it counts as opened, below 0.8 (hinge) or 0.95 (slide)",
     )
 
 

@@ -3,7 +3,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config import load_task_config
+from robocas_ms3.config.load import shipped_configs
+from robocas_ms3.errors import AssetError, RobocasError
 from robocas_ms3.language.instructions import (
     SPLITS,
     TASKS,
@@ -16,6 +19,7 @@ from robocas_ms3.language.instructions import (
     template_ids,
 )
 from robocas_ms3.language.texts import Split, Task, instruction_texts, synonym_texts
+from robocas_ms3.scenes.model import SceneModel
 
 EXTRA = {"pick": {}, "search": {}, "select": {"relation": "nearest"}, "open_pick": {"part": "left door"}}
 
@@ -95,6 +99,21 @@ def test_a_synonym_of_a_support_keeps_its_preposition():
     found = {choose(seed, support="cabinet", object="lemon").text for seed in range(300)}
     assert any("in the cupboard" in text for text in found)
     assert not any("on the c" in text for text in found)
+
+
+@pytest.mark.parametrize("name", sorted(shipped_configs()))
+def test_goods_are_in_what_has_something_above_them_and_on_what_has_not(name):
+    config = load_task_config(name)
+    try:
+        model = SceneModel.load(config, load_pack("builtin"), load_pack("builtin"))
+    except AssetError:  # of a pack that is made from the user's own files
+        return
+    shelf = "shelf" in config.support
+    wanted = "in" if np.isfinite(model.headroom) and not shelf else "on"
+    texts = {choose(seed, support=config.support, object="lemon", synonyms=False).text for seed in range(60)}
+    other = "on" if wanted == "in" else "in"
+    assert any(f" {wanted} the {config.support}" in text for text in texts)
+    assert not any(f" {other} the {config.support}" in text for text in texts)
 
 
 def test_draws_are_repeatable_and_reach_everything():

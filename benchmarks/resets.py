@@ -1,0 +1,72 @@
+"""What a reset takes that finds its layout in the bank, state only; prints JSON.
+
+python benchmarks/resets.py --seeds 60
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+
+from robocas_ms3.config import load_task_config
+from robocas_ms3.scenes.bank import LayoutBank, fill, pairs_of
+from robocas_ms3.tasks import TASKS
+
+
+@dataclass
+class Benchmark:
+    """Fill the bank, then reset to each of its seeds."""
+
+    config: str = "search_table_stacked"
+    """Task configuration; this one has 15 objects."""
+    pack: str = "builtin"
+    """Object pack."""
+    seeds: int = 60
+    """How many, from 0 on."""
+    rounds: int = 3
+    """Times each seed is reset to, at least 2. In the first, objects are read from the pack."""
+
+
+def main(cfg: Benchmark) -> None:
+    """Run it."""
+    torch.set_num_threads(1)  # as generation does; the tensors are small
+    config = load_task_config(cfg.config)
+    env = gym.make(TASKS[config.task].env_id, config=cfg.config, pack=cfg.pack, obs_mode="none", render_backend="none")
+    base = env.unwrapped
+    pairs = pairs_of(range(cfg.seeds))
+    failed = {pair for pair, problem in fill(LayoutBank(base.model), pairs) if problem}
+    seeds = [seed for seed, _ in pairs if (seed, seed) not in failed]
+    rounds = []
+    for _ in range(cfg.rounds):
+        rounds.append([])
+        for seed in seeds:
+            wall, cpu = time.perf_counter(), time.thread_time()
+            env.reset(seed=seed)
+            rounds[-1].append((time.perf_counter() - wall, time.thread_time() - cpu))
+    report = {
+        "config": cfg.config,
+        "objects": len(base.objects),
+        "seeds": len(seeds),
+        "first_round_ms": _figures(rounds[:1]),
+        "later_rounds_ms": _figures(rounds[1:]),
+    }
+    print(json.dumps(report, indent=2))
+
+
+def _figures(rounds: list[list[tuple[float, float]]]) -> dict[str, dict[str, float]]:
+    """Of the wall's clock, and of this thread's CPU time, which a busy machine disturbs less."""
+    figures = {}
+    for name, seconds in zip(("wall", "cpu"), np.concatenate(rounds).T, strict=True):
+        values = {"median": np.median(seconds), "mean": np.mean(seconds), "p95": np.percentile(seconds, 95)}
+        figures[name] = {key: round(1000 * float(v), 1) for key, v in {**values, "max": np.max(seconds)}.items()}
+    return figures
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Benchmark))
