@@ -19,10 +19,13 @@ from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.planning.timing import through, timed
 from robocas_ms3.robots.constants import ARM_ACCELERATION_LIMIT, ARM_VELOCITY_LIMIT
+from robocas_ms3.scenes.grasping import MAX_WIDTH
 from robocas_ms3.scenes.placement import transform
 
 PULLS = 3  # with a new hold each, where one doesn't open far enough
 COMFORT = 0.3  # of the way from where it counts as opened to where a pull ends at most
+NEAR = 0.15  # m around the handle, in which what the fingers take hold of is looked for
+BETWEEN = (0.008, MAX_WIDTH / 2, 0.01)  # m from the TCP along its axes: what is between the pads
 JUDGED = 4  # ways to hold the handle that are checked for collisions where only reach is judged
 SHIFTS = (0.0, -0.03, 0.03)  # m along the bar
 TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
@@ -77,8 +80,7 @@ def pull(arm: Arm, part: Part) -> None:
     with arm.planning():
         arm.hold_nothing()
         arm.planner.set_scene(arm.scene.obstacles_in_base())
-        tcp = arm.planner.tcp(arm.at)
-        back = plan_step_back(arm, arm.at, [moved_back(tcp, distance) for distance in RETREATS], try_free=True)
+        back = _plan_retreat(arm, arm.at, try_free=True)
     arm.follow(back)
 
 
@@ -99,6 +101,9 @@ def plan_pull(arm: Arm, part: Part) -> PullPlan:
         raise PlanningFailed("pull", "unreachable")
     everything = arm.scene.obstacles_in_base()
     others = arm.scene.obstacles_in_base(without_link=(part.furniture, part.handle.link))
+    order = _fitting(arm, part, paths[0], order, frames, others)
+    if not order:
+        raise PlanningFailed("handle", "blocked")
     failure = PlanningFailed("pull", "no_plan")
     for index in order[:PULLS_PLANNED]:
         path = paths[: ends[index], index]
@@ -106,6 +111,7 @@ def plan_pull(arm: Arm, part: Part) -> PullPlan:
             free = _free_length(arm, part, path, frames, others)
             if free < least:
                 raise PlanningFailed("pull", "blocked")
+            free = _retreatable(arm, path[:free], int(np.ceil(least)))
             arm.planner.set_scene(everything)
             away = arm.planner.plan_straight(path[0], moved_back(arm.planner.tcp(path[0]), STANDOFF), stage="approach")
             reach = arm.planner.plan_to_qpos(arm.at, [away.qpos[-1]], stage="reach")
@@ -133,9 +139,10 @@ def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: Array) ->
     except PlanningFailed:
         return 0.0
     share = 0.0
-    for index in np.argsort(-ends, kind="stable")[:JUDGED]:
+    order = [i for i in np.argsort(-ends, kind="stable") if ends[i]]
+    for index in _fitting(arm, part, paths[0], order, frames, others)[:JUDGED]:
         path = paths[: ends[index], index]
-        if len(path) and share < 1:
+        if share < 1:
             share = max(share, min(1.0, _free_length(arm, part, path, frames, others) / enough))
     return share
 
@@ -158,6 +165,28 @@ def _paths(arm: Arm, part: Part, frames: Array) -> tuple[Array, NDArray[np.int_]
     return path, reached(path)
 
 
+def _fitting(arm: Arm, part: Part, starts: Array, order: list[int], frames: Array, others: Array) -> list[int]:
+    """Those of the ways to hold the handle in which it is between the open fingers, which touch nothing.
+
+    Args:
+        arm: the attempt's tools.
+        part: what is opened.
+        starts: (N, 7) of each way; NaN in those that are not in the order.
+        order: of ways.
+        frames: (T, 4, 4) of the part during the pull.
+        others: (P, 3) surfaces of all but the part.
+    """
+    surface = transform(frames[0], part.surface(arm))
+    near = surface[np.linalg.norm(surface - (frames[0] @ part.hold)[:3, 3], axis=1) < NEAR]
+    arm.planner.set_scene(np.concatenate([others, surface]))
+
+    def fits(start: Array) -> bool:
+        between = np.abs(transform(inverse(arm.planner.tcp(start)), near)) < BETWEEN
+        return bool(between.all(axis=1).any()) and not arm.planner.collisions(start, MAX_WIDTH)
+
+    return [i for i in order if fits(starts[i])]
+
+
 def _free_length(arm: Arm, part: Part, path: Array, frames: Array, others: Array) -> int:
     """How many configurations of a path (T, 7) keep clear of everything else and of the part at its poses (T, 4, 4)."""
     planner, width = arm.planner, part.handle.width
@@ -174,6 +203,27 @@ def _free_length(arm: Arm, part: Part, path: Array, frames: Array, others: Array
         if planner.collisions(path[i], width):
             return int(i * (1 - 1 / CHECKED))
     return length
+
+
+def _plan_retreat(arm: Arm, start: Array, *, try_free: bool = False) -> Trajectory:
+    tcp = arm.planner.tcp(start)
+    goals = [moved_back(tcp, distance) for distance in RETREATS]
+    return plan_step_back(arm, start, goals, try_free=try_free)
+
+
+def _retreatable(arm: Arm, path: Array, least: int) -> int:
+    """How much of a pull (T, 7) to do so that the gripper can step back at its end; at least the first few.
+
+    Raises:
+        PlanningFailed: as much as is worth it leaves no way back.
+    """
+    for length in range(len(path), max(least, 1) - 1, -3):
+        try:
+            _plan_retreat(arm, path[length - 1])
+            return length
+        except PlanningFailed:
+            continue
+    raise PlanningFailed("pull", "no_way_back")
 
 
 def _timed(path: Array, dt: float) -> Trajectory:
