@@ -132,7 +132,7 @@ class EpisodeGenerator:
             # seeded by seed and attempt alone: what was planned before must not matter
             entropy = np.random.SeedSequence([executor.seed, attempt])
             self.planner.seed(int(entropy.generate_state(1)[0]))
-            arm = Arm(self.planner, self.reachability, executor, np.random.default_rng(entropy))
+            arm = Arm(self.planner, self.reachability, executor, np.random.default_rng(entropy), attempt)
             try:
                 self.policy(arm)
                 result.success, result.steps = True, len(executor.actions)
@@ -140,20 +140,17 @@ class EpisodeGenerator:
             except PlanningFailed as error:
                 self._log(result, attempt, error, time.perf_counter() - begun)
                 last = error
-            if len(executor.actions) == first:
-                continue  # it failed in planning: nothing to undo
-            if not self.settings.keep_recoveries or last.stage == "horizon":
-                executor.reset()
-                recoveries = []
-                continue
-            try:
-                arm.back_out()
-                recoveries.append(
-                    {"range": [first, len(executor.actions) - 1], "stage": last.stage, "reason": last.reason}
-                )
-            except PlanningFailed:
-                executor.reset()
-                recoveries = []
+            if self.settings.keep_recoveries and len(executor.actions) > first and last.stage != "horizon":
+                try:
+                    arm.back_out()
+                    recoveries.append(
+                        {"range": [first, len(executor.actions) - 1], "stage": last.stage, "reason": last.reason}
+                    )
+                    continue
+                except PlanningFailed:
+                    pass
+            executor.go_back()
+            recoveries = [kept for kept in recoveries if kept["range"][1] < len(executor.actions)]
         return recoveries
 
     @staticmethod

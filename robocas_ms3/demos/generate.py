@@ -177,9 +177,6 @@ def _run(settings: EpisodeSettings, seeds: Iterator[int], folder: Path, jobs: in
 
 def _start_worker(settings: EpisodeSettings) -> None:
     global _worker  # noqa: PLW0603  (one generator a process)
-    import torch
-
-    torch.set_num_threads(1)
     try:
         _worker = EpisodeGenerator(settings)
     except Exception as error:  # noqa: BLE001  (raised by the first task: an initializer's own error breaks the pool)

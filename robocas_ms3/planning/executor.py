@@ -15,6 +15,7 @@ from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.tasks.transfer import TransferEnv
 
 OPEN, CLOSED = 1.0, -1.0
+TRIES = 2  # attempts from a checkpoint
 
 
 @dataclass
@@ -30,6 +31,21 @@ class Segment:
     goal_type: str
     goal_description: str
     first: int
+
+
+@dataclass
+class Checkpoint:
+    """A moment of the demonstration that later attempts may begin at, with nothing in the gripper.
+
+    Attributes:
+        length: actions made until then.
+        facts: what the policy had counted by then.
+        failures: attempts that began there, or went on from there, and failed.
+    """
+
+    length: int
+    facts: dict[str, Any]
+    failures: int = 0
 
 
 @dataclass
@@ -64,6 +80,7 @@ class Executor:
         base: (3,) where the base's joints are told to be: x m, y m, yaw rad.
         seconds: where the time went.
         facts: what a policy counts since the reset, for the record, e.g. ``pushes``.
+        checkpoints: what the policy reached since the reset, so that the next attempt need not begin at the reset.
     """
 
     env: gym.Env
@@ -75,6 +92,7 @@ class Executor:
     base: Array = field(default_factory=lambda: np.zeros(3))
     seconds: Seconds = field(default_factory=Seconds)
     facts: dict[str, Any] = field(default_factory=dict)
+    checkpoints: list[Checkpoint] = field(default_factory=list)
 
     @property
     def base_env(self) -> TransferEnv:
@@ -93,7 +111,39 @@ class Executor:
         with self.seconds.spent_on("reset"):
             _, self.info = self.env.reset(seed=self.seed)
         self.actions, self.segments, self.gripper, self.base = [], [], OPEN, np.zeros(3)
-        self.facts = {}
+        self.facts, self.checkpoints = {}, []
+
+    def mark(self) -> None:
+        """Make this moment a checkpoint."""
+        self.checkpoints.append(Checkpoint(len(self.actions), dict(self.facts)))
+
+    @property
+    def at_checkpoint(self) -> bool:
+        """Whether nothing was done since the last checkpoint."""
+        return bool(self.checkpoints) and self.checkpoints[-1].length == len(self.actions)
+
+    def go_back(self) -> None:
+        """Undo what failed: return to the last checkpoint, where there is none to the reset.
+
+        Where an attempt could do nothing from the checkpoint, or the second one failed, half of all checkpoints are
+        given up. There is no other way back than to simulate all kept actions again, from the reset on.
+        """
+        if self.checkpoints:
+            self.checkpoints[-1].failures += 1
+            if self.at_checkpoint or self.checkpoints[-1].failures == TRIES:
+                del self.checkpoints[len(self.checkpoints) // 2 :]
+        kept = self.checkpoints
+        length = kept[-1].length if kept else 0
+        if length == len(self.actions):
+            return
+        actions, segments = self.actions[:length], [s for s in self.segments if s.first < length]
+        self.reset()
+        for action in actions:
+            self._step(action)
+        self.segments, self.checkpoints = segments, kept
+        if kept:
+            self.facts, self.gripper = dict(kept[-1].facts), float(actions[-1][7])
+            self.base = actions[-1][8:].astype(float) if self.drives else self.base
 
     def follow(self, trajectory: Trajectory, *, until: str | None = None) -> bool:
         """Send a trajectory's rows to the arm, the gripper's command held.

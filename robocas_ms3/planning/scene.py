@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 import torch
 from mani_skill.utils.structs import Articulation
@@ -85,20 +87,23 @@ class PlanningScene:
         """4x4 of the basket's frame in the arm's base frame."""
         return inverse(self.arm_base_in_world) @ matrix(self.env.fixtures.basket.pose.raw_pose[0])
 
-    def obstacles_in_base(self, *, without: int | None = None, without_link: tuple[str, str] | None = None) -> Array:
+    def obstacles_in_base(
+        self, *, without: int | Collection[int] = (), without_link: tuple[str, str] | None = None
+    ) -> Array:
         """Samples (P, 3) of the collision surfaces of furniture, basket and objects.
 
         Args:
-            without: slot of an object to leave out.
+            without: slot or slots of objects to leave out.
             without_link: a piece of furniture and its moving part to leave out.
         """
         to_base = inverse(self.arm_base_in_world)
+        left_out = {without} if isinstance(without, int) else set(without)
         pieces = [
             transform(to_base, self._furniture_in_world(without_link)),
             transform(self.basket_in_base, self.env.model.basket.surface_points(SPACING)),
         ]
         for slot, asset in enumerate(self.env.object_assets[0]):
-            if slot != without:
+            if slot not in left_out:
                 pieces.append(transform(self.object_in_base(slot), asset.surface_points(SPACING)))
         points = np.concatenate(pieces)
         return points[np.linalg.norm(points, axis=1) <= RADIUS]

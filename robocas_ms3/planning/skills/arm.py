@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,6 +29,7 @@ class Arm:
         reachability: batched inverse kinematics of the same arm.
         executor: runs motions in the environment and remembers them.
         rng: source of all randomness of the attempt.
+        attempt: which attempt at the episode this is, from 0.
         at: (7,) rad where the arm was last told to be; at first, where it is.
     """
 
@@ -35,6 +37,7 @@ class Arm:
     reachability: Reachability
     executor: Executor
     rng: np.random.Generator
+    attempt: int = 0
     at: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -98,7 +101,7 @@ class Arm:
         """Plan to the rest configuration."""
         return self.planner.plan_to_qpos(start, [np.array(ARM_REST)], stage="home")
 
-    def rise_clear(self, *, without: int | None = None) -> None:
+    def rise_clear(self, *, without: int | Collection[int] = ()) -> None:
         """Rise in small steps, through whatever is touched, until arm and held object touch nothing.
 
         Args:
@@ -112,8 +115,10 @@ class Arm:
                 self.planner.set_scene(self.scene.obstacles_in_base(without=without))
                 if not self.planner.collisions(self.at, self.planner.finger_width):
                     return
-                goal = raised(self.planner.tcp(self.at), RISE)
-                motion = self.planner.plan_straight(self.at, goal, stage="rise", check_collisions=False)
+                up = raised(self.planner.tcp(self.at), RISE)
+                inward = up.copy()  # at the end of its reach it can only rise towards the robot
+                inward[:2, 3] *= 1 - RISE / np.linalg.norm(up[:2, 3])
+                motion = self.first_line(self.at, [up, inward], stage="rise", check_collisions=False)
             self.follow(motion)
 
     def back_out(self) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import PlanningFailed
@@ -77,18 +78,19 @@ def push_away(arm: Arm, slot: int, target: int) -> None:
         plan = plan_push(arm, slot, target)
     arm.executor.gripper = CLOSED  # it closes on the way
     arm.follow(plan.reach, plan.down)
-    lift = plan.lift if _push_on(arm, plan.push) else _plan_lift(arm, plan.direction)
+    lift = plan.lift if _push_on(arm, plan.push, plan.direction) else _plan_lift(arm, plan.direction)
     arm.follow(lift)
     arm.executor.move_gripper(CLOSED, arm.at, seconds=SETTLE_SECONDS)
 
 
-def _push_on(arm: Arm, push: Trajectory) -> bool:
+def _push_on(arm: Arm, push: Trajectory, direction: Array) -> bool:
     """Run a push step by step; False where it was cut short, since what was pushed resisted."""
     resisted = 0
+    ahead = torch.as_tensor(arm.scene.arm_base_in_world[:3, :3] @ direction, dtype=torch.float32)
     for qpos in push.qpos:
         arm.follow(Trajectory(qpos[None], push.dt))
-        force = float(arm.env.gripper_forces()[0].sum(dim=(0, 1)).norm())
-        resisted = resisted + 1 if force > MAX_FORCE else 0
+        against = -(arm.env.gripper_forces()[0] @ ahead)  # what each object does to each part of the gripper
+        resisted = resisted + 1 if float(against.clamp(min=0).sum()) > MAX_FORCE else 0
         if resisted == STEPS_RESISTED:
             return False
     return True
@@ -101,11 +103,21 @@ def _plan_lift(arm: Arm, direction: Array) -> Trajectory:
 
 
 def plan_push(arm: Arm, slot: int, target: int) -> PushPlan:
-    """Plan the first push that has a way in.
+    """Plan the first push that has a way in; one that would move other objects too only where there is no other.
+
+    The way to the object is clear of everything, and the way along of furniture, basket and target in either case.
 
     Raises:
         PlanningFailed: of the push that came last.
     """
+    slots = set(range(len(arm.env.object_assets[0])))
+    try:
+        return _plan_push(arm, slot, target, movable={slot})
+    except PlanningFailed:
+        return _plan_push(arm, slot, target, movable=slots - {target})
+
+
+def _plan_push(arm: Arm, slot: int, target: int, movable: set[int]) -> PushPlan:
     planner, everything = arm.planner, arm.scene.obstacles_in_base()
     others = arm.scene.obstacles_in_base(without=slot)
     failure = PlanningFailed("push", "no_room")
@@ -120,7 +132,7 @@ def plan_push(arm: Arm, slot: int, target: int) -> PushPlan:
                 failure = error
             if len(begun) == PUSHES_PLANNED:
                 break
-        planner.set_scene(others)  # the object pushed is no obstacle on the way along; everything else is
+        planner.set_scene(arm.scene.obstacles_in_base(without=movable))  # those are no obstacles on the way along
         ways: list[tuple[Array, Trajectory, Trajectory, Trajectory]] = []
         first = np.zeros(3)
         for push, qpos, down in begun:

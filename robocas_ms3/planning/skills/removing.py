@@ -15,16 +15,17 @@ from robocas_ms3.planning.skills.pushing import surface_in_base
 from robocas_ms3.scenes.grasping import MAX_WIDTH, directions_ok, gripper_is_clear
 from robocas_ms3.scenes.placement import transform
 
-GRID = 0.03  # m between places tried
+GRID = 0.04  # m between places tried
 TURNS = 8  # of the object about the vertical
 ROOM = 0.03  # m kept to everything else, seen from above
-EDGE_MARGIN = 0.03  # m kept from the surface's edge
+EDGE_MARGINS = (0.1, 0.03)  # m kept from the surface's edge, where there is room for it
 RELEASE_HEIGHT = 0.012  # m of the object's lowest point above the surface when let go
 COME_DOWN = 0.06  # m above that, from where it comes straight down
 RETREAT = 0.08  # m
+ARM_REACH = 0.8  # m from its base
 LIFTS = (0.08, 0.2)  # m, least and greatest
 GRASPS_LOOKED_AT = 150
-PLACES_PLANNED = 12
+PLACES_SOLVED, PLACES_PLANNED = 96, 12
 
 
 def remove(arm: Arm, slot: int) -> None:
@@ -99,20 +100,25 @@ def plan_place(arm: Arm, slot: int) -> tuple[Trajectory, Trajectory]:
     tcp, object_in_base = scene.tcp_in_base, scene.object_in_base(slot)
     vertices = np.concatenate(asset.hulls)
     others = scene.obstacles_in_base(without=slot)
-    places = free_places(transform(object_in_base, vertices), others, *surface_in_base(arm)) @ tcp
-    if not len(places):
-        raise PlanningFailed("remove", "no_free_place")
-    above = places.copy()
-    above[:, 2, 3] += COME_DOWN
-    solved, qpos = arm.reachability.reachable(above, start)
-    solved[solved] = arm.reachability.reachable(places[solved], start)[0]
-    if not solved.any():
-        raise PlanningFailed("remove", "unreachable")
+    failure = PlanningFailed("remove", "no_free_place")
+    for margin in EDGE_MARGINS:
+        places = free_places(transform(object_in_base, vertices), others, *surface_in_base(arm), margin) @ tcp
+        nearest = np.argsort(np.linalg.norm(places[:, :2, 3] - tcp[:2, 3], axis=1), kind="stable")
+        # near and far ones: all of them would take inverse kinematics seconds
+        places = places[nearest[:: max(1, len(places) // PLACES_SOLVED)]]
+        above = places.copy()
+        above[:, 2, 3] += COME_DOWN
+        solved, qpos = arm.reachability.reachable(above, start)
+        solved[solved] = arm.reachability.reachable(places[solved], start)[0]
+        if solved.any():
+            break
+        failure = PlanningFailed("remove", "unreachable") if len(places) else failure
+    else:
+        raise failure
     places, above, qpos = places[solved], above[solved], qpos[solved]
     arm.planner.set_scene(others)
     arm.planner.attach(AttachedBody(vertices, inverse(tcp) @ object_in_base))
     arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
-    failure = PlanningFailed("remove", "no_plan")
     for index in np.argsort(np.abs(qpos - start).max(axis=1), kind="stable")[:PLACES_PLANNED]:
         try:
             carry = arm.planner.plan_to_pose(start, above[index], stage="remove")
@@ -122,7 +128,7 @@ def plan_place(arm: Arm, slot: int) -> tuple[Trajectory, Trajectory]:
     raise failure
 
 
-def free_places(vertices: Array, others: Array, frame: Array, half: Array) -> Array:
+def free_places(vertices: Array, others: Array, frame: Array, half: Array, margin: float = EDGE_MARGINS[-1]) -> Array:
     """Motions that bring a held object above a free place of a surface, turned about the vertical.
 
     Args:
@@ -130,16 +136,18 @@ def free_places(vertices: Array, others: Array, frame: Array, half: Array) -> Ar
         others: (P, 3) surfaces of everything else.
         frame: 4x4 of the surface's middle in the same frame.
         half: (2,) its half size, m.
+        margin: kept from its edge, m.
 
     Returns:
         (n, 4, 4) motions in that frame.
     """
     middle = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
     outline = (vertices - middle)[:, :2]
-    limit = half - EDGE_MARGIN
+    limit = np.maximum(half - margin, 0)
     axes = [np.arange(-extent, extent + 1e-9, GRID) for extent in limit]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     spots = grid @ frame[:2, :2].T + frame[:2, 3]
+    spots = spots[np.linalg.norm(spots, axis=1) <= ARM_REACH]
     standing = others[others[:, 2] > frame[2, 3] + 0.005]
     tree = KDTree(standing[:, :2])
     distance, _ = tree.query(spots)

@@ -19,14 +19,13 @@ from robocas_ms3.planning.skills.removing import blockers, hang_clear, remove
 from robocas_ms3.scenes.placement import transform
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 
-REMOVALS = 6  # pushes and removals an attempt may make
-FAILED_REMOVALS = 1  # obstacles that an attempt may lose hold of
-LIFT_FIRST = 0.3  # how often an obstacle is lifted though it might be pushed
+REMOVALS = 8  # pushes and removals a demonstration may hold
+FAILED_REMOVALS = 1  # obstacles that a demonstration may lose hold of
+LIFT_FIRST = 0.3  # how often an attempt after the first lifts what it might push
 HEIGHT_NOISE = 0.01  # m, so that another attempt may begin with another of two that are about as high
 LIFT_HEIGHT = 0.15  # m, upstream's
 FALLEN = 0.05  # m below the surface at which an object counts as pushed off it
 HIDDEN_SHARE = 0.2  # of the target, up to which it counts as found (the paper's)
-SMALL_MOVE = 100  # control steps, up to which a skill that failed has only freed the arm
 HORIZON_SHARE = 0.85  # of the horizon, at which an attempt that still clears is given up
 
 
@@ -41,7 +40,8 @@ def attempt(arm: Arm) -> None:
     find, take = subgoal("find the object", *words), subgoal("move and grasp", *words)
     clearing = _Clearing(arm, slot)
     arm.executor.label(**find)
-    look_at(arm, clearing.middle(slot), FAR)
+    if not arm.executor.at_checkpoint:
+        look_at(arm, clearing.middle(slot), FAR)
     while True:
         obstacles = clearing.obstacles()
         if not obstacles or (clearing.stuck and clearing.visible):
@@ -55,6 +55,7 @@ def attempt(arm: Arm) -> None:
         if clearing.clear_one(obstacles):
             look_at(arm, clearing.middle(slot), NEAR)
             clearing.check()
+            arm.executor.mark()
     hang_clear(arm, slot)
     arm.executor.label(**subgoal("transfer object", *words))
     carry_to_basket(arm, slot)
@@ -97,7 +98,8 @@ class _Clearing:
         self.stuck = False
         self._hopeless: set[tuple[str, int]] = set()  # what can't be planned as things stand
         self._on_table = self._above_surface()
-        arm.executor.facts.update(pushes=0, removals=0, failed_removals=0)
+        for fact in ("pushes", "removals", "failed_removals"):
+            arm.executor.facts.setdefault(fact, 0)
 
     def obstacles(self) -> list[int]:
         """What has to go, the highest first; empty: the target is free, by the paper's rule."""
@@ -123,7 +125,7 @@ class _Clearing:
         Raises:
             PlanningFailed: none can be moved, one was lost on the way, or enough has been moved.
         """
-        if self._tried.total() >= REMOVALS:
+        if sum(self._arm.executor.facts.values()) >= REMOVALS:
             raise PlanningFailed("clear", "too_many_obstacles")
         order = list(dict.fromkeys(obstacles))
         if self.stuck:
@@ -131,11 +133,12 @@ class _Clearing:
         failure = PlanningFailed("clear", "nothing_to_move")
         for slot in sorted(set(order) - {self._target}, key=lambda slot: (self._tried[slot] > 1, order.index(slot))):
             # what a push did not move is lifted next time; where pushing went wrong, another attempt may lift first
-            lift_first = self._tried[slot] or self._arm.rng.uniform() < LIFT_FIRST
+            lift_first = self._tried[slot] or (self._arm.attempt > 0 and self._arm.rng.uniform() < LIFT_FIRST)
             skills = ("removals", "pushes") if lift_first else ("pushes", "removals")
             for skill in skills:
                 if (skill, slot) in self._hopeless:
                     continue
+                self._arm.rise_clear()
                 done = len(self._arm.executor.actions)
                 try:
                     self._use(skill, slot)
@@ -144,7 +147,7 @@ class _Clearing:
                     return True
                 except PlanningFailed as error:
                     failure = error
-                    if len(self._arm.executor.actions) > done + SMALL_MOVE:  # it failed on the way, not in planning
+                    if len(self._arm.executor.actions) > done:  # it failed on the way, not in planning
                         self._go_on(slot, failure)
                         self._hopeless.clear()
                         return True
