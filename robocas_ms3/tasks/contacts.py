@@ -25,10 +25,10 @@ def contact_forces(
         rows = [torch.stack([scene.get_pairwise_contact_forces(b, o) for o in objects], dim=1) for b in bodies]
         return torch.stack(rows, dim=1)
     forces = torch.zeros(1, len(bodies), len(objects), 3)
-    body_index = {b._bodies[0].entity.per_scene_id: i for i, b in enumerate(bodies)}
-    object_index = {o._bodies[0].entity.per_scene_id: i for i, o in enumerate(objects)}
+    body_index = {b._bodies[0]: i for i, b in enumerate(bodies)}
+    object_index = {o._bodies[0]: i for i, o in enumerate(objects)}
     for contact in cast(PhysxCpuSystem, scene.px).get_contacts():
-        first, second = (part.entity.per_scene_id for part in contact.bodies)
+        first, second = contact.bodies
         if first in body_index and second in object_index:
             key, sign = (body_index[first], object_index[second]), 1.0
         elif second in body_index and first in object_index:

@@ -104,12 +104,11 @@ class TransferEnv(RoboCASEnv):
             touched = terms.touched(self.gripper_forces())
         poses = self.object_poses if poses is None else poses
         basket, start, slot = self.fixtures.basket.pose, self.basket_at_start, self.target_slot
-        linear = torch.stack([actor.linear_velocity for actor in self.objects], dim=1)
-        angular = torch.stack([actor.angular_velocity for actor in self.objects], dim=1)
+        linear, angular = self._target_velocity()
         return {
             "in_basket": terms.of_target(self.in_basket(poses), slot),
             "untouched": ~terms.of_target(touched, slot),
-            "at_rest": terms.at_rest(terms.of_target(linear, slot), terms.of_target(angular, slot)),
+            "at_rest": terms.at_rest(linear, angular),
             "basket_stands": terms.stands(basket.p, basket.q, start[:, :3], start[:, 3:]),
         }
 
@@ -118,6 +117,15 @@ class TransferEnv(RoboCASEnv):
         basket = self.fixtures.basket.pose
         centers = poses[..., :3] + terms.rotate(poses[..., 3:], self._centers_of_mass)
         return terms.inside_box(centers, basket.p, basket.q, self._basket_low, self._basket_high)
+
+    def _target_velocity(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """(N, 3) m/s and (N, 3) rad/s of the targets; for a single env without asking all objects."""
+        if self.num_envs == 1:
+            target = self.objects[int(self.target_slot[0])]
+            return target.linear_velocity, target.angular_velocity
+        linear = torch.stack([actor.linear_velocity for actor in self.objects], dim=1)
+        angular = torch.stack([actor.angular_velocity for actor in self.objects], dim=1)
+        return terms.of_target(linear, self.target_slot), terms.of_target(angular, self.target_slot)
 
     def _disturbed(self, poses: torch.Tensor) -> torch.Tensor:
         """(N,) how many objects other than the target no longer stand as they stood."""
