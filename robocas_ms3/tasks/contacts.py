@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from mani_skill.envs.scene import ManiSkillScene
@@ -25,8 +25,8 @@ def contact_forces(
         rows = [torch.stack([scene.get_pairwise_contact_forces(b, o) for o in objects], dim=1) for b in bodies]
         return torch.stack(rows, dim=1)
     forces = torch.zeros(1, len(bodies), len(objects), 3)
-    body_index = {b._bodies[0]: i for i, b in enumerate(bodies)}
-    object_index = {o._bodies[0]: i for i, o in enumerate(objects)}
+    body_index: dict[Any, int] = {b._bodies[0]: i for i, b in enumerate(bodies)}
+    object_index: dict[Any, int] = {o._bodies[0]: i for i, o in enumerate(objects)}
     for contact in cast(PhysxCpuSystem, scene.px).get_contacts():
         first, second = contact.bodies
         if first in body_index and second in object_index:
