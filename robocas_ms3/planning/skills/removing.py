@@ -7,11 +7,13 @@ from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
-from robocas_ms3.planning.scene import SPACING, inverse
+from robocas_ms3.planning.protocol import Array, Trajectory
+from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
 from robocas_ms3.planning.skills.grasping import grasp
+from robocas_ms3.planning.skills.placing import attach_held
 from robocas_ms3.planning.skills.pushing import surface_in_base
+from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.scenes.grasping import MAX_WIDTH, directions_ok, gripper_is_clear
 from robocas_ms3.scenes.placement import transform
 
@@ -45,15 +47,13 @@ def remove(arm: Arm, slot: int) -> None:
     arm.open_gripper()
     with arm.planning():
         arm.hold_nothing()
-        retreat = _plan_retreat(arm)
+        retreat = plan_step_back(arm, arm.at, _ways_off(arm.planner.tcp(arm.at)))
     arm.follow(retreat)
 
 
 def hang_clear(arm: Arm, slot: int) -> None:
     """Raise a held object until it touches nothing."""
-    object_in_tcp = inverse(arm.scene.tcp_in_base) @ arm.scene.object_in_base(slot)
-    arm.planner.attach(AttachedBody(np.concatenate(arm.env.object_assets[0][slot].hulls), object_in_tcp))
-    arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
+    attach_held(arm, slot)
     arm.rise_clear(without=slot)
 
 
@@ -96,13 +96,12 @@ def plan_place(arm: Arm, slot: int) -> tuple[Trajectory, Trajectory]:
         PlanningFailed: of the place that came last.
     """
     scene, start = arm.scene, arm.at
-    asset = arm.env.object_assets[0][slot]
-    tcp, object_in_base = scene.tcp_in_base, scene.object_in_base(slot)
-    vertices = np.concatenate(asset.hulls)
+    vertices = transform(scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
+    tcp = scene.tcp_in_base
     others = scene.obstacles_in_base(without=slot)
     failure = PlanningFailed("remove", "no_free_place")
     for margin in EDGE_MARGINS:
-        places = free_places(transform(object_in_base, vertices), others, *surface_in_base(arm), margin) @ tcp
+        places = free_places(vertices, others, *surface_in_base(arm), margin) @ tcp
         nearest = np.argsort(np.linalg.norm(places[:, :2, 3] - tcp[:2, 3], axis=1), kind="stable")
         # near and far ones: all of them would take inverse kinematics seconds
         places = places[nearest[:: max(1, len(places) // PLACES_SOLVED)]]
@@ -117,8 +116,7 @@ def plan_place(arm: Arm, slot: int) -> tuple[Trajectory, Trajectory]:
         raise failure
     places, above, qpos = places[solved], above[solved], qpos[solved]
     arm.planner.set_scene(others)
-    arm.planner.attach(AttachedBody(vertices, inverse(tcp) @ object_in_base))
-    arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
+    attach_held(arm, slot)
     for index in np.argsort(np.abs(qpos - start).max(axis=1), kind="stable")[:PLACES_PLANNED]:
         try:
             carry = arm.planner.plan_to_pose(start, above[index], stage="remove")
@@ -132,9 +130,9 @@ def free_places(vertices: Array, others: Array, frame: Array, half: Array, margi
     """Motions that bring a held object above a free place of a surface, turned about the vertical.
 
     Args:
-        vertices: (V, 3) of the object where it is held, upright frame, m.
+        vertices: (V, 3) of the object where it is held, in the arm's base frame, m.
         others: (P, 3) surfaces of everything else.
-        frame: 4x4 of the surface's middle in the same frame.
+        frame: 4x4 of the surface's middle.
         half: (2,) its half size, m.
         margin: kept from its edge, m.
 
@@ -180,9 +178,7 @@ def _rim(outline: Array, spacing: float = 0.015) -> Array:
     return np.concatenate(points)
 
 
-def _plan_retreat(arm: Arm) -> Trajectory:
-    arm.planner.set_scene(arm.scene.obstacles_in_base())
-    tcp = arm.planner.tcp(arm.at)
-    back = moved_back(tcp, RETREAT)
-    goals = [raised(tcp, RETREAT), raised(back, RETREAT / 2), back, raised(tcp, RETREAT / 2)]
-    return arm.first_line(arm.at, goals, stage="retreat", check_collisions=False)
+def _ways_off(tcp_in_base: Array) -> list[Array]:
+    """Where to step back to from what stands there now: up, back, or between."""
+    back = moved_back(tcp_in_base, RETREAT)
+    return [raised(tcp_in_base, RETREAT), raised(back, RETREAT / 2), back, raised(tcp_in_base, RETREAT / 2)]
