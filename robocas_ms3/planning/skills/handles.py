@@ -23,7 +23,7 @@ from robocas_ms3.scenes.grasping import MAX_WIDTH
 from robocas_ms3.scenes.placement import transform
 
 PULLS = 3  # with a new hold each, where one doesn't open far enough
-COMFORT = 0.3  # of the way from where it counts as opened to where a pull ends at most
+COMFORT = 0.15  # of the way from where it counts as opened to where a pull ends at most
 NEAR = 0.15  # m around the handle, in which what the fingers take hold of is looked for
 BETWEEN = (0.008, MAX_WIDTH / 2, 0.01)  # m from the TCP along its axes: what is between the pads
 JUDGED = 4  # ways to hold the handle that are checked for collisions where only reach is judged
