@@ -16,6 +16,9 @@ class Build:
     """Make the layouts of a range of seeds ahead, so that a reset only sets poses.
 
     What is there already is kept: the same command goes on where one was interrupted.
+
+    One env has objects and arrangement of one seed. Several envs are built with the objects of seeds 0, 1, ... and keep
+    them, while arrangements change: for num_envs=4, --objects 0:4 --seeds 0:100 is what resets without a seed use.
     """
 
     config: Annotated[str, tyro.conf.Positional]
@@ -27,9 +30,7 @@ class Build:
     seeds: str = "0:100"
     """First seed, and the one after the last."""
     objects: str | None = None
-    """Seeds of objects, 0:4 or 3,7: each goes with all of --seeds. Default: objects and arrangement of one seed, as one
-    env has them. Several envs are built with the objects of seeds 0, 1, ... and keep them, so that num_envs=4 wants
-    --objects 0:4 --seeds 0:100."""
+    """Seeds of objects of several envs, 0:4 or 3,7. Default: those of one env."""
     jobs: int | None = None
     """Processes. Default: one for each CPU core."""
     out: Path | None = None
