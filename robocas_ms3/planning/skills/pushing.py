@@ -20,6 +20,7 @@ STAND_OFF = 0.02  # m between the tool and the object before the push (upstream'
 TOOL_RADIUS = 0.012  # m, half the width of the closed fingers
 TIP_BELOW_TCP = 0.0085  # m, by which the pads reach beyond the TCP
 TIP_CLEARANCE = 0.012  # m kept between the finger tips and the surface
+BELOW_TOP = 0.02  # m; nearer to an object's top the tool would slide over it
 ABOVE = 0.08  # m above the start of the push, from where the tool comes straight down
 LIFT = 0.05  # m after the push (upstream's)
 PUSH_LENGTH = (0.06, 0.16)  # m, least and greatest way of the tool once it touches
@@ -200,7 +201,7 @@ def candidates(
     ahead = push_direction(rng, center, target)
     lowest = frame[2, 3] + TIP_CLEARANCE + TIP_BELOW_TCP
     top = points[:, 2].max()
-    heights = [h for h in np.arange(max(target[2], points[:, 2].min(), lowest), top - 0.005, 0.015)]
+    heights = [h for h in np.arange(max(target[2], points[:, 2].min(), lowest), top - BELOW_TOP, 0.015)]
     if not heights and top - 0.01 >= lowest:
         heights = [top - 0.01]
     near = others[np.linalg.norm(others[:, :2] - center[:2], axis=1) < 0.3]

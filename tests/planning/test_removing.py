@@ -1,0 +1,73 @@
+"""A heap's topmost objects are lifted away and put down; a push moves an object away from the target. Simulated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.executor import Executor
+from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.pushing import push_away, push_direction
+from robocas_ms3.planning.skills.removing import remove
+from robocas_ms3.scenes.placement import transform
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def generator():
+    made = EpisodeGenerator(EpisodeSettings("search", "search_table_small_heap", "builtin"))
+    yield made
+    made.close()
+
+
+def begin(generator, seed):
+    """The arm at the start of an episode, and the heap's objects but the target, the highest first."""
+    executor = Executor(generator.env, seed)
+    executor.reset()
+    generator.planner.seed(seed)
+    arm = Arm(generator.planner, generator.reachability, executor, np.random.default_rng(seed))
+    target = int(arm.env.target_slot[0])
+    slots = [s for s in np.flatnonzero(arm.env.present[0].numpy()).tolist() if s != target]
+    return arm, target, sorted(slots, key=lambda slot: -surface(arm, slot)[:, 2].max())
+
+
+def surface(arm, slot):
+    return transform(arm.scene.object_in_base(slot), arm.env.object_assets[0][slot].surface_points())
+
+
+def first_that_works(skill, slots):
+    for slot in slots:
+        try:
+            skill(slot)
+        except PlanningFailed:
+            continue
+        return slot
+    raise AssertionError("none could be moved")
+
+
+def test_a_removed_object_stands_on_a_free_place_of_the_table(generator):
+    arm, target, slots = begin(generator, 1)
+    before = {slot: surface(arm, slot) for slot in [*slots, target]}
+    moved = first_that_works(lambda slot: remove(arm, slot), slots)
+    after = surface(arm, moved)
+    table = min(points[:, 2].min() for points in before.values())
+    assert after[:, 2].min() == pytest.approx(table, abs=0.005)  # it stands on the table
+    assert np.linalg.norm((after - before[moved]).mean(axis=0)[:2]) > 0.05
+    others = np.concatenate([surface(arm, slot) for slot in before if slot != moved])
+    gaps = np.linalg.norm(after[:, None, :2] - others[None, ::10, :2], axis=2)
+    assert gaps.min() > 0.01  # clear of all others, seen from above
+    assert not arm.env.grasped().any()
+    assert float(arm.env.agent.gripper_width[0]) > 0.07
+
+
+def test_a_push_moves_an_object_away_from_the_target(generator):
+    arm, target, slots = begin(generator, 3)
+    starts = {slot: surface(arm, slot).mean(axis=0) for slot in [*slots, target]}
+    pushed = first_that_works(lambda slot: push_away(arm, slot, target), slots)
+    ahead = push_direction(np.random.default_rng(0), starts[pushed], starts[target])
+    shift = surface(arm, pushed).mean(axis=0) - starts[pushed]
+    assert shift @ ahead > 0.02
+    assert np.abs(arm.env.gripper_forces()).max() == 0  # it has let go of everything
