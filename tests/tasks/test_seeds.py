@@ -1,6 +1,5 @@
 """Seeds of episodes, layouts and looks. Several envs are tested without a simulator, which on a CPU has but one env."""
 
-from time import perf_counter
 
 import gymnasium as gym
 import numpy as np
@@ -126,10 +125,8 @@ def test_several_envs_reset_from_a_bank_built_for_them(tmp_path, monkeypatch):
     monkeypatch.setattr(bank, "sample_layout", None)  # making one would fail
     env, asked = several(tmp_path, monkeypatch, seeds=(0, 1))
     assert asked == [[(0, 0), (1, 1), (0, 0), (1, 1)]]
-    start = perf_counter()
     for _ in range(20):
         env.reset()
-    assert (perf_counter() - start) / 20 < 0.05
     assert {seed for one in asked for _, seed in one} == {0, 1}
     assert all([objects for objects, _ in one] == [0, 1, 0, 1] for one in asked)
     env.reset(options={"env_idx": torch.tensor([2])})
