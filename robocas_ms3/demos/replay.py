@@ -80,6 +80,7 @@ def replay(
     kwargs = {**info["env_kwargs"], "control_mode": mode, "obs_mode": obs_mode, **(env_kwargs or {})}
     if obs_mode == "none":
         kwargs.setdefault("render_backend", "none")
+    torch.set_num_threads(1)  # as where episodes are generated
     env = gym.make(info["env_id"], **kwargs)
     episodes = data["episodes"][:count]
     try:
