@@ -19,6 +19,7 @@ def attempt(arm: Arm) -> None:
     if not arm.env.task_stages()["furniture_opened"][0]:
         arm.executor.label(**subgoal("operate the target", *words))
         open_from_reach(arm)
+        arm.executor.mark()
     arm.executor.label(**subgoal("move and grasp", *words))
     grasp_from_reach(arm, slot)
     arm.executor.label(**subgoal("transfer object", *words))
