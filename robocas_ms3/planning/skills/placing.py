@@ -124,8 +124,7 @@ def _ways_off(tcp_in_base: Array) -> list[Array]:
 
 
 def _why_not(arm: Arm) -> str:
-    measures = arm.env.target_measures()
-    for reason in ("in_basket", "untouched", "at_rest", "basket_stands"):
-        if not bool(measures[reason][0]):
-            return f"not_{reason}"
+    for measure, reached in arm.env.target_measures().items():
+        if not bool(reached[0]):
+            return f"not_{measure}"
     return "unstable"
