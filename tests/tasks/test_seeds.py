@@ -1,6 +1,5 @@
 """Seeds of episodes, layouts and looks. Several envs are tested without a simulator, which on a CPU has but one env."""
 
-
 import gymnasium as gym
 import numpy as np
 import pytest

@@ -115,10 +115,7 @@ class Arm:
                 self.planner.set_scene(self.scene.obstacles_in_base(without=without))
                 if not self.planner.collisions(self.at, self.planner.finger_width):
                     return
-                up = raised(self.planner.tcp(self.at), RISE)
-                inward = up.copy()  # at the end of its reach it can only rise towards the robot
-                inward[:2, 3] *= 1 - RISE / np.linalg.norm(up[:2, 3])
-                motion = self.first_line(self.at, [up, inward], stage="rise", check_collisions=False)
+                motion = self._plan_rise(self.planner.tcp(self.at), RISE, stage="rise")
             self.follow(motion)
 
     def back_out(self) -> None:
@@ -127,9 +124,15 @@ class Arm:
         self.open_gripper()
         with self.planning():
             self.planner.set_scene(self.scene.obstacles_in_base())
-            goal = raised(self.scene.tcp_in_base, 0.10)
-            motion = self.planner.plan_straight(self.at, goal, stage="recover", check_collisions=False)
+            motion = self._plan_rise(self.scene.tcp_in_base, 0.10, stage="recover")
         self.follow(motion)
+
+    def _plan_rise(self, tcp_in_base: Array, height: float, *, stage: str) -> Trajectory:
+        """Plan straight up, through whatever is touched; at the end of its reach the arm rises towards the robot."""
+        up = raised(tcp_in_base, height)
+        inward = up.copy()
+        inward[:2, 3] *= 1 - height / np.linalg.norm(up[:2, 3])
+        return self.first_line(self.at, [up, inward], stage=stage, check_collisions=False)
 
 
 def raised(tcp_in_base: Array, height: float) -> Array:
