@@ -63,3 +63,7 @@ class PlanningFailed(RobocasError):
     def __reduce__(self):
         """Let the error cross a process boundary."""
         return type(self), (self.stage, self.reason)
+
+
+class EpisodeLost(PlanningFailed):
+    """What a scripted policy did can't lead to a success any more: it has to be undone."""

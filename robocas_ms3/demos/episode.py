@@ -17,7 +17,7 @@ import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.config import TaskConfig, load_task_config
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.record import EpisodeRecorder
-from robocas_ms3.errors import LayoutError, PlanningFailed
+from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.planning.executor import Executor, Seconds
 from robocas_ms3.planning.mplib_backend import MplibPlanner
 from robocas_ms3.planning.protocol import Planner
@@ -140,7 +140,8 @@ class EpisodeGenerator:
             except PlanningFailed as error:
                 self._log(result, attempt, error, time.perf_counter() - begun)
                 last = error
-            if self.settings.keep_recoveries and len(executor.actions) > first and last.stage != "horizon":
+            acted = len(executor.actions) > first
+            if self.settings.keep_recoveries and acted and not isinstance(last, EpisodeLost):
                 try:
                     arm.back_out()
                     recoveries.append(

@@ -88,13 +88,18 @@ class PlanningScene:
         return inverse(self.arm_base_in_world) @ matrix(self.env.fixtures.basket.pose.raw_pose[0])
 
     def obstacles_in_base(
-        self, *, without: int | Collection[int] = (), without_link: tuple[str, str] | None = None
+        self,
+        *,
+        without: int | Collection[int] = (),
+        without_link: tuple[str, str] | None = None,
+        radius: float = RADIUS,
     ) -> Array:
         """Samples (P, 3) of the collision surfaces of furniture, basket and objects.
 
         Args:
             without: slot or slots of objects to leave out.
             without_link: a piece of furniture and its moving part to leave out.
+            radius: m, from the arm's base as it stands; beyond it they are left out.
         """
         to_base = inverse(self.arm_base_in_world)
         left_out = {without} if isinstance(without, int) else set(without)
@@ -106,4 +111,4 @@ class PlanningScene:
             if slot not in left_out:
                 pieces.append(transform(self.object_in_base(slot), asset.surface_points(SPACING)))
         points = np.concatenate(pieces)
-        return points[np.linalg.norm(points, axis=1) <= RADIUS]
+        return points[np.linalg.norm(points, axis=1) <= radius]

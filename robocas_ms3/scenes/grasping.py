@@ -28,7 +28,7 @@ PREGRASP_DISTANCE = 0.1  # m
 
 NEIGHBOURHOOD = 0.5  # m from an object's centre, beyond which the gripper at one of its grasps does not reach
 
-_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # of the wrist, about the approach
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def filter_grasps(
     rejected["gripper_is_clear"] = int(np.sum(~clear))
     index = index[clear]
     both = np.concatenate([index, index])
-    kept = np.concatenate([poses[index], poses[index] @ _HALF_TURN])
+    kept = np.concatenate([poses[index], poses[index] @ HALF_TURN])
     return GraspFilter(kept, widths[both], qualities[both], both, rejected)
 
 

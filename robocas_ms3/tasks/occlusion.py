@@ -14,6 +14,7 @@ from torch.nn.functional import max_pool2d
 
 CELL = 0.005  # edge of a cell, m
 CELLS = 64  # cells a side, so that what is within 0.16 m of the target's middle counts
+MAX_HIDDEN_SHARE = 0.2  # of a cleared target, the paper's
 REACH = 2  # cells around the target's outline in which others count as neighbours: 1 cm
 
 _NOTHING = -1e3  # height of an empty cell; finite, so that differences stay numbers
@@ -34,7 +35,7 @@ class Clutter(NamedTuple):
     @property
     def cleared(self) -> Tensor:
         """(N,) bool, the paper's rule: at most a fifth is hidden, and fewer than two obstacles are left."""
-        return (self.hidden_share <= 0.2) & (self.obstacles.sum(dim=1) < 2)
+        return (self.hidden_share <= MAX_HIDDEN_SHARE) & (self.obstacles.sum(dim=1) < 2)
 
 
 def surface_points(poses: Tensor, points: Tensor) -> Tensor:

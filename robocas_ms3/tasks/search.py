@@ -12,7 +12,7 @@ from robocas_ms3.tasks.transfer import STAGES, TransferEnv
 
 # of each object's surface; hidden shares are then off ray casting by 0.03 on average, 0.08 at the 95th percentile
 _POINTS = 512
-_FALLEN = 0.05  # m below the surface that objects stand on
+FALLEN = 0.05  # m below the surface that objects stand on, at which one counts as fallen off it
 
 
 @register_env(SEARCH.env_id, max_episode_steps=SEARCH.max_episode_steps)
@@ -50,7 +50,7 @@ class RoboCASSearchEnv(TransferEnv):
         ):
             self._cleared = poses, self.target_slot.clone(), self.clutter().cleared
         surface = float(self.model.support_pose[2, 3]) + self.model.region.z
-        lies = poses[env, self.target_slot, 2] > surface - _FALLEN
+        lies = poses[env, self.target_slot, 2] > surface - FALLEN
         lies &= ~(self.target_held | self._stages["target_grasped"])
         return {"obstacles_cleared": self._cleared[2] & lies}
 

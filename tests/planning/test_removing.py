@@ -8,8 +8,9 @@ import pytest
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.executor import Executor
+from robocas_ms3.planning.pushes import push_direction
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.pushing import push_away, push_direction
+from robocas_ms3.planning.skills.pushing import push_away
 from robocas_ms3.planning.skills.removing import remove
 from robocas_ms3.scenes.placement import transform
 

@@ -90,12 +90,12 @@ def test_a_target_on_the_floor_has_not_been_cleared(env):
 def test_the_policy_finds_the_target_and_says_what_it_moved(tmp_path):
     generator = EpisodeGenerator(EpisodeSettings("search", "search_table_small_heap", "builtin", max_attempts=6))
     try:
-        result = next(r for s in (1, 3) if (r := generator.generate(s, tmp_path, f"episode_{s}")).success)
+        result = next(r for s in (3, 4) if (r := generator.generate(s, tmp_path, f"episode_{s}")).success)
     finally:
         generator.close()
     episode = json.loads((tmp_path / f"episode_{result.seed}.json").read_text())
     record = episode["episodes"][0]["robocas"]
-    assert {"pushes", "removals", "failed_removals"} <= set(record["facts"])
+    assert record["facts"]["pushes"] + record["facts"]["removals"] >= 1
     kinds = [part["goal_type"] for part in record["subgoals"]]
     assert kinds[0] == "find the object"
     assert kinds[-2:] == ["move and grasp", "transfer object"]

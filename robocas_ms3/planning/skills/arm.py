@@ -108,13 +108,15 @@ class Arm:
             without: slot of the held object.
 
         Raises:
-            PlanningFailed: the arm can't rise any further.
+            PlanningFailed: it can't rise any further, or still touches something.
         """
-        for _ in range(RISES):
+        for rises in range(RISES + 1):
             with self.planning():
                 self.planner.set_scene(self.scene.obstacles_in_base(without=without))
                 if not self.planner.collisions(self.at, self.planner.finger_width):
                     return
+                if rises == RISES:
+                    raise PlanningFailed("rise", "still_touching")
                 motion = self._plan_rise(self.planner.tcp(self.at), RISE, stage="rise")
             self.follow(motion)
 

@@ -19,7 +19,7 @@ from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.planning.timing import through, timed
 from robocas_ms3.robots.constants import ARM_ACCELERATION_LIMIT, ARM_VELOCITY_LIMIT
-from robocas_ms3.scenes.grasping import MAX_WIDTH
+from robocas_ms3.scenes.grasping import HALF_TURN, MAX_WIDTH
 from robocas_ms3.scenes.placement import transform
 
 PULLS = 3  # with a new hold each, where one doesn't open far enough
@@ -152,7 +152,7 @@ def _paths(arm: Arm, part: Part, frames: Array) -> tuple[Array, NDArray[np.int_]
     goals, starts = [], []
     for shift in SHIFTS:
         for half_turn in (False, True):
-            hold = part.hold @ np.diag([-1.0, -1, 1, 1]) if half_turn else part.hold
+            hold = part.hold @ HALF_TURN if half_turn else part.hold
             hold[:3, 3] += shift * part.hold[:3, 0]
             for turn in TURNS:
                 goals.append(frames @ hold)

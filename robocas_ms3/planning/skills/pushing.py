@@ -7,54 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.executor import CLOSED
 from robocas_ms3.planning.protocol import Array, Trajectory
+from robocas_ms3.planning.pushes import STAND_OFF, YAWS, Push, candidates
 from robocas_ms3.planning.scene import SPACING, inverse
 from robocas_ms3.planning.skills.arm import Arm, raised
 from robocas_ms3.scenes.placement import transform
 
-STAND_OFF = 0.02  # m between the tool and the object before the push (upstream's)
-TOOL_RADIUS = 0.012  # m, half the width of the closed fingers
-TIP_BELOW_TCP = 0.0085  # m, by which the pads reach beyond the TCP
-TIP_CLEARANCE = 0.012  # m kept between the finger tips and the surface
-BELOW_TOP = 0.02  # m; nearer to an object's top the tool would slide over it
 ABOVE = 0.08  # m above the start of the push, from where the tool comes straight down
 LIFT = 0.05  # m after the push (upstream's)
-PUSH_LENGTH = (0.06, 0.16)  # m, least and greatest way of the tool once it touches
-EDGE_MARGIN = 0.08  # m that a pushed object keeps from the surface's edge
-ON_TOP = 0.01  # m; an object whose centre is closer than this to the target's has no direction of its own (upstream's)
-TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 65.0, -65.0)  # directions tried, off the paper's one
-YAWS = 4  # turns of the tool about the vertical, of half a turn
 SPEED = 0.6  # of the arm's limits while pushing: what is pushed neither rolls far nor jumps
-PUSHES_TRIED, PUSHES_PLANNED = 20, 6
+PUSHES_TRIED, PUSHES_PLANNED = 24, 6
 MAX_FORCE = 30.0  # N; pushed harder, objects wedged against others are shot out of the heap
-STEPS_RESISTED = 2  # control steps of more than that after which a push is cut short
+RESISTED_SECONDS = 0.1  # of more than that after which a push is cut short
 SETTLE_SECONDS = 0.3
-
-
-@dataclass(frozen=True)
-class Push:
-    """A push to try, in the arm's base frame.
-
-    Attributes:
-        start: 4x4 of the TCP beside the object.
-        direction: (3,) unit, level.
-        length: m, the tool's way.
-    """
-
-    start: Array
-    direction: Array
-    length: float
-
-    @property
-    def end(self) -> Array:
-        """4x4 of the TCP at the end."""
-        pose = self.start.copy()
-        pose[:3, 3] += self.length * self.direction
-        return pose
 
 
 @dataclass(frozen=True)
@@ -92,7 +60,7 @@ def _push_on(arm: Arm, push: Trajectory, direction: Array) -> bool:
         arm.follow(Trajectory(qpos[None], push.dt))
         against = -(arm.env.gripper_forces()[0] @ ahead)  # what each object does to each part of the gripper
         resisted = resisted + 1 if float(against.clamp(min=0).sum()) > MAX_FORCE else 0
-        if resisted == STEPS_RESISTED:
+        if resisted * push.dt >= RESISTED_SECONDS - 1e-9:
             return False
     return True
 
@@ -168,7 +136,8 @@ def reachable_pushes(arm: Arm, slot: int, target: int, others: Array) -> Iterato
         transform(arm.scene.object_in_base(s), arm.env.object_assets[0][s].surface_points(SPACING))
         for s in (slot, target)
     )
-    pushes = list(candidates(arm.rng, points, own.mean(axis=0), others, surface_in_base(arm)))
+    fixed = arm.scene.obstacles_in_base(without=range(len(arm.env.object_assets[0])))
+    pushes = list(candidates(arm.rng, points, own.mean(axis=0), others, surface_in_base(arm), fixed))
     if not pushes:
         return
     starts, ends = np.stack([push.start for push in pushes]), np.stack([push.end for push in pushes])
@@ -182,78 +151,6 @@ def reachable_pushes(arm: Arm, slot: int, target: int, others: Array) -> Iterato
     yield from [(pushes[i], qpos[i]) for i in order if reachable[i]][:PUSHES_TRIED]
 
 
-def candidates(
-    rng: np.random.Generator, points: Array, target: Array, others: Array, surface: tuple[Array, Array]
-) -> Iterator[Push]:
-    """Pushes of an object that begin clear of everything else and end on the surface; the paper's direction first.
-
-    The tool touches at the target's height, or at the nearest height above it at which there is room for it.
-
-    Args:
-        rng: source of all randomness.
-        points: (P, 3) surface of the object, upright frame, m.
-        target: (3,) middle of the target.
-        others: (Q, 3) surfaces of everything else.
-        surface: of `surface_in_base`.
-    """
-    frame, half = surface
-    center = points.mean(axis=0)
-    ahead = push_direction(rng, center, target)
-    lowest = frame[2, 3] + TIP_CLEARANCE + TIP_BELOW_TCP
-    top = points[:, 2].max()
-    heights = [h for h in np.arange(max(target[2], points[:, 2].min(), lowest), top - BELOW_TOP, 0.015)]
-    if not heights and top - 0.01 >= lowest:
-        heights = [top - 0.01]
-    near = others[np.linalg.norm(others[:, :2] - center[:2], axis=1) < 0.3]
-    for turn in TURNS_DEG:
-        direction = Rotation.from_euler("z", turn, degrees=True).apply(ahead)
-        for height in heights:
-            extent = extent_behind(points, center, direction, height)
-            if extent is None:
-                continue
-            tool = np.array([*center[:2], height]) - (extent + STAND_OFF + TOOL_RADIUS) * direction
-            if not _tool_fits(tool, near):
-                continue
-            length = STAND_OFF + float(np.clip(2 * extent, *PUSH_LENGTH))
-            if not _ends_on(points + (length - STAND_OFF) * direction, frame, half):
-                continue
-            yaw = np.arctan2(direction[1], direction[0])
-            for k in range(YAWS):
-                start = np.eye(4)
-                start[:3, :3] = (Rotation.from_euler("z", yaw + k * np.pi / YAWS) * _DOWN).as_matrix()
-                start[:3, 3] = tool
-                yield Push(start, direction, length)
-            break  # higher up it would tip rather than slide
-
-
-_DOWN = Rotation.from_euler("x", np.pi)
-
-
-def push_direction(rng: np.random.Generator, center: Array, target: Array) -> Array:
-    """The paper's v_push: (3,) level unit vector from the target to the obstacle.
-
-    Where they are less than 1 cm apart: within 30 deg of towards the robot, which stands at the origin.
-    """
-    away = np.append((center - target)[:2], 0.0)
-    if np.linalg.norm(away) < ON_TOP:
-        home = np.append(-center[:2], 0.0)
-        away = Rotation.from_euler("z", rng.uniform(-30, 30), degrees=True).apply(home)
-    return away / np.linalg.norm(away)
-
-
-def extent_behind(points: Array, center: Array, direction: Array, height: float) -> float | None:
-    """The paper's d_ext: how far an object reaches from its middle against the push, at a height; none: not there.
-
-    Only what the tool would meet counts: points within its width of the line, 1 cm above or below the height.
-    """
-    relative = points - center
-    across = np.abs(relative[:, :2] @ np.array([-direction[1], direction[0]]))
-    slice_ = (across <= TOOL_RADIUS) & (np.abs(points[:, 2] - height) <= 0.01)
-    if not slice_.any():
-        return None
-    return float(np.max(-relative[slice_, :2] @ direction[:2]))
-
-
 def surface_in_base(arm: Arm) -> tuple[Array, Array]:
     """The whole surface that objects are on: 4x4 of its middle in the arm's base frame, and its half size (2,) m."""
     model = arm.env.model
@@ -263,14 +160,3 @@ def surface_in_base(arm: Arm) -> tuple[Array, Array]:
     frame = inverse(arm.scene.arm_base_in_world) @ model.support_pose @ model.support_motion(opened=True)
     frame[:3, 3] += frame[:3, :3] @ np.append((low + high) / 2, surface.z)
     return frame, (high - low) / 2
-
-
-def _ends_on(points: Array, frame: Array, half: Array) -> bool:
-    local = (points - frame[:3, 3]) @ frame[:3, :3]
-    return bool(np.all(np.abs(local[:, :2]) <= half - EDGE_MARGIN))
-
-
-def _tool_fits(tool: Array, points: Array) -> bool:
-    """Whether the closed fingers at a place, and straight above it, meet no point."""
-    above = points[points[:, 2] > tool[2] - TIP_BELOW_TCP - 0.002]
-    return not np.any(np.linalg.norm(above[:, :2] - tool[:2], axis=1) < TOOL_RADIUS + 0.003)

@@ -44,6 +44,8 @@ def remove(arm: Arm, slot: int) -> None:
     if not arm.holds(slot):
         raise PlanningFailed("remove", "dropped")
     arm.follow(down)
+    if not arm.holds(slot):
+        raise PlanningFailed("remove", "dropped")
     arm.open_gripper()
     with arm.planning():
         arm.hold_nothing()

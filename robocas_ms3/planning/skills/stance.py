@@ -28,7 +28,7 @@ from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.handles import open_part, pull_share
 from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.placing import attach_held, drop_poses
-from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, directions_ok, gripper_is_clear
+from robocas_ms3.scenes.grasping import HALF_TURN, PREGRASP_DISTANCE, directions_ok, gripper_is_clear
 from robocas_ms3.scenes.placement import transform
 
 PLACES = 3  # to do one thing from
@@ -84,7 +84,7 @@ def drive_to_object(arm: Arm, slot: int, *, elsewhere: bool = False) -> None:
     if not arm.executor.drives:
         return
     with arm.planning():
-        others = transform(arm.scene.arm_base_in_world, arm.scene.obstacles_in_base(without=slot))
+        others = transform(arm.scene.arm_base_in_world, arm.scene.obstacles_in_base(without=slot, radius=np.inf))
         grasps = clear_grasps(arm, slot, others)
         if not elsewhere and reach_share(arm, base_at(arm), grasps, others) >= COMFORTABLE:
             return
@@ -121,8 +121,8 @@ def drive_to_handle(arm: Arm, *, elsewhere: bool = False) -> None:
         return pull_share(arm, part, frame, transform(inverse(frame), others))
 
     with arm.planning():
-        base = arm.scene.arm_base_in_world
-        others = transform(base, arm.scene.obstacles_in_base(without_link=(part.furniture, part.handle.link)))
+        base, unseen = arm.scene.arm_base_in_world, (part.furniture, part.handle.link)
+        others = transform(base, arm.scene.obstacles_in_base(without_link=unseen, radius=np.inf))
         moved = part.in_world(arm, part.way(arm))
         swept = np.concatenate([transform(frame, part.surface(arm)[::THINNED]) for frame in moved[::THINNED]])
         if not elsewhere and share(base_at(arm)) >= PULLED:
@@ -152,7 +152,7 @@ def drive_to_basket(arm: Arm, slot: int) -> None:
 
     with arm.planning():
         attach_held(arm, slot)
-        cloud = transform(arm.scene.arm_base_in_world, arm.scene.obstacles_in_base(without=slot))
+        cloud = transform(arm.scene.arm_base_in_world, arm.scene.obstacles_in_base(without=slot, radius=np.inf))
         start, here = np.zeros(3), base_at(arm)
         route = None
         if np.any(here) and share(start) >= ABOVE_BASKET:
@@ -170,7 +170,7 @@ def drive_to_basket(arm: Arm, slot: int) -> None:
 def _fold(arm: Arm) -> Array:
     """Go to the rest configuration; gives the surfaces (P, 3) of all obstacles, world, m."""
     with arm.planning():
-        in_base = arm.scene.obstacles_in_base()
+        in_base = arm.scene.obstacles_in_base(radius=np.inf)
         arm.planner.set_scene(in_base)
         home = arm.plan_home(arm.at)
     arm.follow(home)
@@ -208,7 +208,7 @@ def reach_share(arm: Arm, base: Array, grasps: Array, others: Array) -> float:
     if not len(chosen):
         return 0.0
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(GRASPS, len(chosen))).round().astype(int)]
-    poses = inverse(frame) @ np.concatenate([chosen, chosen @ np.diag([-1.0, -1, 1, 1])])  # and their twins
+    poses = inverse(frame) @ np.concatenate([chosen, chosen @ HALF_TURN])  # and their twins
     before = poses.copy()
     before[:, :3, 3] -= PREGRASP_DISTANCE * before[:, :3, 2]
     solved, qpos = arm.reachability.reachable(np.concatenate([poses, before]), arm.at)

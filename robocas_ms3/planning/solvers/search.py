@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.errors import EpisodeLost, PlanningFailed
 from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array
@@ -17,16 +17,15 @@ from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_ba
 from robocas_ms3.planning.skills.pushing import push_away, surface_in_base
 from robocas_ms3.planning.skills.removing import blockers, hang_clear, remove
 from robocas_ms3.scenes.placement import transform
-from robocas_ms3.tasks.search import RoboCASSearchEnv
+from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE
+from robocas_ms3.tasks.search import FALLEN, RoboCASSearchEnv
+from robocas_ms3.tasks.spec import SEARCH
 
 REMOVALS = 8  # pushes and removals a demonstration may hold
-FAILED_REMOVALS = 1  # obstacles that a demonstration may lose hold of
 LIFT_FIRST = 0.3  # how often an attempt after the first lifts what it might push
 HEIGHT_NOISE = 0.01  # m, so that another attempt may begin with another of two that are about as high
 LIFT_HEIGHT = 0.15  # m, upstream's
-FALLEN = 0.05  # m below the surface at which an object counts as pushed off it
-HIDDEN_SHARE = 0.2  # of the target, up to which it counts as found (the paper's)
-HORIZON_SHARE = 0.85  # of the horizon, at which an attempt that still clears is given up
+CLEARING_SECONDS = 0.85 * SEARCH.max_episode_steps / 20  # after which an attempt that still clears is given up
 
 
 def attempt(arm: Arm) -> None:
@@ -59,6 +58,7 @@ def attempt(arm: Arm) -> None:
     hang_clear(arm, slot)
     arm.executor.label(**subgoal("transfer object", *words))
     carry_to_basket(arm, slot)
+    clearing.check_surface()
     release_into_basket(arm, slot)
 
 
@@ -98,7 +98,7 @@ class _Clearing:
         self.stuck = False
         self._hopeless: set[tuple[str, int]] = set()  # what can't be planned as things stand
         self._on_table = self._above_surface()
-        for fact in ("pushes", "removals", "failed_removals"):
+        for fact in ("pushes", "removals"):
             arm.executor.facts.setdefault(fact, 0)
 
     def obstacles(self) -> list[int]:
@@ -113,7 +113,7 @@ class _Clearing:
     @property
     def visible(self) -> bool:
         """Whether the gripper's camera sees most of the target."""
-        return hidden_share(self._arm, self._target) <= HIDDEN_SHARE
+        return hidden_share(self._arm, self._target) <= MAX_HIDDEN_SHARE
 
     def clear_one(self, obstacles: list[int]) -> bool:
         """Push an object aside or lift it away: the first one of a list that can be moved.
@@ -126,7 +126,7 @@ class _Clearing:
             PlanningFailed: none can be moved, one was lost on the way, or enough has been moved.
         """
         if sum(self._arm.executor.facts.values()) >= REMOVALS:
-            raise PlanningFailed("clear", "too_many_obstacles")
+            raise EpisodeLost("clear", "too_many_obstacles")
         order = list(dict.fromkeys(obstacles))
         if self.stuck:
             order += [slot for first in obstacles[:2] for slot in blockers(self._arm, first) if slot not in order]
@@ -148,27 +148,12 @@ class _Clearing:
                 except PlanningFailed as error:
                     failure = error
                     if len(self._arm.executor.actions) > done:  # it failed on the way, not in planning
-                        self._go_on(slot, failure)
-                        self._hopeless.clear()
-                        return True
+                        raise
                     self._hopeless.add((skill, slot))
         if self.stuck:
             raise failure
         self.stuck = True
         return False
-
-    def _go_on(self, slot: int, failure: PlanningFailed) -> None:
-        """Let go of an obstacle that could not be put down elsewhere, and rise; the demonstration goes on from there.
-
-        Raises:
-            PlanningFailed: that has happened too often.
-        """
-        facts = self._arm.executor.facts
-        if facts["failed_removals"] == FAILED_REMOVALS:
-            raise failure
-        self._arm.back_out()
-        facts["failed_removals"] += 1
-        self._tried[slot] += 1
 
     def _use(self, skill: str, slot: int) -> None:
         arm = self._arm
@@ -186,10 +171,18 @@ class _Clearing:
         Raises:
             PlanningFailed: otherwise.
         """
-        if self._on_table - self._above_surface():
-            raise PlanningFailed("push", "fell_off_table")
-        if len(self._arm.executor.actions) > HORIZON_SHARE * self._env.SPEC.max_episode_steps:
-            raise PlanningFailed("horizon", "clearing_takes_too_long")
+        self.check_surface()
+        if len(self._arm.executor.actions) * self._arm.executor.dt > CLEARING_SECONDS:
+            raise EpisodeLost("horizon", "clearing_takes_too_long")
+
+    def check_surface(self) -> None:
+        """See that nothing but the target has left the table.
+
+        Raises:
+            EpisodeLost: otherwise.
+        """
+        if self._on_table - self._above_surface() - {self._target}:
+            raise EpisodeLost("clear", "fell_off_table")
 
     def middle(self, slot: int) -> Array:
         """(3,) middle of an object's surface, in the arm's base frame, m."""

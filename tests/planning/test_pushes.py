@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
-from robocas_ms3.planning.skills import pushing
+from robocas_ms3.planning import pushes as pushing
 from robocas_ms3.planning.skills.looking import sample_views
 from robocas_ms3.planning.skills.removing import free_places
 from robocas_ms3.scenes.placement import transform
@@ -28,8 +28,8 @@ TARGET = np.array([0.6, 0.0, 0.13])
 NOTHING = np.zeros((0, 3))
 
 
-def pushes(target=TARGET, others=NOTHING, points=OBSTACLE, half=HALF) -> list[pushing.Push]:
-    return list(pushing.candidates(np.random.default_rng(0), points, target, others, (TABLE, half)))
+def pushes(target=TARGET, others=NOTHING, points=OBSTACLE, half=HALF, fixed=NOTHING) -> list[pushing.Push]:
+    return list(pushing.candidates(np.random.default_rng(0), points, target, others, (TABLE, half), fixed))
 
 
 def test_the_direction_leads_from_target_to_obstacle_and_is_level():
@@ -76,7 +76,11 @@ def test_where_something_stands_the_tool_does_not_come_down():
     standing = box((0.58, 0.62), (0.0, 0.06), (0.1, 0.15))
     assert all(push.start[2, 3] > 0.15 for push in pushes(others=standing) if push.direction[1] > 0.99)
     wall = box((0.4, 0.8), (-0.1, 0.06), (0.1, 0.3))
-    assert pushes(others=wall) == []
+    sideways = pushes(others=wall)
+    assert sideways  # along the wall there is room
+    assert all(abs(push.direction[1]) < 1e-9 for push in sideways)
+    around = np.concatenate([wall, box((0.5, 0.56), (0, 0.2), (0.1, 0.3)), box((0.64, 0.7), (0, 0.2), (0.1, 0.3))])
+    assert pushes(others=around) == []
 
 
 def test_no_push_goes_over_the_edge():
@@ -89,10 +93,22 @@ def test_no_push_goes_over_the_edge():
 def test_every_push_ends_on_the_surface(x, y, seed):
     points = OBSTACLE - OBSTACLE.mean(axis=0) + [x, y, 0.15]
     rng = np.random.default_rng(seed)
-    for push in pushing.candidates(rng, points, np.array([0.6, 0.0, 0.12]), NOTHING, (TABLE, HALF)):
+    for push in pushing.candidates(rng, points, np.array([0.6, 0.0, 0.12]), NOTHING, (TABLE, HALF), NOTHING):
         moved = points + (push.length - pushing.STAND_OFF) * push.direction
         assert np.all(np.abs(moved[:, :2] - TABLE[:2, 3]) <= HALF - pushing.EDGE_MARGIN)
         assert push.start[2, 3] - pushing.TIP_BELOW_TCP >= SURFACE + pushing.TIP_CLEARANCE - 1e-9
+
+
+def test_an_object_is_not_pushed_against_a_wall_it_does_not_pass_under():
+    ahead = pushes()[0]
+    assert ahead.direction == pytest.approx([0, 1, 0])
+    end = 0.13 + ahead.length - pushing.STAND_OFF  # of the object's front
+    wall = box((0.5, 0.7), (end + 0.01, end + 0.02), (0.1, 0.3))
+    assert not any(push.direction @ [0, 1, 0] > 0.99 for push in pushes(fixed=wall))
+    beyond = wall + [0, 0.02, 0]
+    assert pushes(fixed=beyond)[0].direction == pytest.approx([0, 1, 0])
+    above = wall + [0, 0, 0.11]
+    assert pushes(fixed=above)[0].direction == pytest.approx([0, 1, 0])
 
 
 def test_free_places_are_on_the_surface_and_clear_of_everything():
