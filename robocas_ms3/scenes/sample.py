@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from robocas_ms3.assets.pack import LoadedObject
+from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject
 from robocas_ms3.config.task import OrderlyLayout, PoseRandomisation, ScatteredLayout
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout
@@ -73,7 +73,8 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
     assets = [model.object_pack.objects[i] for i in ids]
     present, candidate = _presence(model, len(ids), rng(_COUNT))
     robot_pose = _moved(model.robot_pose, config.randomisation.robot, rng(_ROBOT))
-    basket_pose = _moved(model.basket_pose, config.randomisation.basket, rng(_BASKET))
+    basket_rng = rng(_BASKET)
+    basket_pose = _moved(model.basket_pose, config.randomisation.basket, basket_rng)
     layout_rng, target_rng = rng(_LAYOUT), rng(_TARGET)
     used = [asset for asset, there in zip(assets, present, strict=True) if there]
     unsettled, unarranged = 0, []
@@ -88,6 +89,10 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
             unarranged.append(error)  # in another order the columns may fit
             continue
         placed = model.support_pose @ model.support_motion(opened=False) @ arranged
+        if config.randomisation.basket is not None and meets_basket(used, placed, model.basket, basket_pose):
+            basket_pose = _moved(model.basket_pose, config.randomisation.basket, basket_rng)
+            unsettled += 1
+            continue
         settled = settle(used, placed, model, basket_pose)
         if not settled.stable:
             unsettled += 1
@@ -103,11 +108,29 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
     raise _failure(unarranged, unsettled)
 
 
+def meets_basket(assets: list[LoadedObject], poses: Array, basket: LoadedFurniture, basket_pose: Array) -> bool:
+    """Whether an object is in the basket, or where its walls are, judged by boxes around them.
+
+    Args:
+        assets: K objects.
+        poses: (K, 4, 4) in the world.
+        basket: what may have been moved among them.
+        basket_pose: 4x4 in the world.
+    """
+    walls = np.concatenate(basket.hulls)
+    low, high = walls.min(axis=0), walls.max(axis=0)
+    for asset, pose in zip(assets, poses, strict=True):
+        points = transform(np.linalg.inv(basket_pose) @ pose, np.concatenate(asset.hulls))
+        if np.all((points.max(axis=0) > low) & (points.min(axis=0) < high)):
+            return True
+    return False
+
+
 def _failure(unarranged: list[LayoutError], unsettled: int) -> LayoutError:
     """What to say of a layout that could not be made; the commonest cause names the cure."""
     if len(unarranged) == _TRIES:
         return unarranged[-1]
-    found = f"{_TRIES} layouts tried: {len(unarranged)} did not fit, {unsettled} did not come to rest"
+    found = f"{_TRIES} layouts tried: {len(unarranged)} did not fit, {unsettled} did not come to rest or met the basket"
     if unsettled > _TRIES // 2:
         fix = "Lower objects.count, enlarge the surface, or use objects that stand firmly."
         return LayoutError("the objects don't come to rest", where="layout", found=found, fix=fix)

@@ -11,7 +11,7 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 
-from robocas_ms3.errors import ConfigError, LayoutError
+from robocas_ms3.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.scenes.bank import LayoutSource, Pair
 from robocas_ms3.scenes.layout import Layout
 
@@ -56,6 +56,7 @@ class SeededEnv(BaseEnv):
         self._layouts = layouts
         self._seed_range = seeds or (SEVERAL_ENVS_SEEDS if num_envs > 1 else None)
         self._resets_seeded = False
+        self._asked_for: set[int] = set()  # envs whose seeds were asked for
         self._layout_seeds = np.zeros(num_envs, dtype=np.int64)
         self._objects_seeds = np.zeros(num_envs, dtype=np.int64)
         if reconfiguration_freq is None:
@@ -69,12 +70,28 @@ class SeededEnv(BaseEnv):
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
         """Reset; see ``BaseEnv``. The same seed gives the same layout, whichever envs are reset.
 
+        Args:
+            seed: of each env. With several envs a single one is the first env's, and the others take those after it,
+                within the range if it is of the range.
+            options: of ``BaseEnv``, but not ``reset_to_env_states``.
+
         Raises:
             LayoutError: there is no layout for a seed that was asked for, or for many that were drawn.
+            RobocasError: ``reset_to_env_states`` was given.
         """
+        if options and "reset_to_env_states" in options:
+            fix = "Reset with the seed of the recorded episode, then call set_state_dict."
+            raise RobocasError("a state lacks objects, target and stages", where="reset_to_env_states", fix=fix)
         self._resets_seeded = self._made and seed is not None
         if self.num_envs > 1:
-            return super().reset(seed if self._made else self._first_seeds(), options)
+            envs = options["env_idx"].tolist() if options and "env_idx" in options else range(self.num_envs)
+            self._asked_for = set(envs) if self._resets_seeded else set()
+            if not self._made:
+                seed = self._seeds_from((self._seed_range or SEVERAL_ENVS_SEEDS)[0], self.num_envs)
+            elif seed is not None and np.ndim(seed) == 0:
+                self._asked_for = set(list(envs)[:1])
+                seed = self._seeds_from(int(np.asarray(seed)), len(envs))
+            return super().reset(seed, options)
         for _ in range(self._other_seeds):
             try:
                 return super().reset(seed, options)
@@ -85,10 +102,12 @@ class SeededEnv(BaseEnv):
                 seed = None
         return super().reset(seed, options)
 
-    def _first_seeds(self) -> list[int]:
-        """What several envs are built with; ManiSkill's own lie outside the range."""
+    def _seeds_from(self, first: int, count: int) -> list[int]:
+        """Seeds one after the other; ManiSkill's own would lie outside the range."""
         low, high = self._seed_range or SEVERAL_ENVS_SEEDS
-        return [low + env % (high - low + 1) for env in range(self.num_envs)]
+        if not low <= first <= high:
+            return [first + i for i in range(count)]
+        return [low + (first - low + i) % (high - low + 1) for i in range(count)]
 
     def _set_episode_rng(self, seed: Any, env_idx: torch.Tensor) -> None:
         """Seed the episodes of some envs and no others; ManiSkill's own forgets the others' seeds."""
@@ -151,7 +170,7 @@ class SeededEnv(BaseEnv):
             try:
                 return make(int(seeds[env]))
             except LayoutError as error:
-                if self._resets_seeded or self.num_envs == 1:  # one env starts over, as its objects change too
+                if env in self._asked_for or self.num_envs == 1:  # one env starts over, as its objects change too
                     raise
                 _log.warning("env %d: no layout for seed %d, another is drawn: %s", env, seeds[env], error)
                 seeds[env] = self._draw_seed(env)

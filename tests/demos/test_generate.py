@@ -5,12 +5,14 @@ import json
 import h5py
 import numpy as np
 import pytest
+import torch
 
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.record import merge, open_trajectory, read_json
 from robocas_ms3.demos.replay import replay
-from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.errors import DatasetError, EpisodeLost, OutputExistsError, PlanningFailed, RobocasError
+from robocas_ms3.planning.protocol import Trajectory
 from robocas_ms3.robots.constants import ARM_SLICE
 
 pytestmark = pytest.mark.slow
@@ -142,3 +144,59 @@ def test_overwrite_deletes_only_what_generate_made(tmp_path):
     with pytest.raises(RobocasError, match="was not made by `robocas generate`"):
         generate(SETTINGS, tmp_path, episodes=1, overwrite=True)
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_the_way_back_to_a_checkpoint_is_part_of_the_record(tmp_path):
+    """A policy that stirs the heap, marks, stirs on and fails; the next attempt finds what the first one marked."""
+    generator = EpisodeGenerator(EpisodeSettings("search", "search_table_small_heap", "builtin", max_attempts=2))
+    seen = []
+
+    def stir(arm, steps):
+        for step in range(steps):
+            turned = arm.at + np.eye(7)[1] * 0.06  # the shoulder: down into the heap
+            arm.at = turned
+            arm.executor.follow(Trajectory(turned[None], arm.executor.dt))
+            arm.executor.facts["stirred"] = step
+
+    def policy(arm):
+        if not seen:
+            stir(arm, 12)
+            arm.executor.mark()
+        seen.append((arm.env.get_state().clone(), dict(arm.executor.facts), len(arm.executor.actions)))
+        stir(arm, 6)
+        if len(seen) == 1:
+            raise PlanningFailed("stir", "enough")
+
+    generator.policy = policy
+    result = generator.generate(1, tmp_path, "stirred")
+    generator.close()
+    assert [(failure.stage, failure.reason) for failure in result.failures] == [("stir", "enough")]
+    (first, facts, length), (again, facts_again, length_again) = seen
+    assert torch.equal(first, again)  # bit for bit
+    assert (facts, length) == (facts_again, length_again) == ({"stirred": 11}, 12)
+    data = read_json(tmp_path / "stirred.h5")["episodes"][0]
+    assert data["elapsed_steps"] == result.steps == 18
+    assert len(load(tmp_path / "stirred.h5")["traj_0"]["actions"]) == 18
+
+
+def test_recoveries_stay_unless_the_episode_is_lost(tmp_path):
+    settings = EpisodeSettings("search", "search_table_small_heap", "builtin", max_attempts=4, keep_recoveries=True)
+    generator = EpisodeGenerator(settings)
+    failures = iter([PlanningFailed("grasp", "missed"), EpisodeLost("clear", "fell_off_table")])
+    begun = []
+
+    def policy(arm):
+        begun.append(len(arm.executor.actions))
+        arm.executor.move_gripper(-1.0, arm.at, seconds=0.2)
+        failure = next(failures, None)
+        if failure:
+            raise failure
+
+    generator.policy = policy
+    result = generator.generate(1, tmp_path, "kept")
+    generator.close()
+    assert result.attempts == 3
+    assert begun[0] == 0
+    assert begun[1] > 4  # what failed stays, and the arm's way out of it
+    assert begun[2] == 0  # all of it undone
+    assert read_json(tmp_path / "kept.h5")["episodes"][0]["robocas"]["recoveries"] == []

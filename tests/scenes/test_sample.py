@@ -11,7 +11,7 @@ from robocas_ms3.errors import ConfigError, LayoutError
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import transform
-from robocas_ms3.scenes.sample import object_set, sample_layout
+from robocas_ms3.scenes.sample import meets_basket, object_set, sample_layout
 
 
 def model(name: str = "pick_table_scattered", **changes) -> SceneModel:
@@ -137,6 +137,17 @@ def test_robot_and_basket_move_within_bounds_and_leave_the_objects():
     turn = plain.robot_pose[:3, :3].T @ moved.robot_pose[:3, :3]
     assert 0 < np.rad2deg(abs(np.arctan2(turn[1, 0], turn[0, 0]))) <= 6
     assert not np.allclose(plain.basket_pose, moved.basket_pose)
+
+
+def test_nothing_stands_in_a_basket_that_was_moved_among_the_objects():
+    moving = model(randomisation={"basket": {"position": 0.25, "yaw_deg": 20}})
+    for seed in (5, 6, 7):
+        layout = sample_layout(moving, seed, seed)
+        assets = [moving.object_pack.objects[i] for i in layout.object_ids]
+        assert not meets_basket(assets, layout.object_poses, moving.basket, layout.basket_pose)
+    inside = layout.object_poses.copy()
+    inside[0, :3, 3] = layout.basket_pose[:3, 3] + [0, 0, 0.05]
+    assert meets_basket(assets, inside, moving.basket, layout.basket_pose)
 
 
 def test_no_target_is_an_error_that_says_what_to_change():

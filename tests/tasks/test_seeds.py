@@ -10,7 +10,7 @@ from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from robocas_ms3 import tasks
 from robocas_ms3.cli.layouts import Build, Layouts, main
 from robocas_ms3.config import load_task_config
-from robocas_ms3.errors import ConfigError, LayoutError
+from robocas_ms3.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.scenes import bank
 from robocas_ms3.scenes.sample import object_set
 from robocas_ms3.tasks import RoboCASPickEnv
@@ -131,6 +131,44 @@ def test_several_envs_reset_from_a_bank_built_for_them(tmp_path, monkeypatch):
     env.reset(options={"env_idx": torch.tensor([2])})
     assert [objects for objects, _ in asked[-1]] == [0]
     assert env.layouts[0].object_ids == env.ids[2] == env.ids[0] != env.ids[1]
+
+
+def test_one_seed_for_several_envs_is_the_first_ones_and_the_others_follow_within_the_range(monkeypatch):
+    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: lambda objects, seed: (objects, seed))
+    env, asked = several(None, monkeypatch, seeds=(10, 13))
+    env.reset(seed=12)
+    assert [seed for _, seed in asked[-1]] == [12, 13, 10, 11]
+    env.reset(seed=500)
+    assert [seed for _, seed in asked[-1]] == [500, 501, 502, 503]
+    env.reset(seed=13, options={"env_idx": torch.tensor([1, 3])})
+    assert [seed for _, seed in asked[-1]] == [13, 10]
+    env.reset(seed=[4, 3, 2, 1])
+    assert [seed for _, seed in asked[-1]] == [4, 3, 2, 1]
+
+
+def test_only_the_seed_that_was_asked_for_must_have_a_layout(monkeypatch):
+    def layouts(objects, seed):
+        if seed in (2, 11):
+            raise LayoutError("none", where="layout")
+        return objects, seed
+
+    monkeypatch.setattr(tasks.base, "layout_bank", lambda model, folder: layouts)
+    env, asked = several(None, monkeypatch, seeds=(10, 13))
+    env.reset(seed=10)
+    drawn = [seed for _, seed in asked[-1]]
+    assert drawn[0] == 10
+    assert drawn[1] in (10, 12, 13)
+    with pytest.raises(LayoutError):
+        env.reset(seed=11)
+    with pytest.raises(LayoutError):
+        env.reset(seed=[1, 2, 3, 4])
+
+
+def test_states_are_no_way_to_reset():
+    env = gym.make("RoboCASPick-v1", **STATE_ONLY)
+    with pytest.raises(RobocasError, match="reset_to_env_states.*set_state_dict"):
+        env.reset(options={"reset_to_env_states": {}})
+    env.close()
 
 
 def test_several_envs_draw_from_a_range_without_being_told_and_beyond_it_share_objects(monkeypatch):
