@@ -150,7 +150,7 @@ class EpisodeGenerator:
                     continue
                 except PlanningFailed:
                     pass
-            executor.go_back()
+            executor.go_back(far=last.stage == "horizon")  # what took too long will do so again
             recoveries = [kept for kept in recoveries if kept["range"][1] < len(executor.actions)]
         return recoveries
 

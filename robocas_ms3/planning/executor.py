@@ -122,15 +122,18 @@ class Executor:
         """Whether nothing was done since the last checkpoint."""
         return bool(self.checkpoints) and self.checkpoints[-1].length == len(self.actions)
 
-    def go_back(self) -> None:
+    def go_back(self, *, far: bool = False) -> None:
         """Undo what failed: return to the last checkpoint, where there is none to the reset.
 
         Where an attempt could do nothing from the checkpoint, or the second one failed, half of all checkpoints are
         given up. There is no other way back than to simulate all kept actions again, from the reset on.
+
+        Args:
+            far: give up half of all checkpoints in any case.
         """
         if self.checkpoints:
             self.checkpoints[-1].failures += 1
-            if self.at_checkpoint or self.checkpoints[-1].failures == TRIES:
+            if far or self.at_checkpoint or self.checkpoints[-1].failures == TRIES:
                 del self.checkpoints[len(self.checkpoints) // 2 :]
         kept = self.checkpoints
         length = kept[-1].length if kept else 0

@@ -88,6 +88,16 @@ def test_a_checkpoint_from_which_nothing_can_be_done_is_given_up_at_once():
     assert made.env.done == [1]
 
 
+def test_what_took_too_long_gives_up_half_of_the_checkpoints_at_once():
+    made = executor()
+    for value in (1, 2, 3, 4):
+        act(made, value)
+        made.mark()
+    act(made, 9)
+    made.go_back(far=True)
+    assert made.env.done == [1, 2]
+
+
 def test_a_reset_forgets_the_checkpoints():
     made = executor()
     act(made, 1)

@@ -126,7 +126,7 @@ class _Clearing:
             PlanningFailed: none can be moved, one was lost on the way, or enough has been moved.
         """
         if sum(self._arm.executor.facts.values()) >= REMOVALS:
-            raise EpisodeLost("clear", "too_many_obstacles")
+            raise EpisodeLost("horizon", "too_many_obstacles")
         order = list(dict.fromkeys(obstacles))
         if self.stuck:
             order += [slot for first in obstacles[:2] for slot in blockers(self._arm, first) if slot not in order]
