@@ -132,7 +132,7 @@ def _failure(unarranged: list[LayoutError], unsettled: int) -> LayoutError:
         return unarranged[-1]
     found = f"{_TRIES} layouts tried: {len(unarranged)} did not fit, {unsettled} did not come to rest or met the basket"
     if unsettled > _TRIES // 2:
-        fix = "Lower objects.count, enlarge the surface, or use objects that stand firmly."
+        fix = "Lower objects.count, enlarge the surface, use objects that stand firmly, or move the basket less."
         return LayoutError("the objects don't come to rest", where="layout", found=found, fix=fix)
     fix = "Raise target.max_distance, lower target.min_grasps or min_free_grasps, or use other objects."
     return LayoutError("no object qualifies as the target", where="target", found=found, fix=fix)

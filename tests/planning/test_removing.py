@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
+from mani_skill.utils.structs import Pose
 
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.errors import EpisodeLost, PlanningFailed
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.pushes import push_direction
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.pushing import push_away
 from robocas_ms3.planning.skills.removing import remove
+from robocas_ms3.planning.solvers.search import _Clearing
 from robocas_ms3.scenes.placement import transform
 
 pytestmark = pytest.mark.slow
@@ -72,3 +75,13 @@ def test_a_push_moves_an_object_away_from_the_target(generator):
     shift = surface(arm, pushed).mean(axis=0) - starts[pushed]
     assert shift @ ahead > 0.02
     assert np.abs(arm.env.gripper_forces()).max() == 0  # it has let go of everything
+
+
+@pytest.mark.parametrize("which", ["target", "another"])
+def test_what_lies_on_the_floor_ends_an_attempt_even_one_that_begins_after_the_fall(generator, which):
+    arm, target, slots = begin(generator, 3)
+    _Clearing(arm, target).check_surface()
+    fallen = arm.env.objects[target if which == "target" else slots[0]]
+    fallen.set_pose(Pose.create_from_pq(torch.tensor([[-1.0, -1.0, 0.1]]), fallen.pose.q))
+    with pytest.raises(EpisodeLost, match="fell_off_table"):
+        _Clearing(arm, target).check_surface()

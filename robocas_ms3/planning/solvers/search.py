@@ -97,7 +97,6 @@ class _Clearing:
         self._tried: Counter[int] = Counter()
         self.stuck = False
         self._hopeless: set[tuple[str, int]] = set()  # what can't be planned as things stand
-        self._on_table = self._above_surface()
         for fact in ("pushes", "removals"):
             arm.executor.facts.setdefault(fact, 0)
 
@@ -169,19 +168,21 @@ class _Clearing:
         """See that nothing has been pushed off the table, and that there is time left.
 
         Raises:
-            PlanningFailed: otherwise.
+            EpisodeLost: otherwise.
         """
         self.check_surface()
         if len(self._arm.executor.actions) * self._arm.executor.dt > CLEARING_SECONDS:
             raise EpisodeLost("horizon", "clearing_takes_too_long")
 
     def check_surface(self) -> None:
-        """See that nothing but the target has left the table.
+        """See that nothing has fallen off the table since the reset.
 
         Raises:
             EpisodeLost: otherwise.
         """
-        if self._on_table - self._above_surface() - {self._target}:
+        frame, _ = surface_in_base(self._arm)
+        present = np.flatnonzero(self._env.present[0].cpu().numpy()).tolist()
+        if any(self._arm.scene.object_in_base(slot)[2, 3] < frame[2, 3] - FALLEN for slot in present):
             raise EpisodeLost("clear", "fell_off_table")
 
     def middle(self, slot: int) -> Array:
@@ -190,8 +191,3 @@ class _Clearing:
 
     def _points(self, slot: int) -> Array:
         return transform(self._arm.scene.object_in_base(slot), self._env.object_assets[0][slot].surface_points())
-
-    def _above_surface(self) -> set[int]:
-        frame, _ = surface_in_base(self._arm)
-        present = np.flatnonzero(self._env.present[0].cpu().numpy()).tolist()
-        return {slot for slot in present if self._arm.scene.object_in_base(slot)[2, 3] > frame[2, 3] - FALLEN}
