@@ -26,6 +26,8 @@ FRONT_ELEVATION_DEG = (-60.0, 10.0)  # of a front approach above the horizontal
 FREE_LEAN_DEG = 15.0  # an approach this close to straight down has no horizontal direction to speak of
 PREGRASP_DISTANCE = 0.1  # m
 
+# m to either side that a free grasp leaves: planners see what stands around in voxels of 5 mm.
+SIDE_CLEARANCE = 0.005
 NEIGHBOURHOOD = 0.5  # m from an object's centre, beyond which the gripper at one of its grasps does not reach
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # of the wrist, about the approach
@@ -86,7 +88,7 @@ def directions_ok(
 
 
 def gripper_is_clear(
-    tcp_in_world: Array, points_in_world: Array, sweep: float = PREGRASP_DISTANCE
+    tcp_in_world: Array, points_in_world: Array, sweep: float = PREGRASP_DISTANCE, side_clearance: float = 0.0
 ) -> NDArray[np.bool_]:
     """Say for each grasp (G, 4, 4) whether no point (P, 3) lies in the open gripper, from pre-grasp to grasp.
 
@@ -94,12 +96,14 @@ def gripper_is_clear(
         tcp_in_world: (G, 4, 4).
         points_in_world: (P, 3) m.
         sweep: distance from which the gripper comes in along its approach, m.
+        side_clearance: how far from its sides (along x and y of the TCP) points have to stay, m.
     """
     clear = np.ones(len(tcp_in_world), dtype=bool)
     if len(points_in_world) == 0 or len(tcp_in_world) == 0:
         return clear
-    low, high = GRIPPER_BOXES[:, 0].copy(), GRIPPER_BOXES[:, 1]
-    low[:, 2] -= sweep
+    low, high = GRIPPER_BOXES[:, 0].copy(), GRIPPER_BOXES[:, 1].copy()
+    low -= (side_clearance, side_clearance, sweep)
+    high += (side_clearance, side_clearance, 0.0)
     centers = tcp_in_world[:, :3, 3]
     reach = GRIPPER_RADIUS + sweep
     near = np.all((points_in_world >= centers.min(0) - reach) & (points_in_world <= centers.max(0) + reach), axis=1)
@@ -122,6 +126,7 @@ def filter_grasps(
     scene_points_in_world: Array,
     qualities: Array | None = None,
     sweep: float = PREGRASP_DISTANCE,
+    side_clearance: float = 0.0,
     approach: Approach = "top",
 ) -> GraspFilter:
     """Keep the grasps that a robot standing there could try; the wrist-turned twin of each is added.
@@ -134,6 +139,7 @@ def filter_grasps(
         scene_points_in_world: (P, 3) surfaces that the open gripper may not touch, the object itself left out.
         qualities: (G,), more is better; none: all alike.
         sweep: straight way in, m.
+        side_clearance: how far from the gripper's sides the points have to stay, m.
         approach: from where the gripper may come.
     """
     poses = np.asarray(tcp_in_world, dtype=np.float64).reshape(-1, 4, 4)
@@ -147,7 +153,7 @@ def filter_grasps(
         rejected[name] = int(np.sum(left & ~passed))
         left &= passed
     index = np.flatnonzero(left)
-    clear = gripper_is_clear(poses[index], np.asarray(scene_points_in_world, dtype=np.float64), sweep)
+    clear = gripper_is_clear(poses[index], np.asarray(scene_points_in_world, dtype=np.float64), sweep, side_clearance)
     rejected["gripper_is_clear"] = int(np.sum(~clear))
     index = index[clear]
     both = np.concatenate([index, index])
@@ -204,7 +210,7 @@ def count_free_grasps(
     robot_xy: Array,
     approach: Approach = "top",
 ) -> int:
-    """How many of an object's grasps come from the robot's side and touch nothing else on their way in.
+    """How many of an object's grasps come from the robot's side and pass clear of everything else on their way in.
 
     Args:
         asset: the object.
@@ -223,6 +229,7 @@ def count_free_grasps(
         arm_base_in_world=base,
         object_center_in_world=center,
         scene_points_in_world=near,
+        side_clearance=SIDE_CLEARANCE,
         approach=approach,
     )
     return len(kept) // 2

@@ -125,6 +125,22 @@ def test_without_a_sweep_only_the_grasp_itself_counts():
     assert gripper_is_clear(grasp()[None], above[None], sweep=0.0)[0]
 
 
+@pytest.mark.parametrize(
+    ("point", "clear"),
+    [
+        ((0.0, 0.050, 0.0), False),  # 4 mm outside of a pad, which ends at y = 46 mm
+        ((0.0, 0.052, 0.0), True),
+        ((0.014, 0.042, 0.0), False),  # 4 mm beside it
+        ((0.016, 0.042, 0.0), True),
+        ((0.0, 0.042, 0.010), True),  # below it: its sides alone leave room
+    ],
+)
+def test_a_free_grasp_leaves_room_at_its_sides(point, clear):
+    pose = grasp(30, 10)
+    there = pose[:3, :3] @ np.array(point) + pose[:3, 3]
+    assert gripper_is_clear(pose[None], there[None], side_clearance=0.005)[0] == clear
+
+
 def test_filter_counts_what_fell_where_and_adds_the_turned_twin():
     poses = np.array(
         [grasp(), grasp(), grasp(100), grasp(40, 180), grasp(80, 0, 80), grasp(0, 0, 0, CENTER + [0, 0.1, 0])]
