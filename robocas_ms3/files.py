@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import glob
 import json
 import os
@@ -114,6 +115,27 @@ def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool = Fa
         )
     if taken and overwrite:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+@contextmanager
+def locked_folder(path: Path | str) -> Iterator[None]:
+    """Hold a lock on a folder that may not exist yet; it ends with the process, however that ends.
+
+    Raises:
+        RobocasError: another process holds it.
+    """
+    path = Path(path)
+    make_folder(path.parent)
+    lock = path.parent / f".{path.name}.lock"
+    with lock.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise RobocasError("another process is writing here", where=path, fix="Wait until it is done.") from error
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
 
 
 def write_json(path: Path | str, data: Any) -> None:

@@ -25,14 +25,26 @@ class Convert:
     """Embed instruction and sub-goals (needs the extra 'language')."""
     video: bool = True
     """Write a video of each episode and a contact sheet into OUT/preview."""
+    cameras: tuple[Literal["base_camera", "gripper_camera", "static_camera"], ...] = (
+        "base_camera",
+        "gripper_camera",
+        "static_camera",
+    )
+    """Which cameras."""
     size: tuple[int, int] | None = None
     """Width and height of the pictures; default: the cameras' own, 640 480."""
+    depth: bool = True
+    """Store depth beside RGB."""
+    image_format: Literal["png", "jpg", "webp"] = "png"
+    """Of RGB; the loader released with RoboCAS opens png only."""
     include_failed: bool = False
     """Also convert episodes without success."""
     overwrite: bool = False
     """Replace the dataset that is there."""
     resume: bool = False
     """Go on with a conversion that was interrupted."""
+    append: bool = False
+    """Add to the dataset that is there; its episodes keep their numbers."""
     jobs: int = 1
     """Processes that render."""
 
@@ -43,6 +55,7 @@ def main(cfg: Convert) -> int:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from robocas_ms3.datasets.convert import convert
+    from robocas_ms3.datasets.pictures import Pictures
     from robocas_ms3.datasets.video import write_previews
 
     console = Console(stderr=True)
@@ -59,10 +72,11 @@ def main(cfg: Convert) -> int:
             cfg.out,
             rate_hz=cfg.rate,
             embeddings=cfg.embeddings,
-            size=cfg.size,
+            pictures=Pictures(cfg.cameras, cfg.size, cfg.depth, cfg.image_format),
             include_failed=cfg.include_failed,
             overwrite=cfg.overwrite,
             resume=cfg.resume,
+            append=cfg.append,
             jobs=cfg.jobs,
             on_start=start,
             on_episode=lambda _: progress.advance(progress.task_ids[0]),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Callable
@@ -14,15 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import robocas_ms3
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import sample_states, sample_stride, sample_subgoals
-from robocas_ms3.datasets.info import SPLIT_RULE, action_space, data_info
+from robocas_ms3.datasets.episode import sample_stride
+from robocas_ms3.datasets.info import write_info
+from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.plan import Plan, appended_plan, dataset_settings, new_plan, resumed_plan
+from robocas_ms3.datasets.provenance import succeeded
+from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.workers import Job, OpenSource, write_all
 from robocas_ms3.datasets.writer import FrameSource, WrittenEpisode
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import claim_output, make_folder, write_json
+from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Conversion:
 
     Attributes:
         episodes: the new ones, by number.
-        kept: how many were there already (``resume``).
+        kept: how many of the trajectory's were there already (``resume``, ``append``).
         seconds: for everything.
     """
 
@@ -40,11 +42,11 @@ class Conversion:
     seconds: float
 
 
-def open_env(env_info: dict[str, Any], control_mode: str, size: tuple[int, int] | None) -> FrameSource:
+def open_env(env_info: dict[str, Any], control_mode: str, pictures: Pictures) -> FrameSource:
     """Show states through the environment that recorded them."""
     from robocas_ms3.datasets.render import EnvFrames
 
-    return EnvFrames(env_info, control_mode, size)
+    return EnvFrames(env_info, control_mode, pictures)
 
 
 def convert(
@@ -52,11 +54,12 @@ def convert(
     out: str | Path,
     *,
     rate_hz: float = 5.0,
+    pictures: Pictures | None = None,
     embeddings: bool = True,
-    size: tuple[int, int] | None = None,
     include_failed: bool = False,
     overwrite: bool = False,
     resume: bool = False,
+    append: bool = False,
     jobs: int = 1,
     on_start: Callable[[int], None] | None = None,
     on_episode: Callable[[WrittenEpisode], None] | None = None,
@@ -64,72 +67,104 @@ def convert(
 ) -> Conversion:
     """Write a RoboCAS dataset from a trajectory file.
 
+    Killed at any moment, it goes on with ``resume`` (or the same ``append`` again), and ends as if it had not been.
+
     Args:
         trajectory: ``F.h5`` with ``F.json`` beside it.
         out: the dataset's folder.
         rate_hz: steps a second; divides the control frequency.
+        pictures: which ones; default: RGB as PNG and depth of all cameras, 640 x 480.
         embeddings: whether to embed the texts.
-        size: width and height of the pictures; None: 640 x 480.
         include_failed: also convert episodes without success.
         overwrite: replace what is in ``out``.
         resume: keep the episodes that are there.
+        append: add to the dataset in ``out``; what is there keeps its numbers and its side of the split, and recordings
+            that it holds already are not added again.
         jobs: worker processes.
         on_start: called with the number of episodes to write.
         on_episode: called after each.
         open_source: what shows the states; must be importable by workers.
 
     Raises:
-        DatasetError: the input is unusable, nothing to convert, no render device.
-        OutputExistsError: ``out`` is not empty and neither flag is set.
+        DatasetError: the input is unusable, nothing to convert, no render device, another conversion is at it.
+        OutputExistsError: ``out`` is not empty and no flag is set.
         MissingExtraError: embeddings are wanted and the ``language`` extra is not installed.
     """
     begun = time.perf_counter()
-    out = Path(out)
+    out, pictures = Path(out), pictures or Pictures()
     with TrajectoryFile(trajectory) as file:
         stride = sample_stride(file.control_freq, rate_hz)
-        chosen = _choose(file, include_failed)
-        settings = _settings(file, chosen, rate_hz, embeddings, size)
+        chosen = choose(file, include_failed)
+        settings = dataset_settings(rate_hz, pictures, embeddings)
         # Everything that may fail comes before the output is touched.
-        claim_output(out, resume=resume or overwrite)
-        if resume:
-            _check_resume(out, settings)
-        elif overwrite:
-            _check_overwrite(out)
+        claim_output(out, resume=resume or append or overwrite)
+        if append:
+            plan = appended_plan(out, file, chosen, settings)
+        elif resume:
+            plan = resumed_plan(out, file, chosen, settings)
+        else:
+            plan = new_plan(file, chosen, settings)
+            if overwrite:
+                _check_overwrite(out)
         if open_source is open_env:
             from robocas_ms3.datasets.render import require_renderer
 
             require_renderer()
-        vectors = _embed_all(file, chosen) if embeddings else None
-        claim_output(out, overwrite=overwrite and not resume, resume=resume)
-        make_folder(out)
-        tasks = [(n, i) for n, i in enumerate(chosen) if not (out / schema.episode_folder(n)).is_dir()]
-        if on_start:
-            on_start(len(tasks))
-        written: list[WrittenEpisode] = []
-        try:
-            write_json(out / schema.CONVERSION_FILE, settings)
-            (out / schema.DATA_INFO_FILE).unlink(missing_ok=True)
-            job = Job(file.path, out, stride, size, vectors, open_source, tasks)
-            with closing(write_all(job, jobs)) as episodes:
-                for episode in episodes:
-                    written.append(episode)
-                    if on_episode:
-                        on_episode(episode)
-            write_json(out / schema.DATA_INFO_FILE, _info(file, out, chosen, stride))
-        except BaseException:
-            if not any(out.glob("episode_*")):
-                shutil.rmtree(out, ignore_errors=True)  # nothing came of it
-            raise
+        vectors = embed_texts(file, chosen) if embeddings else None
+        with locked_folder(out):
+            claim_output(out, overwrite=overwrite and not (resume or append), resume=True)
+            make_folder(out)
+            _sweep(out)
+            missing = [task for task in plan.tasks if not (out / schema.episode_folder(task[0])).is_dir()]
+            if on_start:
+                on_start(len(missing))
+            job = Job(file.path, out, stride, rate_hz, pictures, vectors, open_source, missing)
+            written = _write(job, plan, jobs, on_episode)
     written.sort(key=lambda episode: episode.number)
-    return Conversion(written, len(chosen) - len(tasks), time.perf_counter() - begun)
+    return Conversion(written, len(plan.tasks) - len(missing), time.perf_counter() - begun)
 
 
-def _succeeded(episode: dict[str, Any]) -> bool:
-    return bool(np.all(episode.get("success", False)))
+def _write(
+    job: Job, plan: Plan, jobs: int, on_episode: Callable[[WrittenEpisode], None] | None
+) -> list[WrittenEpisode]:
+    written: list[WrittenEpisode] = []
+    before = _split_before(job.out)
+    try:
+        write_json(job.out / schema.CONVERSION_FILE, plan.content)
+        with closing(write_all(job, jobs)) as episodes:
+            for episode in episodes:
+                written.append(episode)
+                if on_episode:
+                    on_episode(episode)
+        write_info(job.out, before)
+    except BaseException:
+        if not any(job.out.glob("episode_*")):
+            shutil.rmtree(job.out, ignore_errors=True)  # nothing came of it
+        raise
+    return written
 
 
-def _choose(file: TrajectoryFile, include_failed: bool) -> list[int]:
-    chosen = [i for i, episode in enumerate(file.episodes) if include_failed or _succeeded(episode)]
+def _split_before(out: Path) -> tuple[list[int], list[int]]:
+    """Training and validation episodes of the dataset that is there, if one is."""
+    if not (out / schema.DATA_INFO_FILE).is_file():
+        return [], []
+    info = Dataset(out).info
+    return info.get("train_eps", []), info.get("val_eps", [])
+
+
+def _sweep(out: Path) -> None:
+    """Remove what a killed conversion left half written; nobody else writes here, the folder is locked."""
+    for leftover in [*out.glob(".*.tmp*"), *out.glob(".*.old")]:
+        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+
+
+def choose(file: TrajectoryFile, include_failed: bool) -> list[int]:
+    """Indices of the episodes to convert.
+
+    Raises:
+        DatasetError: there are none.
+    """
+    chosen = [i for i, episode in enumerate(file.episodes) if include_failed or succeeded(episode)]
     if not chosen:
         some = bool(file.episodes)
         raise DatasetError(
@@ -141,51 +176,6 @@ def _choose(file: TrajectoryFile, include_failed: bool) -> list[int]:
     return chosen
 
 
-def _settings(
-    file: TrajectoryFile, chosen: list[int], rate_hz: float, embeddings: bool, size: tuple[int, int] | None
-) -> dict[str, Any]:
-    episodes = {}
-    for number, index in enumerate(chosen):
-        episode = file.episodes[index]
-        episodes[str(number)] = {
-            "trajectory_episode": episode["episode_id"],
-            "seed": episode.get("episode_seed"),
-            "success": _succeeded(episode),
-            "target": episode.get("robocas", {}).get("target"),
-        }
-    return {
-        "format": "robocas",
-        "made_with": {"robocas_ms3": robocas_ms3.__version__, "trajectory": file.versions},
-        "trajectory": file.path.name,
-        "env_info": file.env_info,
-        "control_freq": file.control_freq,
-        "rate_hz": rate_hz,
-        "image_size": list(size) if size else None,
-        "embeddings": embeddings,
-        "split": SPLIT_RULE,
-        "episodes": episodes,
-    }
-
-
-def _check_resume(out: Path, settings: dict[str, Any]) -> None:
-    if not out.is_dir() or not any(out.iterdir()):
-        return
-    path = out / schema.CONVERSION_FILE
-    try:
-        before = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DatasetError("can't resume: no conversion was begun here", where=path, fix="Pass --overwrite.") from error
-    now = json.loads(json.dumps(settings))
-    different = sorted(key for key in now if before.get(key) != now[key])
-    if different:
-        raise DatasetError(
-            "can't resume with other settings",
-            where=path,
-            found=f"different {', '.join(different)}",
-            fix="Pass --overwrite, or the settings of before.",
-        )
-
-
 def _check_overwrite(out: Path) -> None:
     """Delete datasets only, whatever folder was named by mistake."""
     marks = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
@@ -195,7 +185,7 @@ def _check_overwrite(out: Path) -> None:
         )
 
 
-def _embed_all(file: TrajectoryFile, chosen: list[int]) -> dict[str, NDArray[np.float32]]:
+def embed_texts(file: TrajectoryFile, chosen: list[int]) -> dict[str, NDArray[np.float32]]:
     """Embed every distinct text here, so that no worker has to load the model."""
     from robocas_ms3.language.embed import TextEmbedder
 
@@ -206,16 +196,3 @@ def _embed_all(file: TrajectoryFile, chosen: list[int]) -> dict[str, NDArray[np.
         texts[recording.instruction] = None
         texts.update(dict.fromkeys(goal.goal_description for goal in recording.subgoals))
     return dict(zip(texts, embedder(texts), strict=True))
-
-
-def _info(file: TrajectoryFile, out: Path, chosen: list[int], stride: int) -> dict[str, Any]:
-    seeds, lengths, instructions, subgoals, positions, turns = {}, {}, {}, {}, [], []
-    for number, index in enumerate(chosen):
-        recording = file.recording(index)
-        samples = sample_states(recording.control_steps, stride)
-        seeds[number], lengths[number], instructions[number] = recording.seed, len(samples), recording.instruction
-        subgoals[number] = sample_subgoals(recording.subgoals, samples)
-        with np.load(out / schema.episode_folder(number) / schema.EPISODE_FILE, allow_pickle=False) as arrays:
-            positions.append(arrays["rel_pos"])
-            turns.append(arrays["rel_orn"])
-    return data_info(seeds, lengths, instructions, subgoals, action_space(positions, turns))

@@ -9,10 +9,11 @@ import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.episode import invert
+from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.trajectory import Recording
 from robocas_ms3.datasets.writer import CameraModel, Frame
 from robocas_ms3.errors import DatasetError
@@ -29,28 +30,29 @@ class EnvFrames:
         finger_range: target of one finger at -1 and +1, m.
     """
 
-    def __init__(self, env_info: dict[str, Any], control_mode: str, size: tuple[int, int] | None = None) -> None:
+    def __init__(self, env_info: dict[str, Any], control_mode: str, pictures: Pictures | None = None) -> None:
         """Make the environment, with cameras.
 
         Args:
             env_info: of the trajectory's JSON.
             control_mode: of its actions.
-            size: width and height of the pictures; None leaves the cameras' own, 640 x 480.
+            pictures: which ones to render; default: all.
 
         Raises:
             DatasetError: there is no render device, or no such environment.
         """
         kwargs = dict(env_info["env_kwargs"])
         sensors = dict(kwargs.pop("sensor_configs", None) or {})
-        if size is not None:
-            sensors["width"], sensors["height"] = size
+        self._pictures = pictures or Pictures()
+        if self._pictures.size is not None:
+            sensors["width"], sensors["height"] = self._pictures.size
         for key in ("render_backend", "render_mode", "sim_backend", "num_envs", "obs_mode", "control_mode"):
             kwargs.pop(key, None)
         require_renderer()
         try:
             self.env = gym.make(
                 env_info["env_id"],
-                obs_mode="rgb+depth",
+                obs_mode="+".join(self._pictures.kinds),
                 control_mode=control_mode,
                 num_envs=1,
                 sim_backend="physx_cpu",
@@ -74,6 +76,8 @@ class EnvFrames:
             DatasetError: the scene is not the recorded one: another pack, configuration or version.
         """
         self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
+        for name in set(self._base._sensors) - set(self._pictures.cameras):
+            del self._base._sensors[name]  # they are made anew at each reset; what is there is rendered
         controller = self._base.agent.controller
         self.gripper_column = controller.action_mapping["gripper"][0]
         gripper = controller.controllers["gripper"].config
@@ -120,10 +124,10 @@ class EnvFrames:
         tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
         self._base.set_state_dict(tensors)
         pictures = self._base._get_obs_sensor_data()
-        agent = self._base.agent
+        agent, wanted = self._base.agent, self._pictures
         return Frame(
-            rgb={c.name: pictures[c.name]["rgb"][0].cpu().numpy() for c in schema.CAMERAS},
-            depth={c.name: to_millimetres(pictures[c.name]["depth"][0, ..., 0]) for c in schema.CAMERAS},
+            rgb={name: pictures[name]["rgb"][0].cpu().numpy() for name in wanted.cameras},
+            depth={name: to_millimetres(pictures[name]["depth"][0, ..., 0]) for name in wanted.cameras if wanted.depth},
             tcp_in_world=_matrix(agent.tcp.pose),
             arm_base_in_world=_matrix(agent.arm_base_link.pose),
         )
@@ -133,7 +137,7 @@ class EnvFrames:
         agent = self._base.agent
         parents = {"ee": agent.tcp.pose, "arm_base": agent.arm_base_link.pose}
         models = {}
-        for spec in schema.CAMERAS:
+        for spec in self._pictures.specs:
             camera = self._base.scene.sensors[spec.name].camera
             world_in_camera = np.vstack([camera.get_extrinsic_matrix()[0].cpu().numpy(), [0, 0, 0, 1]])
             parent_in_world = _matrix(parents[spec.parent]) if spec.parent in parents else np.eye(4)
@@ -143,6 +147,38 @@ class EnvFrames:
                 camera_in_parent=invert(parent_in_world) @ invert(world_in_camera.astype(np.float64)),
             )
         return models
+
+    def scene(self) -> dict[str, Any]:
+        """Task, configuration, layout and objects, for ``scene.json``."""
+        return describe_scene(self._base)
+
+
+def describe_scene(env: Any) -> dict[str, Any]:
+    """Task, configuration, layout and objects of an environment (one env)."""
+    layout = env.layouts[0]
+    return {
+        "task": env.SPEC.name,
+        "config": env.task_config.model_dump(mode="json"),
+        "layout": {
+            "object_ids": list(layout.object_ids),
+            "poses": [_numbers(pose) for pose in layout.object_poses],
+            "present": layout.present.tolist(),
+            "robot_pose": _numbers(layout.robot_pose),
+            "basket_pose": _numbers(layout.basket_pose),
+            "relation": layout.relation,
+        },
+        "objects": [
+            {"slot": slot, "id": asset.asset.id, "name": asset.asset.name}
+            for slot, asset in enumerate(env.object_assets[0])
+            if layout.present[slot]
+        ],
+    }
+
+
+def _numbers(pose: NDArray[np.float64]) -> list[float]:
+    """x, y, z, qw, qx, qy, qz of a 4x4."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return [round(float(value), 9) for value in (*pose[:3, 3], quaternion[3], *quaternion[:3])]
 
 
 def require_renderer() -> None:

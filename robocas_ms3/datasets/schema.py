@@ -3,15 +3,16 @@
 ::
 
     data_info.json                    overview and split, see DATA_INFO
-    conversion.json                   how the dataset was made; ours, the released loader ignores it
+    conversion.json                   settings, and which recording became which episode; the released loader ignores it
     episode_0000000/
+      scene.json                      how the episode was made, see SCENE; the released loader ignores it
       episode_info.npz                arrays over T steps, see EPISODE_INFO; holds no pickles
       gripper_camera/, base_camera/, static_camera/
         cam_pos_wrt_<parent>.npy      4x4 OpenCV camera frame (x right, y down, z forward) in its parent; the paper's
         cam_pose_wrt_<parent>.npy     name and upstream's, the same content
         intrinsic.npy                 (4,) fx, fy, cx, cy in pixels
-        rgb/0000.png ...              8-bit RGB, one a step
-        depth/0000.png ...            16-bit grey, millimetres along the optical axis, 0 = nothing
+        rgb/0000.png ...              8-bit RGB, one a step; jpg or webp where that was asked for
+        depth/0000.png ...            16-bit grey, millimetres along the optical axis, 0 = nothing; may be left out
 
 Metres and radians; quaternions are xyzw.
 """
@@ -29,12 +30,19 @@ from robocas_ms3.language.templates import GOAL_TYPES
 
 DataType = Literal["float32", "int64", "bool", "str"]
 
+SCHEMA_VERSION = 2
+"""Raised when older datasets need ``robocas upgrade``. 1: no ``scene.json``; 0: upstream's, see docs/dataset.md."""
+
 EPISODE_FILE = "episode_info.npz"
+SCENE_FILE = "scene.json"
 DATA_INFO_FILE = "data_info.json"
 CONVERSION_FILE = "conversion.json"
 PREVIEW_FOLDER = "preview"
 INTRINSIC_FILE = "intrinsic.npy"
 IMAGE_KINDS = ("rgb", "depth")
+ImageFormat = Literal["png", "jpg", "webp"]
+IMAGE_FORMATS: tuple[ImageFormat, ...] = ("png", "jpg", "webp")
+"""Of RGB; the released loader opens ``png`` only. Depth is always PNG, which loses nothing."""
 MAX_STEPS = 10_000  # four digits in image names
 MAX_DEPTH_MM = 65_535
 
@@ -137,6 +145,26 @@ EPISODE_INFO: tuple[ArraySpec, ...] = (
 RELATIVE_PAIRS = (("ee_pos", "ee_orn", "rel_pos", "rel_orn"), ("base_pos", "base_orn", "base_rel_pos", "base_rel_orn"))
 """Keys of absolute position and orientation, and of the same as relative motion."""
 
+SCENE: dict[str, str] = {
+    "schema_version": f"{SCHEMA_VERSION}",
+    "task": "pick, select, search or open_pick",
+    "env_info": "{env_id, env_kwargs}: what makes the environment",
+    "seed": "of `env.reset`",
+    "reset_options": "further options of `env.reset`",
+    "config": "the whole configuration",
+    "layout": "{object_ids, poses [x, y, z, qw, qx, qy, qz] in the world, present, robot_pose, basket_pose, relation}",
+    "objects": "[{slot, id, name}] those that take part",
+    "target": "{slot, asset_id, name}",
+    "success": "whether the recording ended in success",
+    "control_mode": "of the recorded actions",
+    "control_freq": "of the recorded actions, Hz",
+    "rate_hz": "of this dataset",
+    "source": "{trajectory, episode_id, recording: SHA-256 of seed and actions}",
+    "recorded": "what the generator said of the episode: template, relation, facts, attempts, seconds",
+    "versions": "{package: version} the episode was generated with",
+}
+"""Keys of ``scene.json``."""
+
 DATA_INFO: dict[str, str] = {
     "train_eps": "list of episode numbers",
     "val_eps": "list of episode numbers: 10 % of the seeds, at least one where there are two",
@@ -160,9 +188,9 @@ def episode_number(folder: str) -> int | None:
     return int(digits) if folder.startswith("episode_") and len(digits) == 7 and digits.isdecimal() else None
 
 
-def image_path(episode: Path, camera: str, kind: str, step: int) -> Path:
-    """Path of a picture; ``kind`` is ``rgb`` or ``depth``."""
-    return episode / camera / kind / f"{step:04d}.png"
+def image_path(episode: Path, camera: str, kind: str, step: int, image_format: ImageFormat = "png") -> Path:
+    """Path of a picture; ``kind`` is ``rgb`` or ``depth``, the format that of RGB."""
+    return episode / camera / kind / f"{step:04d}.{image_format if kind == 'rgb' else 'png'}"
 
 
 def markdown() -> str:
@@ -177,6 +205,7 @@ def markdown() -> str:
     rows += [
         f"| `{c.name}` | {c.parent_frame} | " + ", ".join(f"`{name}`" for name in c.pose_files) + " |" for c in CAMERAS
     ]
-    rows += ["", f"| key of `{DATA_INFO_FILE}` | value |", "|---|---|"]
-    rows += [f"| `{key}` | {meaning} |" for key, meaning in DATA_INFO.items()]
+    for file, keys in ((DATA_INFO_FILE, DATA_INFO), (SCENE_FILE, SCENE)):
+        rows += ["", f"| key of `{file}` | value |", "|---|---|"]
+        rows += [f"| `{key}` | {meaning} |" for key, meaning in keys.items()]
     return "\n".join(rows)

@@ -15,8 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import geometry, schema
 from robocas_ms3.datasets.check_info import check_info
+from robocas_ms3.datasets.check_scene import check_scene, check_settings
 from robocas_ms3.datasets.episode import relative_motion, to_matrices, wrap_angle
-from robocas_ms3.datasets.png import PngHeader, read_header
+from robocas_ms3.datasets.picture_files import PictureHeader, read_header
+from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.violation import Violation
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.language.templates import GOAL_TYPES
@@ -67,11 +69,13 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
         raise DatasetError("no such dataset folder", where=root)
     numbers = {n: folder for folder in sorted(root.iterdir()) if (n := schema.episode_number(folder.name)) is not None}
     violations: list[Violation] = []
+    pictures, wrong = check_settings(root)
+    violations += wrong
     loaded: dict[int, dict[str, NDArray]] = {}
     embedded: set[bool] = set()
     for done, (number, folder) in enumerate(numbers.items()):
         arrays: dict[str, NDArray] = {}
-        violations += _episode(root, folder, arrays)
+        violations += _episode(folder, arrays, pictures)
         loaded[number] = {k: v for k, v in arrays.items() if not k.endswith(("_embs", "_embedding"))}
         if arrays:
             embedded.add("language_embedding" in arrays)
@@ -84,7 +88,7 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
     return Report(len(numbers), steps, violations)
 
 
-def _episode(root: Path, folder: Path, arrays: dict[str, NDArray]) -> Iterator[Violation]:
+def _episode(folder: Path, arrays: dict[str, NDArray], pictures: Pictures) -> Iterator[Violation]:
     """Check one episode; what could be read of its arrays is put into ``arrays``."""
     file = f"{folder.name}/{schema.EPISODE_FILE}"
     try:
@@ -108,13 +112,14 @@ def _episode(root: Path, folder: Path, arrays: dict[str, NDArray]) -> Iterator[V
     if sound:
         yield from _quaternions(file, arrays)
         yield from _values(file, arrays)
+    yield from check_scene(folder, arrays)
     cameras: dict[str, tuple[NDArray, NDArray]] = {}
-    yield from _cameras(folder, cameras)
+    yield from _cameras(folder, cameras, pictures)
     complete = True
-    for violation in _pictures(folder, steps):
+    for violation in _pictures(folder, steps, pictures):
         complete = False
         yield violation
-    if sound and complete and len(cameras) == len(schema.CAMERAS):
+    if sound and complete and pictures.depth and len(cameras) == len(pictures.cameras):
         yield from _geometry(folder, arrays, cameras, steps)
 
 
@@ -201,9 +206,13 @@ def _values(file: str, arrays: dict[str, NDArray]) -> Iterator[Violation]:
                 yield Violation(file, spec.name, "unit length", f"off by {error:.2g}")
 
 
-def _cameras(folder: Path, cameras: dict[str, tuple[NDArray, NDArray]]) -> Iterator[Violation]:
+def _cameras(folder: Path, cameras: dict[str, tuple[NDArray, NDArray]], pictures: Pictures) -> Iterator[Violation]:
     """Check intrinsics and poses; sound ones are put into ``cameras``."""
-    for camera in schema.CAMERAS:
+    for spec in schema.CAMERAS:
+        if spec not in pictures.specs and (folder / spec.name).exists():
+            expected = f"the cameras of {schema.CONVERSION_FILE} only"
+            yield Violation(f"{folder.name}/{spec.name}", "", expected, "another camera")
+    for camera in pictures.specs:
         found: dict[str, NDArray] = {}
         for name, shape in ((schema.INTRINSIC_FILE, (4,)), *((name, (4, 4)) for name in camera.pose_files)):
             file = f"{folder.name}/{camera.name}/{name}"
@@ -240,27 +249,30 @@ def _is_rigid(matrix: NDArray) -> bool:
     )
 
 
-def _pictures(folder: Path, steps: int) -> Iterator[Violation]:
-    sizes: dict[str, PngHeader] = {}
-    for camera in schema.CAMERAS:
-        for kind in schema.IMAGE_KINDS:
+def _pictures(folder: Path, steps: int, pictures: Pictures) -> Iterator[Violation]:
+    sizes: dict[str, PictureHeader] = {}
+    for camera in pictures.specs:
+        for kind in pictures.kinds:
             directory = folder / camera.name / kind
             shown = f"{folder.name}/{camera.name}/{kind}"
             there = {path.name for path in directory.iterdir()} if directory.is_dir() else set()
-            wanted = {schema.image_path(folder, camera.name, kind, step).name for step in range(steps)}
+            image_format = pictures.image_format
+            wanted = {schema.image_path(folder, camera.name, kind, step, image_format).name for step in range(steps)}
             for name in sorted(wanted - there):
                 yield Violation(f"{shown}/{name}", "", "a picture of every step", "no file")
             for name in sorted(there - wanted):
-                yield Violation(f"{shown}/{name}", "", f"{steps} pictures from 0000.png", "a file beyond them")
+                yield Violation(
+                    f"{shown}/{name}", "", f"{steps} pictures from {min(wanted, default='none')}", "a file beyond them"
+                )
             bits, channels = _HEADERS[kind]
             for name in sorted(wanted & there):
                 try:
                     header = read_header(directory / name)
                 except ValueError as error:
-                    yield Violation(f"{shown}/{name}", "", "a PNG", str(error))
+                    yield Violation(f"{shown}/{name}", "", "a sound picture", str(error))
                     continue
                 first = sizes.setdefault(camera.name, header)
-                expected = PngHeader(first.width, first.height, bits, channels)
+                expected = PictureHeader(first.width, first.height, bits, channels)
                 if header != expected:
                     yield Violation(f"{shown}/{name}", "", str(expected), str(header))
 
@@ -275,7 +287,7 @@ def _geometry(
     for step in chosen:
         parents = {"ee": ee[step], "arm_base": base[step], "world": np.eye(4)}
         seen.append([])
-        for camera in schema.CAMERAS:
+        for camera in [camera for camera in schema.CAMERAS if camera.name in cameras]:
             intrinsic, pose = cameras[camera.name]
             path = schema.image_path(folder, camera.name, "depth", step)
             depth = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), dtype=np.uint16)

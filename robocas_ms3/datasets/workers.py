@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Generator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -14,12 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.provenance import scene_record
 from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.writer import FrameSource, WrittenEpisode, write_episode
 from robocas_ms3.errors import DatasetError
 
-OpenSource = Callable[[dict[str, Any], str, "tuple[int, int] | None"], FrameSource]
-"""Makes a frame source from ``env_info``, control mode and picture size."""
+OpenSource = Callable[[dict[str, Any], str, Pictures], FrameSource]
+"""Makes a frame source from ``env_info``, control mode and what is to be rendered."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,8 @@ class Job:
         trajectory: the HDF5 file.
         out: the dataset.
         stride: control steps a dataset step.
-        size: width and height of the pictures, None: the cameras' own.
+        rate_hz: of the dataset.
+        pictures: which ones.
         vectors: embedding (384,) of every text; None: no embeddings.
         open_source: makes what shows the states.
         tasks: (number in the dataset, index in the trajectory) of each episode to write.
@@ -39,7 +43,8 @@ class Job:
     trajectory: Path
     out: Path
     stride: int
-    size: tuple[int, int] | None
+    rate_hz: float
+    pictures: Pictures
     vectors: dict[str, NDArray[np.float32]] | None
     open_source: OpenSource
     tasks: list[tuple[int, int]]
@@ -89,9 +94,18 @@ class _Writer:
         recording = self.file.recording(index)
         if self.source is None or recording.control_mode != self.control_mode:
             self._close_source()
-            self.source = job.open_source(self.file.env_info, recording.control_mode, job.size)
+            self.source = job.open_source(self.file.env_info, recording.control_mode, job.pictures)
             self.control_mode = recording.control_mode
-        return write_episode(job.out, number, recording, self.source, stride=job.stride, embed=self._embed())
+        return write_episode(
+            job.out,
+            number,
+            recording,
+            self.source,
+            stride=job.stride,
+            pictures=job.pictures,
+            describe=lambda scene: scene_record(self.file, index, recording, scene, job.rate_hz),
+            embed=self._embed(),
+        )
 
     def _embed(self) -> Callable[[list[str]], NDArray[np.float32]] | None:
         vectors = self.job.vectors
@@ -114,7 +128,16 @@ def _start_worker(job: Job) -> None:
     global _writer  # noqa: PLW0603  (state of a worker process)
     # One thread a process: several that render in software on all cores get in each other's way.
     os.environ.setdefault("LP_NUM_THREADS", "1")
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
     _writer = _Writer(job)
+
+
+def _leave_with_parent() -> None:
+    """A worker whose parent was killed would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _write(task: tuple[int, int]) -> WrittenEpisode:

@@ -1,16 +1,16 @@
-"""Writes one episode's folder: pictures while they are rendered, arrays at the end; the folder appears whole."""
+"""Writes one episode's folder: pictures while they are rendered, the rest at the end; the folder appears whole."""
 
 from __future__ import annotations
 
+import json
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,13 +22,13 @@ from robocas_ms3.datasets.episode import (
     sample_states,
     sample_subgoals,
 )
+from robocas_ms3.datasets.pictures import Pictures, write_picture
 from robocas_ms3.datasets.trajectory import Recording
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder
 
 ENCODERS = 2  # threads; OpenCV encodes outside Python's lock
 _MAX_WAITING = 24  # pictures, which bounds memory
-PNG_LEVEL = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Frame:
 
     Attributes:
         rgb: camera -> (H, W, 3) uint8.
-        depth: camera -> (H, W) uint16, mm.
+        depth: camera -> (H, W) uint16, mm; empty where depth is not wanted.
         tcp_in_world, arm_base_in_world: (4, 4).
     """
 
@@ -78,6 +78,10 @@ class FrameSource(Protocol):
         """The cameras, at the state shown last."""
         ...
 
+    def scene(self) -> dict[str, Any]:
+        """What ``scene.json`` says of the scene: ``task``, ``config``, ``layout``, ``objects``."""
+        ...
+
     def close(self) -> None:
         """Free what it holds."""
         ...
@@ -95,6 +99,21 @@ class Timing:
 
 
 @dataclass(frozen=True)
+class Shown:
+    """A rendered episode, all but its pictures.
+
+    Attributes:
+        arrays: of ``episode_info.npz``.
+        cameras: by name.
+        scene: see ``FrameSource.scene``.
+    """
+
+    arrays: dict[str, np.ndarray]
+    cameras: dict[str, CameraModel]
+    scene: dict[str, Any]
+
+
+@dataclass(frozen=True)
 class WrittenEpisode:
     """An episode on disk: its number in the dataset, T, bytes, and what it took."""
 
@@ -104,8 +123,66 @@ class WrittenEpisode:
     timing: Timing
 
 
+def show_episode(
+    recording: Recording,
+    source: FrameSource,
+    *,
+    stride: int,
+    embed: Callable[[list[str]], NDArray] | None,
+    on_frame: Callable[[int, Frame], None],
+    timing: Timing | None = None,
+) -> Shown:
+    """Render a recording and hand over its pictures one step at a time.
+
+    Args:
+        recording: what to show.
+        source: shows its states.
+        stride: control steps a dataset step.
+        embed: texts -> (N, 384); None leaves the embeddings out.
+        on_frame: called with step and frame.
+        timing: what this took is added to it.
+
+    Raises:
+        DatasetError: too long for four digits, or the scene can't be shown.
+    """
+    timing = timing or Timing()
+    begun = time.perf_counter()
+    samples = sample_states(recording.control_steps, stride)
+    subgoals = sample_subgoals(recording.subgoals, samples)
+    if len(samples) > schema.MAX_STEPS:
+        where = f"episode {recording.episode_id}"
+        raise DatasetError("too many steps", where=where, expected=f"<= {schema.MAX_STEPS}", found=len(samples))
+    source.load(recording)
+    timing.load += time.perf_counter() - begun
+    poses = []
+    begun = time.perf_counter()
+    for step, frame in enumerate(source.frames(recording, samples)):
+        timing.render += time.perf_counter() - begun
+        poses.append((frame.tcp_in_world, frame.arm_base_in_world))
+        on_frame(step, frame)
+        begun = time.perf_counter()
+    tcp, base = (np.stack(column) for column in zip(*poses, strict=True))
+    joints = recording.joints(samples)
+    status = gripper_open(
+        recording.actions[:, source.gripper_column],
+        samples,
+        finger_range=source.finger_range,
+        initial_width=float(joints.qpos[0, 10:12].sum()),
+    )
+    arrays = episode_arrays(Frames(tcp, base), joints, status, recording.instruction, subgoals, embed)
+    return Shown(arrays, source.cameras(), source.scene())
+
+
 def write_episode(
-    root: Path, number: int, recording: Recording, source: FrameSource, *, stride: int, embed=None
+    root: Path,
+    number: int,
+    recording: Recording,
+    source: FrameSource,
+    *,
+    stride: int,
+    pictures: Pictures,
+    describe: Callable[[dict[str, Any]], dict[str, Any]],
+    embed: Callable[[list[str]], NDArray] | None = None,
 ) -> WrittenEpisode:
     """Render a recording and write its folder.
 
@@ -115,6 +192,8 @@ def write_episode(
         recording: what to write.
         source: shows its states.
         stride: control steps a dataset step.
+        pictures: which ones.
+        describe: makes ``scene.json`` of what the source says of the scene.
         embed: texts -> (N, 384); None leaves the embeddings out.
 
     Raises:
@@ -122,73 +201,61 @@ def write_episode(
     """
     started = time.perf_counter()
     timing = Timing()
-    samples = sample_states(recording.control_steps, stride)
-    subgoals = sample_subgoals(recording.subgoals, samples)
-    if len(samples) > schema.MAX_STEPS:
-        raise DatasetError(
-            "too many steps", where=f"episode {number}", expected=f"<= {schema.MAX_STEPS}", found=len(samples)
-        )
-    source.load(recording)
-    timing.load = time.perf_counter() - started
     with replacing_folder(root / schema.episode_folder(number)) as folder:
-        for camera in schema.CAMERAS:
-            for kind in schema.IMAGE_KINDS:
-                (folder / camera.name / kind).mkdir(parents=True)
-        tcp, base = _write_pictures(folder, source.frames(recording, samples), timing)
-        for camera in schema.CAMERAS:
-            model = source.cameras()[camera.name]
+        for camera in pictures.cameras:
+            for kind in pictures.kinds:
+                (folder / camera / kind).mkdir(parents=True)
+        with _Encoders(folder, pictures, timing) as encoders:
+            shown = show_episode(recording, source, stride=stride, embed=embed, on_frame=encoders.add, timing=timing)
+        write_cameras(folder, {name: shown.cameras[name] for name in pictures.cameras})
+        np.savez(folder / schema.EPISODE_FILE, **shown.arrays)
+        text = json.dumps(describe(shown.scene), indent=1, ensure_ascii=False)
+        (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
+        size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    timing.total = time.perf_counter() - started
+    return WrittenEpisode(number, len(shown.arrays["ee_pos"]), size, timing)
+
+
+def write_cameras(folder: Path, cameras: dict[str, CameraModel]) -> None:
+    """Write intrinsics and poses into an episode's folder."""
+    for camera in schema.CAMERAS:
+        if camera.name in cameras:
+            model = cameras[camera.name]
+            (folder / camera.name).mkdir(exist_ok=True)
             np.save(folder / camera.name / schema.INTRINSIC_FILE, model.intrinsic)
             for name in camera.pose_files:
                 np.save(folder / camera.name / name, model.camera_in_parent)
-        joints = recording.joints(samples)
-        status = gripper_open(
-            recording.actions[:, source.gripper_column],
-            samples,
-            finger_range=source.finger_range,
-            initial_width=float(joints.qpos[0, 10:12].sum()),
-        )
-        arrays = episode_arrays(Frames(tcp, base), joints, status, recording.instruction, subgoals, embed)
-        np.savez(folder / schema.EPISODE_FILE, **arrays)
-        size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    timing.total = time.perf_counter() - started
-    return WrittenEpisode(number, len(samples), size, timing)
 
 
-def _write_pictures(folder: Path, frames: Iterator[Frame], timing: Timing) -> tuple[NDArray, NDArray]:
-    """Encode pictures on other threads while the next state renders; gives the poses (T, 4, 4) of TCP and arm base."""
-    poses = []
-    waiting: deque[Future[float]] = deque()
+class _Encoders:
+    """Encodes pictures on other threads while the next state renders."""
 
-    def collect(limit: int) -> None:
+    def __init__(self, folder: Path, pictures: Pictures, timing: Timing) -> None:
+        self._folder, self._pictures, self._timing = folder, pictures, timing
+        self._waiting: deque[Future[float]] = deque()
+        self._pool = ThreadPoolExecutor(ENCODERS, thread_name_prefix="pictures")
+
+    def __enter__(self) -> _Encoders:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            if kind is None:
+                self._collect(0)
+        finally:
+            self._pool.shutdown(cancel_futures=True)
+
+    def add(self, step: int, frame: Frame) -> None:
+        """Take a frame; waits where too many are waiting."""
+        for kind in self._pictures.kinds:
+            shots = frame.rgb if kind == "rgb" else frame.depth
+            for camera in self._pictures.cameras:
+                path = schema.image_path(self._folder, camera, kind, step, self._pictures.image_format)
+                self._waiting.append(self._pool.submit(write_picture, path, shots[camera]))
+        self._collect(_MAX_WAITING)
+
+    def _collect(self, limit: int) -> None:
         begun = time.perf_counter()
-        while len(waiting) > limit:
-            timing.encode += waiting.popleft().result()
-        timing.wait += time.perf_counter() - begun
-
-    with ThreadPoolExecutor(ENCODERS, thread_name_prefix="png") as encoders:
-        begun = time.perf_counter()
-        for step, frame in enumerate(frames):
-            timing.render += time.perf_counter() - begun
-            poses.append((frame.tcp_in_world, frame.arm_base_in_world))
-            for camera in schema.CAMERAS:
-                for kind, picture in (("rgb", frame.rgb[camera.name]), ("depth", frame.depth[camera.name])):
-                    path = schema.image_path(folder, camera.name, kind, step)
-                    waiting.append(encoders.submit(_write_png, path, picture))
-            collect(_MAX_WAITING)
-            begun = time.perf_counter()
-        collect(0)
-    tcp, base = (np.stack(column) for column in zip(*poses, strict=True))
-    return tcp, base
-
-
-def _write_png(path: Path, picture: NDArray) -> float:
-    begun = time.perf_counter()
-    if picture.ndim == 3:
-        picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-    try:
-        written = cv2.imwrite(str(path), picture, PNG_LEVEL)
-    except cv2.error as error:
-        raise DatasetError("can't encode this picture", where=path, found=str(error).splitlines()[0]) from error
-    if not written:
-        raise DatasetError("can't write this picture", where=path, fix="Is the disk full?")
-    return time.perf_counter() - begun
+        while len(self._waiting) > limit:
+            self._timing.encode += self._waiting.popleft().result()
+        self._timing.wait += time.perf_counter() - begun

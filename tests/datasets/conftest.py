@@ -28,7 +28,7 @@ def made(trajectory, tmp_path_factory):
     """A dataset of two episodes that nobody may change."""
     out = tmp_path_factory.mktemp("made") / "dataset"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("robocas_ms3.datasets.convert._embed_all", made_up_vectors)
+        patch.setattr("robocas_ms3.datasets.convert.embed_texts", made_up_vectors)
         convert(trajectory, out, open_source=RayCaster)
     return out
 

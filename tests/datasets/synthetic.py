@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.episode import invert, to_matrices, wxyz_to_xyzw
+from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.writer import CameraModel, Frame
 
 STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one
@@ -62,8 +63,9 @@ class RayCaster:
     gripper_column = 7
     finger_range = (-0.01, 0.04)
 
-    def __init__(self, env_info, control_mode, size):
-        self.size = size or SIZE
+    def __init__(self, env_info, control_mode, pictures=None):
+        self.pictures = pictures or Pictures()
+        self.size = self.pictures.size or SIZE
         self.closed = False
 
     def load(self, recording):
@@ -73,7 +75,15 @@ class RayCaster:
         self.closed = True
 
     def cameras(self):
-        return {name: CameraModel(self.intrinsic(), camera) for name, camera in CAMERA_IN_PARENT.items()}
+        return {name: CameraModel(self.intrinsic(), CAMERA_IN_PARENT[name]) for name in self.pictures.cameras}
+
+    def scene(self):
+        return {
+            "task": "pick",
+            "config": {"task": "pick"},
+            "layout": {"object_ids": ["cube"] * 3},
+            "objects": [{"slot": slot, "id": "cube", "name": "cube"} for slot in range(3)],
+        }
 
     def intrinsic(self):
         width, height = self.size
@@ -85,8 +95,10 @@ class RayCaster:
             base, tcp = robot_frames(state["articulations"]["robocas_mobile_panda"][0])
             parents = {"base_camera": base, "gripper_camera": tcp, "static_camera": np.eye(4)}
             boxes = [TABLE] + [(p[0, :3] - HALF, p[0, :3] + HALF) for p in state["actors"].values()]
-            pictures = {n: self.shoot(parents[n] @ camera, boxes) for n, camera in CAMERA_IN_PARENT.items()}
-            yield Frame({n: p[0] for n, p in pictures.items()}, {n: p[1] for n, p in pictures.items()}, tcp, base)
+            wanted = {n: CAMERA_IN_PARENT[n] for n in self.pictures.cameras}
+            shots = {n: self.shoot(parents[n] @ camera, boxes) for n, camera in wanted.items()}
+            depth = {n: p[1] for n, p in shots.items() if self.pictures.depth}
+            yield Frame({n: p[0] for n, p in shots.items()}, depth, tcp, base)
 
     def shoot(self, camera_in_world, boxes):
         width, height = self.size

@@ -1,5 +1,8 @@
 import json
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -11,8 +14,12 @@ from synthetic import STEPS, RayCaster, robot_frames, write_trajectory
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.convert import convert
 from robocas_ms3.datasets.episode import to_matrices
+from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.trajectory import TrajectoryFile
+from robocas_ms3.datasets.validate import validate
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.files import locked_folder
 
 
 def run(trajectory, out, **kwargs):
@@ -28,7 +35,7 @@ def test_the_folder_is_the_schemas(made):
     assert names == {"data_info.json", "conversion.json", "episode_0000000", "episode_0000001"}
     episode = made / "episode_0000001"
     assert {path.name for path in episode.iterdir()} == {
-        "episode_info.npz", "base_camera", "gripper_camera", "static_camera",
+        "episode_info.npz", "scene.json", "base_camera", "gripper_camera", "static_camera",
     }  # fmt: skip
     for camera, parent in (("base", "arm_base"), ("gripper", "ee"), ("static", "world")):
         folder = episode / f"{camera}_camera"
@@ -132,7 +139,9 @@ def test_resume_keeps_what_is_there(trajectory, tmp_path):
     assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
     assert files_of(out) == before
     assert (out / "episode_0000000" / "episode_info.npz").stat().st_mtime_ns == kept
-    with pytest.raises(DatasetError, match="can't resume with other settings .found different rate_hz"):
+    with pytest.raises(
+        DatasetError, match="can't resume with other settings .expected rate_hz 5.0, found rate_hz 10.0"
+    ):
         run(trajectory, out, resume=True, rate_hz=10)
     assert files_of(out) == before
 
@@ -221,3 +230,88 @@ def test_no_render_device_is_said_before_anything_is_written(trajectory, tmp_pat
     with pytest.raises(DatasetError, match="no render device. Run scripts/setup.sh or install a Vulkan driver"):
         convert(trajectory, tmp_path / "out", embeddings=False)
     assert not (tmp_path / "out").exists()
+
+
+def test_every_episode_says_how_it_was_made(made, trajectory):
+    scene = json.loads((made / "episode_0000001" / "scene.json").read_text())
+    assert list(scene) == list(schema.SCENE)
+    assert scene["seed"] == 5
+    assert scene["success"] is True
+    assert scene["env_info"]["env_id"] == "robocas_ms3:RoboCASPick-v1"
+    assert scene["source"]["trajectory"] == "F.h5"
+    assert scene["source"]["episode_id"] == 2
+    ledger = json.loads((made / "conversion.json").read_text())["episodes"]
+    assert scene["source"]["recording"] == ledger["1"]["recording"] != ledger["0"]["recording"]
+
+
+@pytest.mark.parametrize("image_format", ["jpg", "webp"])
+def test_fewer_and_smaller_pictures(trajectory, tmp_path, image_format):
+    out = tmp_path / "out"
+    pictures = Pictures(("static_camera", "base_camera"), (80, 60), depth=False, image_format=image_format)
+    run(trajectory, out, pictures=pictures)
+    episode = Dataset(out).episode(1)
+    assert (episode.cameras, episode.has_depth, episode.image_format) == (
+        ("base_camera", "static_camera"),
+        False,
+        image_format,
+    )
+    frame = next(RayCaster({}, "", pictures).frames(recording(trajectory, 2), np.array([8])))
+    difference = episode.rgb("base_camera", 2).astype(int) - frame.rgb["base_camera"]
+    assert episode.rgb("base_camera", 2).shape == (60, 80, 3)
+    assert np.abs(difference).mean() < 4  # lossy, but the same picture
+    assert validate(out).violations == []
+
+
+def recording(trajectory, index):
+    with TrajectoryFile(trajectory) as file:
+        return file.recording(index)
+
+
+def test_append_keeps_numbers_and_split(trajectory, tmp_path):
+    out = tmp_path / "out"
+    run(trajectory, out)
+    before, info = files_of(out), json.loads((out / "data_info.json").read_text())
+    more = write_trajectory(tmp_path / "more.h5", seeds=tuple(range(10, 18)))
+    done = run(more, out, append=True)
+    assert [e.number for e in done.episodes] == list(range(2, 10))
+    after, info_after = files_of(out), json.loads((out / "data_info.json").read_text())
+    changed = {name for name in before if after[name] != before[name]}
+    assert changed == {"data_info.json", "conversion.json"}
+    for part in ("train_eps", "val_eps"):
+        assert set(info[part]) <= set(info_after[part])
+    assert sorted(info_after["train_eps"] + info_after["val_eps"]) == list(range(10))
+    assert json.loads((out / "episode_0000004" / "scene.json").read_text())["source"]["trajectory"] == "more.h5"
+    assert validate(out).violations == []
+    again = run(more, out, append=True)
+    assert (again.kept, again.episodes) == (8, [])
+    assert files_of(out) == after
+
+
+def test_append_wants_a_dataset_of_the_same_settings(trajectory, tmp_path):
+    with pytest.raises(DatasetError, match="no dataset to append to.*without --append first"):
+        run(trajectory, tmp_path / "none", append=True)
+    run(trajectory, tmp_path / "out")
+    before = files_of(tmp_path / "out")
+    with pytest.raises(DatasetError, match="can't append with other settings .expected rate_hz 5.0, found rate_hz 10"):
+        run(trajectory, tmp_path / "out", append=True, rate_hz=10)
+    assert files_of(tmp_path / "out") == before
+
+
+@pytest.mark.parametrize("moment", ["picture", "arrays", "rename", "overview"])
+def test_killed_and_resumed_is_as_if_never_killed(trajectory, tmp_path, moment):
+    """kill -9 in a process of its own, at four places."""
+    run(trajectory, tmp_path / "whole")
+    out = tmp_path / "out"
+    command = [sys.executable, str(Path(__file__).parent / "dying.py"), moment, str(trajectory), str(out)]
+    environment = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}  # there is no simulator in this, only its import
+    done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    run(trajectory, out, resume=True)
+    assert files_of(out) == files_of(tmp_path / "whole")
+    with pytest.raises(DatasetError, match="no successful"):
+        run(write_trajectory(tmp_path / "failed.h5", failed=(0, 1, 2)), out, resume=True)
+
+
+def test_two_conversions_into_one_folder_are_refused(trajectory, tmp_path):
+    with locked_folder(tmp_path / "out"), pytest.raises(RobocasError, match="another process is writing here"):
+        run(trajectory, tmp_path / "out")

@@ -68,7 +68,10 @@ def test_no_folder(tmp_path):
 
 
 def test_an_empty_folder(tmp_path):
-    assert found(tmp_path) == ["data_info.json: expected this file, found no file"]
+    assert found(tmp_path) == [
+        "conversion.json: expected this file (robocas import-robocas or upgrade writes one), found no file",
+        "data_info.json: expected this file, found no file",
+    ]
 
 
 @pytest.mark.parametrize("spec", EPISODE_INFO, ids=lambda spec: spec.name)
@@ -180,8 +183,8 @@ def test_pictures(dataset):
     assert sorted(found(dataset)) == [
         f"{place}/depth/0006.png: expected 64 x 48, 1 x 16 bit, found 64 x 48, 1 x 8 bit",
         f"{place}/rgb/0002.png: expected a picture of every step, found no file",
-        f"{place}/rgb/0003.png: expected a PNG, found PNG cut off",
-        f"{place}/rgb/0004.png: expected a PNG, found damaged PNG",
+        f"{place}/rgb/0003.png: expected a sound picture, found PNG cut off",
+        f"{place}/rgb/0004.png: expected a sound picture, found damaged PNG",
         f"{place}/rgb/0005.png: expected 64 x 48, 3 x 8 bit, found 64 x 40, 3 x 8 bit",
         f"{place}/rgb/0007.png: expected 7 pictures from 0000.png, found a file beyond them",
     ]

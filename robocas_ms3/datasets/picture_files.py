@@ -1,4 +1,4 @@
-"""Reads a PNG's header and checks its checksums, without decoding it."""
+"""Reads a picture's header and checks that it is whole: a PNG by its checksums, without decoding it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from PIL import Image, UnidentifiedImageError
+
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 
 
 @dataclass(frozen=True)
-class PngHeader:
+class PictureHeader:
     """Size in pixels, bits a channel, channels."""
 
     width: int
@@ -24,12 +26,28 @@ class PngHeader:
         return f"{self.width} x {self.height}, {self.channels} x {self.bits} bit"
 
 
-def read_header(path: Path) -> PngHeader:
-    """Read a PNG's header.
+def read_header(path: Path) -> PictureHeader:
+    """Read a picture's header.
 
     Raises:
-        ValueError: the file is no PNG, cut off, or damaged.
+        ValueError: the file is of another format than its suffix says, cut off, or damaged.
     """
+    return _read_png(path) if path.suffix == ".png" else _decode(path)
+
+
+def _decode(path: Path) -> PictureHeader:
+    wanted = {".jpg": "JPEG", ".webp": "WEBP"}[path.suffix]
+    try:
+        with Image.open(path, formats=[wanted]) as picture:
+            picture.load()
+            return PictureHeader(*picture.size, 8, len(picture.getbands()))
+    except UnidentifiedImageError as error:
+        raise ValueError(f"not a {wanted}") from error
+    except OSError as error:
+        raise ValueError(f"damaged {wanted}: {error}") from error
+
+
+def _read_png(path: Path) -> PictureHeader:
     data = path.read_bytes()
     if not data.startswith(_SIGNATURE):
         raise ValueError("not a PNG")
@@ -43,7 +61,7 @@ def read_header(path: Path) -> PngHeader:
             raise ValueError("damaged PNG")
         if kind == b"IHDR":
             width, height, bits, colour = struct.unpack_from(">IIBB", data, offset + 8)
-            header = PngHeader(width, height, bits, _CHANNELS.get(colour, 0))
+            header = PictureHeader(width, height, bits, _CHANNELS.get(colour, 0))
         if kind == b"IEND" and header is not None:
             return header
         offset = end + 4

@@ -1,0 +1,69 @@
+"""Checks how a dataset says it was made: ``conversion.json`` and every episode's ``scene.json``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.violation import Violation
+from robocas_ms3.errors import DatasetError
+
+FILE = schema.CONVERSION_FILE
+
+
+def check_settings(root: Path) -> tuple[Pictures, list[Violation]]:
+    """Check ``conversion.json``, and tell which pictures it promises (all of them, where it can't be read)."""
+    try:
+        settings = json.loads((root / FILE).read_text(encoding="utf-8"))
+        version = settings.get("schema_version", 1)
+        if version != schema.SCHEMA_VERSION:
+            return Pictures(), [
+                Violation(FILE, "schema_version", f"{schema.SCHEMA_VERSION} (robocas upgrade)", str(version))
+            ]
+        size = settings["image_size"]
+        pictures = Pictures(
+            tuple(settings["cameras"]), tuple(size) if size else None, settings["depth"], settings["image_format"]
+        )
+    except FileNotFoundError:
+        return Pictures(), [Violation(FILE, "", "this file (robocas import-robocas or upgrade writes one)", "no file")]
+    except KeyError as error:
+        return Pictures(), [Violation(FILE, str(error).strip("'"), "this key", "no such key")]
+    except (OSError, ValueError, TypeError, AttributeError, DatasetError) as error:
+        return Pictures(), [Violation(FILE, "", "settings of a dataset", str(error).splitlines()[0])]
+    problems = []
+    marks: dict[str, str] = {}
+    for number, entry in settings.get("episodes", {}).items():
+        mark = entry.get("recording") or number
+        if mark in marks:
+            problems.append(
+                Violation(FILE, f"episodes.{number}", "each recording once", f"that of episode {marks[mark]}")
+            )
+        marks.setdefault(mark, number)
+    return pictures, problems
+
+
+def check_scene(folder: Path, arrays: Mapping[str, NDArray]) -> Iterator[Violation]:
+    """Check an episode's ``scene.json``."""
+    file = f"{folder.name}/{schema.SCENE_FILE}"
+    try:
+        scene: Any = json.loads((folder / schema.SCENE_FILE).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        yield Violation(file, "", "this file", "no file")
+        return
+    except (OSError, ValueError) as error:
+        yield Violation(file, "", "JSON", str(error).splitlines()[0])
+        return
+    if not isinstance(scene, dict):
+        yield Violation(file, "", "an object", type(scene).__name__)
+        return
+    for key in schema.SCENE:
+        if key not in scene:
+            yield Violation(file, key, "this key", "no such key")
+    if scene.get("schema_version") != schema.SCHEMA_VERSION:
+        yield Violation(file, "schema_version", str(schema.SCHEMA_VERSION), str(scene.get("schema_version")))

@@ -1,0 +1,60 @@
+"""``scene.json``: how an episode was made, so that it can be made, judged and replayed again."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
+
+
+def fingerprint(recording: Recording) -> str:
+    """SHA-256 of what makes a recording: seed, control mode, instruction, actions. The same one is never twice here."""
+    digest = hashlib.sha256()
+    digest.update(f"{recording.seed} {recording.control_mode} {recording.instruction}\n".encode())
+    digest.update(np.ascontiguousarray(recording.actions).tobytes())
+    return digest.hexdigest()
+
+
+def scene_record(
+    file: TrajectoryFile, index: int, recording: Recording, scene: dict[str, Any], rate_hz: float
+) -> dict[str, Any]:
+    """Content of ``scene.json``.
+
+    Args:
+        file: the trajectory.
+        index: of the episode in it.
+        recording: the episode.
+        scene: ``task``, ``config``, ``layout`` and ``objects``, as the scene's source gives them.
+        rate_hz: of the dataset.
+    """
+    entry = dict(file.episodes[index].get("robocas", {}))
+    known = {"target", "instruction", "subgoals", "objects"}  # said elsewhere
+    record = {
+        **scene,
+        "schema_version": schema.SCHEMA_VERSION,
+        "env_info": {key: file.env_info[key] for key in ("env_id", "env_kwargs")},
+        "seed": recording.seed,
+        "reset_options": recording.reset_options,
+        "target": entry.get("target"),
+        "success": succeeded(file.episodes[index]),
+        "control_mode": recording.control_mode,
+        "control_freq": file.control_freq,
+        "rate_hz": rate_hz,
+        "source": {
+            "trajectory": file.path.name,
+            "episode_id": recording.episode_id,
+            "recording": fingerprint(recording),
+        },
+        "recorded": {key: value for key, value in entry.items() if key not in known},
+        "versions": file.versions,
+    }
+    return {key: record.get(key) for key in schema.SCENE}
+
+
+def succeeded(episode: dict[str, Any]) -> bool:
+    """Whether a trajectory's entry ended in success."""
+    return bool(np.all(episode.get("success", False)))

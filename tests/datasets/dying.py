@@ -1,0 +1,35 @@
+"""Convert a made-up trajectory and die by SIGKILL on the way: `python dying.py MOMENT TRAJECTORY OUT`."""
+
+import os
+import signal
+import sys
+
+from synthetic import RayCaster
+
+from robocas_ms3 import files
+from robocas_ms3.datasets import convert, writer
+
+PLACES = {  # moment -> (module, function, which call is the last)
+    "picture": (writer, "write_picture", 50),  # in the second episode
+    "arrays": (writer, "write_cameras", 2),
+    "rename": (files, "_move_in", 2),
+    "overview": (convert, "write_info", 1),
+}
+
+
+def die_at(module, name, last):
+    whole, calls = getattr(module, name), []
+
+    def dying(*args, **kwargs):
+        calls.append(name)
+        if len(calls) == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return whole(*args, **kwargs)
+
+    setattr(module, name, dying)
+
+
+if __name__ == "__main__":
+    moment, trajectory, out = sys.argv[1:]
+    die_at(*PLACES[moment])
+    convert.convert(trajectory, out, embeddings=False, open_source=RayCaster)
