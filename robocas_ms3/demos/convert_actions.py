@@ -6,13 +6,15 @@ in the world's, so it refuses the end effector's own frame and goes wrong when t
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from sapien.wrapper.pinocchio_model import PinocchioModel
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.robots import constants as c
-from robocas_ms3.robots.controllers import to_ee_delta_action
+from robocas_ms3.robots.controllers import RoboCASEEPoseController, to_ee_delta_action
 from robocas_ms3.robots.urdf import robot_files
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -62,7 +64,10 @@ class ActionConverter:
         position, rotation = self._tcp(arm)
         if self.mode == "pd_ee_pose":
             return np.concatenate([position, rotation.as_euler("XYZ"), gripper]).astype(np.float32)
-        pose = self.env.agent.tcp_in_arm_base.raw_pose[0].cpu().numpy().astype(float)
+        agent: Any = self.env.agent
+        controller = agent.controller.controllers["arm"]
+        assert isinstance(controller, RoboCASEEPoseController)
+        pose = controller.reference_pose().raw_pose[0].cpu().numpy().astype(float)
         now_inverse = Rotation.from_quat(pose[[4, 5, 6, 3]]).inv()
         delta = to_ee_delta_action(now_inverse.apply(position - pose[:3]), now_inverse * rotation)
         return np.append(np.clip(delta, -1, 1), gripper).astype(np.float32)

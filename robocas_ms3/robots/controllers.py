@@ -3,7 +3,8 @@
 Actions of ``pd_ee_delta_pose``: (x, y, z, rx, ry, rz) in [-1, 1], all in the current TCP frame. Translation is
 metres / 0.1. Rotation is Euler angles in radians / 0.5, in the convention of ManiSkill's controllers (intrinsic XYZ:
 R = Rx Ry Rz), its norm clipped to 1. A positive angle turns positively about the TCP's axis (ManiSkill's own controller
-turns the other way).
+turns the other way). They start from the pose that the last action asked for, not from where the arm is: it lags 75 ms
+behind, and deltas of recorded poses that started from there would add the lag up, to centimetres within seconds.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ BODY_FRAME = "body_translation:body_aligned_body_rotation"
 BATCHED_IK_ITERATIONS = 5
 # Distances of a joint from its drive target (rad, m) that no motion explains: the state was set from outside.
 ARM_SET_FROM_OUTSIDE, HELD_SET_FROM_OUTSIDE = 0.3, 0.02
+# m and rad between the TCP and the pose it was asked for: beyond, something holds the arm back, or set it elsewhere.
+EE_HELD_BACK = (0.1, 0.5)
 
 
 def to_ee_delta_action(
@@ -192,8 +195,9 @@ class HeldJointsControllerConfig(PDJointPosControllerConfig):
 class RoboCASEEPoseController(PDEEPoseController):
     """End-effector pose control: deltas in the end effector's frame, or absolute poses in the arm's base frame.
 
-    Differs from ManiSkill's: rotations have their natural sign, and body-frame deltas work on a GPU too, since the
-    target pose in the base frame is computed before inverse kinematics.
+    Differs from ManiSkill's: rotations have their natural sign; body-frame deltas work on a GPU too, since the target
+    pose in the base frame is computed before inverse kinematics; and a target that the arm does not come near to is
+    given up, so that deltas don't pile up while something is in the way.
     """
 
     def _check_gpu_sim_works(self) -> None:
@@ -222,11 +226,24 @@ class RoboCASEEPoseController(PDEEPoseController):
         action = self._preprocess_action(action)
         self._step = 0
         self._start_qpos = self.qpos
-        now = self.ee_pose_at_base
-        self._target_pose = self.compute_target_pose(self._target_pose if self.config.use_target else now, action)
+        now, reference = self.ee_pose_at_base, self.reference_pose()
+        self._target_pose = self.compute_target_pose(reference, action)
         target = self._solve(self._target_pose, now)
-        self._target_qpos = self._start_qpos if target is None else target
+        if target is None:
+            target, self._target_pose = self._start_qpos, reference
+        self._target_qpos = target
         self.set_drive_targets(self._target_qpos)
+
+    def reference_pose(self) -> Pose:
+        """(N,) poses in the arm's base frame that the next deltas start from."""
+        now = self.ee_pose_at_base
+        if not self.config.use_target or self._target_pose is None:
+            return now
+        far, turned = EE_HELD_BACK
+        distance = torch.linalg.norm(self._target_pose.p - now.p, dim=1)
+        cosine = (self._target_pose.q * now.q).sum(dim=1).abs()  # of half the angle between them
+        lost = (distance > far) | (cosine < np.cos(turned / 2))
+        return Pose.create(torch.where(lost[:, None], now.raw_pose, self._target_pose.raw_pose))
 
     def _solve(self, target: Pose, now: Pose) -> torch.Tensor | None:
         qpos = self.articulation.get_qpos()

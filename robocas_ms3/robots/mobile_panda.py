@@ -118,6 +118,7 @@ class RoboCASMobilePanda(BaseAgent):
                 rot_lower=-ROTATION_SCALE,
                 rot_upper=ROTATION_SCALE,
                 frame=BODY_FRAME,
+                use_target=True,
                 **end_effector,
             ),
             pd_ee_pose=RoboCASEEPoseControllerConfig(

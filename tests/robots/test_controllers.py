@@ -93,8 +93,7 @@ def test_action_dimensions_and_the_base(make_env, mode):
         env.step(action)
     qpos = agent.robot.qpos[0].numpy()
     assert qpos[:3] == pytest.approx(base, abs=1e-3)
-    if mode != "pd_ee_delta_pose_base":  # the base's push moves the arm, whose deltas start where it is
-        assert qpos[3:10] == pytest.approx(c.ARM_EVALUATION_START, abs=3e-3)
+    assert qpos[3:10] == pytest.approx(c.ARM_EVALUATION_START, abs=3e-3)
 
 
 def test_joint_delta_moves_by_a_tenth_of_a_radian(make_env):
@@ -116,6 +115,29 @@ def test_ee_delta_moves_along_and_turns_about_the_tcps_own_axes(make_env, axis):
     motion = np.concatenate([translation / 0.1, rotation / 0.5])
     assert motion[axis] == pytest.approx(0.4, rel=0.12)
     assert np.abs(np.delete(motion, axis)).max() < 0.06
+
+
+def test_ee_deltas_add_up_without_the_arms_lag(make_env):
+    env, agent = make_env("pd_ee_delta_pose", control_freq=5)
+    start = matrix(agent.tcp.pose)
+    for _ in range(10):
+        env.step(np.array([0, 0, -0.15, 0, 0, 0.1, 1], np.float32))
+    for _ in range(5):
+        env.step(np.array([0, 0, 0, 0, 0, 0, 1], np.float32))
+    translation, rotation = moved(start, matrix(agent.tcp.pose))
+    assert translation == pytest.approx([0, 0, -0.15], abs=1e-3)
+    assert rotation == pytest.approx([0, 0, 0.5], abs=2e-3)
+
+
+def test_ee_deltas_start_where_the_arm_is_after_it_was_held_back(make_env):
+    env, agent = make_env("pd_ee_delta_pose", control_freq=5)
+    elsewhere = agent.robot.qpos.clone()
+    elsewhere[0, 3] += 0.3  # 0.3 rad about the first joint moves the TCP by more than 10 cm
+    agent.robot.set_qpos(elsewhere)
+    there = matrix(agent.tcp.pose)
+    env.step(np.array([0, 0, 0.1, 0, 0, 0, 1], np.float32))
+    translation, _ = moved(there, matrix(agent.tcp.pose))
+    assert np.linalg.norm(translation) < 0.02
 
 
 def test_ee_delta_rotation_is_clipped_by_norm(make_env):
