@@ -1,1 +1,19 @@
-"""RoboCAS datasets: one declared schema, the converter, the validator, videos."""
+"""RoboCAS datasets: one declared schema, the converter, the validator, videos, statistics, a torch dataset."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from robocas_ms3.datasets.torch_dataset import RoboCASDataset
+
+__all__ = ["RoboCASDataset"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import torch only where it is asked for."""
+    if name in __all__:
+        from robocas_ms3.datasets import torch_dataset
+
+        return getattr(torch_dataset, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

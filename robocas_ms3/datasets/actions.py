@@ -1,0 +1,75 @@
+"""The 7-D action of RoboCAS, from a dataset's arrays, and its scale."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.errors import DatasetError
+
+ACTION_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
+"""Motion in m and Euler xyz angles in rad, both in the EEF frame at the step; gripper command, 1 = open."""
+ACTION_ARRAYS = ("rel_pos", "rel_orn", "gripper_status")
+"""Keys of ``episode_info.npz`` that actions are made of."""
+
+
+def episode_actions(arrays: Mapping[str, NDArray]) -> NDArray[np.float32]:
+    """Actions (T, 7) of an episode; row t leads from step t to t + 1, so the last one, which leads nowhere, holds.
+
+    Position and turn are ``rel_pos[t]`` and ``rel_orn[t]`` as Euler angles about the fixed axes x, y, z (scipy's
+    "xyz", the convention of ``action_space``); the gripper command is ``gripper_status[t + 1]``.
+    """
+    status = np.asarray(arrays["gripper_status"], dtype=np.float64)
+    actions = np.zeros((len(status), 7))
+    actions[:-1, :3] = arrays["rel_pos"][:-1]
+    if len(status) > 1:
+        actions[:-1, 3:6] = Rotation.from_quat(np.asarray(arrays["rel_orn"][:-1], np.float64)).as_euler("xyz")
+    actions[:-1, 6] = status[1:]
+    actions[-1, 6] = status[-1]
+    return actions.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class ActionScale:
+    """Maps motion within a range to [-1, 1]; the gripper stays 0 or 1.
+
+    Attributes:
+        low, high: (6,) ends of the range, m and rad.
+    """
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, action_space: Mapping[str, Any], where: object = "action_space") -> ActionScale:
+        """From ``action_space`` of ``data_info.json``.
+
+        Raises:
+            DatasetError: it is not two rows of three numbers for position and for rotation.
+        """
+        try:
+            rows = [np.asarray(action_space[key], float) for key in ("relative_position", "relative_rotation")]
+        except (KeyError, TypeError, ValueError) as error:
+            raise DatasetError("no range of actions", where=where, found=str(error)) from error
+        if any(row.shape != (2, 3) or not np.isfinite(row).all() for row in rows):
+            found = [row.tolist() for row in rows]
+            raise DatasetError("no range of actions", where=where, expected="[low (3), high (3)] each", found=found)
+        low, high = np.concatenate(rows, axis=1)
+        return cls(low, high)
+
+    def encode(self, actions: NDArray) -> NDArray[np.float32]:
+        """Actions (..., 7), clipped to the range; an axis that never moves gives 0."""
+        span = self.high - self.low
+        scaled = 2 * (actions[..., :6] - self.low) / np.where(span > 0, span, 1) - 1
+        motion = np.where(span > 0, np.clip(scaled, -1, 1), 0)
+        return np.concatenate([motion, actions[..., 6:]], axis=-1).astype(np.float32)
+
+    def decode(self, actions: NDArray) -> NDArray[np.float32]:
+        """The inverse of ``encode``, within the range."""
+        motion = self.low + (actions[..., :6] + 1) / 2 * (self.high - self.low)
+        return np.concatenate([motion, actions[..., 6:]], axis=-1).astype(np.float32)

@@ -1,0 +1,69 @@
+"""Forward kinematics of the robot, from its URDF and in numpy: poses of recorded states without a simulator."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.datasets.episode import Frames, Joints
+from robocas_ms3.robots.constants import ARM_BASE_LINK, ARM_SLICE, BASE_SLICE, TCP_LINK
+from robocas_ms3.robots.urdf import robot_files
+
+Array = NDArray[np.float64]
+
+
+def robot_frames(joints: Joints) -> Frames:
+    """Poses of the TCP and of the arm's base in the world."""
+    urdf = robot_files().urdf
+    base = joints.root_in_world @ chain(urdf, "root", ARM_BASE_LINK, joints.qpos[:, BASE_SLICE])
+    return Frames(base @ chain(urdf, ARM_BASE_LINK, TCP_LINK, joints.qpos[:, ARM_SLICE]), base)
+
+
+def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:
+    """Pose of a link in another one, (T, 4, 4).
+
+    Args:
+        urdf: the robot.
+        root, tip: links.
+        positions: (T, n) m or rad of the n moving joints between them, from the root on.
+    """
+    pose = np.tile(np.eye(4), (len(positions), 1, 1))
+    columns = iter(np.asarray(positions, np.float64).T)
+    for kind, origin, axis in _joints(urdf, root, tip):
+        pose = pose @ origin
+        if kind == "fixed":
+            continue
+        along = next(columns)[:, None] * axis
+        motion = np.tile(np.eye(4), (len(positions), 1, 1))
+        if kind == "prismatic":
+            motion[:, :3, 3] = along
+        else:
+            motion[:, :3, :3] = Rotation.from_rotvec(along).as_matrix()
+        pose = pose @ motion
+    return pose
+
+
+@lru_cache(maxsize=8)
+def _joints(urdf: Path, root: str, tip: str) -> list[tuple[str, Array, Array]]:
+    """(type, origin (4, 4), axis (3,)) of each joint from one link to another."""
+    by_child = {joint.find("child").attrib["link"]: joint for joint in ElementTree.parse(urdf).iterfind("joint")}  # type: ignore[union-attr]
+    found: list[tuple[str, Array, Array]] = []
+    while tip != root:
+        joint = by_child[tip]
+        origin, axis = np.eye(4), joint.find("axis")
+        at = joint.find("origin")
+        if at is not None:
+            origin[:3, 3] = _numbers(at.get("xyz", "0 0 0"))
+            origin[:3, :3] = Rotation.from_euler("xyz", _numbers(at.get("rpy", "0 0 0"))).as_matrix()
+        found.append((joint.attrib["type"], origin, _numbers("1 0 0" if axis is None else axis.attrib["xyz"])))
+        tip = joint.find("parent").attrib["link"]  # type: ignore[union-attr]
+    return found[::-1]
+
+
+def _numbers(text: str) -> Array:
+    return np.array([float(word) for word in text.split()])

@@ -1,0 +1,386 @@
+"""The torch dataset against a naive loader written from the facts of RoboCAS-v0, and against bad input."""
+
+import json
+import math
+import os
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from torch.utils.data import DataLoader, WeightedRandomSampler
+
+from robocas_ms3.datasets import RoboCASDataset
+from robocas_ms3.datasets.actions import ActionScale, episode_actions
+from robocas_ms3.datasets.episode import Joints
+from robocas_ms3.datasets.forward import robot_frames
+from robocas_ms3.datasets.sampling import SampleIndex, balancing_weights
+from robocas_ms3.datasets.windows import Window
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.robots.constants import ARM_EVALUATION_START
+
+CAMERAS = ("base_camera", "gripper_camera")
+SMALL = (32, 24)  # half of the synthetic pictures
+
+
+def naive_euler_xyz(x, y, z, w):
+    """Turn about the fixed x axis, then y, then z: R = Rz Ry Rx, from the quaternion's matrix."""
+    r20 = 2 * (x * z - w * y)
+    roll = math.atan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+    yaw = math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+    return [roll, math.asin(max(-1, min(1, -r20))), yaw]
+
+
+def naive_halved(path):
+    pixels = np.asarray(Image.open(path)).astype(float)
+    return (pixels[0::2, 0::2] + pixels[0::2, 1::2] + pixels[1::2, 0::2] + pixels[1::2, 1::2]) / 4
+
+
+def naive_sample(root, number, t, horizon, chunk, padding):
+    """Step by step, as the facts say it; beyond the ends as docs/training.md says."""
+    folder = root / f"episode_{number:07d}"
+    info = np.load(folder / "episode_info.npz")
+    length = int(info["episode_length"])
+    pictures, state, observed, actions, acted = [], [], [], [], []
+    for step in range(t - horizon + 1, t + chunk):
+        if step <= t:
+            observed.append(step >= 0)
+            blank = step < 0 and padding == "zero"
+            files = [folder / camera / "rgb" / f"{max(step, 0):04d}.png" for camera in CAMERAS]
+            pictures.append([naive_halved(file).transpose(2, 0, 1) * (not blank) for file in files])
+            row = [*info["ee_pos"][max(step, 0)], *info["ee_orn"][max(step, 0)], info["gripper_width"][max(step, 0)]]
+            state.append([0.0] * 8 if blank else row)
+        inside = 0 <= step <= length - 2
+        acted.append(inside)
+        if inside:
+            next_command = float(info["gripper_status"][step + 1])
+            actions.append([*info["rel_pos"][step], *naive_euler_xyz(*info["rel_orn"][step].astype(float))])
+            actions[-1].append(next_command)
+        elif padding == "zero":
+            actions.append([0.0] * 7)
+        else:
+            actions.append([0.0] * 6 + [float(info["gripper_status"][0 if step < 0 else length - 1])])
+    return dict(rgb=pictures, state=state, observation_mask=observed, action=actions, action_mask=acted)
+
+
+@pytest.mark.parametrize(
+    ("horizon", "chunk", "padding"), [(6, 1, "hold"), (1, 1, "drop"), (2, 5, "zero"), (3, 9, "hold"), (2, 3, "drop")]
+)
+def test_every_element_is_the_naive_loaders(made, horizon, chunk, padding):
+    data = RoboCASDataset(
+        made,
+        split="all",
+        observation_horizon=horizon,
+        action_horizon=chunk,
+        padding=padding,
+        size=SMALL,
+        state=("ee_pos", "ee_orn", "gripper_width"),
+    )
+    where = [data.locate(index) for index in range(len(data))]
+    steps = range(horizon - 1, 7 - chunk) if padding == "drop" else range(6)  # T is 7: states 0, 4, .. 20, 22
+    assert where == [(number, step) for number in (0, 1) for step in steps]
+    for index, (number, step) in enumerate(where):
+        sample, expected = data[index], naive_sample(made, number, step, horizon, chunk, padding)
+        assert (sample["episode"], sample["step"]) == (number, step)
+        for key, value in expected.items():
+            tolerance = 0.5 if key == "rgb" else 1e-6  # whole grey levels
+            assert sample[key].shape == np.shape(value), key
+            assert np.abs(sample[key].double().numpy() - np.asarray(value, float)).max() <= tolerance, key
+    assert {key for key, value in sample.items() if torch.is_tensor(value)} == set(expected)
+
+
+def test_what_is_held_is_the_nearest_gripper_command(dataset):
+    file = dataset / "episode_0000001/episode_info.npz"
+    arrays = dict(np.load(file))
+    arrays["gripper_status"] = np.array([False, True, True, True, True, True, True])
+    np.savez(file, **arrays)
+    data = RoboCASDataset(dataset, split="all", cameras=(), observation_horizon=3, action_horizon=3)
+    assert data[data.index(1, 0)]["action"][:, 6].tolist() == [0, 0, 1, 1, 1]
+    assert data[data.index(1, 5)]["action"][:, 6].tolist() == [1, 1, 1, 1, 1]
+    assert data[data.index(1, 5)]["action_mask"].tolist() == [True, True, True, False, False]
+
+
+def test_actions_by_hand():
+    s = math.sqrt(0.5)
+    arrays = dict(
+        rel_pos=np.array([[0.01, 0.02, 0.03], [0, 0, -0.01], [9, 9, 9]], np.float32),
+        rel_orn=np.array([[0, 0, s, s], [0.5, 0.5, 0.5, 0.5], [0, 0, 0, 1]], np.float32),
+        gripper_status=np.array([True, True, False]),
+    )
+    quarter = math.pi / 2
+    expected = [
+        [0.01, 0.02, 0.03, 0, 0, quarter, 1],  # the command given between steps 0 and 1 stands at step 1: open
+        [0, 0, -0.01, quarter, 0, quarter, 0],  # x -> y -> z -> x: a quarter about x, then about z
+        [0, 0, 0, 0, 0, 0, 0],  # nothing follows the last step
+    ]
+    assert np.allclose(episode_actions(arrays), expected, atol=1e-6)
+
+
+def test_scale_maps_the_range_to_one_and_clips():
+    scale = ActionScale.of(
+        {"relative_position": [[-0.1, 0, 0], [0.1, 0, 0.5]], "relative_rotation": [[-1, -1, -1], [1, 1, 3]]}
+    )
+    action = np.array([0.05, 7, 0.25, -9, 0, 1, 1])
+    encoded = scale.encode(action)
+    assert np.allclose(encoded, [0.5, 0, 0, -1, 0, 0, 1])  # the second axis never moves
+    assert np.allclose(scale.decode(encoded), [0.05, 0, 0.25, -1, 0, 1, 1])
+    with pytest.raises(DatasetError, match="no range of actions"):
+        ActionScale.of({"relative_position": [[0, 0, 0]], "relative_rotation": [[0, 0, 0]]})
+
+
+def test_normalised_by_the_overviews_ranges(made):
+    plain = RoboCASDataset(made, split="all", cameras=(), observation_horizon=1)
+    scaled = RoboCASDataset(made, split="all", cameras=(), observation_horizon=1, normalize=True)
+    space = json.loads((made / "data_info.json").read_text())["action_space"]
+    for raw, seen in zip((plain[i]["action"][0] for i in range(len(plain))), scaled, strict=True):
+        for axis in range(6):
+            low, high = (row[axis % 3] for row in space["relative_position" if axis < 3 else "relative_rotation"])
+            expected = 2 * (float(raw[axis]) - low) / (high - low) - 1
+            assert float(seen["action"][0, axis]) == pytest.approx(max(-1, min(1, expected)), abs=1e-5)
+        assert seen["action"][0, 6] == raw[6]
+    assert scaled.scale is not None
+
+
+def test_depth_pictures_as_they_are_and_floats(made):
+    options = dict(split="all", observation_horizon=2, cameras=("static_camera",), depth=True)
+    whole = RoboCASDataset(made, size=None, **options)[3]
+    shot = np.asarray(Image.open(made / "episode_0000000/static_camera/depth/0003.png"))
+    assert whole["depth"].shape == (2, 1, 48, 64)
+    assert np.allclose(whole["depth"][1, 0], shot / 1000.0)
+    small = RoboCASDataset(made, size=SMALL, float_images=True, **options)[3]
+    blocks = shot.reshape(24, 2, 32, 2).transpose(0, 2, 1, 3).reshape(24, 32, 4) / 1000.0
+    one_of_its_pixels = np.abs(blocks - small["depth"][1, 0].numpy()[..., None]).min(-1) < 1e-6
+    assert one_of_its_pixels.all()  # no distance is made up
+    assert small["rgb"].dtype == torch.float32
+    level = np.asarray(Image.open(made / "episode_0000000/static_camera/rgb/0003.png")) / 255.0
+    assert np.allclose(whole["rgb"][1, 0].numpy().transpose(1, 2, 0) / 255.0, level)
+    assert 0 < float(small["rgb"].max()) <= 1
+
+
+def test_words_and_subgoals(made):
+    data = RoboCASDataset(made, split="all", cameras=(), observation_horizon=3, embedding=True, subgoals=True)
+    info = np.load(made / "episode_0000001/episode_info.npz")
+    sample = data[data.index(1, 1)]
+    assert sample["instruction"] == str(info["language_goal"])
+    assert sample["subgoal"] == info["step_lang_goals"][1]
+    assert np.array_equal(sample["language_embedding"], info["language_embedding"])
+    assert np.array_equal(sample["subgoal_embedding"], info["step_goal_embs"][[0, 0, 1]])
+    assert sample["subgoal_type"].tolist() == [2, 2, 2]  # move and grasp
+    assert data[data.index(1, 5)]["subgoal_type"].tolist() == [3, 3, 3]  # transfer object
+
+
+@given(st.dictionaries(st.integers(0, 99), st.tuples(st.integers(0, 3), st.integers(0, 6)), min_size=1))
+def test_index_and_back(episodes):
+    samples = {number: range(first, first + count) for number, (first, count) in episodes.items()}
+    index = SampleIndex(samples)
+    listed = [(number, step) for number, steps in samples.items() for step in steps]
+    assert [index.locate(i) for i in range(len(index))] == listed
+    assert [index.index(*place) for place in listed] == list(range(len(listed)))
+    assert [index.locate(i - len(listed)) for i in range(len(index))] == listed
+    with pytest.raises(IndexError):
+        index.locate(len(listed))
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 30))
+def test_dropped_samples_are_those_with_padding(horizon, chunk, length):
+    whole = Window(horizon, chunk, "drop")
+    complete = [
+        step
+        for step in Window(horizon, chunk).samples(length)
+        if whole.observed(step)[0] >= 0 and whole.acted(step)[-1] <= length - 2
+    ]
+    assert list(whole.samples(length)) == complete
+
+
+def test_weights_draw_all_stages_alike(made):
+    data = RoboCASDataset(made, split="all", cameras=(), observation_horizon=1, subgoals=True)
+    weights = data.weights()
+    assert data.stages.tolist() == [2, 2, 2, 3, 3, 3] * 2
+    assert balancing_weights(np.array([0, 0, 0, 5])).tolist() == pytest.approx([1 / 6, 1 / 6, 1 / 6, 1 / 2])
+    generator = torch.Generator().manual_seed(0)
+    sampler = WeightedRandomSampler(weights.tolist(), 400, generator=generator)
+    drawn = torch.cat([batch["subgoal_type"][:, 0] for batch in DataLoader(data, batch_size=100, sampler=sampler)])
+    assert 160 < int((drawn == 2).sum()) < 240
+
+
+def test_split_is_the_overviews(dataset):
+    info = json.loads((dataset / "data_info.json").read_text())
+    parts = [RoboCASDataset(dataset, split=side, cameras=()).episodes for side in ("train", "val", "all")]
+    assert parts == [info["train_eps"], info["val_eps"], [0, 1]]
+    info["val_eps"] = []
+    (dataset / "data_info.json").write_text(json.dumps(info))
+    with pytest.raises(DatasetError, match="this split holds no episodes.*some in val"):
+        RoboCASDataset(dataset, split="val")
+
+
+def test_opening_reads_the_overview_only(made, tmp_path):
+    for name in ("data_info.json", "conversion.json"):
+        (tmp_path / name).write_bytes((made / name).read_bytes())
+    data = RoboCASDataset(tmp_path, split="all", depth=True, embedding=True, subgoals=True, normalize=True)
+    assert len(data) == 12
+    assert data.weights().sum() == pytest.approx(1)
+    with pytest.raises(DatasetError, match="this episode can't be read"):
+        data[0]
+
+
+def test_workers_see_what_one_process_sees(made):
+    data = RoboCASDataset(made, split="all", size=SMALL, subgoals=True)
+    before = len(os.listdir("/proc/self/fd"))
+    alone = list(DataLoader(data, batch_size=5))
+    assert len(os.listdir("/proc/self/fd")) == before  # nothing stays open
+    shared = list(DataLoader(data, batch_size=5, num_workers=2, multiprocessing_context="fork"))
+    again = list(DataLoader(pickle.loads(pickle.dumps(data)), batch_size=5))
+    for others in (shared, again):
+        for one, other in zip(alone, others, strict=True):
+            assert one.keys() == other.keys()
+            for key, value in one.items():
+                assert torch.equal(value, other[key]) if torch.is_tensor(value) else value == other[key]
+    assert len(pickle.dumps(data)) < 20_000  # the cache stays behind
+
+
+@pytest.mark.slow
+def test_spawned_workers(trajectory, monkeypatch):
+    monkeypatch.setenv("ROBOCAS_DEFER_REGISTRATION", "1")
+    data = RoboCASDataset(trajectory, split="all", cameras=())
+    loader = DataLoader(data, batch_size=4, num_workers=1, multiprocessing_context="spawn")
+    assert torch.equal(torch.cat([batch["action"] for batch in loader]), torch.stack([item["action"] for item in data]))
+
+
+def test_trajectories_give_what_their_conversion_gives(made, trajectory):
+    keys = ("robot_joints", "arm_joint_vel", "gripper_width", "agv_pose", "gripper_status")
+    options = dict(cameras=(), observation_horizon=3, action_horizon=4, state=keys, subgoals=True)
+    for side in ("train", "val", "all"):
+        folder = RoboCASDataset(made, split=side, **options)
+        file = RoboCASDataset(trajectory, split=side, **options)
+        assert (len(folder), folder.episodes) == (len(file), file.episodes)
+        assert np.array_equal(folder.stages, file.stages)
+        for one, other in zip(folder, file, strict=True):
+            for key, value in one.items():
+                if key == "action":  # the synthetic robot has made-up kinematics
+                    assert torch.equal(value[:, 6], other[key][:, 6])
+                else:
+                    assert torch.equal(value, other[key]) if torch.is_tensor(value) else value == other[key], key
+
+
+def test_trajectories_at_another_rate_and_with_failures(trajectory):
+    data = RoboCASDataset(trajectory, split="all", cameras=(), rate_hz=10, include_failed=True, normalize=True)
+    assert len(data) == 3 * 11  # 22 control steps in pairs
+    assert float(data[0]["action"][:, :6].abs().max()) <= 1
+    with pytest.raises(DatasetError, match="the rate must divide"):
+        RoboCASDataset(trajectory, cameras=(), rate_hz=3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(), "there are no pictures here.*expected cameras=()"),
+        (dict(cameras=(), depth=True), "there is no depth here"),
+        (dict(cameras=(), embedding=True), "there are no embeddings here"),
+    ],
+)
+def test_trajectories_hold_no_pictures(trajectory, options, message):
+    with pytest.raises(DatasetError, match=message):
+        RoboCASDataset(trajectory, **options)
+
+
+def test_forward_kinematics_by_hand():
+    # All joints 0: the flange is 88 mm ahead of and 0.926 m above panda_link0 (Franka's data sheet), the TCP 0.1334 m
+    # below it, looking down. The base moved by (0.1, 0.2) and turned by 90 deg, on a root at (1, 0).
+    qpos = np.zeros((2, 12))
+    qpos[0, :3] = 0.1, 0.2, math.pi / 2
+    qpos[1, 3:10] = ARM_EVALUATION_START
+    root = np.tile(np.eye(4), (2, 1, 1))
+    root[:, 0, 3] = 1
+    frames = robot_frames(Joints(qpos, qpos, root))
+    assert np.allclose(frames.arm_base_in_world[0, :3, 3], [1.1, 0.2, 0.49])
+    assert np.allclose(frames.tcp_in_world[0, :3, 3], [1.1, 0.2 + 0.088, 0.49 + 0.926 - 0.1334])
+    assert np.allclose(frames.tcp_in_world[0, :3, 2], [0, 0, -1])
+    assert frames.tcp_in_world[1, 2, 3] == pytest.approx(0.61 + 0.29, abs=0.01)  # above the table at the start
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(observation_horizon=0), "observation_horizon: a horizon is a number of steps.*found 0"),
+        (dict(action_horizon=2.0), "action_horizon"),
+        (dict(padding="mirror"), "no such padding"),
+        (dict(cameras=("head_camera",)), "no such camera.*base_camera.*head_camera"),
+        (dict(cameras=("base_camera", "base_camera")), "no such camera.*each once"),
+        (dict(split="test"), "split: no such choice"),
+        (dict(state=("language_goal",)), "state: no such choice"),
+        (dict(size=(0, 10)), "no such size"),
+        (dict(rate_hz=10), "another rate.*expected 5 Hz"),
+        (dict(padding="drop", observation_horizon=5, action_horizon=3), "no episode is long enough.*8 steps, found 7"),
+    ],
+)
+def test_wrong_options(made, options, message):
+    with pytest.raises(DatasetError, match=message):
+        RoboCASDataset(made, **options)
+
+
+def first_item(root, **options):
+    return RoboCASDataset(root, split="all", observation_horizon=1, **options)[0]
+
+
+def test_damaged_pictures(dataset):
+    shot = dataset / "episode_0000000/base_camera/rgb/0000.png"
+    grey = Image.open(shot).convert("L")
+    shot.write_bytes(shot.read_bytes()[:100])
+    with pytest.raises(DatasetError, match=r"0000\.png: this picture is damaged"):
+        first_item(dataset)
+    grey.save(shot)
+    with pytest.raises(DatasetError, match=r"not a picture of this kind.*\(48, 64\) uint8"):
+        first_item(dataset)
+    shot.unlink()
+    with pytest.raises(DatasetError, match=r"0000\.\w+: can't read this picture"):
+        first_item(dataset)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda a: a["rel_pos"].__setitem__((2, 1), np.nan), "rel_pos: not a number"),
+        (lambda a: a.update(rel_pos=a["rel_pos"][:-1]), "another length than the overview says.*expected 7, found 6"),
+        (lambda a: a.update(gripper_status=np.array([object()])), "this episode can't be read|gripper_status"),
+    ],
+)
+def test_damaged_arrays(dataset, change, message):
+    file = dataset / "episode_0000000/episode_info.npz"
+    arrays = dict(np.load(file))
+    change(arrays)
+    np.savez(file, **arrays)
+    with pytest.raises(DatasetError, match=message):
+        first_item(dataset, cameras=())
+
+
+def test_missing_pieces(dataset, tmp_path):
+    with pytest.raises(DatasetError, match="no dataset here"):
+        RoboCASDataset(tmp_path / "nothing")
+    with pytest.raises(DatasetError, match="no such trajectory file"):
+        RoboCASDataset(tmp_path / "nothing.h5", cameras=())
+    info = json.loads((dataset / "data_info.json").read_text())
+    for change, message in (
+        (dict(ep_length={"0": 7}), "episodes of unknown length.*1"),
+        (dict(ep_length=[7, 7]), "this overview is damaged"),
+        (dict(step_goals={"0": [{"goal_type": 1}]}), r"step_goals\.0: these sub-goals are damaged"),
+    ):
+        (dataset / "data_info.json").write_text(json.dumps({**info, **change}))
+        with pytest.raises(DatasetError, match=message):
+            [RoboCASDataset(dataset, split=side, cameras=()) for side in ("train", "val")]
+    (dataset / "data_info.json").write_text(json.dumps({k: v for k, v in info.items() if k != "step_goals"}))
+    with pytest.raises(DatasetError, match="no sub-goals are known"):
+        RoboCASDataset(dataset, cameras=()).weights()
+    (dataset / "data_info.json").write_text("{")
+    with pytest.raises(DatasetError, match="damaged"):
+        RoboCASDataset(dataset)
+
+
+def test_the_package_alone_brings_no_torch():
+    code = "import sys, robocas_ms3.datasets; sys.exit('torch' in sys.modules)"
+    environment = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}
+    assert subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
