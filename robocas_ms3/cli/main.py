@@ -18,8 +18,24 @@ import tyro
 from robocas_ms3 import __version__
 from robocas_ms3.errors import RobocasError
 
-# Each names a module beside this one, with a dataclass called as the command and `main(cfg) -> int`.
-COMMANDS = ("doctor", "list", "show", "generate", "replay", "convert", "validate", "video", "assets", "layouts")
+# Each names a module beside this one, with a dataclass called as the command and `main(cfg) -> int`; a dash in its name
+# is an underscore in the module's: import-robocas, import_robocas.py, ImportRobocas.
+COMMANDS = (
+    "doctor",
+    "list",
+    "show",
+    "generate",
+    "replay",
+    "convert",
+    "validate",
+    "video",
+    "merge",
+    "split",
+    "upgrade",
+    "import-robocas",
+    "assets",
+    "layouts",
+)
 DESCRIPTION = (
     "RoboCAS for ManiSkill3: demonstrations and datasets of manipulation in complex object arrangements. "
     "`robocas COMMAND --help` explains a command; --debug with any of them shows tracebacks."
@@ -73,18 +89,24 @@ def run(argv: Sequence[str]) -> int:
 def _dispatch(arguments: list[str]) -> int:
     if arguments and arguments[0] in COMMANDS:  # only the command that is asked for is imported
         name, rest = arguments[0], arguments[1:]
-        module = importlib.import_module(f"robocas_ms3.cli.{name}")
-        cfg = tyro.cli(_config_type(module, name), prog=f"robocas {name}", args=rest, config=CLI_STYLE)
+        module = module_of(name)
+        cfg = tyro.cli(config_type(module, name), prog=f"robocas {name}", args=rest, config=CLI_STYLE)
         return module.main(cfg)
-    modules = {name: importlib.import_module(f"robocas_ms3.cli.{name}") for name in COMMANDS}
-    choices = [Annotated[_config_type(module, name), tyro.conf.subcommand(name)] for name, module in modules.items()]
+    modules = {name: module_of(name) for name in COMMANDS}
+    choices = [Annotated[config_type(module, name), tyro.conf.subcommand(name)] for name, module in modules.items()]
     choice: Any = reduce(operator.or_, choices)
     tyro.cli(choice, prog="robocas", description=DESCRIPTION, args=arguments or ["--help"], config=CLI_STYLE)
     raise AssertionError("tyro leaves the process on --help and on an unknown command")
 
 
-def _config_type(module: ModuleType, name: str) -> type:
-    return getattr(module, name.capitalize())
+def module_of(name: str) -> ModuleType:
+    """Module of a command."""
+    return importlib.import_module(f"robocas_ms3.cli.{name.replace('-', '_')}")
+
+
+def config_type(module: ModuleType, name: str) -> type:
+    """Dataclass of a command, in its module."""
+    return getattr(module, "".join(word.capitalize() for word in name.split("-")))
 
 
 def _say(text: str, stream: TextIO, code: int) -> int:

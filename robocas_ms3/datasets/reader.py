@@ -1,9 +1,14 @@
-"""Opens a dataset: arrays, pictures, cameras and provenance of its episodes."""
+"""Opens a dataset: arrays, pictures, cameras and provenance of its episodes.
+
+Datasets in upstream's format made elsewhere open too: other types are cast to the schema's, what is missing is made of
+what is there (`tolerant`), either name of a camera's pose will do.
+"""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,31 +18,63 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures import read_picture
+from robocas_ms3.datasets.tolerant import complete, load_arrays
 from robocas_ms3.errors import DatasetError
+
+_RATE_HZ = 5.0  # upstream's
+_SEE_VALIDATE = "robocas validate lists all that is wrong."
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode's folder."""
+    """One episode's folder.
+
+    Attributes:
+        folder: its path.
+        dataset: it is in; says what is not in the folder.
+    """
 
     folder: Path
+    dataset: Dataset | None = field(default=None, repr=False, compare=False)
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
-        """Everything in ``episode_info.npz``, by the schema's keys."""
-        with np.load(self.folder / schema.EPISODE_FILE, allow_pickle=False) as content:
-            return {key: content[key] for key in content.files}
+        """``episode_info.npz``, by the schema's keys and of its types; what is missing is made where it can be.
+
+        Raises:
+            DatasetError: the file is damaged, or an array is: pickled, or of another type.
+        """
+        path = self.folder / schema.EPISODE_FILE
+        loaded = load_arrays(path)
+        if any(spec.name not in loaded.arrays for spec in schema.EPISODE_INFO if not spec.embedding):
+            complete(loaded, self._said(), self.dataset.rate_hz if self.dataset else _RATE_HZ)
+        for key, reason in loaded.unreadable.items():
+            if key not in loaded.derived:
+                raise DatasetError("this array can't be read", where=f"{path}, {key}", found=reason, fix=_SEE_VALIDATE)
+        return loaded.arrays
+
+    def _said(self) -> dict[str, Any]:
+        """What ``data_info.json`` says of this episode."""
+        if self.dataset is None:
+            return {}
+        return said_of(self.dataset.info, schema.episode_number(self.folder.name))
 
     @property
     def steps(self) -> int:
-        """T."""
+        """T.
+
+        Raises:
+            DatasetError: the arrays do not tell.
+        """
+        if "episode_length" not in self.arrays:
+            where = self.folder / schema.EPISODE_FILE
+            raise DatasetError("this episode has no length", where=where, expected="episode_length or ee_pos")
         return int(self.arrays["episode_length"])
 
     @cached_property
     def scene(self) -> dict[str, Any]:
         """``scene.json``; empty where there is none."""
-        path = self.folder / schema.SCENE_FILE
-        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        return _read_json(self.folder / schema.SCENE_FILE)
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
@@ -71,19 +108,24 @@ class Episode:
         return read_picture(self.image_path(camera, "depth", step))
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
-        """(4,) fx, fy, cx, cy in pixels."""
-        return np.load(self.folder / camera / schema.INTRINSIC_FILE, allow_pickle=False)
+        """(4,) fx, fy, cx, cy in pixels; a 3x3 camera matrix is read as such.
+
+        Raises:
+            DatasetError: the file is missing or damaged.
+        """
+        array = _read_array(self.folder / camera / schema.INTRINSIC_FILE)
+        return np.array([array[0, 0], array[1, 1], array[0, 2], array[1, 2]]) if array.shape == (3, 3) else array
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
         """(4, 4) OpenCV camera frame in its parent (see ``schema.CAMERAS``), under either name.
 
         Raises:
-            DatasetError: there is neither file.
+            DatasetError: there is neither file, or it is damaged.
         """
         spec = next(spec for spec in schema.CAMERAS if spec.name == camera)
         for name in spec.pose_files:
             if (self.folder / camera / name).is_file():
-                return np.load(self.folder / camera / name, allow_pickle=False)
+                return _read_array(self.folder / camera / name)
         raise DatasetError("no pose of this camera", where=self.folder / camera, expected=" or ".join(spec.pose_files))
 
 
@@ -123,7 +165,7 @@ class Dataset:
     @property
     def rate_hz(self) -> float:
         """Steps a second: from ``conversion.json``, 5 where there is none."""
-        return float(self.settings.get("rate_hz", 5.0))
+        return float(self.settings.get("rate_hz", _RATE_HZ))
 
     def episode(self, number: int) -> Episode:
         """Open an episode.
@@ -134,13 +176,34 @@ class Dataset:
         if number not in self.numbers:
             known = f"{self.numbers[0]} to {self.numbers[-1]}"
             raise DatasetError("no such episode", where=self.root, expected=known, found=number)
-        return Episode(self.root / schema.episode_folder(number))
+        return Episode(self.root / schema.episode_folder(number), self)
+
+
+def said_of(info: Mapping[str, Any], number: int | None) -> dict[str, Any]:
+    """What ``data_info.json`` says of an episode: its entry under each key that has entries of episodes."""
+    tables = {key: info.get(key) for key in ("ep_length", "language_goal", "step_goals")}
+    return {k: table[str(number)] for k, table in tables.items() if isinstance(table, dict) and str(number) in table}
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return {}
-    except ValueError as error:
+    except (OSError, ValueError) as error:
         raise DatasetError("this JSON is damaged", where=path, found=str(error).splitlines()[0]) from error
+    if not isinstance(content, dict):
+        raise DatasetError("this JSON is damaged", where=path, expected="an object", found=type(content).__name__)
+    return content
+
+
+def _read_array(path: Path) -> NDArray[np.float64]:
+    try:
+        array = np.load(path, allow_pickle=False)
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+            raise ValueError("no array of numbers")
+    except (OSError, ValueError, EOFError) as error:
+        raise DatasetError(
+            "this array can't be read", where=path, found=str(error).splitlines()[0], fix=_SEE_VALIDATE
+        ) from error
+    return array

@@ -1,6 +1,5 @@
 import dataclasses
 import errno
-import importlib
 import os
 import subprocess
 import sys
@@ -73,7 +72,7 @@ def test_every_command_explains_itself(name, capsys):
     out = capsys.readouterr().out
     assert exit_info.value.code == 0
     assert f"usage: robocas {name}" in out
-    config_type = getattr(importlib.import_module(f"robocas_ms3.cli.{name}"), name.capitalize())
+    config_type = cli.config_type(cli.module_of(name), name)
     assert dataclasses.is_dataclass(config_type)
     assert config_type.__doc__.strip().split()[0] in out
 

@@ -1,0 +1,53 @@
+"""A progress bar on stderr that appears when there is something to do, so that an error is one line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A bar; its methods are callbacks of what does the work."""
+
+    progress: Any
+    description: str
+
+    def start(self, count: int) -> None:
+        """Show it, for so many."""
+        self.progress.add_task(self.description, total=count)
+        self.progress.start()
+
+    def advance(self, *_: object) -> None:
+        """One more is done."""
+        self.progress.advance(self.progress.task_ids[0])
+
+    def at(self, done: int, count: int) -> None:
+        """So many of all are done."""
+        if not self.progress.task_ids:
+            self.start(count)
+        self.progress.update(self.progress.task_ids[0], completed=done)
+
+
+@contextmanager
+def bar(description: str) -> Iterator[Bar]:
+    """Yield a bar, and end it."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    progress = Progress(*columns, console=Console(stderr=True))
+    try:
+        yield Bar(progress, description)
+    finally:
+        if progress.live.is_started:  # else it prints an empty line
+            progress.stop()
+
+
+def say(text: str) -> None:
+    """Print a line on stdout."""
+    from rich.console import Console
+
+    Console().print(text, soft_wrap=True, highlight=False, markup=False)

@@ -1,0 +1,111 @@
+"""``robocas import-robocas``."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from robocas_ms3.datasets.manage.survey import Survey
+
+
+@dataclass
+class ImportRobocas:
+    """Bring a dataset in upstream's format, made elsewhere, into this one's; without --out only say what is wrong.
+
+    What can be put right is: types, missing arrays that follow from others, either name of a camera's pose, the turned
+    EEF frame. Episodes that can't are left out, and named. Exit code 1 where no episode can be taken.
+    """
+
+    dataset: Annotated[Path, tyro.conf.Positional]
+    """Folder of the dataset; nothing in it changes."""
+    out: Path | None = None
+    """Folder of the new dataset; episodes keep their numbers."""
+    rate: float | None = None
+    """Its steps a second; default: what conversion.json says, 5 where there is none, as in upstream's."""
+    turn_eef: bool = True
+    """Turn the EEF frame to ManiSkill's TCP where the gripper camera's place says that it is turned."""
+    link: bool = False
+    """Hard links to the pictures instead of copies."""
+    json: bool = False
+    """Print a machine-readable report."""
+    overwrite: bool = False
+    """Replace the dataset that is there."""
+    resume: bool = False
+    """Go on with an import that was interrupted."""
+
+
+def main(cfg: ImportRobocas) -> int:
+    """Look, tell, import; gives the exit code."""
+    import json
+
+    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.datasets.manage.importing import import_robocas
+    from robocas_ms3.datasets.manage.survey import survey
+    from robocas_ms3.files import claim_output
+
+    if cfg.out is not None:
+        claim_output(cfg.out, resume=cfg.resume or cfg.overwrite)  # before minutes of reading
+    with bar("episodes read") as shown:
+        found = survey(cfg.dataset, rate_hz=cfg.rate, turn_eef=cfg.turn_eef, on_episode=shown.at)
+    if cfg.json:
+        say(json.dumps(found.as_json(), indent=2, ensure_ascii=False))
+    else:
+        _table(found)
+    if not found.taken or cfg.out is None:
+        return 0 if found.taken else 1
+    with bar("episodes written") as shown:
+        kept = import_robocas(
+            found,
+            cfg.out,
+            link=cfg.link,
+            overwrite=cfg.overwrite,
+            resume=cfg.resume,
+            on_start=shown.start,
+            on_episode=shown.advance,
+        )
+    if not cfg.json:
+        say(f"{cfg.out}: {len(found.taken)} episodes{f', {kept} kept' if kept else ''}")
+    return 0
+
+
+def _table(found: Survey) -> None:
+    """What is wrong, the same of many episodes in one line."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from robocas_ms3.cli.bars import say
+
+    rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
+    for finding in found.findings:
+        place = finding.file.split("/", 1)[1] if finding.episode is not None and "/" in finding.file else finding.file
+        numbers = rows[(finding.outcome, place, finding.problem)]
+        if finding.episode is not None:
+            numbers.append(finding.episode)
+    if rows:
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        for name in ("episodes", "what", "where", "problem"):
+            table.add_column(name, overflow="fold", no_wrap=False)
+        for (outcome, place, problem), numbers in sorted(rows.items()):
+            table.add_row(ranges(numbers) or "all", outcome, place, problem)
+        console = Console(markup=False, highlight=False)
+        console.print(table)
+    left_out = len(found.as_json()["left_out"])
+    say(f"{found.root}: {found.episodes} episodes, {len(found.taken)} can be taken, {left_out} are left out")
+
+
+def ranges(numbers: list[int], most: int = 6) -> str:
+    """Numbers in short: ``0-3, 7``."""
+    runs: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    texts = [str(a) if a == b else f"{a}-{b}" for a, b in runs]
+    more = f" and {sum(b - a + 1 for a, b in runs[most:])} more" if len(runs) > most else ""
+    return ", ".join(texts[:most]) + more

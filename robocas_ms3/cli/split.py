@@ -1,0 +1,109 @@
+"""``robocas split``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass
+class Split:
+    """Split a dataset into several, or into training and validation anew.
+
+    --out-train T --out-val V: its two sides as datasets. --parts 0.8 0.2 --out O: datasets O/part_0, O/part_1, ... of
+    these shares. --by task --out O: one dataset for each task (or target). --in-place --val-share 0.2: only
+    data_info.json is written, no episode is touched; without --val-share it is rebuilt from the episodes on disk, and
+    every episode keeps its side.
+    """
+
+    dataset: Annotated[Path, tyro.conf.Positional]
+    """Folder of the dataset."""
+    out_train: Path | None = None
+    """Folder of the training episodes."""
+    out_val: Path | None = None
+    """Folder of the validation episodes."""
+    parts: tuple[float, ...] = ()
+    """Shares of the parts; they sum to 1."""
+    out: Path | None = None
+    """Folder of the parts' folders."""
+    in_place: bool = False
+    """Write only data_info.json anew."""
+    val_share: float | None = None
+    """Choose training and validation anew, with this share to validate; default: every episode keeps its side."""
+    by: Literal["seed", "target", "task"] | None = None
+    """What is never cut: episodes of one seed (default), target object or task."""
+    copy: bool = False
+    """Copy files, also where hard links would do."""
+    overwrite: bool = False
+    """Replace datasets that are there."""
+    resume: bool = False
+    """Go on with a split that was interrupted."""
+
+
+def main(cfg: Split) -> int:
+    """Split, with a progress bar; gives the exit code."""
+    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.datasets.manage.splitting import Share, resplit, write_parts
+
+    check(cfg)
+    share = None if cfg.val_share is None else Share(cfg.val_share, cfg.by or "seed")
+    if cfg.in_place:
+        train, val = resplit(cfg.dataset, share)
+        say(f"{cfg.dataset}: {len(train)} episodes train, {len(val)} validate")
+        return 0
+    part, pieces = _pieces(cfg, share)
+    with bar("episodes") as shown:
+        done = write_parts(
+            part,
+            pieces,
+            share=share,
+            link=not cfg.copy,
+            overwrite=cfg.overwrite,
+            resume=cfg.resume,
+            on_start=shown.start,
+            on_episode=shown.advance,
+        )
+    for written in done:
+        say(str(written))
+    return 0
+
+
+def check(cfg: Split) -> None:
+    """Check that one way of splitting was chosen, whole.
+
+    Raises:
+        DatasetError: none, several, or half of one.
+    """
+    from robocas_ms3.errors import DatasetError
+
+    sides = cfg.out_train is not None or cfg.out_val is not None
+    ways = [cfg.in_place, sides, cfg.out is not None]
+    if sum(ways) != 1 or (sides and (cfg.out_train is None or cfg.out_val is None)):
+        raise DatasetError(
+            "how to split?",
+            expected="one of --in-place, --out-train T --out-val V, --parts ... --out O, --by ... --out O",
+        )
+    if cfg.parts and cfg.out is None:
+        raise DatasetError("parts need a folder", expected="--out")
+    if cfg.out is not None and not cfg.parts and cfg.by in (None, "seed"):
+        raise DatasetError("what is a part?", expected="--parts, or --by task or target")
+    if cfg.in_place and cfg.by and cfg.val_share is None:
+        raise DatasetError("how much validates?", expected="--val-share")
+
+
+def _pieces(cfg: Split, share):
+    from robocas_ms3.datasets.manage.parts import open_part
+    from robocas_ms3.datasets.manage.splitting import parts_by_share, parts_by_side, parts_by_value
+
+    part = open_part(cfg.dataset)
+    if cfg.out is None:
+        assert cfg.out_train is not None
+        assert cfg.out_val is not None
+        return part, parts_by_side(part, share, cfg.out_train, cfg.out_val)
+    by = cfg.by or "seed"
+    if cfg.parts:
+        return part, parts_by_share(part, cfg.parts, by, share, cfg.out)
+    return part, parts_by_value(part, by, share, cfg.out)

@@ -1,0 +1,120 @@
+"""Makes a dataset of episodes of others: merging and splitting."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import robocas_ms3
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.info import write_info
+from robocas_ms3.datasets.manage.output import Placed, begun_output
+from robocas_ms3.datasets.manage.parts import Part
+from robocas_ms3.datasets.plan import SETTINGS
+from robocas_ms3.files import replacing_folder
+
+Side = Literal["train", "val"]
+OnStart = Callable[[int], None]
+OnEpisode = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Member:
+    """An episode that will be in the new dataset.
+
+    Attributes:
+        part: the dataset it is in.
+        name: of that dataset, for the ledger.
+        number: of the episode in it.
+        side: of the split it will be on.
+    """
+
+    part: Part
+    name: str
+    number: int
+    side: Side
+
+
+@dataclass(frozen=True)
+class Assembled:
+    """What was done: episodes, how many of them were there already, files linked and copied."""
+
+    out: Path
+    episodes: int
+    kept: int
+    linked: int
+    copied: int
+
+    def __str__(self) -> str:
+        """One line."""
+        kept = f", {self.kept} of them were there" if self.kept else ""
+        return f"{self.out}: {self.episodes} episodes{kept}, {self.linked} files linked, {self.copied} copied"
+
+
+def assemble(
+    out: Path,
+    members: Sequence[Member],
+    *,
+    split_rule: str,
+    link: bool = True,
+    overwrite: bool = False,
+    resume: bool = False,
+    on_start: OnStart | None = None,
+    on_episode: OnEpisode | None = None,
+) -> Assembled:
+    """Write a dataset of these episodes, in this order, numbered from 0.
+
+    Killed at any moment, it goes on with ``resume``, and ends as if it had not been. Hard links share the files with
+    the datasets they are from: nothing in this package changes a file in place, an editor may.
+
+    Args:
+        out: its folder.
+        members: at least one; all of the same settings.
+        split_rule: how their sides were chosen, for ``conversion.json``.
+        link: hard links where the file system allows; else copies.
+        overwrite: replace a dataset that is there.
+        resume: keep the episodes that are there.
+        on_start: called with the number of episodes to write.
+        on_episode: called with the number of each, when it is there.
+
+    Raises:
+        DatasetError: the output is an input, or something else was begun there.
+        OutputExistsError: ``out`` is not empty and neither flag is set.
+    """
+    inputs = list(dict.fromkeys(member.part.root for member in members))
+    with begun_output(out, _plan(members, split_rule), inputs=inputs, overwrite=overwrite, resume=resume):
+        placed = Placed(link)
+        missing = [n for n in range(len(members)) if not (out / schema.episode_folder(n)).is_dir()]
+        if on_start:
+            on_start(len(missing))
+        for number in missing:
+            member = members[number]
+            with replacing_folder(out / schema.episode_folder(number)) as folder:
+                placed.tree(member.part.root / schema.episode_folder(member.number), folder)
+            if on_episode:
+                on_episode(number)
+        sides = [[n for n, member in enumerate(members) if member.side == side] for side in ("train", "val")]
+        write_info(out, (sides[0], sides[1]))
+    return Assembled(out, len(members), len(members) - len(missing), placed.linked, placed.copied)
+
+
+def _plan(members: Sequence[Member], split_rule: str) -> dict[str, Any]:
+    settings = members[0].part.settings
+    return {
+        "format": "robocas",
+        "schema_version": schema.SCHEMA_VERSION,
+        "made_with": {"robocas_ms3": robocas_ms3.__version__},
+        **{key: settings[key] for key in SETTINGS},
+        "split": split_rule,
+        "episodes": {str(number): _entry(member) for number, member in enumerate(members)},
+    }
+
+
+def _entry(member: Member) -> dict[str, Any]:
+    entry = dict(member.part.ledger[member.number])
+    source = {"dataset": member.name, "episode": member.number}
+    if "from" in entry:
+        source["from"] = entry["from"]  # it had been moved before
+    return {**entry, "from": source}

@@ -1,0 +1,160 @@
+"""Brings a dataset in upstream's format, made elsewhere, into the schema's form."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import robocas_ms3
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.info import write_info
+from robocas_ms3.datasets.manage.eef import about_z
+from robocas_ms3.datasets.manage.findings import Found
+from robocas_ms3.datasets.manage.output import Placed, begun_output
+from robocas_ms3.datasets.manage.parts import schema_version
+from robocas_ms3.datasets.manage.reading import read_episode
+from robocas_ms3.datasets.manage.survey import Survey, read_info
+from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.plan import dataset_settings
+from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.datasets.writer import CameraModel, write_cameras
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.files import replacing_folder, write_json
+
+REPORT_FILE = "import_report.json"
+SPLIT_RULE = "as in the dataset it was imported from; episodes that were not listed there as by the writer's rule"
+
+
+def import_robocas(
+    surveyed: Survey,
+    out: Path,
+    *,
+    link: bool = False,
+    overwrite: bool = False,
+    resume: bool = False,
+    on_start: Callable[[int], None] | None = None,
+    on_episode: Callable[[int], None] | None = None,
+) -> int:
+    """Write a dataset of the episodes that can be taken; they keep their numbers. Gives how many were there already.
+
+    Pictures are copied or linked, arrays and camera files written anew; nothing of upstream's folder changes. Killed at
+    any moment, it goes on with ``resume``.
+
+    Args:
+        surveyed: of `survey.survey`.
+        out: folder of the new dataset; ``import_report.json`` goes there too.
+        link: hard links to the pictures where the file system allows; else copies.
+        overwrite: replace a dataset that is there.
+        resume: go on with what was begun.
+        on_start: called with the number of episodes to write.
+        on_episode: called with the number of each.
+
+    Raises:
+        DatasetError: nothing can be taken, or the output is the input or something else was begun there.
+        OutputExistsError: ``out`` is not empty and neither flag is set.
+    """
+    if not surveyed.taken or surveyed.layout is None:
+        raise DatasetError(
+            "no episode can be taken",
+            where=surveyed.root,
+            found=f"{surveyed.episodes} episodes, all of them damaged",
+            fix="robocas import-robocas without --out says what is wrong.",
+        )
+    dataset = Dataset(surveyed.root)
+    info = read_info(dataset, [])
+    plan = _plan(dataset, surveyed)
+    with begun_output(out, plan, inputs=[surveyed.root], overwrite=overwrite, resume=resume):
+        placed = Placed(link)
+        missing = [n for n in surveyed.taken if not (out / schema.episode_folder(n)).is_dir()]
+        if on_start:
+            on_start(len(missing))
+        for number in missing:
+            found = read_episode(
+                dataset, number, info, [], rate_hz=surveyed.rate_hz, turn_eef=surveyed.turn_eef, pictures=False
+            )
+            if found is None:
+                raise DatasetError(
+                    "this episode changed meanwhile", where=surveyed.root / schema.episode_folder(number)
+                )
+            with replacing_folder(out / schema.episode_folder(number)) as folder:
+                _write(folder, dataset.episode(number), found, surveyed, placed)
+            if on_episode:
+                on_episode(number)
+        write_json(out / REPORT_FILE, surveyed.as_json())
+        write_info(out, (info.get("train_eps", []), info.get("val_eps", [])))
+    return len(surveyed.taken) - len(missing)
+
+
+def _plan(dataset: Dataset, surveyed: Survey) -> dict[str, Any]:
+    assert surveyed.layout is not None
+    layout = surveyed.layout
+    pictures = Pictures(layout.cameras, layout.size, layout.depth, layout.image_format)
+    unknown = dict.fromkeys(("trajectory", "trajectory_episode", "seed", "success", "target", "recording"))
+    before = dataset.settings.get("episodes", {})  # of one that is ours
+    name = surveyed.root.resolve().name
+    episodes = {
+        str(n): {**unknown, **before.get(str(n), {}), "from": {"dataset": name, "episode": n}} for n in surveyed.taken
+    }
+    return {
+        "format": "robocas",
+        "schema_version": schema.SCHEMA_VERSION,
+        "made_with": {"robocas_ms3": robocas_ms3.__version__},
+        **dataset_settings(surveyed.rate_hz, pictures, surveyed.embeddings),
+        "split": SPLIT_RULE,
+        "source": {"format": _format(dataset), "dataset": name},
+        "episodes": episodes,
+    }
+
+
+def _format(dataset: Dataset) -> str:
+    return f"robocas v{schema_version(dataset)}"
+
+
+def _write(folder: Path, episode: Episode, found: Found, surveyed: Survey, placed: Placed) -> None:
+    assert surveyed.layout is not None
+    layout = surveyed.layout
+    cameras = {
+        camera: CameraModel(
+            np.asarray(episode.intrinsic(camera), dtype=np.float64),
+            np.asarray(episode.camera_in_parent(camera), dtype=np.float64),
+        )
+        for camera in layout.cameras
+    }
+    if found.turn_deg:
+        gripper = cameras["gripper_camera"]
+        pose = about_z(-found.turn_deg) @ gripper.camera_in_parent
+        cameras["gripper_camera"] = CameraModel(gripper.intrinsic, pose)
+    for camera in layout.cameras:
+        for kind in ("rgb", "depth") if layout.depth else ("rgb",):
+            (folder / camera / kind).mkdir(parents=True)
+            for step in range(found.steps):
+                source = episode.image_path(camera, kind, step)
+                placed.file(source, schema.image_path(folder, camera, kind, step, layout.image_format))
+    write_cameras(folder, cameras)
+    kept = [spec for spec in schema.EPISODE_INFO if surveyed.embeddings or not spec.embedding]
+    arrays = {spec.name: found.arrays[spec.name] for spec in kept if spec.name in found.arrays}
+    np.savez(folder / schema.EPISODE_FILE, **arrays)
+    text = json.dumps(_scene(episode, found, surveyed), indent=1, ensure_ascii=False)
+    (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
+
+
+def _scene(episode: Episode, found: Found, surveyed: Survey) -> dict[str, Any]:
+    """``scene.json``: nearly all of it is not known, unless the episode said it already."""
+    assert episode.dataset is not None
+    before = episode.scene if episode.scene.get("schema_version") == schema.SCHEMA_VERSION else {}
+    source = {
+        "recording": None,
+        **(before.get("source") or {}),
+        "format": _format(episode.dataset),
+        "dataset": surveyed.root.resolve().name,
+        "episode": found.number,
+        "derived": found.derived,
+        "missing": found.missing,
+        "mended": found.mended,
+    }
+    known = {"schema_version": schema.SCHEMA_VERSION, "rate_hz": float(surveyed.rate_hz), "source": source}
+    return {key: known.get(key, before.get(key)) for key in schema.SCENE}

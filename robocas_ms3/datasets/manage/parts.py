@@ -1,0 +1,128 @@
+"""A dataset that others are made of: finished, of this schema version, with a ledger."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.tolerant import arrays_fingerprint
+from robocas_ms3.errors import DatasetError
+
+Sides = tuple[list[int], list[int]]
+"""Training and validation episodes."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A dataset and what it says of itself.
+
+    Attributes:
+        dataset: it.
+        ledger: number -> entry of ``conversion.json``.
+        sides: its split.
+    """
+
+    dataset: Dataset
+    ledger: Mapping[int, dict[str, Any]]
+    sides: Sides
+
+    @property
+    def root(self) -> Path:
+        """Its folder."""
+        return self.dataset.root
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """``conversion.json``."""
+        return self.dataset.settings
+
+    def identity(self, number: int) -> str:
+        """What tells an episode from others: its recording's fingerprint, that of its arrays where it has none."""
+        mark = self.ledger[number].get("recording")
+        return mark or f"arrays {arrays_fingerprint(self.dataset.episode(number).arrays)}"
+
+
+def schema_version(dataset: Dataset) -> int:
+    """Version of a dataset's schema: 0 is upstream's."""
+    return int(dataset.settings.get("schema_version", 1)) if dataset.settings else 0
+
+
+def open_part(root: Path) -> Part:
+    """Open a dataset to make others of.
+
+    Raises:
+        DatasetError: there is none, it is of another version, unfinished, or contradicts itself.
+    """
+    dataset = Dataset(root)
+    version = schema_version(dataset)
+    if version != schema.SCHEMA_VERSION:
+        fixes = {0: "Run robocas import-robocas first.", 1: "Run robocas upgrade first."}
+        raise DatasetError(
+            "a dataset of another schema version",
+            where=root,
+            expected=schema.SCHEMA_VERSION,
+            found=version,
+            fix=fixes.get(version, "Use a newer robocas."),
+        )
+    check_whole(dataset)
+    ledger = {int(number): entry for number, entry in dataset.settings.get("episodes", {}).items()}
+    unlisted = [number for number in dataset.numbers if number not in ledger]
+    if unlisted:
+        where = root / schema.CONVERSION_FILE
+        raise DatasetError("these episodes are not listed", where=where, found=shown(unlisted))
+    for number in dataset.numbers:
+        found = dataset.episode(number).scene.get("schema_version", 1)
+        if found != schema.SCHEMA_VERSION:
+            raise DatasetError(
+                "an episode of another schema version",
+                where=root / schema.episode_folder(number) / schema.SCENE_FILE,
+                expected=schema.SCHEMA_VERSION,
+                found=found,
+                fix="Run robocas upgrade first.",
+            )
+    return Part(dataset, ledger, (list(dataset.info["train_eps"]), list(dataset.info["val_eps"])))
+
+
+def check_whole(dataset: Dataset) -> None:
+    """Check that ``data_info.json`` lists the episodes on disk: an unfinished conversion's does not.
+
+    Raises:
+        DatasetError: it lists others.
+    """
+    path = dataset.root / schema.DATA_INFO_FILE
+    info = dataset.info
+    if not info:
+        raise DatasetError(
+            "this dataset is not finished", where=path, found="no file", fix="Run robocas convert --resume first."
+        )
+    sides = [info.get(key) for key in ("train_eps", "val_eps")]
+    listed = [number for side in sides if isinstance(side, list) for number in side]
+    if sorted(map(str, listed)) != sorted(map(str, dataset.numbers)):
+        different = sorted(set(map(str, listed)) ^ set(map(str, dataset.numbers)), key=lambda n: (len(n), n))
+        raise DatasetError(
+            "not the episodes on disk",
+            where=path,
+            found=f"{shown(different)} missing, twice, or not on disk",
+            fix="Finish it with robocas convert, or accept what is there with robocas split --in-place.",
+        )
+
+
+def shown(values: Iterable[object], most: int = 8) -> str:
+    """A few of many, for messages."""
+    values = [str(value) for value in values]
+    return ", ".join(values[:most]) + (f" and {len(values) - most} more" if len(values) > most else "")
+
+
+def names_of(roots: Iterable[Path]) -> list[str]:
+    """Names that tell datasets apart, as short as they can be: the last parts of their paths."""
+    parts = [root.resolve().parts for root in roots]
+    for length in range(1, max(map(len, parts), default=1) + 1):
+        names = ["/".join(path[-length:]) for path in parts]
+        if len(set(names)) == len(names):
+            return names
+    return ["/".join(path) for path in parts]

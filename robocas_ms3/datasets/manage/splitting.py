@@ -1,0 +1,203 @@
+"""One dataset as several, or its split into training and validation anew."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.info import write_info
+from robocas_ms3.datasets.manage.assemble import Assembled, Member, OnEpisode, OnStart, Side, assemble
+from robocas_ms3.datasets.manage.parts import Part, Sides, names_of
+from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.files import locked_folder, write_json
+
+By = Literal["seed", "target", "task"]
+KEEP_RULE = "every episode keeps the side it had in the dataset it is from"
+
+
+@dataclass(frozen=True)
+class Share:
+    """How training and validation are chosen.
+
+    Attributes:
+        val: share of the episodes that validate, between 0 and 1.
+        by: what stays on one side: episodes of one seed, target object or task.
+    """
+
+    val: float
+    by: By = "seed"
+
+    @property
+    def rule(self) -> str:
+        """In words, for ``conversion.json``."""
+        return f"{self.by}s in the order of sha256({self.by}), the first {self.val:g} of the episodes validate"
+
+
+def groups_of(dataset: Dataset, by: By) -> dict[int, str]:
+    """Episode number -> its seed, target object or task, as text.
+
+    Raises:
+        DatasetError: an episode does not say it.
+    """
+    groups = {}
+    for number in dataset.numbers:
+        scene = dataset.episode(number).scene
+        target = scene.get("target") or {}
+        value = {"seed": scene.get("seed"), "target": target.get("asset_id"), "task": scene.get("task")}[by]
+        if value is None and by == "seed":
+            value = number  # an unknown seed is one of its own, as in `info.summarize`
+        if value is None:
+            raise DatasetError(
+                f"this episode does not say its {by}",
+                where=dataset.root / schema.episode_folder(number) / schema.SCENE_FILE,
+                fix="Run robocas upgrade --trajectory, or choose another --by.",
+            )
+        groups[number] = str(value)
+    return groups
+
+
+def cut(groups: Mapping[int, str], shares: Sequence[float]) -> list[list[int]]:
+    """Cut episodes into parts of about these shares; a group is never cut.
+
+    Groups come in the order of their SHA-256, and fill the last part first: a group's place depends on the groups
+    alone. Each part gets a group as long as there are some.
+
+    Args:
+        groups: episode number -> its group.
+        shares: of each part; they sum to 1.
+
+    Raises:
+        DatasetError: fewer groups than parts, or no shares.
+    """
+    if len(shares) < 2 or min(shares) <= 0 or abs(sum(shares) - 1) > 1e-6:
+        raise DatasetError("not shares of a whole", expected="two or more, > 0, sum 1", found=list(shares))
+    members: dict[str, list[int]] = {}
+    for number, group in groups.items():
+        members.setdefault(group, []).append(number)
+    ranked = sorted(members, key=lambda group: hashlib.sha256(group.encode()).hexdigest())
+    if len(ranked) < len(shares):
+        raise DatasetError("too few to split", expected=f"{len(shares)} groups", found=len(ranked))
+    parts: list[list[int]] = []
+    for index in reversed(range(1, len(shares))):
+        goal = round(shares[index] * len(groups))
+        counts = np.cumsum([len(members[group]) for group in ranked[: len(ranked) - index]])
+        taken = int(np.argmin(np.abs(counts - goal))) + 1
+        parts.append(sorted(number for group in ranked[:taken] for number in members[group]))
+        ranked = ranked[taken:]
+    parts.append(sorted(number for group in ranked for number in members[group]))
+    return parts[::-1]
+
+
+def resplit(root: Path, share: Share | None = None) -> Sides:
+    """Rewrite ``data_info.json`` from the episodes on disk; no episode is touched. Gives the sides.
+
+    Args:
+        root: the dataset.
+        share: how to split; None: every episode keeps its side, new ones are split by the writer's rule.
+
+    Raises:
+        DatasetError: there is no dataset, or it can't be split so.
+    """
+    dataset = Dataset(root)
+    with locked_folder(root):
+        before = dataset.info
+        sides: Sides = (list(before.get("train_eps", [])), list(before.get("val_eps", [])))
+        if share is not None:
+            train, val = cut(groups_of(dataset, share.by), [1 - share.val, share.val])
+            sides = (train, val)
+            if dataset.settings:
+                write_json(root / schema.CONVERSION_FILE, {**dataset.settings, "split": share.rule})
+        info = write_info(root, sides)
+    return info["train_eps"], info["val_eps"]
+
+
+def parts_by_side(part: Part, share: Share | None, train: Path, val: Path) -> dict[Path, Sides]:
+    """Training and validation as two datasets: output -> sides of its episodes."""
+    sides = part.sides if share is None else _sides(part.dataset, share)
+    return {train: (sides[0], []), val: ([], sides[1])}
+
+
+def parts_by_share(part: Part, shares: Sequence[float], by: By, share: Share | None, out: Path) -> dict[Path, Sides]:
+    """Datasets ``out/part_0``, ... of these shares."""
+    pieces = cut(groups_of(part.dataset, by), shares)
+    return {out / f"part_{index}": _within(part, piece, share) for index, piece in enumerate(pieces)}
+
+
+def parts_by_value(part: Part, by: By, share: Share | None, out: Path) -> dict[Path, Sides]:
+    """A dataset ``out/<value>`` for each task or target object."""
+    groups = groups_of(part.dataset, by)
+    pieces = {value: [n for n, group in groups.items() if group == value] for value in sorted(set(groups.values()))}
+    return {out / value: _within(part, piece, share) for value, piece in pieces.items()}
+
+
+def write_parts(
+    part: Part,
+    pieces: Mapping[Path, Sides],
+    *,
+    share: Share | None,
+    link: bool = True,
+    overwrite: bool = False,
+    resume: bool = False,
+    on_start: OnStart | None = None,
+    on_episode: OnEpisode | None = None,
+) -> list[Assembled]:
+    """Write the datasets that a split makes.
+
+    Args:
+        part: the dataset that is split.
+        pieces: output -> training and validation episodes of ``part``.
+        share: how the sides were chosen; None: as they were.
+        link: see `assemble`.
+        overwrite: see `assemble`.
+        resume: see `assemble`.
+        on_start: called with the number of episodes of all pieces.
+        on_episode: called after each.
+
+    Raises:
+        DatasetError: an output would be empty, is the input, or something else was begun there.
+        OutputExistsError: one is not empty and neither flag is set.
+    """
+    for out, sides in pieces.items():
+        if not any(sides):
+            raise DatasetError("no episodes for this part", where=out, fix="Choose other shares.")
+    counts: list[int] = []
+    if on_start:
+        on_start(sum(len(side) for sides in pieces.values() for side in sides))
+    name = names_of([part.root])[0]
+    done = []
+    for out, (train, val) in pieces.items():
+        side_of: dict[int, Side] = {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}
+        done.append(
+            assemble(
+                out,
+                [Member(part, name, number, side_of[number]) for number in sorted(side_of)],
+                split_rule=share.rule if share else KEEP_RULE,
+                link=link,
+                overwrite=overwrite,
+                resume=resume,
+                on_start=counts.append,
+                on_episode=on_episode,
+            )
+        )
+    return done
+
+
+def _within(part: Part, numbers: list[int], share: Share | None) -> Sides:
+    if share is not None and len(numbers) > 1:
+        groups = groups_of(part.dataset, share.by)
+        train, val = cut({number: groups[number] for number in numbers}, [1 - share.val, share.val])
+        return train, val
+    chosen = set(numbers)
+    return [n for n in part.sides[0] if n in chosen], [n for n in part.sides[1] if n in chosen]
+
+
+def _sides(dataset: Dataset, share: Share) -> Sides:
+    train, val = cut(groups_of(dataset, share.by), [1 - share.val, share.val])
+    return train, val

@@ -1,0 +1,136 @@
+"""Looks through a dataset made elsewhere: which episodes can be taken, how, and what is wrong with the others."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.manage.findings import Finding, Layout
+from robocas_ms3.datasets.manage.reading import read_episode
+from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.tolerant import arrays_fingerprint
+from robocas_ms3.errors import DatasetError
+
+
+@dataclass
+class Survey:
+    """What was found.
+
+    Attributes:
+        root: the dataset.
+        rate_hz: its steps a second.
+        turn_eef: see `reading.read_episode`.
+        episodes: how many there are.
+        taken: number -> T of those that can be taken.
+        layout: of their pictures; None where there are none.
+        embeddings: whether all of them have embeddings.
+        findings: everything worth telling.
+    """
+
+    root: Path
+    rate_hz: float
+    turn_eef: bool
+    episodes: int
+    taken: dict[int, int]
+    layout: Layout | None
+    embeddings: bool
+    findings: list[Finding]
+
+    def as_json(self) -> dict[str, Any]:
+        """The report."""
+        left_out = sorted({f.episode for f in self.findings if f.outcome == "left out" and f.episode is not None})
+        return {
+            "dataset": self.root.resolve().name,
+            "rate_hz": self.rate_hz,
+            "episodes": self.episodes,
+            "taken": len(self.taken),
+            "steps": sum(self.taken.values()),
+            "left_out": left_out,
+            "pictures": asdict(self.layout) if self.layout else None,
+            "embeddings": self.embeddings,
+            "findings": [asdict(finding) for finding in self.findings],
+        }
+
+
+def survey(
+    root: Path,
+    *,
+    rate_hz: float | None = None,
+    turn_eef: bool = True,
+    on_episode: Callable[[int, int], None] | None = None,
+) -> Survey:
+    """Look at every episode: arrays, cameras, and each picture's header and checksums.
+
+    Args:
+        root: the dataset.
+        rate_hz: its steps a second; default: by ``conversion.json``, 5 where there is none.
+        turn_eef: see `reading.read_episode`.
+        on_episode: called with (done, all) after each.
+
+    Raises:
+        DatasetError: there are no episodes.
+    """
+    dataset = Dataset(root)
+    rate_hz = dataset.rate_hz if rate_hz is None else rate_hz
+    findings: list[Finding] = []
+    info = read_info(dataset, findings)
+    layouts: dict[int, Layout] = {}
+    lengths: dict[int, int] = {}
+    embedded: set[int] = set()
+    marks: dict[str, int] = {}
+    for done, number in enumerate(dataset.numbers):
+        found = read_episode(dataset, number, info, findings, rate_hz=rate_hz, turn_eef=turn_eef)
+        if found is not None:
+            first = marks.setdefault(arrays_fingerprint(found.arrays), number)
+            if first != number:
+                name = schema.episode_folder(number)
+                findings.append(Finding(number, name, f"the same as episode {first}", "left out"))
+            elif found.layout is not None:
+                lengths[number], layouts[number] = found.steps, found.layout
+                embedded |= {number} if found.embedded else set()
+        if on_episode:
+            on_episode(done + 1, len(dataset.numbers))
+    layout = Counter(layouts.values()).most_common(1)[0][0] if layouts else None
+    for number, other in layouts.items():
+        if other != layout:
+            name = schema.episode_folder(number)
+            findings.append(Finding(number, name, f"pictures of {other}; most are of {layout}", "left out"))
+            del lengths[number]
+    embeddings = bool(lengths) and embedded >= set(lengths)
+    if not embeddings and embedded & set(lengths):
+        lacking = f"{len(set(lengths) - embedded)} episodes lack embeddings: those of the others are not taken"
+        findings.append(Finding(None, schema.EPISODE_FILE, lacking, "mended"))
+    findings.sort(key=lambda finding: -1 if finding.episode is None else finding.episode)
+    return Survey(root, rate_hz, turn_eef, len(dataset.numbers), lengths, layout, embeddings, findings)
+
+
+def read_info(dataset: Dataset, findings: list[Finding]) -> dict[str, Any]:
+    """``data_info.json`` as far as it can be read; what is wrong with it is added to the findings."""
+    file = schema.DATA_INFO_FILE
+    try:
+        info = dataset.info
+    except DatasetError as error:
+        findings.append(Finding(None, file, f"damaged: {error.found}", "mended"))
+        return {}
+    if not info:
+        findings.append(Finding(None, file, "no file: made of the episodes, with a split of its own", "mended"))
+        return {}
+    sides = {key: [n for n in _numbers(info.get(key)) if n in dataset.numbers] for key in ("train_eps", "val_eps")}
+    listed = [n for key in ("train_eps", "val_eps") for n in _numbers(info.get(key))]
+    for number in sorted(set(listed) - set(dataset.numbers)):
+        findings.append(Finding(number, file, "listed, but there is no such folder", "mended"))
+    for number in sorted({n for n in listed if listed.count(n) > 1}):
+        findings.append(Finding(number, f"{file}, train_eps, val_eps", "listed twice: it trains", "mended"))
+    unlisted = sorted(set(dataset.numbers) - set(listed))
+    findings += [Finding(n, f"{file}, train_eps, val_eps", "not listed: added", "mended") for n in unlisted]
+    sides["val_eps"] = [n for n in sides["val_eps"] if n not in set(sides["train_eps"])]
+    return {**info, **sides}
+
+
+def _numbers(values: Any) -> list[int]:
+    values = values if isinstance(values, list) else []
+    return [int(v) for v in values if isinstance(v, int) or (isinstance(v, str) and v.isdecimal())]
