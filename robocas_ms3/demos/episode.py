@@ -23,9 +23,12 @@ from robocas_ms3.planning.mplib_backend import MplibPlanner
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.retreating import back_out
 from robocas_ms3.robots.urdf import robot_files
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.spec import TASKS
+
+STANDARD_FREQ = 20  # Hz, at which the tasks' horizons are given
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class EpisodeSettings:
     task: str
     config: str | dict[str, Any]
     pack: str
-    control_freq: int = 20
+    control_freq: int = STANDARD_FREQ
     max_attempts: int = 20
     keep_recoveries: bool = False
 
@@ -82,8 +85,10 @@ class EpisodeGenerator:
         # On a busy machine the threads of torch's small operations wait for each other, 25 times longer than they work.
         torch.set_num_threads(1)
         config = load_task_config(settings.config)
+        self.horizon = horizon(settings.task, settings.control_freq)
         self.env = gym.make(
             TASKS[settings.task].env_id,
+            max_episode_steps=self.horizon,
             config=settings.config,
             pack=settings.pack,
             obs_mode="none",
@@ -135,15 +140,16 @@ class EpisodeGenerator:
             arm = Arm(self.planner, self.reachability, executor, np.random.default_rng(entropy), attempt)
             try:
                 self.policy(arm)
+                self._check(executor)
                 result.success, result.steps = True, len(executor.actions)
                 return recoveries
             except PlanningFailed as error:
                 self._log(result, attempt, error, time.perf_counter() - begun)
                 last = error
-            acted = len(executor.actions) > first
-            if self.settings.keep_recoveries and acted and not isinstance(last, EpisodeLost):
+            mendable = first < len(executor.actions) < self.horizon and not isinstance(last, EpisodeLost)
+            if self.settings.keep_recoveries and mendable:
                 try:
-                    arm.back_out()
+                    back_out(arm)
                     recoveries.append(
                         {"range": [first, len(executor.actions) - 1], "stage": last.stage, "reason": last.reason}
                     )
@@ -153,6 +159,18 @@ class EpisodeGenerator:
             executor.go_back(far=last.stage == "horizon")  # what took too long will do so again
             recoveries = [kept for kept in recoveries if kept["range"][1] < len(executor.actions)]
         return recoveries
+
+    def _check(self, executor: Executor) -> None:
+        """See that what a policy says it has done is a demonstration.
+
+        Raises:
+            PlanningFailed: the task has not succeeded.
+            EpisodeLost: it took longer than an episode may.
+        """
+        if len(executor.actions) > self.horizon:
+            raise EpisodeLost("horizon", "too_long")
+        if not executor.flag("success"):
+            raise PlanningFailed("episode", "no_success")
 
     @staticmethod
     def _log(result: EpisodeResult, attempt: int, error: PlanningFailed, seconds: float) -> None:
@@ -186,6 +204,14 @@ class EpisodeGenerator:
     def close(self) -> None:
         """Close the environment."""
         self.env.close()
+
+
+def horizon(task: str, control_freq: int) -> int:
+    """Control steps a demonstration may have: as many seconds as the task allows at the standard rate.
+
+    ``gym.make`` alone allows ``TaskSpec.max_episode_steps`` at any rate.
+    """
+    return TASKS[task].max_episode_steps * control_freq // STANDARD_FREQ
 
 
 def recordable_config(config: TaskConfig, name: str | None) -> str | dict[str, Any]:

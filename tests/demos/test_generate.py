@@ -6,18 +6,21 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from mani_skill.utils.gym_utils import find_max_episode_steps_value
 
-from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings, horizon
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.record import merge, open_trajectory, read_json
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.errors import DatasetError, EpisodeLost, OutputExistsError, PlanningFailed, RobocasError
+from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Trajectory
 from robocas_ms3.robots.constants import ARM_SLICE
 
 pytestmark = pytest.mark.slow
 SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
 SEEDS = 3
+TOO_LONG = "horizon", "too_long"
 
 
 @pytest.fixture(scope="module")
@@ -146,8 +149,78 @@ def test_overwrite_deletes_only_what_generate_made(tmp_path):
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
 
-def test_the_way_back_to_a_checkpoint_is_part_of_the_record(tmp_path):
+def call_it_done(monkeypatch):
+    """Let policies that only stir count as successful: what is tested is how attempts are kept or undone."""
+    flag = Executor.flag
+    monkeypatch.setattr(Executor, "flag", lambda self, name: name == "success" or flag(self, name))
+
+
+def waiting(steps):
+    """A policy that waits, each attempt as many control steps as the next number says; -1: and then fails."""
+    begun, numbers = [], iter(steps)
+
+    def policy(arm):
+        begun.append(len(arm.executor.actions))
+        number = next(numbers)
+        arm.executor.move_gripper(1.0, arm.at, seconds=abs(number) * arm.executor.dt)
+        if number < 0:
+            raise PlanningFailed("grasp", "missed")
+
+    return policy, begun
+
+
+@pytest.mark.parametrize(
+    ("keep", "steps", "begins"),
+    [
+        (False, [12, 10], [0, 0]),  # one step too many would be 11
+        (True, [12, 10], [0, 0]),
+        (True, [-2, 8, 4], None),  # kept, with the way out of it: then too long, and undone
+        (True, [-12, 4], [0, 0]),  # failed, and too long for anything to follow
+    ],
+)
+def test_what_takes_longer_than_an_episode_may_is_undone(tmp_path, monkeypatch, keep, steps, begins):
+    settings = EpisodeSettings("pick", "pick_table_scattered", "builtin", max_attempts=len(steps), keep_recoveries=keep)
+    generator = EpisodeGenerator(settings)
+    call_it_done(monkeypatch)
+    generator.horizon = 10
+    generator.policy, begun = waiting(steps)
+    result = generator.generate(1, tmp_path, "timed")
+    generator.close()
+    assert result.success
+    assert begun[-1] == 0
+    assert begins is None or begun == begins
+    too_long = [failure.attempt for failure in result.failures if (failure.stage, failure.reason) == TOO_LONG]
+    assert too_long == [i for i, number in enumerate(steps[:-1]) if number > 0]
+    data = read_json(tmp_path / "timed.h5")["episodes"][0]
+    assert data["elapsed_steps"] == result.steps == steps[-1]
+    assert data["robocas"]["recoveries"] == []
+
+
+@pytest.mark.parametrize(("freq", "steps"), [(20, 800), (5, 200), (100, 4000)])
+def test_the_horizon_is_as_many_seconds_at_any_rate(freq, steps):
+    assert horizon("pick", freq) == steps
+
+
+def test_a_horizon_at_another_rate_is_the_environments_too():
+    generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin", control_freq=5))
+    assert find_max_episode_steps_value(generator.env) == generator.horizon == 200
+    generator.close()
+
+
+def test_that_a_policy_is_done_is_no_success(tmp_path):
+    generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin", max_attempts=2))
+    generator.policy, begun = waiting([3, 3])
+    result = generator.generate(1, tmp_path, "nothing")
+    generator.close()
+    assert not result.success
+    assert begun == [0, 0]
+    assert [(failure.stage, failure.reason) for failure in result.failures] == [("episode", "no_success")] * 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_way_back_to_a_checkpoint_is_part_of_the_record(tmp_path, monkeypatch):
     """A policy that stirs the heap, marks, stirs on and fails; the next attempt finds what the first one marked."""
+    call_it_done(monkeypatch)
     generator = EpisodeGenerator(EpisodeSettings("search", "search_table_small_heap", "builtin", max_attempts=2))
     seen = []
 
@@ -179,7 +252,8 @@ def test_the_way_back_to_a_checkpoint_is_part_of_the_record(tmp_path):
     assert len(load(tmp_path / "stirred.h5")["traj_0"]["actions"]) == 18
 
 
-def test_recoveries_stay_unless_the_episode_is_lost(tmp_path):
+def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch):
+    call_it_done(monkeypatch)
     settings = EpisodeSettings("search", "search_table_small_heap", "builtin", max_attempts=4, keep_recoveries=True)
     generator = EpisodeGenerator(settings)
     failures = iter([PlanningFailed("grasp", "missed"), EpisodeLost("clear", "fell_off_table")])

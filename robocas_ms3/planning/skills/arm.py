@@ -117,19 +117,10 @@ class Arm:
                     return
                 if rises == RISES:
                     raise PlanningFailed("rise", "still_touching")
-                motion = self._plan_rise(self.planner.tcp(self.at), RISE, stage="rise")
+                motion = self.plan_rise(self.planner.tcp(self.at), RISE, stage="rise")
             self.follow(motion)
 
-    def back_out(self) -> None:
-        """After a failed attempt that stays in the record: open the gripper and rise out of whatever is there."""
-        self.hold_nothing()
-        self.open_gripper()
-        with self.planning():
-            self.planner.set_scene(self.scene.obstacles_in_base())
-            motion = self._plan_rise(self.scene.tcp_in_base, 0.10, stage="recover")
-        self.follow(motion)
-
-    def _plan_rise(self, tcp_in_base: Array, height: float, *, stage: str) -> Trajectory:
+    def plan_rise(self, tcp_in_base: Array, height: float, *, stage: str) -> Trajectory:
         """Plan straight up, through whatever is touched; at the end of its reach the arm rises towards the robot."""
         up = raised(tcp_in_base, height)
         inward = up.copy()

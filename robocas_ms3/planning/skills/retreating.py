@@ -1,13 +1,19 @@
-"""Step back from what the gripper has just let go of, where it still stands against it."""
+"""Step back from what the gripper has just let go of, where it still stands against it; back out of what failed."""
 
 from __future__ import annotations
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, Trajectory
-from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.arm import Arm, moved_back
+
+BACK_OUT_RISE = 0.10  # m
+BACK_OUT = (0.25, 0.15, 0.10, 0.06)  # m against the approach; the first one to which the way is free
+POINTS_DOWN = -0.7  # upright component of an approach that is rather from above than level
 
 
-def plan_step_back(arm: Arm, start: Array, goals: list[Array], *, try_free: bool = False) -> Trajectory:
+def plan_step_back(
+    arm: Arm, start: Array, goals: list[Array], *, try_free: bool = False, only_free: bool = False
+) -> Trajectory:
     """Plan a straight line to the first of several TCP poses that one leads to, through whatever is touched.
 
     Args:
@@ -15,13 +21,45 @@ def plan_step_back(arm: Arm, start: Array, goals: list[Array], *, try_free: bool
         start: (7,) rad.
         goals: 4x4 in the arm's base frame, the best first.
         try_free: first look for a line that touches nothing of the planner's scene.
+        only_free: take no other.
 
     Raises:
-        PlanningFailed: none of them can be reached on a straight line.
+        PlanningFailed: none of them can be reached on such a straight line.
     """
-    if try_free:
+    if try_free or only_free:
         try:
             return arm.first_line(start, goals, stage="retreat")
         except PlanningFailed:
-            pass
+            if only_free:
+                raise
     return arm.first_line(start, goals, stage="retreat", check_collisions=False)
+
+
+def back_out(arm: Arm) -> None:
+    """After a failed attempt that stays in the record: open the gripper and get out of whatever is there.
+
+    On what lies open to above the arm rises, through what it touches. Where it reached in level, as into a shelf or
+    for a handle, something may be above: it steps straight back, on a way that is free of all but the target, which
+    it may still stand against.
+
+    Raises:
+        PlanningFailed: it can't; the attempt has to be undone.
+    """
+    arm.hold_nothing()
+    arm.open_gripper()
+    with arm.planning():
+        tcp = arm.planner.tcp(arm.at)
+        arm.planner.set_scene(arm.scene.obstacles_in_base())
+        if arm.env.task_config.target.approach == "top" and tcp[2, 2] < POINTS_DOWN:
+            motion = arm.plan_rise(arm.scene.tcp_in_base, BACK_OUT_RISE, stage="recover")
+        else:
+            motion = _plan_back_out(arm, [moved_back(tcp, distance) for distance in BACK_OUT])
+    arm.follow(motion)
+
+
+def _plan_back_out(arm: Arm, goals: list[Array]) -> Trajectory:
+    try:
+        return plan_step_back(arm, arm.at, goals, only_free=True)
+    except PlanningFailed:
+        arm.planner.set_scene(arm.scene.obstacles_in_base(without=int(arm.env.target_slot[0])))
+        return plan_step_back(arm, arm.at, goals, only_free=True)
