@@ -21,3 +21,5 @@ the others order them from the robot's left to its right, where ``middle`` needs
 """
 
 RELATIONS: tuple[Relation, ...] = get_args(Relation)
+NEED_THREE: tuple[Relation, ...] = ("second_nearest", "second_from_left", "middle", "second_from_right")
+"""Those that say nothing of two objects."""

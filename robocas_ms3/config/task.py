@@ -133,7 +133,9 @@ class TargetConfig(StrictModel):
     approach: Literal["top", "front"] = Field(
         default="top", description="top: from above; front: level, as into a shelf"
     )
-    relations: list[Relation] = Field(default=list(RELATIONS), description="select: how the target is told apart")
+    relations: Annotated[list[Relation], Field(min_length=1)] = Field(
+        default=list(RELATIONS), description="select: how the target is told apart; default: all that its copies allow"
+    )
     max_visible_share: Annotated[float, Field(gt=0, le=1)] = Field(
         default=0.9, description="search: the target's p_vis from above is lower"
     )

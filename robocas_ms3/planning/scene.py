@@ -94,7 +94,7 @@ class PlanningScene:
         without_link: tuple[str, str] | None = None,
         radius: float = RADIUS,
     ) -> Array:
-        """Samples (P, 3) of the collision surfaces of furniture, basket and objects.
+        """Samples (P, 3) of the collision surfaces of furniture, basket and the objects that are there.
 
         Args:
             without: slot or slots of objects to leave out.
@@ -103,12 +103,13 @@ class PlanningScene:
         """
         to_base = inverse(self.arm_base_in_world)
         left_out = {without} if isinstance(without, int) else set(without)
+        present = self.env.present[0].tolist()
         pieces = [
             transform(to_base, self._furniture_in_world(without_link)),
             transform(self.basket_in_base, self.env.model.basket.surface_points(SPACING)),
         ]
         for slot, asset in enumerate(self.env.object_assets[0]):
-            if slot not in left_out:
+            if present[slot] and slot not in left_out:
                 pieces.append(transform(self.object_in_base(slot), asset.surface_points(SPACING)))
         points = np.concatenate(pieces)
         return points[np.linalg.norm(points, axis=1) <= radius]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 
 from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, Pack, load_pack
-from robocas_ms3.config.task import PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
+from robocas_ms3.config.relations import NEED_THREE, RELATIONS
+from robocas_ms3.config.task import OrderlyLayout, PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.scenes.placement import Array, Region, planar_pose
 
@@ -87,7 +90,41 @@ def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
         resolve_ids(pack, names, key=f"randomisation.object_sets.{number}")
     if config.randomisation.distractors:
         resolve_ids(pack, config.randomisation.distractors.ids, key="randomisation.distractors.ids")
+    _check_relations(pack, config, ids)
     return ids
+
+
+def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
+    """Check that a layout can have objects enough of a name for the relations that a configuration asks for.
+
+    All of them together, the default, stand for those that can be.
+
+    Raises:
+        ConfigError: it can't.
+    """
+    asked, layout, random = config.target.relations, config.layout, config.randomisation
+    if config.task != "select" or not isinstance(layout, OrderlyLayout) or set(asked) == set(RELATIONS):
+        return
+    wrong = [relation for relation in asked if relation in NEED_THREE]
+    sets = [resolve_ids(pack, names, key="randomisation.object_sets") for names in random.object_sets or ()] or [ids]
+    most = max(_most_alike(pack, names, layout.copies, config.objects.count) for names in sets)
+    if random.distractors and random.distractors.count[1]:  # may be of the same name
+        most += random.distractors.count[1]
+    if wrong and most < 3:
+        raise ConfigError(
+            f"target.relations: {', '.join(wrong)} needs three objects of a name or more",
+            expected="layout.copies and objects.count of 3 or more",
+            found=f"layout.copies {layout.copies}, objects.count {config.objects.count}",
+            fix="Raise layout.copies, or leave these relations out.",
+        )
+
+
+def _most_alike(pack: Pack, ids: list[str], copies: int, count: int) -> int:
+    """How many objects of one name a layout may have at most."""
+    names = Counter(pack.objects[i].asset.name for i in ids)
+    kinds = -(-count // copies)
+    rounds = -(-kinds // len(ids))  # kinds are drawn again where there are too few
+    return min(count, copies * rounds * max(names.values()))
 
 
 def resolve_ids(pack: Pack, wanted: list[str | int] | list[str], *, key: str) -> list[str]:

@@ -136,6 +136,11 @@ class SceneModel:
         furniture = self._opened_points if opened else self._closed_points
         return np.concatenate([furniture, transform(basket_pose, self.basket.surface_points())])
 
+    @property
+    def furniture_points(self) -> Array:
+        """Samples (P, 3) of the collision surfaces of furniture, doors and drawers as at first, world, m."""
+        return self._closed_points
+
     @cached_property
     def _closed_points(self) -> Array:
         return self._furniture_points(opened=False)

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject
-from robocas_ms3.config.task import OrderlyLayout, PoseRandomisation, ScatteredLayout
+from robocas_ms3.config.task import OrderlyLayout, ScatteredLayout
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout
 from robocas_ms3.scenes.lookup import resolve_ids
@@ -17,11 +17,13 @@ from robocas_ms3.scenes.orderly import sample_orderly
 from robocas_ms3.scenes.placement import Array, Placeable, choose_objects, planar_pose, sample_scattered, transform
 from robocas_ms3.scenes.settle import settle
 from robocas_ms3.scenes.stacked import drop_heap
+from robocas_ms3.scenes.standing import place_basket, place_robot
 from robocas_ms3.scenes.targets import Arrangement, Choice, choose_target
 
 # Every random decision of a scene has a stream of its own, so that a new one never shifts the others.
 _OBJECTS, _LAYOUT, _TARGET, _ROBOT, _BASKET, _COUNT = range(6)
 _TRIES = 50
+_SEVERAL = 5  # layouts without a target, of which the target is to blame, not that others did not come to rest
 _log = logging.getLogger(__name__)
 
 
@@ -62,7 +64,8 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
         seed: decides everything else.
 
     Raises:
-        LayoutError: the objects don't fit, don't come to rest, or none qualifies as the target.
+        LayoutError: the objects don't fit, don't come to rest, or none qualifies as the target; or robot or basket
+            find no place where they can stand.
     """
 
     def rng(stream: int) -> np.random.Generator:
@@ -72,12 +75,12 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
     ids = object_set(model, objects_seed)
     assets = [model.object_pack.objects[i] for i in ids]
     present, candidate = _presence(model, len(ids), rng(_COUNT))
-    robot_pose = _moved(model.robot_pose, config.randomisation.robot, rng(_ROBOT))
     basket_rng = rng(_BASKET)
-    basket_pose = _moved(model.basket_pose, config.randomisation.basket, basket_rng)
+    robot_pose = place_robot(model, rng(_ROBOT))
+    basket_pose = place_basket(model, robot_pose, basket_rng)
     layout_rng, target_rng = rng(_LAYOUT), rng(_TARGET)
     used = [asset for asset, there in zip(assets, present, strict=True) if there]
-    unsettled, unarranged = 0, []
+    unsettled, untargeted, unarranged = 0, 0, []
     choice: Choice | None = None
     for _ in range(_TRIES):
         poses = np.stack([_parked(slot, asset) for slot, asset in enumerate(assets)])
@@ -90,7 +93,7 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
             continue
         placed = model.support_pose @ model.support_motion(opened=False) @ arranged
         if config.randomisation.basket is not None and meets_basket(used, placed, model.basket, basket_pose):
-            basket_pose = _moved(model.basket_pose, config.randomisation.basket, basket_rng)
+            basket_pose = place_basket(model, robot_pose, basket_rng)
             unsettled += 1
             continue
         settled = settle(used, placed, model, basket_pose)
@@ -105,7 +108,8 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
             return Layout(
                 ids, poses, robot_pose, basket_pose, choice.slot, choice.relation, present, choice.visible_shares
             )
-    raise _failure(unarranged, unsettled)
+        untargeted += 1
+    raise _failure(model, unarranged, unsettled, untargeted)
 
 
 def meets_basket(assets: list[LoadedObject], poses: Array, basket: LoadedFurniture, basket_pose: Array) -> bool:
@@ -126,15 +130,21 @@ def meets_basket(assets: list[LoadedObject], poses: Array, basket: LoadedFurnitu
     return False
 
 
-def _failure(unarranged: list[LayoutError], unsettled: int) -> LayoutError:
-    """What to say of a layout that could not be made; the commonest cause names the cure."""
-    if len(unarranged) == _TRIES:
+def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, untargeted: int) -> LayoutError:
+    """What to say of a layout that could not be made: where several came to rest, that none had a target."""
+    if untargeted < _SEVERAL and len(unarranged) > _TRIES // 2:
         return unarranged[-1]
-    found = f"{_TRIES} layouts tried: {len(unarranged)} did not fit, {unsettled} did not come to rest or met the basket"
-    if unsettled > _TRIES // 2:
+    found = (
+        f"{_TRIES} layouts tried: {len(unarranged)} did not fit, {unsettled} did not come to rest or met the basket, "
+        f"{untargeted} had no target"
+    )
+    if untargeted < _SEVERAL:
         fix = "Lower objects.count, enlarge the surface, use objects that stand firmly, or move the basket less."
         return LayoutError("the objects don't come to rest", where="layout", found=found, fix=fix)
     fix = "Raise target.max_distance, lower target.min_grasps or min_free_grasps, or use other objects."
+    if model.config.task == "select":
+        names = ", ".join(model.config.target.relations)
+        fix = f"Give other target.relations than {names}, or more layout.copies. {fix}"
     return LayoutError("no object qualifies as the target", where="target", found=found, fix=fix)
 
 
@@ -244,16 +254,6 @@ def _presence(model: SceneModel, slots: int, rng: np.random.Generator) -> tuple[
     slot = np.arange(slots)
     candidate = slot < used
     return candidate | ((slot >= count) & (slot < count + extra)), candidate
-
-
-def _moved(pose: Array, by: PoseRandomisation | None, rng: np.random.Generator) -> Array:
-    """Shift a pose in x and y and turn it about its own vertical."""
-    if by is None:
-        return pose
-    shift, yaw = rng.uniform(-by.position, by.position, 2), np.deg2rad(rng.uniform(-by.yaw_deg, by.yaw_deg))
-    moved = pose @ planar_pose(0, 0, 0, yaw)
-    moved[:2, 3] += shift
-    return moved
 
 
 def _parked(slot: int, asset: LoadedObject) -> Array:

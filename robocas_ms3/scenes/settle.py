@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import sapien
 
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.pack import LoadedObject
@@ -79,11 +80,7 @@ def _simulate(
 ) -> tuple[Array, Array, Array]:
     """Poses (K, 4, 4), speeds (K,) m/s and (K,) rad/s after a while in a new scene."""
     scene = new_scene()
-    for name, asset in model.furniture.items():
-        frame = model.furniture_poses[name]
-        add_fixed(scene, asset.hulls, frame, asset.asset.friction)
-        for link, motion in link_poses(asset.asset.links, model.joint_positions(name, opened=False)).items():
-            add_fixed(scene, asset.links[link].hulls, frame @ motion, asset.asset.friction)
+    add_furniture(scene, model)
     add_fixed(scene, model.basket.hulls, basket_pose, model.basket.asset.friction)
     bodies = [add_body(scene, solid_of(asset), pose) for asset, pose in zip(assets, poses, strict=True)]
     for _ in range(round(seconds / TIME_STEP)):
@@ -93,3 +90,12 @@ def _simulate(
         np.array([np.linalg.norm(body.linear_velocity) for body in bodies]),
         np.array([np.linalg.norm(body.angular_velocity) for body in bodies]),
     )
+
+
+def add_furniture(scene: sapien.Scene, model: SceneModel) -> None:
+    """Add the furniture where it stands, doors and drawers as at first; none of it moves."""
+    for name, asset in model.furniture.items():
+        frame = model.furniture_poses[name]
+        add_fixed(scene, asset.hulls, frame, asset.asset.friction)
+        for link, motion in link_poses(asset.asset.links, model.joint_positions(name, opened=False)).items():
+            add_fixed(scene, asset.links[link].hulls, frame @ motion, asset.asset.friction)

@@ -50,6 +50,7 @@ def test_the_scattered_pick_has_upstreams_numbers():
         ("robot.yaw_deg", "90", ["'robot.yaw_deg'", "a number", "'90'"]),
         ("surface.furniture", "desk", ["surface.furniture", "['table']", "'desk'"]),
         ("surface.min_xy", [0.4, 0.0], ["min_xy", "below max_xy"]),
+        ("target.relations", [], ["'target.relations'", "at least 1 item", "[]"]),
         ("task", "juggle", ["'task'", "'pick'", "'juggle'"]),
     ],
 )

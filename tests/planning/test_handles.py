@@ -86,7 +86,7 @@ def test_a_pull_ends_where_the_arm_does(reachability):
 def test_the_body_is_free_where_no_point_is_inside_it():
     frame = np.eye(4)
     frame[:3, 3] = 1.0, 2.0, 0.49  # the arm's base, 0.49 m above the floor
-    beside = np.array([[1.3, 2.0, 0.2], [1.0, 2.24, 0.2], [1.2, 2.0, 0.31], [1.14, 2.0, 0.65]])
+    beside = np.array([[1.3, 2.0, 0.2], [1.0, 2.24, 0.2], [1.2, 2.0, 0.31], [1.14, 2.0, 0.65], [1.0, 2.0, -5.0]])
     assert body_is_free(frame, beside)
     for hit in ([1.27, 2.0, 0.2], [1.0, 1.78, 0.2], [1.14, 2.0, 0.4], [1.08, 2.0, 0.6]):
         assert not body_is_free(frame, np.array([hit]))

@@ -11,7 +11,7 @@ from robocas_ms3.errors import ConfigError, LayoutError
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import transform
-from robocas_ms3.scenes.sample import meets_basket, object_set, sample_layout
+from robocas_ms3.scenes.sample import _failure, meets_basket, object_set, sample_layout
 
 
 def model(name: str = "pick_table_scattered", **changes) -> SceneModel:
@@ -79,7 +79,11 @@ def height_of(scene: SceneModel, layout) -> float:
 
 @pytest.mark.parametrize(("kind", "room"), [("scattered", 0.07), ("orderly", 0.12)])
 def test_nothing_stands_higher_than_the_headroom(kind, room):
-    changes = {"layout": {"kind": kind}, "objects": {"ids": ["mustard_bottle", "sugar_box", "mug"], "count": 4}}
+    changes = {
+        "layout": {"kind": kind},
+        "objects": {"ids": ["mustard_bottle", "sugar_box", "mug"], "count": 4},
+        "target": {"min_free_grasps": 0},  # what lies is wide; this is not about targets
+    }
     free, low = model(**changes), under(room, **changes)
     assert max(height_of(free, sample_layout(free, seed, seed)) for seed in range(3)) > room + 0.02
     for seed in range(3):
@@ -148,6 +152,43 @@ def test_nothing_stands_in_a_basket_that_was_moved_among_the_objects():
     inside = layout.object_poses.copy()
     inside[0, :3, 3] = layout.basket_pose[:3, 3] + [0, 0, 0.05]
     assert meets_basket(assets, inside, moving.basket, layout.basket_pose)
+
+
+def rows(copies: int, relations: list[str] | None, count: int = 10, **objects) -> SceneModel:
+    target = {} if relations is None else {"relations": relations}
+    layout = {"kind": "orderly", "copies": copies}
+    return model("select_table_orderly", layout=layout, target=target, objects={"count": count, **objects})
+
+
+@pytest.mark.parametrize("relations", [["middle"], ["nearest", "second_from_left", "second_nearest"]])
+def test_relations_of_three_need_three(relations):
+    words = (
+        rf"target.relations: {', '.join(r for r in relations if r != 'nearest')} needs.*copies 2.*Raise layout.copies"
+    )
+    with pytest.raises(ConfigError, match=words):
+        rows(2, relations)
+    with pytest.raises(ConfigError, match=r"objects.count 2"):
+        rows(3, relations, count=2)
+    rows(3, relations)
+    rows(2, relations, count=6, ids=["mug", "soap_box"])  # four mugs, or four boxes
+
+
+def test_relations_of_two_and_all_of_them_go_with_two_copies():
+    assert len(rows(2, None).config.target.relations) == 8
+    rows(2, ["nearest", "farthest", "leftmost", "rightmost"])
+    rows(2, list(rows(2, None).config.target.relations))  # the default, as a record has it
+
+
+def test_layouts_that_come_to_rest_without_a_target_blame_the_target():
+    scene = rows(4, ["middle"], count=8)  # never an odd number
+    error = _failure(scene, [], 30, 20)
+    assert error.where == "target"
+    assert "30 did not come to rest" in str(error) and "20 had no target" in str(error)
+    assert "other target.relations than middle, or more layout.copies" in error.fix
+    assert _failure(scene, [], 48, 2).what == "the objects don't come to rest"
+    crowded = LayoutError("no room", where="layout")
+    assert _failure(scene, [crowded] * 48, 2, 0) is crowded
+    assert "relations" not in _failure(model(), [], 0, 50).fix
 
 
 def test_no_target_is_an_error_that_says_what_to_change():

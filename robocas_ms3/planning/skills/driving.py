@@ -15,15 +15,13 @@ from robocas_ms3.planning.scene import inverse, matrix
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.timing import stopping
 from robocas_ms3.robots.constants import ARM_BASE_ABOVE_BASE_LINK, BASE_LIMITS, BASE_LINK_HEIGHT
+from robocas_ms3.scenes import standing
 from robocas_ms3.scenes.placement import planar_pose, transform
 
 SPEED, ACCELERATION = 0.25, 0.4  # m/s and rad/s; m/s^2 and rad/s^2
 SETTLE_SECONDS = 0.4
 ARRIVED = 0.01  # m, rad
 CHECK_STEP = 0.08  # m or rad between poses at which a drive is checked
-# What turns with the base, the lowest link included: half sizes in x and y, height up to which it goes, m, with room to
-# spare
-BODY_BOXES = ((0.28, 0.23, 0.30), (0.15, 0.13, 0.64))
 ARM_LENGTH = 1.2  # m from its base to the tips, hand and what it holds included
 THINNED = 3  # every third point of the clouds will do: nothing thinner than 2 cm could slip between them
 LIMIT_MARGIN = 0.01  # m, rad
@@ -150,7 +148,6 @@ def _leg_is_free(arm: Arm, start: Array, goal: Array, cloud: Array) -> bool:
 
 def body_is_free(arm_base_in_world: Array, cloud: Array) -> bool:
     """Whether none of the points (P, 3), world, is where the body on the floor would be."""
-    local = transform(inverse(arm_base_in_world), cloud)
-    local[:, 2] += BASE_LINK_HEIGHT + ARM_BASE_ABOVE_BASE_LINK  # above the floor
-    inside = [np.all(np.abs(local[:, :2]) <= (x, y), axis=1) & (local[:, 2] <= z) for x, y, z in BODY_BOXES]
-    return not np.logical_or.reduce(inside).any()
+    root = arm_base_in_world.copy()
+    root[2, 3] -= BASE_LINK_HEIGHT + ARM_BASE_ABOVE_BASE_LINK  # on the floor
+    return standing.body_is_free(root, cloud)

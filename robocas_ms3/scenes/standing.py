@@ -1,0 +1,122 @@
+"""Where robot and basket stand: as configured, or moved by the seed to where they can stand."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+
+from robocas_ms3.assets.physics import TIME_STEP, Solid, add_body, add_fixed, engine_settings, new_scene, pose_matrix
+from robocas_ms3.config.task import PoseRandomisation
+from robocas_ms3.errors import LayoutError
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.placement import Array, planar_pose, transform
+from robocas_ms3.scenes.settle import add_furniture
+
+# What turns with the robot's base, the lowest link included: half sizes in x and y, height up to which it goes, m, with
+# room to spare
+BODY_BOXES = ((0.28, 0.23, 0.30), (0.15, 0.13, 0.64))
+STAND_SECONDS = 1.0
+MAX_SHIFT, MAX_TURN_DEG = 0.005, 2.0  # meanwhile, of a basket that stands
+LOAD = 0.5  # kg, of something in it
+_TRIES = 50
+
+
+def place_robot(model: SceneModel, rng: np.random.Generator) -> Array:
+    """4x4 of the robot's root, drawn until its body is clear of furniture; as configured where nothing moves it.
+
+    Raises:
+        LayoutError: it never is.
+    """
+    by = model.config.randomisation.robot
+    points = np.zeros((0, 3)) if by is None else model.furniture_points
+    return _place("robot", model.robot_pose, by, rng, lambda pose: body_is_free(pose, points))
+
+
+def place_basket(model: SceneModel, robot_pose: Array, rng: np.random.Generator) -> Array:
+    """4x4 of the basket's frame, drawn until it stands, clear of the robot; as configured where nothing moves it.
+
+    Raises:
+        LayoutError: it never does.
+    """
+    points = model.basket.surface_points()
+
+    def good(pose: Array) -> bool:
+        return body_is_free(robot_pose, transform(pose, points)) and basket_stands(model, pose)
+
+    return _place("basket", model.basket_pose, model.config.randomisation.basket, rng, good)
+
+
+def _place(
+    name: str, pose: Array, by: PoseRandomisation | None, rng: np.random.Generator, good: Callable[[Array], bool]
+) -> Array:
+    if by is None:
+        return pose
+    for _ in range(_TRIES):
+        moved = _moved(pose, by, rng)
+        if good(moved):
+            return moved
+    raise LayoutError(
+        f"the {name} can't stand anywhere near where it is configured",
+        where=f"randomisation.{name}",
+        found=f"{_TRIES} places tried",
+        fix=f"Lower randomisation.{name}.position, or configure the {name} farther from furniture and edges.",
+    )
+
+
+def _moved(pose: Array, by: PoseRandomisation, rng: np.random.Generator) -> Array:
+    """Shift a pose in x and y and turn it about its own vertical."""
+    shift, yaw = rng.uniform(-by.position, by.position, 2), np.deg2rad(rng.uniform(-by.yaw_deg, by.yaw_deg))
+    moved = pose @ planar_pose(0, 0, 0, yaw)
+    moved[:2, 3] += shift
+    return moved
+
+
+def body_is_free(base_in_world: Array, cloud: Array) -> bool:
+    """Whether none of some points is where the robot's body would be. Nothing below the floor is.
+
+    Args:
+        base_in_world: 4x4 of a frame on the floor, turned as the mobile base is: the robot's root, base joints at 0.
+        cloud: (P, 3) world, m.
+    """
+    local = transform(np.linalg.inv(base_in_world), cloud)
+    x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
+    inside = [(x <= half_x) & (y <= half_y) & (z <= height) for half_x, half_y, height in BODY_BOXES]
+    return not ((z > 0) & np.logical_or.reduce(inside)).any()
+
+
+def basket_stands(model: SceneModel, basket_pose: Array) -> bool:
+    """Whether the basket stays where it is put, also with something in any of its corners. Simulated, 30 ms.
+
+    Over an edge it tips, in the air it falls, out of a wall it is pushed. Objects are no part of this.
+
+    Args:
+        model: where room and furniture stand; doors and drawers stay as at first.
+        basket_pose: 4x4 in the world.
+    """
+    facts = model.basket.asset
+    assert facts.inner is not None  # the model saw to it
+    assert facts.mass is not None
+    mass, own_center = facts.mass + LOAD, np.array(facts.center_of_mass)
+    inertia, axes = np.array(facts.inertia), np.array(facts.inertia_wxyz)
+    with engine_settings():
+        for corner in itertools.product(*zip(facts.inner.min[:2], facts.inner.max[:2], strict=True)):
+            load = np.array([*corner, facts.inner.min[2]])
+            center = (facts.mass * own_center + LOAD * load) / mass
+            if not _stands(Solid(model.basket.hulls, mass, center, inertia, axes, facts.friction), model, basket_pose):
+                return False
+    return True
+
+
+def _stands(solid: Solid, model: SceneModel, pose: Array) -> bool:
+    scene = new_scene()
+    add_furniture(scene, model)
+    add_fixed(scene, model.room.hulls, np.eye(4), model.room.asset.friction)
+    body = add_body(scene, solid, pose)
+    for _ in range(round(STAND_SECONDS / TIME_STEP)):
+        scene.step()
+    after = pose_matrix(body)
+    cosine = (np.trace(pose[:3, :3].T @ after[:3, :3]) - 1) / 2
+    turn = np.arccos(np.clip(cosine, -1, 1))
+    return bool(np.linalg.norm(after[:3, 3] - pose[:3, 3]) <= MAX_SHIFT and turn <= np.deg2rad(MAX_TURN_DEG))
