@@ -11,9 +11,11 @@ from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
 from robocas_ms3.errors import EpisodeLost, PlanningFailed
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.pushes import push_direction
+from robocas_ms3.planning.skills import pushing
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.pushing import push_away
 from robocas_ms3.planning.skills.removing import remove
+from robocas_ms3.planning.solvers import search
 from robocas_ms3.planning.solvers.search import _Clearing
 from robocas_ms3.scenes.placement import transform
 
@@ -75,6 +77,48 @@ def test_a_push_moves_an_object_away_from_the_target(generator):
     shift = surface(arm, pushed).mean(axis=0) - starts[pushed]
     assert shift @ ahead > 0.02
     assert np.abs(arm.env.gripper_forces()).max() == 0  # it has let go of everything
+
+
+def test_a_push_that_moves_nothing_is_none_but_counts_as_tried(generator, monkeypatch):
+    arm, target, slots = begin(generator, 3)
+    clearing, facts = _Clearing(arm, target), arm.executor.facts
+    pushed = arm.env.objects[slots[0]]
+
+    def push(by):
+        def move(arm, slot, target):
+            pushed.set_pose(Pose.create_from_pq(pushed.pose.p + torch.tensor([[by, 0.0, 0.0]]), pushed.pose.q))
+
+        monkeypatch.setattr(search, "push_away", move)
+        clearing._use("pushes", slots[0])
+
+    push(0.015)
+    assert facts == {"pushes": 0, "pushes_in_vain": 1, "removals": 0}
+    push(0.025)
+    assert facts == {"pushes": 1, "pushes_in_vain": 1, "removals": 0}
+    facts["pushes_in_vain"] = search.REMOVALS - 1
+    with pytest.raises(EpisodeLost, match="too_many_obstacles"):
+        clearing.clear_one(slots)
+
+
+def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, monkeypatch):
+    arm, target, slots = begin(generator, 3)
+    pushed = first_that_works(lambda slot: pushing.plan_push(arm, slot, target), slots)
+    fixed, width = pushing._fixed, arm.planner.finger_width
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0.2, 1.2, 0.005), np.arange(-0.5, 0.5, 0.005)))
+
+    def board_at(height):  # in the arm's base frame
+        board = np.stack([x, y, np.full(x.size, height)], axis=1)
+        monkeypatch.setattr(pushing, "_fixed", lambda arm: np.concatenate([fixed(arm), board]))
+
+    board_at(pushing.surface_in_base(arm)[0][2, 3] + 0.3)  # across hand or wrist
+    with pytest.raises(PlanningFailed, match="push"):
+        pushing.plan_push(arm, pushed, target)
+    board_at(arm.scene.tcp_in_base[2, 3] + 0.12)
+    with pytest.raises(PlanningFailed, match="push"):  # where a push was cut short
+        pushing._plan_lift(arm, np.array([1.0, 0, 0]))
+    assert arm.planner.finger_width == width
+    monkeypatch.setattr(pushing, "_fixed", fixed)
+    pushing._plan_lift(arm, np.array([1.0, 0, 0]))
 
 
 @pytest.mark.parametrize("which", ["target", "another"])

@@ -10,6 +10,7 @@ from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.scene import inverse, matrix
 from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.scenes.randomise import draw_camera_shift
 from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh
 
 CAMERA = "gripper_camera"
@@ -74,11 +75,21 @@ def hidden_share(arm: Arm, slot: int) -> float:
 
 
 def camera_in_base(arm: Arm) -> Array:
-    """4x4 of the gripper's camera in the arm's base frame: x forward, y left, z up."""
+    """4x4 of the gripper's camera in the arm's base frame, where the episode has it: x forward, y left, z up."""
     config = _camera_config(arm)
     link = arm.env.agent.robot.links_map[str(config.entity_uid)]
-    camera_in_link = matrix(config.pose.raw_pose[0])
+    camera_in_link = matrix(config.pose.raw_pose[0]) @ _shift(arm)
     return inverse(arm.scene.arm_base_in_world) @ matrix(link.pose.raw_pose[0]) @ camera_in_link
+
+
+def _shift(arm: Arm) -> Array:
+    """4x4 by which the configuration's randomisation has moved the camera, rendered or not, in its own frame."""
+    by = arm.env.task_config.randomisation.cameras
+    if by is None:
+        return np.eye(4)
+    # numbered as in the environment's `_setup_sensors`
+    number = sorted(config.uid for config in arm.env.agent._sensor_configs).index(CAMERA)
+    return draw_camera_shift(by, number, arm.env._scene_seeds[0])
 
 
 def _camera_config(arm: Arm) -> CameraConfig:

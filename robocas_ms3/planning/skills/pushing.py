@@ -66,15 +66,37 @@ def _push_on(arm: Arm, push: Trajectory, direction: Array) -> bool:
 
 
 def _plan_lift(arm: Arm, direction: Array) -> Trajectory:
-    back = arm.planner.tcp(arm.at)
+    """Plan up and back, or straight up, from where a push was cut short, clear of furniture and basket.
+
+    Raises:
+        PlanningFailed: there is no such way.
+    """
+    width, arm.planner.finger_width = arm.planner.finger_width, 0.0
+    try:
+        arm.planner.set_scene(_fixed(arm))
+        tcp = arm.planner.tcp(arm.at)
+        return arm.first_line(arm.at, [_lifted(tcp, direction), raised(tcp, LIFT)], stage="push")
+    finally:
+        arm.planner.finger_width = width
+
+
+def _lifted(tcp_in_base: Array, direction: Array) -> Array:
+    """The TCP above and a little behind where a push ends."""
+    back = raised(tcp_in_base, LIFT)
     back[:3, 3] -= STAND_OFF * direction
-    return arm.planner.plan_straight(arm.at, raised(back, LIFT), stage="push", check_collisions=False)
+    return back
+
+
+def _fixed(arm: Arm) -> Array:
+    """Surfaces (P, 3) of furniture and basket in the arm's base frame, m."""
+    return arm.scene.obstacles_in_base(without=range(len(arm.env.object_assets[0])))
 
 
 def plan_push(arm: Arm, slot: int, target: int) -> PushPlan:
     """Plan the first push that has a way in; one that would move other objects too only where there is no other.
 
-    The way to the object is clear of everything, and the way along of furniture, basket and target in either case.
+    The way to the object is clear of everything, the way along of furniture, basket and target in either case, and the
+    way up after it of furniture and basket.
 
     Raises:
         PlanningFailed: of the push that came last.
@@ -101,17 +123,17 @@ def _plan_push(arm: Arm, slot: int, target: int, movable: set[int]) -> PushPlan:
                 failure = error
             if len(begun) == PUSHES_PLANNED:
                 break
-        planner.set_scene(arm.scene.obstacles_in_base(without=movable))  # those are no obstacles on the way along
+        along_scene, fixed = arm.scene.obstacles_in_base(without=movable), _fixed(arm)
         ways: list[tuple[Array, Trajectory, Trajectory, Trajectory]] = []
         first = np.zeros(3)
         for push, qpos, down in begun:
             if ways and push.direction @ first < 1 - 1e-6:
                 break
             try:
+                planner.set_scene(along_scene)  # what may move is no obstacle on the way along
                 along = planner.plan_straight(down.qpos[-1], push.end, stage="push", speed=SPEED)
-                back = push.end.copy()
-                back[:3, 3] -= STAND_OFF * push.direction
-                lift = planner.plan_straight(along.qpos[-1], raised(back, LIFT), stage="push", check_collisions=False)
+                planner.set_scene(fixed)  # the pushed object may lean on the tool
+                lift = planner.plan_straight(along.qpos[-1], _lifted(push.end, push.direction), stage="push")
                 ways.append((qpos, down, along, lift))
                 first = push.direction
             except PlanningFailed as error:
@@ -136,8 +158,7 @@ def reachable_pushes(arm: Arm, slot: int, target: int, others: Array) -> Iterato
         transform(arm.scene.object_in_base(s), arm.env.object_assets[0][s].surface_points(SPACING))
         for s in (slot, target)
     )
-    fixed = arm.scene.obstacles_in_base(without=range(len(arm.env.object_assets[0])))
-    pushes = list(candidates(arm.rng, points, own.mean(axis=0), others, surface_in_base(arm), fixed))
+    pushes = list(candidates(arm.rng, points, own.mean(axis=0), others, surface_in_base(arm), _fixed(arm)))
     if not pushes:
         return
     starts, ends = np.stack([push.start for push in pushes]), np.stack([push.end for push in pushes])

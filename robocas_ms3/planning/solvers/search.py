@@ -21,7 +21,8 @@ from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE
 from robocas_ms3.tasks.search import FALLEN, RoboCASSearchEnv
 from robocas_ms3.tasks.spec import SEARCH
 
-REMOVALS = 8  # pushes and removals a demonstration may hold
+REMOVALS = 8  # pushes and removals a demonstration may hold, in vain or not
+MOVED = 0.02  # m by which a push moves its object at least; less is one in vain
 LIFT_FIRST = 0.3  # how often an attempt after the first lifts what it might push
 HEIGHT_NOISE = 0.01  # m, so that another attempt may begin with another of two that are about as high
 LIFT_HEIGHT = 0.15  # m, upstream's
@@ -97,7 +98,7 @@ class _Clearing:
         self._tried: Counter[int] = Counter()
         self.stuck = False
         self._hopeless: set[tuple[str, int]] = set()  # what can't be planned as things stand
-        for fact in ("pushes", "removals"):
+        for fact in ("pushes", "pushes_in_vain", "removals"):
             arm.executor.facts.setdefault(fact, 0)
 
     def obstacles(self) -> list[int]:
@@ -155,13 +156,16 @@ class _Clearing:
         return False
 
     def _use(self, skill: str, slot: int) -> None:
-        arm = self._arm
+        arm, fact = self._arm, skill
         if skill == "pushes":
+            before = self.middle(slot)
             push_away(arm, slot, self._target)
+            if np.linalg.norm(self.middle(slot) - before) <= MOVED:
+                fact = "pushes_in_vain"
         else:
             arm.executor.gripper = OPEN  # it opens on the way
             remove(arm, slot)
-        arm.executor.facts[skill] += 1
+        arm.executor.facts[fact] += 1
         self._tried[slot] += 1
 
     def check(self) -> None:

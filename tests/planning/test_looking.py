@@ -1,0 +1,35 @@
+"""Where policies take the gripper's camera to be is where it is rendered from."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import robocas_ms3.tasks  # noqa: F401
+from robocas_ms3.config import load_task_config
+from robocas_ms3.planning.scene import PlanningScene
+from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.looking import _shift, camera_in_base
+
+pytestmark = pytest.mark.slow
+
+
+class Looking(Arm):
+    """An arm that only looks."""
+
+    def __init__(self, env):
+        self._env, self.scene = env, PlanningScene(env)
+
+    env = property(lambda self: self._env)
+
+
+def test_the_cameras_shift_is_known():
+    config = load_task_config("search_table_small_heap").model_dump(mode="json")
+    config["randomisation"]["cameras"] = {"position": 0.1, "rotation_deg": 15}
+    made = gym.make("RoboCASSearch-v1", config=config, obs_mode="none")
+    made.reset(seed=1)
+    arm = Looking(made.unwrapped)
+    rendered = arm.env._sensors["gripper_camera"].camera._render_cameras[0].global_pose.to_transformation_matrix()
+    pose, shift = arm.scene.arm_base_in_world @ camera_in_base(arm), _shift(arm)
+    made.close()
+    assert pose == pytest.approx(rendered, abs=1e-4)
+    assert np.linalg.norm(shift[:3, 3]) > 0.02
