@@ -46,3 +46,7 @@ def test_read_dataset(recorded, needs_renderer, tmp_path):
     assert lines[0].startswith("0: grasp the ")
     assert any("move and grasp" in line and "(240, 320, 3)" in line for line in lines)
     assert any("transfer object" in line for line in lines)
+    about, trained = run("04_train_loader.py", "dataset", cwd=tmp_path)
+    assert about.startswith("1 episodes, ")
+    first, last = trained.split("loss ")[1].split(" -> ")
+    assert float(last) < float(first)
