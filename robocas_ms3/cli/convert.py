@@ -4,27 +4,33 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from robocas_ms3.datasets.convert import Conversion
 
 
 @dataclass
 class Convert:
-    """Write a dataset from a trajectory file made by ``robocas generate``."""
+    """Write a dataset from a trajectory file made by ``robocas generate``; LeRobot's also from a RoboCAS dataset."""
 
     trajectory: Annotated[Path, tyro.conf.Positional]
-    """F.h5, with F.json beside it."""
+    """F.h5, with F.json beside it, which is rendered; for --to lerobot also the folder of a RoboCAS dataset, whose
+    pictures are taken."""
     out: Path
     """Folder of the dataset."""
-    to: Literal["robocas"] = "robocas"
-    """Format of the dataset."""
-    rate: float = 5.0
-    """Steps a second; must divide the control frequency."""
+    to: Literal["robocas", "lerobot"] = "robocas"
+    """Format of the dataset; lerobot is LeRobot's v3.0 and needs the extra 'lerobot'."""
+    codec: Literal["h264", "av1"] = "h264"
+    """Of lerobot's videos; AV1 takes half the space."""
+    rate: float | None = None
+    """Steps a second; must divide the control frequency. Default: 5, or that of the RoboCAS dataset."""
     embeddings: bool = True
-    """Embed instruction and sub-goals (needs the extra 'language')."""
+    """Embed instruction and sub-goals (needs the extra 'language'; lerobot has none)."""
     video: bool = True
-    """Write a video of each episode and a contact sheet into OUT/preview."""
+    """Write a video of each episode and a contact sheet into OUT/preview (not for lerobot)."""
     cameras: tuple[Literal["base_camera", "gripper_camera", "static_camera"], ...] = (
         "base_camera",
         "gripper_camera",
@@ -36,7 +42,7 @@ class Convert:
     depth: bool = True
     """Store depth beside RGB."""
     image_format: Literal["png", "jpg", "webp"] = "png"
-    """Of RGB; the loader released with RoboCAS opens png only."""
+    """Of RGB; the loader released with RoboCAS opens png only. Not for lerobot, which has videos."""
     include_failed: bool = False
     """Also convert episodes without success."""
     overwrite: bool = False
@@ -66,22 +72,24 @@ def main(cfg: Convert) -> int:
         progress.add_task("episodes", total=count)
         progress.start()
 
+    common: dict[str, Any] = {
+        "pictures": Pictures(cfg.cameras, cfg.size, cfg.depth, cfg.image_format),
+        "include_failed": cfg.include_failed,
+        "overwrite": cfg.overwrite,
+        "resume": cfg.resume,
+        "jobs": cfg.jobs,
+        "on_start": start,
+        "on_episode": lambda _: progress.advance(progress.task_ids[0]),
+    }
     try:
-        done = convert(
-            cfg.trajectory,
-            cfg.out,
-            rate_hz=cfg.rate,
-            embeddings=cfg.embeddings,
-            pictures=Pictures(cfg.cameras, cfg.size, cfg.depth, cfg.image_format),
-            include_failed=cfg.include_failed,
-            overwrite=cfg.overwrite,
-            resume=cfg.resume,
-            append=cfg.append,
-            jobs=cfg.jobs,
-            on_start=start,
-            on_episode=lambda _: progress.advance(progress.task_ids[0]),
-        )
-        if cfg.video:
+        if cfg.to == "lerobot":
+            done = _to_lerobot(cfg, common)
+        else:
+            rate = 5.0 if cfg.rate is None else cfg.rate
+            done = convert(
+                cfg.trajectory, cfg.out, rate_hz=rate, embeddings=cfg.embeddings, append=cfg.append, **common
+            )
+        if cfg.video and cfg.to == "robocas":
             videos = progress.add_task("videos", total=len(done.episodes) + done.kept)
             write_previews(cfg.out, on_video=lambda _: progress.advance(videos))
     finally:
@@ -96,3 +104,13 @@ def main(cfg: Convert) -> int:
         highlight=False,
     )
     return 0
+
+
+def _to_lerobot(cfg: Convert, common: dict[str, Any]) -> Conversion:
+    from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+    from robocas_ms3.errors import DatasetError
+
+    for flag, given in (("--append", cfg.append), ("--image-format", cfg.image_format != "png")):
+        if given:
+            raise DatasetError("not for LeRobot datasets", where=flag, fix="Leave it out.")
+    return convert_lerobot(cfg.trajectory, cfg.out, rate_hz=cfg.rate, codec=cfg.codec, **common)

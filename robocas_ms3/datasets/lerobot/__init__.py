@@ -1,0 +1,1 @@
+"""LeRobot datasets v3.0: written, read and checked without ``lerobot``; see docs/lerobot.md."""

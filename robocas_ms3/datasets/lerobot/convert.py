@@ -1,0 +1,216 @@
+"""From a trajectory, or a RoboCAS dataset, to a LeRobot dataset."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Literal
+
+import robocas_ms3
+from robocas_ms3.datasets.convert import Conversion, open_env
+from robocas_ms3.datasets.info import split_by_seed
+from robocas_ms3.datasets.lerobot.schema import CONVERSION_FILE, INFO_FILE, Limits, require_extra
+from robocas_ms3.datasets.lerobot.sources import EpisodeSource, Request, open_request
+from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.workers import OpenSource
+from robocas_ms3.datasets.writer import WrittenEpisode
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
+
+Codec = Literal["h264", "av1"]
+
+PARTS = ".parts"
+"""Folder of the episodes done so far; gone when the dataset is there."""
+_PLAN, _JOINED = "plan.json", ".joined"
+_FOLDERS = ("data", "videos", "depth", "meta")  # meta comes last: where it is, the dataset is whole
+
+
+def convert_lerobot(
+    source: str | Path,
+    out: str | Path,
+    *,
+    rate_hz: float | None = None,
+    pictures: Pictures | None = None,
+    codec: Codec = "h264",
+    include_failed: bool = False,
+    overwrite: bool = False,
+    resume: bool = False,
+    jobs: int = 1,
+    limits: Limits | None = None,
+    on_start: Callable[[int], None] | None = None,
+    on_episode: Callable[[WrittenEpisode], None] | None = None,
+    open_source: OpenSource = open_env,
+) -> Conversion:
+    """Write a LeRobot dataset v3.0.
+
+    Episodes are written one by one into ``out/.parts`` and joined at the end, without encoding again. Killed at any
+    moment, it goes on with ``resume`` and ends as if it had not been; until it is done there is no ``meta`` folder.
+
+    Args:
+        source: ``F.h5``, which is rendered, or the folder of a RoboCAS dataset.
+        out: the dataset's folder.
+        rate_hz: steps a second, a whole number; default: 5, or the folder's.
+        pictures: cameras, size, depth; default: all, as they are.
+        codec: of RGB.
+        include_failed: also convert episodes without success.
+        overwrite: replace what is in ``out``.
+        resume: keep the episodes that are there.
+        jobs: worker processes.
+        limits: sizes of files; default: LeRobot's.
+        on_start: called with the number of episodes to write.
+        on_episode: called after each.
+        open_source: what shows a trajectory's states; must be importable by workers.
+
+    Raises:
+        DatasetError: the input is unusable, nothing to convert, no render device, a rate that LeRobot can't have.
+        OutputExistsError: ``out`` is not empty and no flag is set.
+        MissingExtraError: the ``lerobot`` extra is not installed.
+    """
+    require_extra()
+    begun = time.perf_counter()
+    out, limits = Path(out), limits or Limits()
+    request = Request(Path(source), rate_hz, pictures or Pictures(), include_failed, open_source)
+    with closing(open_request(request)) as opened:
+        # Everything that may fail comes before the output is touched.
+        plan = _plan(opened, opened.entries(), codec)
+        claim_output(out, resume=resume or overwrite)
+        if overwrite and not resume:
+            _check_overwrite(out)
+        if request.open_source is open_env and request.path.is_file():
+            from robocas_ms3.datasets.render import require_renderer
+
+            require_renderer()
+        with locked_folder(out):
+            claim_output(out, overwrite=overwrite and not resume, resume=True)
+            if resume:
+                _check_resume(out, plan)
+            written = [] if (out / INFO_FILE).is_file() else _write(
+                request, opened, out, plan, codec, jobs, limits, on_start, on_episode
+            )  # fmt: skip
+            shutil.rmtree(out / PARTS, ignore_errors=True)
+    return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - begun)
+
+
+def _plan(source: EpisodeSource, entries: list[dict[str, Any]], codec: str) -> dict[str, Any]:
+    train, val = split_by_seed({i: i if e["seed"] is None else _seed(e["seed"]) for i, e in enumerate(entries)})
+    plan = {
+        "format": "lerobot",
+        "made_with": {"robocas_ms3": robocas_ms3.__version__},
+        "settings": {
+            "rate_hz": source.fps,
+            "cameras": list(source.cameras),
+            "depth": source.depth,
+            "codec": codec,
+            "size": source.size,
+        },
+        "train_eps": train,
+        "val_eps": val,
+        "episodes": entries,
+    }
+    return json.loads(json.dumps(plan))
+
+
+def _seed(seed: Any) -> int:
+    return int(seed[0] if isinstance(seed, list) else seed)
+
+
+def _write(
+    request: Request,
+    source: EpisodeSource,
+    out: Path,
+    plan: dict[str, Any],
+    codec: str,
+    jobs: int,
+    limits: Limits,
+    on_start: Callable[[int], None] | None,
+    on_episode: Callable[[WrittenEpisode], None] | None,
+) -> list[WrittenEpisode]:
+    from robocas_ms3.datasets.lerobot.assemble import assemble
+    from robocas_ms3.datasets.lerobot.stage import StageJob, part_folder, stage_all
+
+    parts = make_folder(out / PARTS)
+    written: list[WrittenEpisode] = []
+    try:
+        _sweep(out)
+        if not (parts / _PLAN).is_file():
+            write_json(parts / _PLAN, plan)
+        entries = enumerate(plan["episodes"])
+        missing = [(i, e["source"]) for i, e in entries if not part_folder(parts, i).is_dir()]
+        if on_start:
+            on_start(len(missing))
+        with closing(stage_all(StageJob(request, parts, codec, missing), source, jobs)) as episodes:
+            for episode in episodes:
+                written.append(episode)
+                if on_episode:
+                    on_episode(episode)
+        joined = make_folder(out / _JOINED)
+        assemble(parts, plan, source.fps, joined, limits)
+        for name in _FOLDERS:
+            if (joined / name).is_dir():
+                os.replace(joined / name, out / name)
+        joined.rmdir()
+    except BaseException:
+        if not any(parts.glob("episode_*")):
+            shutil.rmtree(out, ignore_errors=True)  # nothing came of it
+        raise
+    return sorted(written, key=lambda episode: episode.number)
+
+
+def _sweep(out: Path) -> None:
+    """Remove what a killed conversion left half written; nobody else writes here, the folder is locked."""
+    for name in (_JOINED, *_FOLDERS):
+        if (out / name).is_dir():
+            shutil.rmtree(out / name)
+    for leftover in [*(out / PARTS).glob(".*.tmp*"), *(out / PARTS).glob(".*.old")]:
+        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+
+
+def _check_resume(out: Path, plan: dict[str, Any]) -> None:
+    """Go on with the same conversion only.
+
+    Raises:
+        DatasetError: another one was begun in ``out``, or something else is there.
+    """
+    if not out.is_dir() or not any(out.iterdir()):
+        return
+    path = out / CONVERSION_FILE if (out / INFO_FILE).is_file() else out / PARTS / _PLAN
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        if (out / PARTS).is_dir() and not any((out / PARTS).glob("episode_*")):
+            return  # killed before it wrote what it was to do
+        what = "can't resume: no conversion to LeRobot was begun here"
+        raise DatasetError(what, where=path, fix="Pass --overwrite.") from error
+    old, new = before.get("settings", {}), plan["settings"]
+    different = [key for key in new if old.get(key) != new[key]]
+    if different:
+        raise DatasetError(
+            "can't resume with other settings",
+            where=path,
+            expected=", ".join(f"{key} {old.get(key)}" for key in different),
+            found=", ".join(f"{key} {new[key]}" for key in different),
+            fix="Pass --overwrite, or the settings of before.",
+        )
+    if before.get("episodes") != plan["episodes"]:
+        raise DatasetError(
+            "can't resume: these episodes are not what was begun here",
+            where=path,
+            expected=f"{len(before.get('episodes', []))} episodes",
+            found=f"{len(plan['episodes'])}",
+            fix="Pass --overwrite to begin again.",
+        )
+
+
+def _check_overwrite(out: Path) -> None:
+    """Delete LeRobot datasets only, whatever folder was named by mistake."""
+    marks = (INFO_FILE, PARTS)
+    if out.is_dir() and any(out.iterdir()) and not any((out / mark).exists() for mark in marks):
+        raise DatasetError(
+            "refusing to overwrite what is not a LeRobot dataset", where=out, expected=" or ".join(marks),
+            fix="Choose another.",
+        )  # fmt: skip

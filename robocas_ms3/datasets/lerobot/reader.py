@@ -1,0 +1,201 @@
+"""Opens a LeRobot dataset made here, with the face of the reader of RoboCAS datasets; needs no ``lerobot``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.lerobot.tables import numbers, read_texts
+from robocas_ms3.datasets.lerobot.video import read_frames
+from robocas_ms3.errors import DatasetError
+
+
+@dataclass(frozen=True)
+class LeRobotDataset:
+    """A dataset's folder."""
+
+    root: Path
+
+    def __post_init__(self) -> None:
+        """Check that there is something.
+
+        Raises:
+            DatasetError: no LeRobot dataset there, or one of another version.
+        """
+        schema.require_extra()
+        version = self.info.get("codebase_version")
+        if version != schema.CODEBASE_VERSION:
+            raise DatasetError(
+                "a LeRobot dataset of another version", where=self.root, expected=schema.CODEBASE_VERSION, found=version
+            )
+
+    @cached_property
+    def info(self) -> dict[str, Any]:
+        """``meta/info.json``."""
+        path = self.root / schema.INFO_FILE
+        try:
+            return json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise DatasetError("no LeRobot dataset here", where=path, found=type(error).__name__) from error
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """``meta/robocas/conversion.json``; empty where there is none."""
+        path = self.root / schema.CONVERSION_FILE
+        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+    @property
+    def rate_hz(self) -> float:
+        """Steps a second."""
+        return float(self.info["fps"])
+
+    @cached_property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(schema.camera_of(key) for key, ft in self.info["features"].items() if ft["dtype"] == "video")
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether depth is there."""
+        return bool(self.rows) and f"depth/{self.cameras[0]}/file_index" in self.rows[0]
+
+    @cached_property
+    def rows(self) -> list[dict[str, Any]]:
+        """What ``meta/episodes`` says of each episode, but statistics."""
+        found: list[dict[str, Any]] = []
+        for path in sorted((self.root / "meta/episodes").glob("*/*.parquet")):
+            with pq.ParquetFile(path) as file:
+                names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
+                found += file.read(columns=names).to_pylist()
+        return found
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the episodes."""
+        return [row["episode_index"] for row in self.rows]
+
+    @cached_property
+    def tasks(self) -> list[str]:
+        """Instructions, by ``task_index``."""
+        return read_texts(self.root / schema.TASKS_FILE)
+
+    @cached_property
+    def subtasks(self) -> list[str]:
+        """Texts of sub-goals, by ``subtask_index``."""
+        return read_texts(self.root / schema.SUBTASKS_FILE)
+
+    def episode(self, number: int) -> LeRobotEpisode:
+        """Open an episode.
+
+        Raises:
+            DatasetError: there is none of this number.
+        """
+        if not 0 <= number < len(self.rows):
+            raise DatasetError("no such episode", where=self.root, expected=f"0 to {len(self.rows) - 1}", found=number)
+        return LeRobotEpisode(self, number)
+
+
+@dataclass(frozen=True)
+class LeRobotEpisode:
+    """One episode."""
+
+    dataset: LeRobotDataset
+    number: int
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """What ``meta/episodes`` says of it."""
+        return self.dataset.rows[self.number]
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return int(self.row["length"])
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return self.dataset.cameras
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether depth is there."""
+        return self.dataset.has_depth
+
+    @cached_property
+    def table(self) -> pa.Table:
+        """Its rows of the data."""
+        row = self.row
+        path = schema.data_file(
+            self.dataset.root, schema.DATA_PATH, row["data/chunk_index"], row["data/file_index"]
+        )  # fmt: skip
+        return pq.read_table(path, filters=[("episode_index", "=", self.number)])
+
+    @cached_property
+    def columns(self) -> dict[str, NDArray]:
+        """Numeric features, (T, D)."""
+        table = self.table
+        return {name: numbers(table.column(name)) for name in table.column_names if name != schema.SUBGOAL_TYPE.key}
+
+    @cached_property
+    def arrays(self) -> dict[str, NDArray]:
+        """Arrays of ``episode_info.npz`` but the embeddings, by the schema's keys."""
+        texts = [self.dataset.subtasks[i] for i in self.columns[schema.SUBTASK_INDEX.key][:, 0]]
+        types = self.table.column(schema.SUBGOAL_TYPE.key).to_pylist()
+        return schema.robocas_arrays(self.columns, self.row["tasks"][0], texts, types)
+
+    @cached_property
+    def _ours(self) -> dict[str, Any]:
+        path = self.dataset.root / schema.SCENES_FILE
+        if not path.is_file():
+            return {}
+        found = pq.read_table(path, filters=[("episode_index", "=", self.number)]).to_pylist()
+        return {key: json.loads(value) for key, value in found[0].items() if key != "episode_index"} if found else {}
+
+    @property
+    def scene(self) -> dict[str, Any]:
+        """``scene.json``; empty where there is none."""
+        return self._ours.get("scene", {})
+
+    def intrinsic(self, camera: str) -> NDArray[np.float64]:
+        """(4,) fx, fy, cx, cy in pixels."""
+        return np.array(self._ours["cameras"][camera]["intrinsic"])
+
+    def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
+        """(4, 4) OpenCV camera frame in its parent."""
+        return np.array(self._ours["cameras"][camera]["camera_in_parent"])
+
+    def video(self, camera: str, kind: str) -> tuple[Path, int]:
+        """File of a camera's video and the number of its first frame there; ``kind`` is ``rgb`` or ``depth``."""
+        names = {"video_key": schema.image_key(camera), "camera": camera}
+        start = f"videos/{names['video_key']}" if kind == "rgb" else f"depth/{camera}"
+        pattern = schema.VIDEO_PATH if kind == "rgb" else schema.DEPTH_PATH
+        row = self.row
+        path = schema.data_file(
+            self.dataset.root, pattern, row[f"{start}/chunk_index"], row[f"{start}/file_index"], **names
+        )  # fmt: skip
+        return path, round(row[f"{start}/from_timestamp"] * self.dataset.info["fps"])
+
+    def frames(self, camera: str, kind: str = "rgb", first: int = 0, count: int | None = None) -> Iterator[NDArray]:
+        """Pictures one after the other, which is quicker than one by one."""
+        path, start = self.video(camera, kind)
+        count = self.steps - first if count is None else count
+        return read_frames(path, start + first, count, self.dataset.info["fps"])
+
+    def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
+        """(H, W, 3) RGB."""
+        return next(iter(list(self.frames(camera, "rgb", step, 1))))
+
+    def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
+        """(H, W) mm, 0 = nothing."""
+        return next(iter(list(self.frames(camera, "depth", step, 1))))

@@ -1,0 +1,197 @@
+"""Writes each episode by itself: its table, its videos, the rest as JSON. A folder appears whole."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import threading
+import time
+from collections.abc import Generator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets.lerobot.schema import SUBGOAL_TYPE, frame_columns
+from robocas_ms3.datasets.lerobot.sources import EpisodeSource, Request, open_request
+from robocas_ms3.datasets.lerobot.stats import Levels
+from robocas_ms3.datasets.lerobot.tables import column
+from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder
+from robocas_ms3.datasets.schema import episode_folder
+from robocas_ms3.datasets.writer import Timing, WrittenEpisode
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.files import replacing_folder
+
+FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
+SUBGOAL = "subgoal"  # column of texts, which become numbers when parts are joined
+
+
+@dataclass(frozen=True)
+class StageJob:
+    """What a process needs to know.
+
+    Attributes:
+        request: what is converted.
+        parts: folder of the parts.
+        codec: of RGB.
+        tasks: (episode index, number in the source) of those to write.
+    """
+
+    request: Request
+    parts: Path
+    codec: str
+    tasks: list[tuple[int, int]]
+
+
+def part_folder(parts: Path, index: int) -> Path:
+    """Folder of an episode's part."""
+    return parts / episode_folder(index)
+
+
+def video_name(camera: str, kind: str, codec: str) -> str:
+    """Name of a video in a part; ``kind`` is ``rgb`` or ``depth``."""
+    return f"{kind}_{camera}{CODINGS[codec if kind == 'rgb' else 'depth'].suffix}"
+
+
+def stage_all(job: StageJob, source: EpisodeSource, processes: int) -> Generator[WrittenEpisode, None, None]:
+    """Write parts; gives each episode when it is done, in any order.
+
+    Args:
+        job: what to write.
+        source: open already, for this process.
+        processes: how many work.
+
+    Raises:
+        DatasetError: an episode can't be written, or a process died.
+    """
+    if processes <= 1 or len(job.tasks) < 2:
+        for index, number in job.tasks:
+            yield stage_episode(job, source, index, number)
+        return
+    pool = ProcessPoolExecutor(
+        min(processes, len(job.tasks)),
+        mp_context=multiprocessing.get_context("spawn"),  # a renderer does not survive a fork
+        initializer=_start_worker,
+        initargs=(job,),
+    )
+    try:
+        for future in as_completed([pool.submit(_stage, *task) for task in job.tasks]):
+            yield future.result()
+    except BrokenProcessPool as error:
+        raise DatasetError(
+            "a worker process died", where=job.parts, fix="Is memory short? Pass --resume and fewer --jobs."
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def stage_episode(job: StageJob, source: EpisodeSource, index: int, number: int) -> WrittenEpisode:
+    """Write one episode's part.
+
+    Raises:
+        DatasetError: it can't be shown or written.
+    """
+    begun, timing = time.perf_counter(), Timing()
+    with replacing_folder(part_folder(job.parts, index)) as folder:
+        with _Videos(folder, job.codec, source.fps, timing) as videos:
+            shown = source.play(number, videos.add, timing)
+        arrays = shown.arrays
+        steps = int(arrays["episode_length"])
+        if videos.steps != steps:
+            raise DatasetError("pictures and arrays differ in length", where=number, expected=steps, found=videos.steps)
+        columns: dict[str, Any] = {key: column(values) for key, values in frame_columns(arrays).items()}
+        columns[SUBGOAL_TYPE.key] = pa.array(arrays["step_goal_type"].tolist(), pa.string())
+        columns["timestamp"] = pa.array((np.arange(steps) / source.fps).astype(np.float32))
+        columns["frame_index"] = pa.array(np.arange(steps))
+        columns[SUBGOAL] = pa.array(arrays["step_lang_goals"].tolist(), pa.string())
+        pq.write_table(pa.table(columns), folder / FRAMES_FILE)
+        about = {
+            "steps": steps,
+            "instruction": str(arrays["language_goal"]),
+            "scene": shown.scene,
+            "cameras": {
+                name: {
+                    "intrinsic": np.asarray(shown.cameras[name].intrinsic).tolist(),
+                    "camera_in_parent": np.asarray(shown.cameras[name].camera_in_parent).tolist(),
+                }
+                for name in source.cameras
+            },
+            "depth": source.depth,
+            "levels": {name: levels.counts.tolist() for name, levels in videos.levels.items()},
+        }
+        (folder / EPISODE_FILE).write_text(json.dumps(about, ensure_ascii=False), encoding="utf-8")
+        size = sum(file.stat().st_size for file in folder.iterdir())
+    timing.total = time.perf_counter() - begun
+    return WrittenEpisode(index, steps, size, timing)
+
+
+class _Videos:
+    """Encoders of an episode: one a camera and kind, opened with the first frame."""
+
+    def __init__(self, folder: Path, codec: str, fps: int, timing: Timing) -> None:
+        self._folder, self._codec, self._fps, self._timing = folder, codec, fps, timing
+        self._encoders: dict[tuple[str, str], Encoder] = {}
+        self._stack = ExitStack()
+        self.levels: dict[str, Levels] = {}
+        self.steps = 0
+
+    def __enter__(self) -> _Videos:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        begun = time.perf_counter()
+        self._stack.__exit__(*error)
+        self._timing.encode += time.perf_counter() - begun
+
+    def add(self, step: int, rgb: dict[str, NDArray], depth: dict[str, NDArray]) -> None:
+        begun = time.perf_counter()
+        for kind, shots in (("rgb", rgb), ("depth", depth)):
+            for camera, picture in shots.items():
+                self._encoder(kind, camera, picture).add(picture)
+                if kind == "rgb":
+                    self.levels.setdefault(camera, Levels()).add(picture)
+        self.steps = step + 1
+        self._timing.encode += time.perf_counter() - begun
+
+    def _encoder(self, kind: str, camera: str, picture: NDArray) -> Encoder:
+        if (kind, camera) not in self._encoders:
+            height, width = picture.shape[:2]
+            path = self._folder / video_name(camera, kind, self._codec)
+            coding = CODINGS[self._codec if kind == "rgb" else "depth"]
+            encoder = self._stack.enter_context(Encoder(path, coding, self._fps, (width, height)))
+            self._encoders[kind, camera] = encoder
+        return self._encoders[kind, camera]
+
+
+_job: StageJob | None = None
+_source: EpisodeSource | None = None
+
+
+def _start_worker(job: StageJob) -> None:
+    global _job, _source  # noqa: PLW0603  (state of a worker process)
+    # One thread a process: several that render in software on all cores get in each other's way.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    _job, _source = job, open_request(job.request)
+
+
+def _leave_with_parent() -> None:
+    """A worker whose parent was killed would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def _stage(index: int, number: int) -> WrittenEpisode:
+    assert _job is not None
+    assert _source is not None
+    return stage_episode(_job, _source, index, number)

@@ -1,0 +1,125 @@
+"""Statistics of features, in LeRobot's form: min, max, mean, std, count and quantiles q01, q10, q50, q90, q99."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+_BINS = 5000
+_FINE = 300  # longer pictures are thinned for statistics, as LeRobot does it
+_THINNED = 150
+
+Stats = dict[str, Any]
+
+
+def vector_stats(values: NDArray) -> Stats:
+    """Of an episode's feature (T, D): lists of D numbers."""
+    numbers = values.astype(np.float64)
+    quantiles = np.quantile(numbers, list(QUANTILES.values()), axis=0)
+    return {
+        "min": values.min(axis=0).tolist(),
+        "max": values.max(axis=0).tolist(),
+        "mean": numbers.mean(axis=0).tolist(),
+        "std": numbers.std(axis=0).tolist(),
+        "count": [len(values)],
+        **{name: row.tolist() for name, row in zip(QUANTILES, quantiles, strict=True)},
+    }
+
+
+class Range:
+    """Count, mean, spread, smallest and largest of a feature over many episodes, which come one at a time."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.low = self.high = self._mean = self._squares = np.zeros(0)
+
+    def add(self, values: NDArray) -> None:
+        """Take an episode's (T, D)."""
+        numbers = values.astype(np.float64)
+        count, mean = len(numbers), numbers.mean(axis=0)
+        squares = ((numbers - mean) ** 2).sum(axis=0)
+        low, high = numbers.min(axis=0), numbers.max(axis=0)
+        if not self.count:
+            self.count, self._mean, self._squares, self.low, self.high = count, mean, squares, low, high
+            return
+        total, apart = self.count + count, mean - self._mean
+        self._squares = self._squares + squares + apart**2 * self.count * count / total  # Chan et al. 1979
+        self._mean = self._mean + apart * count / total
+        self.low, self.high, self.count = np.minimum(self.low, low), np.maximum(self.high, high), total
+
+    def stats(self, histogram: Histogram, integer: bool) -> Stats:
+        """Of all of them; the quantiles come from a histogram of the same."""
+        whole = np.int64 if integer else np.float64
+        return {
+            "min": self.low.astype(whole).tolist(),
+            "max": self.high.astype(whole).tolist(),
+            "mean": self._mean.tolist(),
+            "std": np.sqrt(self._squares / self.count).tolist(),
+            "count": [self.count],
+            **histogram.quantiles(),
+        }
+
+
+class Histogram:
+    """Counts of a feature between its smallest and largest number, for quantiles over any number of episodes."""
+
+    def __init__(self, low: NDArray, high: NDArray) -> None:
+        self._low, self._width = low, np.where(high > low, high - low, 1.0) / _BINS
+        self._counts = np.zeros((len(low), _BINS), np.int64)
+
+    def add(self, values: NDArray) -> None:
+        """Take an episode's (T, D)."""
+        bins = np.clip((values - self._low) / self._width, 0, _BINS - 1).astype(np.int64)
+        for column in range(len(self._counts)):
+            self._counts[column] += np.bincount(bins[:, column], minlength=_BINS)
+
+    def quantiles(self) -> dict[str, list[float]]:
+        """Each to 1/5000 of the range."""
+        total = self._counts.sum(axis=1, keepdims=True)
+        below = np.cumsum(self._counts, axis=1)
+        return {
+            name: (self._low + self._width * (below < share * total).sum(axis=1)).tolist()
+            for name, share in QUANTILES.items()
+        }
+
+
+class Levels:
+    """How often each of the 256 levels of each channel occurs: exact statistics of any number of pictures."""
+
+    def __init__(self, counts: NDArray | None = None, pictures: int = 0) -> None:
+        self.counts = np.zeros((3, 256), np.int64) if counts is None else np.array(counts, np.int64)
+        self.pictures = pictures
+
+    def add(self, picture: NDArray[np.uint8]) -> None:
+        """Take (H, W, 3); of large pictures every few pixels."""
+        longest = max(picture.shape[:2])
+        step = longest // _THINNED if longest >= _FINE else 1
+        for channel in range(3):
+            self.counts[channel] += np.bincount(picture[::step, ::step, channel].ravel(), minlength=256)
+        self.pictures += 1
+
+    def merge(self, other: Levels) -> None:
+        """Take another's."""
+        self.counts += other.counts
+        self.pictures += other.pictures
+
+    def stats(self) -> Stats:
+        """Levels between 0 and 1, each statistic (3, 1, 1); ``count`` is that of pictures."""
+        levels = np.arange(256) / 255
+        total = self.counts.sum(axis=1)
+        mean = self.counts @ levels / total
+        variance = self.counts @ levels**2 / total - mean**2
+        below = np.cumsum(self.counts, axis=1)
+        found = {
+            "min": levels[(self.counts > 0).argmax(axis=1)],
+            "max": levels[255 - (self.counts[:, ::-1] > 0).argmax(axis=1)],
+            "mean": mean,
+            "std": np.sqrt(np.maximum(variance, 0)),
+        }
+        for name, share in QUANTILES.items():
+            found[name] = levels[(below < share * total[:, None]).sum(axis=1)]
+        shaped = {name: row.reshape(3, 1, 1).tolist() for name, row in found.items()}
+        return {**shaped, "count": [self.pictures]}

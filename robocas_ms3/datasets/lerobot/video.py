@@ -1,0 +1,241 @@
+"""Videos with PyAV: encoded one episode at a time, joined without encoding again, read frame by frame."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from av.error import FFmpegError
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets.lerobot.schema import CHUNK_FILES
+from robocas_ms3.errors import DatasetError
+
+
+@dataclass(frozen=True)
+class Coding:
+    """How pictures become a video.
+
+    Attributes:
+        encoder: FFmpeg's name.
+        pixels: FFmpeg's pixel format.
+        suffix: of files.
+        options: of the encoder.
+    """
+
+    encoder: str
+    pixels: str
+    suffix: str
+    options: dict[str, str] = field(default_factory=dict)
+
+
+# A key frame every second one, as LeRobot has it: a random frame costs at most two. No B-frames, so that the order of
+# packets is that of frames and parts join without edit lists. Fixed threads: the same pictures give the same bytes.
+CODINGS = {
+    "h264": Coding(
+        "libx264",
+        "yuv420p",
+        ".mp4",
+        {"g": "2", "crf": "20", "preset": "veryfast", "bf": "0", "rc-lookahead": "0", "threads": "1"},
+    ),
+    "av1": Coding("libsvtav1", "yuv420p", ".mp4", {"g": "2", "crf": "30", "preset": "10", "svtav1-params": "lp=1"}),
+    # Lossless, 16 bits, a checksum in every slice, every frame by itself.
+    "depth": Coding("ffv1", "gray16le", ".mkv", {"level": "3", "slices": "4", "slicecrc": "1", "g": "1"}),
+}
+_CONTAINER = {"fflags": "+bitexact"}  # no dates and random numbers in the file
+
+
+class Encoder:
+    """Writes one video; use it in a ``with`` statement."""
+
+    def __init__(self, path: Path, coding: Coding, fps: int, size: tuple[int, int]) -> None:
+        """Open the file.
+
+        Args:
+            path: of the video.
+            coding: how.
+            fps: frames a second.
+            size: width and height, pixels.
+
+        Raises:
+            DatasetError: a size the codec can't take, or no such encoder in this FFmpeg.
+        """
+        width, height = size
+        if coding.pixels == "yuv420p" and (width % 2 or height % 2):
+            raise DatasetError(
+                "videos need even sizes", where="size", expected="even width and height", found=f"{width} x {height}"
+            )
+        os.environ.setdefault("SVT_LOG", "1")  # errors only; it would write a page of settings
+        self.path, self.frames = path, 0
+        self._coding = coding
+        self._container = av.open(str(path), "w", options=_CONTAINER)
+        try:
+            stream: Any = self._container.add_stream(coding.encoder, rate=fps, options=coding.options)
+        except (FFmpegError, ValueError) as error:
+            self._container.close()
+            raise DatasetError("this FFmpeg has no such encoder", where=coding.encoder, found=error) from error
+        stream.width, stream.height, stream.pix_fmt = width, height, coding.pixels
+        self._stream, self._time_base = stream, Fraction(1, fps)
+
+    def __enter__(self) -> Encoder:
+        """Itself."""
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        """Finish the file."""
+        try:
+            if kind is None:
+                self._container.mux(self._stream.encode(None))
+        finally:
+            self._container.close()
+
+    def add(self, picture: NDArray) -> None:
+        """Append (H, W, 3) uint8 RGB or (H, W) uint16."""
+        layout = "rgb24" if picture.ndim == 3 else "gray16le"
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=layout)
+        frame.pts, frame.time_base = self.frames, self._time_base
+        self._container.mux(self._stream.encode(frame))
+        self.frames += 1
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an episode lies in the joined videos: file, and its first frame there."""
+
+    chunk: int
+    file: int
+    first: int
+
+
+class Joiner:
+    """Copies videos one behind the other into numbered files; only the one being written is open."""
+
+    def __init__(self, path: Callable[[int, int], Path], fps: int, limit_mb: float, limit_seconds: float) -> None:
+        """Nothing is written yet.
+
+        Args:
+            path: of a file, from chunk and file number.
+            fps: frames a second.
+            limit_mb: size a file may have, 2^20 bytes.
+            limit_seconds: length it may have.
+        """
+        self._path, self._fps = path, fps
+        self._limit_bytes, self._limit_frames = limit_mb * 2**20, limit_seconds * fps
+        self._count = self._bytes = self._frames = 0  # files; of the one being written
+        self._head: tuple[Any, ...] = ()
+        self._out: Any = None
+        self._stream: Any = None
+
+    def add(self, part: Path, frames: int) -> Place:
+        """Append a video of so many frames.
+
+        Raises:
+            DatasetError: it has others, or is damaged.
+        """
+        size = part.stat().st_size
+        try:
+            with av.open(str(part)) as video:
+                stream = video.streams.video[0]
+                head = (stream.codec_context.name, stream.width, stream.height, stream.codec_context.extradata)
+                full = self._bytes + size > self._limit_bytes or self._frames + frames > self._limit_frames
+                # Another head: an encoder of another version, after an interruption. One file has one only.
+                if self._out is None or full or head != self._head:
+                    self._begin(stream, head)
+                first, found = self._frames, 0
+                for packet in video.demux(stream):
+                    if packet.dts is None:  # the end
+                        continue
+                    packet.pts = packet.dts = self._pts(first + found, packet.time_base)
+                    packet.stream = self._stream
+                    assert self._out is not None
+                    self._out.mux(packet)
+                    found += 1
+        except FFmpegError as error:
+            raise DatasetError("this video is damaged", where=part, found=error.strerror) from error
+        if found != frames:
+            raise DatasetError("frames are missing in this video", where=part, expected=frames, found=found)
+        self._frames += frames
+        self._bytes += size
+        return Place(*divmod(self._count - 1, CHUNK_FILES), first)
+
+    def close(self) -> None:
+        """Finish the file that is being written."""
+        if self._out is not None:
+            self._out.close()
+            self._out = None
+
+    def _begin(self, template: Any, head: tuple[Any, ...]) -> None:
+        self.close()
+        path = self._path(*divmod(self._count, CHUNK_FILES))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        options = {**_CONTAINER, "movflags": "faststart"} if path.suffix == ".mp4" else _CONTAINER
+        self._out = av.open(str(path), "w", options=options)
+        self._stream = self._out.add_stream_from_template(template, opaque=True)  # no decoder's name
+        self._stream.time_base = template.time_base
+        self._head, self._count = head, self._count + 1
+        self._bytes = self._frames = 0
+
+    def _pts(self, frame: int, time_base: Fraction) -> int:
+        return round(Fraction(frame, self._fps) / time_base)
+
+
+def read_frames(path: Path, first: int, count: int, fps: int) -> Iterator[NDArray]:
+    """Frames of a video, (H, W, 3) uint8 RGB or (H, W) uint16, from number ``first`` on.
+
+    Raises:
+        DatasetError: the file is missing, damaged, or ends before.
+    """
+    given = 0
+    try:
+        with av.open(str(path)) as video:
+            stream: Any = video.streams.video[0]
+            layout = "gray16le" if stream.codec_context.pix_fmt == "gray16le" else "rgb24"
+            video.seek(round(Fraction(first, fps) / stream.time_base), stream=stream, backward=True)
+            for frame in video.decode(stream):
+                if round(frame.pts * stream.time_base * fps) < first + given:
+                    continue  # between the key frame and the one asked for
+                if given == count:
+                    break
+                if round(frame.pts * stream.time_base * fps) != first + given:
+                    break
+                yield frame.to_ndarray(format=layout)
+                given += 1
+    except FFmpegError as error:
+        raise DatasetError("can't read this video", where=path, found=error.strerror) from error
+    if given < count:
+        raise DatasetError("frames are missing in this video", where=path, expected=first + count, found=first + given)
+
+
+def packet_times(path: Path) -> tuple[list[Fraction], dict[str, Any]]:
+    """Times of a video's frames in s, without decoding them, and what ``info.json`` says of it.
+
+    Raises:
+        DatasetError: the file is missing or damaged.
+    """
+    try:
+        with av.open(str(path)) as video:
+            stream: Any = video.streams.video[0]
+            times = [p.pts * p.time_base for p in video.demux(stream) if p.pts is not None]
+            return sorted(times), describe(stream)
+    except (FFmpegError, IndexError) as error:
+        raise DatasetError("can't read this video", where=path, found=getattr(error, "strerror", error)) from error
+
+
+def describe(stream: Any) -> dict[str, Any]:
+    """What ``info.json`` says of a video."""
+    return {
+        "video.height": stream.height,
+        "video.width": stream.width,
+        "video.codec": stream.codec.canonical_name,
+        "video.pix_fmt": stream.pix_fmt,
+        "video.is_depth_map": False,
+        "video.fps": round(stream.average_rate or stream.base_rate),
+        "video.channels": 3,
+        "has_audio": False,
+    }

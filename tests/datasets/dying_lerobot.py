@@ -1,0 +1,26 @@
+"""Convert a made-up trajectory to LeRobot and die by SIGKILL on the way: `python dying_lerobot.py MOMENT TRAJECTORY OUT`."""
+
+import sys
+
+from dying import die_at
+from synthetic import RayCaster
+
+from robocas_ms3 import files
+from robocas_ms3.datasets.lerobot import assemble, convert, stage, tables, video
+
+PLACES = {  # moment -> (module, name of the function or method's owner and it, which call is the last)
+    "frame": (video.Encoder, "add", 50),  # in the second episode
+    "part": (files, "_move_in", 2),
+    "plan": (convert, "write_json", 1),
+    "join": (video.Joiner, "add", 7),
+    "table": (tables.RollingTable, "add", 4),
+    "overview": (assemble, "write_json", 2),
+    "rename": (convert.os, "replace", 3),  # plan, data, videos: the third
+    "sweep": (convert.shutil, "rmtree", 1),
+}
+
+if __name__ == "__main__":
+    moment, trajectory, out = sys.argv[1:]
+    assert stage
+    die_at(*PLACES[moment])
+    convert.convert_lerobot(trajectory, out, open_source=RayCaster)

@@ -1,0 +1,311 @@
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from synthetic import RayCaster, write_trajectory
+
+from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.lerobot.check import check_lerobot
+from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
+from robocas_ms3.datasets.lerobot.schema import Limits
+from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.trajectory import TrajectoryFile
+from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.files import locked_folder
+
+
+def run(source, out, **kwargs):
+    return convert_lerobot(source, out, open_source=RayCaster, **kwargs)
+
+
+def files_of(root):
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def lerobot(trajectory, tmp_path_factory):
+    """A dataset of two episodes that nobody may change."""
+    out = tmp_path_factory.mktemp("lerobot") / "dataset"
+    run(trajectory, out)
+    return out
+
+
+def test_the_folder_is_that_of_version_3(lerobot):
+    expected = {
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+        "meta/subtasks.parquet",
+        "meta/episodes/chunk-000/file-000.parquet",
+        "meta/robocas/conversion.json",
+        "meta/robocas/episodes.parquet",
+        "data/chunk-000/file-000.parquet",
+    }
+    for camera in ("base", "gripper", "static"):
+        expected.add(f"videos/observation.images.{camera}_camera/chunk-000/file-000.mp4")
+        expected.add(f"depth/{camera}_camera/chunk-000/file-000.mkv")
+    assert set(files_of(lerobot)) == expected
+    assert {path.name for path in lerobot.iterdir()} == {"meta", "data", "videos", "depth"}
+    info = json.loads((lerobot / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0"
+    assert (info["fps"], info["total_episodes"], info["total_frames"], info["total_tasks"]) == (5, 2, 14, 2)
+    assert info["splits"] == {"train": "0:2"}
+    video = info["features"]["observation.images.base_camera"]
+    assert (video["dtype"], video["shape"], video["info"]["video.codec"]) == ("video", [48, 64, 3], "h264")
+    # Every column but the videos, in the features' order, of their types: `datasets` casts by them.
+    table = pq.read_table(lerobot / "data/chunk-000/file-000.parquet")
+    assert table.column_names == [key for key, ft in info["features"].items() if ft["dtype"] != "video"]
+    assert str(table.schema.field("action").type) == "fixed_size_list<element: float>[7]"
+    assert table.column("index").to_pylist() == list(range(14))
+    assert table.column("frame_index").to_pylist() == [*range(7), *range(7)]
+    np.testing.assert_allclose(table.column("timestamp").to_pylist()[:7], np.arange(7) / 5, atol=1e-6)
+
+
+def test_texts(lerobot):
+    dataset = LeRobotDataset(lerobot)
+    instructions = [f"grasp the cube {seed} on the table and move it to the basket" for seed in (3, 5)]
+    assert dataset.tasks == instructions
+    assert [row["tasks"] for row in dataset.rows] == [[text] for text in instructions]
+    columns = dataset.episode(1).columns
+    assert columns["task_index"].ravel().tolist() == [1] * 7
+    subgoals = [dataset.subtasks[i] for i in columns["subtask_index"][:, 0]]
+    assert subgoals == ["grasp the cube 5 on the table"] * 3 + ["Drop the cube 5 into the basket"] * 4
+    types = dataset.episode(1).table.column("subgoal_type").to_pylist()
+    assert types == ["move and grasp"] * 3 + ["transfer object"] * 4
+
+
+def test_from_a_folder_as_from_the_trajectory(lerobot, made, tmp_path):
+    """Nothing is rendered the second time, and it is the same but for where it comes from."""
+    out = tmp_path / "out"
+    convert_lerobot(made, out, open_source=None)  # type: ignore[arg-type]
+    before, after = files_of(lerobot), files_of(out)
+    different = {name for name in before if before[name] != after.get(name)}
+    assert different == {"meta/robocas/conversion.json", "meta/robocas/episodes.parquet"}
+    assert set(before) == set(after)
+    assert LeRobotDataset(out).episode(1).scene == Dataset(made).episode(1).scene
+
+
+@pytest.mark.parametrize("codec", ["h264", "av1"])
+def test_and_back(made, tmp_path, codec):
+    run(made, tmp_path / "out", codec=codec)
+    dataset, source = LeRobotDataset(tmp_path / "out"), Dataset(made)
+    assert dataset.info["features"]["observation.images.base_camera"]["info"]["video.codec"] == codec
+    for number in source.numbers:
+        ours, theirs = dataset.episode(number), source.episode(number)
+        for key, values in ours.arrays.items():
+            if values.dtype.kind == "f":
+                np.testing.assert_allclose(values, theirs.arrays[key], atol=1e-6, err_msg=key)
+            else:
+                np.testing.assert_array_equal(values, theirs.arrays[key], err_msg=key)
+        for key in ("ee_pos", "ee_orn", "robot_joints", "arm_joint_vel", "base_pos", "agv_pose", "rel_pos"):
+            np.testing.assert_array_equal(ours.arrays[key], theirs.arrays[key], err_msg=key)
+        for camera in ours.cameras:
+            np.testing.assert_array_equal(ours.intrinsic(camera), theirs.intrinsic(camera))
+            np.testing.assert_array_equal(ours.camera_in_parent(camera), theirs.camera_in_parent(camera))
+            for step in (0, 3, 6):  # bit for bit, whatever the order
+                np.testing.assert_array_equal(ours.depth(camera, step), theirs.depth(camera, step))
+                difference = np.abs(ours.rgb(camera, step).astype(int) - theirs.rgb(camera, step))
+                assert difference.mean() < 6  # the made-up pictures are all edges; subsampled colours bleed there
+        shown = np.stack(list(ours.frames("base_camera", "depth")))
+        assert shown.shape == (7, 48, 64)
+        assert shown.dtype == np.uint16
+
+
+def test_depth_of_all_16_bits(trajectory, tmp_path):
+    noise = np.random.default_rng(0).integers(0, 65536, (7, 48, 64), np.uint16)
+
+    class Noisy(RayCaster):
+        def frames(self, recording, samples):
+            for step, frame in enumerate(super().frames(recording, samples)):
+                frame.depth["gripper_camera"][:] = noise[step]
+                yield frame
+
+    convert_lerobot(trajectory, tmp_path / "out", open_source=Noisy)
+    found = LeRobotDataset(tmp_path / "out").episode(1)
+    np.testing.assert_array_equal(np.stack(list(found.frames("gripper_camera", "depth"))), noise)
+
+
+def test_each_video_frame_is_that_of_its_step(trajectory, tmp_path):
+    """The grey level is the number of the frame: joining must neither drop, double nor shift one."""
+
+    class Grey(RayCaster):
+        def frames(self, recording, samples):
+            for step, frame in enumerate(super().frames(recording, samples)):
+                frame.rgb["base_camera"][:] = 20 * step + 10 * recording.seed
+                yield frame
+
+    out = tmp_path / "out"
+    convert_lerobot(trajectory, out, open_source=Grey, include_failed=True, pictures=Pictures(("base_camera",)))
+    dataset = LeRobotDataset(out)
+    for number, seed in enumerate((3, 4, 5)):
+        for step in (6, 0, 5, 2):
+            level = dataset.episode(number).rgb("base_camera", step).mean()
+            assert abs(level - (20 * step + 10 * seed)) < 4
+
+
+def test_statistics_are_those_of_the_data(lerobot):
+    stats = json.loads((lerobot / "meta/stats.json").read_text())
+    dataset = LeRobotDataset(lerobot)
+    action = np.concatenate([dataset.episode(i).columns["action"] for i in (0, 1)])
+    np.testing.assert_allclose(stats["action"]["mean"], action.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(stats["action"]["std"], action.std(axis=0), atol=1e-6)
+    np.testing.assert_allclose(stats["action"]["max"], action.max(axis=0))
+    assert stats["action"]["count"] == [14]
+    assert stats["observation.images.base_camera"]["count"] == [14]
+    frames = np.stack([frame for i in (0, 1) for frame in dataset.episode(i).frames("base_camera")])
+    mean = np.array(stats["observation.images.base_camera"]["mean"]).reshape(3)
+    np.testing.assert_allclose(mean, frames.mean(axis=(0, 1, 2)) / 255, atol=0.02)
+    rows = pq.read_table(lerobot / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    first = dataset.episode(0).columns["action"]
+    np.testing.assert_allclose(rows[0]["stats/action/mean"], first.mean(axis=0), atol=1e-6)
+    assert rows[0]["stats/action/count"] == [7]
+
+
+def test_files_roll_over_at_their_limits(trajectory, tmp_path):
+    out = tmp_path / "out"
+    run(trajectory, out, include_failed=True, limits=Limits(data_mb=1e-6, video_mb=100, video_seconds=14 / 5))
+    dataset = LeRobotDataset(out)
+    assert [row["data/file_index"] for row in dataset.rows] == [0, 1, 2]
+    assert [row["videos/observation.images.base_camera/file_index"] for row in dataset.rows] == [0, 0, 1]
+    assert [row["depth/base_camera/from_timestamp"] for row in dataset.rows] == [0, 1.4, 0]
+    assert [row["meta/episodes/file_index"] for row in dataset.rows] == [0, 0, 0]
+    assert check_lerobot(out) == []
+    by_size = tmp_path / "by_size"
+    run(trajectory, by_size, include_failed=True, limits=Limits(video_mb=1e-6))
+    assert [row["depth/base_camera/file_index"] for row in LeRobotDataset(by_size).rows] == [0, 1, 2]
+    assert check_lerobot(by_size) == []
+
+
+def test_fewer_pictures_and_another_rate(trajectory, tmp_path):
+    out = tmp_path / "out"
+    run(trajectory, out, rate_hz=10, pictures=Pictures(("static_camera",), (80, 60), depth=False))
+    dataset = LeRobotDataset(out)
+    assert (dataset.cameras, dataset.has_depth, dataset.rate_hz) == (("static_camera",), False, 10)
+    assert not (out / "depth").exists()
+    assert dataset.episode(0).rgb("static_camera", 5).shape == (60, 80, 3)
+    assert dataset.episode(0).columns["timestamp"][3, 0] == pytest.approx(0.3)
+    assert check_lerobot(out) == []
+
+
+def fails(match, source, out, kind=RobocasError, **kwargs):
+    with pytest.raises(kind, match=match) as caught:
+        run(source, out, **kwargs)
+    assert "\n" not in str(caught.value)
+    assert not Path(out).exists()
+
+
+def test_errors_leave_nothing_behind(trajectory, made, tmp_path):
+    out = tmp_path / "out"
+    fails("whole number of frames a second", trajectory, out, rate_hz=2.5)
+    fails("the rate must divide the control frequency", trajectory, out, rate_hz=3)
+    fails("no such trajectory file", tmp_path / "none.h5", out)
+    fails("no dataset here", tmp_path, out)
+    fails("a dataset keeps its rate .expected 5 Hz, found 10.", made, out, rate_hz=10)
+    fails("a dataset keeps its pictures' size .expected 64 x 48", made, out, pictures=Pictures(size=(32, 32)))
+    fails("videos need even sizes .expected .* found 65 x 48", trajectory, out, pictures=Pictures(size=(65, 48)))
+    fails("no successful episodes", write_trajectory(tmp_path / "failed.h5", seeds=(1,), failed=(0,)), out)
+
+
+def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
+    out = tmp_path / "out"
+    run(trajectory, out)
+    before = files_of(out)
+    with pytest.raises(OutputExistsError, match="--resume to go on, --overwrite to replace"):
+        run(trajectory, out, codec="av1")
+    with pytest.raises(DatasetError, match="can't resume with other settings .expected codec h264, found codec av1"):
+        run(trajectory, out, codec="av1", resume=True)
+    with pytest.raises(DatasetError, match="these episodes are not what was begun here"):
+        run(trajectory, out, include_failed=True, resume=True)
+    with pytest.raises(DatasetError):
+        run(tmp_path / "missing.h5", out, overwrite=True)
+    assert files_of(out) == before
+    done = run(trajectory, out, resume=True)
+    assert (done.episodes, done.kept) == ([], 2)
+    assert files_of(out) == before
+    run(trajectory, out, overwrite=True, include_failed=True)
+    assert LeRobotDataset(out).info["total_episodes"] == 3
+
+
+def test_overwrite_deletes_lerobot_datasets_only(trajectory, made, tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    for folder in (tmp_path, made):
+        with pytest.raises(DatasetError, match="refusing to overwrite what is not a LeRobot dataset"):
+            run(trajectory, folder, overwrite=True)
+        with pytest.raises(DatasetError, match="no conversion to LeRobot was begun here"):
+            run(trajectory, folder, resume=True)
+    assert (tmp_path / "thesis.tex").exists()
+    with locked_folder(tmp_path / "out"), pytest.raises(RobocasError, match="another process is writing here"):
+        run(trajectory, tmp_path / "out")
+
+
+def test_failed_episodes_of_a_folder_stay_out(made, tmp_path):
+    source = shutil.copytree(made, tmp_path / "source")
+    scene = json.loads((source / "episode_0000000/scene.json").read_text())
+    (source / "episode_0000000/scene.json").write_text(json.dumps({**scene, "success": False}))
+    run(source, tmp_path / "out")
+    dataset = LeRobotDataset(tmp_path / "out")
+    assert [entry["source"] for entry in dataset.settings["episodes"]] == [1]
+    assert dataset.numbers == [0]
+    assert check_lerobot(tmp_path / "out") == []
+
+
+def test_processes_write_the_same(trajectory, lerobot, tmp_path, monkeypatch):
+    monkeypatch.setenv("ROBOCAS_DEFER_REGISTRATION", "1")  # the workers need no ManiSkill here
+    run(trajectory, tmp_path / "out", jobs=2)
+    assert files_of(tmp_path / "out") == files_of(lerobot)
+
+
+def test_what_breaks_is_gone_on_with(trajectory, lerobot, tmp_path):
+    class Breaking(RayCaster):
+        def frames(self, recording, samples):
+            for step, frame in enumerate(super().frames(recording, samples)):
+                if recording.seed == 5 and step == 3:
+                    raise DatasetError("it broke")
+                yield frame
+
+    out = tmp_path / "out"
+    with pytest.raises(DatasetError, match="it broke"):
+        convert_lerobot(trajectory, out, open_source=Breaking)
+    assert {path.name for path in out.iterdir()} == {".parts"}
+    done = run(trajectory, out, resume=True)
+    assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
+    assert files_of(out) == files_of(lerobot)
+
+
+@pytest.mark.parametrize("moment", ["frame", "part", "plan", "join", "table", "overview", "rename", "sweep"])
+def test_killed_and_resumed_is_as_if_never_killed(trajectory, lerobot, tmp_path, moment):
+    """kill -9 in a process of its own; nothing lies under a final name that is not whole."""
+    out = tmp_path / "out"
+    command = [sys.executable, str(Path(__file__).parent / "dying_lerobot.py"), moment, str(trajectory), str(out)]
+    environment = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}  # there is no simulator in this, only its import
+    done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    if (out / schema.INFO_FILE).exists():
+        assert check_lerobot(out) == []
+    run(trajectory, out, resume=True)
+    assert files_of(out) == files_of(lerobot)
+    assert {path.name for path in out.iterdir()} == {"meta", "data", "videos", "depth"}
+
+
+def test_the_split_is_that_of_robocas(lerobot, made):
+    settings, info = LeRobotDataset(lerobot).settings, json.loads((made / "data_info.json").read_text())
+    assert (settings["train_eps"], settings["val_eps"]) == (info["train_eps"], info["val_eps"])
+
+
+def test_scenes_and_cameras_travel_along(lerobot, trajectory):
+    episode = LeRobotDataset(lerobot).episode(1)
+    assert episode.scene["seed"] == 5
+    assert episode.scene["target"]["name"] == "cube 5"
+    np.testing.assert_array_equal(episode.intrinsic("base_camera"), [24, 24, 32, 24])
+    with TrajectoryFile(trajectory) as file:
+        robot = file.recording(2).states["articulations"]["robocas_mobile_panda"]
+    np.testing.assert_array_equal(episode.arrays["robot_joints"], robot[[0, 4, 8, 12, 16, 20, 22], 16:23])
