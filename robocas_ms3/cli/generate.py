@@ -19,7 +19,7 @@ class Generate:
     task: Annotated[Literal["pick", "select", "search", "open_pick"], tyro.conf.Positional]
     """Which task."""
     episodes: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 10
-    """How many successful episodes to record."""
+    """How many successful episodes to record, at least 1."""
     config: str | None = None
     """Name of a shipped task configuration, or a YAML file. Default: the task's own (see `robocas list`)."""
     pack: str = "builtin"
@@ -27,11 +27,11 @@ class Generate:
     out: Path | None = None
     """Output folder. Default: demos/<config>-<pack>."""
     seed: int = 0
-    """First seed; the following episodes take the seeds after it."""
+    """First seed, 0 or more; the following episodes take the seeds after it."""
     jobs: int = 1
     """Worker processes. The outcome does not depend on it."""
     control_freq: int = 20
-    """Control rate in Hz (the paper's is 5)."""
+    """Control rate in Hz (the paper's is 5); must divide 100, the rate of physics."""
     max_attempts: int = 20
     """Attempts of the policy before a seed is given up."""
     keep_recoveries: bool = False
@@ -70,16 +70,20 @@ def main(cfg: Generate) -> int:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        bar = progress.add_task(f"{cfg.task}: recording", total=cfg.episodes)
+    progress = Progress(*columns, console=Console(stderr=True))  # shown once there is something to do
 
-        def on_result(result: EpisodeResult) -> None:
-            if result.success:
-                progress.advance(bar)
-            else:
-                last = result.failures[-1]
-                progress.console.print(f"seed {result.seed}: given up ({last.stage}: {last.reason})", highlight=False)
+    def on_start() -> None:
+        progress.add_task(f"{cfg.task}: recording", total=cfg.episodes)
+        progress.start()
 
+    def on_result(result: EpisodeResult) -> None:
+        if result.success:
+            progress.advance(progress.task_ids[0])
+        else:
+            last = result.failures[-1]
+            progress.console.print(f"seed {result.seed}: given up ({last.stage}: {last.reason})", highlight=False)
+
+    try:
         summary = generate(
             settings,
             out,
@@ -88,8 +92,12 @@ def main(cfg: Generate) -> int:
             jobs=cfg.jobs,
             resume=cfg.resume,
             overwrite=cfg.overwrite,
+            on_start=on_start,
             on_result=on_result,
         )
+    finally:
+        if progress.live.is_started:  # else it would print an empty line
+            progress.stop()
     seconds = ", ".join(f"{part} {value:.2f}" for part, value in summary.mean_seconds.items())
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"{summary.episodes} episodes from {summary.seeds} seeds ({summary.success_rate:.0%})")

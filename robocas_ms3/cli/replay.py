@@ -17,7 +17,7 @@ class Replay:
     """
 
     trajectory: Annotated[Path, tyro.conf.Positional]
-    """The HDF5 file; its JSON lies beside it."""
+    """The HDF5 file, its JSON beside it; or the folder that `robocas generate` made."""
     control_mode: Annotated[str | None, tyro.conf.arg(aliases=["-c"])] = None
     """Convert the actions: pd_joint_delta_pos, pd_ee_delta_pose or pd_ee_pose. Default: as recorded."""
     obs_mode: Annotated[str, tyro.conf.arg(aliases=["-o"])] = "none"
@@ -25,7 +25,7 @@ class Replay:
     use_env_states: bool = False
     """Set the recorded state after every step."""
     count: int | None = None
-    """Only the first so many episodes."""
+    """Only the first so many episodes, at least 1."""
     save: Path | None = None
     """Write the replayed episodes to this HDF5 file."""
     allow_failure: bool = False
@@ -42,9 +42,10 @@ def main(cfg: Replay) -> int:
     from robocas_ms3.demos.record import read_json
     from robocas_ms3.demos.replay import replay
 
-    total = len(read_json(cfg.trajectory)["episodes"][: cfg.count])
+    trajectory = cfg.trajectory / "trajectory.h5" if cfg.trajectory.is_dir() else cfg.trajectory
+    total = len(read_json(trajectory)["episodes"][: cfg.count])
     results = replay(
-        cfg.trajectory,
+        trajectory,
         control_mode=cfg.control_mode,
         obs_mode=cfg.obs_mode,
         use_env_states=cfg.use_env_states,

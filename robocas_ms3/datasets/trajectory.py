@@ -81,6 +81,10 @@ class TrajectoryFile:
         """
         self.path = Path(path)
         metadata_path = self.path.with_suffix(".json")
+        if self.path.is_dir():
+            inside = self.path / "trajectory.h5"
+            fix = f"Did you mean {inside}?" if inside.is_file() else "Give the .h5 file that robocas generate made."
+            raise DatasetError("this is a folder, not a trajectory file", where=self.path, fix=fix)
         if not self.path.is_file():
             raise DatasetError("no such trajectory file", where=self.path, fix="Make one with robocas generate.")
         if not metadata_path.is_file():

@@ -9,16 +9,17 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from robocas_ms3.demos.checks import check_arguments, check_same_run
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.ledger import Failure, Ledger, count_by_stage
 from robocas_ms3.demos.record import merge, open_trajectory, read_json
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.files import claim_output, make_folder, write_json
+from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
 
+_BEGINNINGS = {"run.json", "failures.jsonl", "episodes"}  # of a run that has not finished a seed yet
 _worker: EpisodeGenerator | Exception | None = None
 
 
@@ -59,6 +60,7 @@ def generate(
     jobs: int = 1,
     resume: bool = False,
     overwrite: bool = False,
+    on_start: Callable[[], None] = lambda: None,
     on_result: Callable[[EpisodeResult], None] = lambda result: None,
 ) -> Summary:
     """Generate episodes of consecutive seeds until there are enough.
@@ -76,20 +78,44 @@ def generate(
         jobs: worker processes.
         resume: go on with what is in ``out``.
         overwrite: replace what is in ``out``.
+        on_start: called once arguments, configuration, pack and output turned out right.
         on_result: called for each seed, in order.
 
     Raises:
         OutputExistsError: ``out`` has content and neither flag is set.
-        RobocasError: ``out`` was made with other settings, or far too many seeds fail.
+        RobocasError: an argument is wrong, which leaves no trace; ``out`` was made with other settings, or another
+            process writes there; far too many seeds fail.
     """
+    check_arguments(settings, episodes=episodes, first_seed=first_seed, jobs=jobs)
     if overwrite and out.is_dir() and any(out.iterdir()) and not (out / "run.json").is_file():
         raise RobocasError("this folder was not made by `robocas generate`", where=out, fix="It stays; choose another.")
-    claim_output(out, overwrite=overwrite, resume=resume)
-    fresh = not out.exists()
-    make_folder(out)
-    run = {"settings": asdict(settings), "first_seed": first_seed}
-    _check_same_run(out / "run.json", run)
-    write_json(out / "run.json", run)
+    with locked_folder(out):
+        if _only_begun(out):
+            shutil.rmtree(out)
+        claim_output(out, overwrite=overwrite, resume=resume)
+        run = {"settings": asdict(settings), "first_seed": first_seed}
+        check_same_run(out / "run.json", run)
+        make_folder(out)
+        write_json(out / "run.json", run)
+        on_start()
+        return _generate_in(out, settings, episodes, first_seed, jobs, on_result)
+
+
+def _only_begun(out: Path) -> bool:
+    """Whether a run was begun here, and ended before it was through with a seed."""
+    if not (out / "run.json").is_file() or {path.name for path in out.iterdir()} - _BEGINNINGS:
+        return False
+    return not _finished(out, out / "episodes", Ledger(out / "failures.jsonl"))
+
+
+def _generate_in(
+    out: Path,
+    settings: EpisodeSettings,
+    episodes: int,
+    first_seed: int,
+    jobs: int,
+    on_result: Callable[[EpisodeResult], None],
+) -> Summary:
     shards, ledger = make_folder(out / "episodes"), Ledger(out / "failures.jsonl")
     results = _finished(out, shards, ledger)
     ledger.keep_only({result.seed for result in results})
@@ -115,8 +141,8 @@ def generate(
                         fix=f"See {ledger.path.name}; a smaller objects.count may help.",
                     )
     except RobocasError:
-        if fresh and not results:
-            shutil.rmtree(out)  # it never began: a wrong pack or configuration
+        if not results:
+            shutil.rmtree(out)  # it never began
         raise
     finally:
         results.sort(key=lambda r: r.seed)
@@ -188,23 +214,6 @@ def _generate(seed: int, folder: Path) -> EpisodeResult:
         raise _worker
     assert _worker is not None
     return _worker.generate(seed, folder, shard_name(seed))
-
-
-def _check_same_run(path: Path, run: dict[str, Any]) -> None:
-    import json
-
-    if not path.is_file():
-        return
-    before = json.loads(path.read_text(encoding="utf-8"))
-    for key, value in json.loads(json.dumps(run)).items():
-        if before.get(key) != value:
-            raise RobocasError(
-                f"{key} differ from those this output was begun with",
-                where=path,
-                expected=before.get(key),
-                found=value,
-                fix="Use the same, another --out, or --overwrite.",
-            )
 
 
 def _finished(out: Path, shards: Path, ledger: Ledger) -> list[EpisodeResult]:

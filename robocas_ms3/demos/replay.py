@@ -10,11 +10,13 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 import torch
+from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES, parse_obs_mode_to_struct
 from mani_skill.trajectory.utils import dict_to_list_of_dicts
 
-from robocas_ms3.demos.convert_actions import ActionConverter
+from robocas_ms3.demos.checks import check_number
+from robocas_ms3.demos.convert_actions import CONVERTIBLE, ActionConverter
 from robocas_ms3.demos.record import EpisodeRecorder, merge, open_trajectory, read_json
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.errors import DatasetError, RobocasError
 from robocas_ms3.files import claim_output, replacing_folder
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -49,7 +51,7 @@ def replay(
     overwrite: bool = False,
     env_kwargs: dict[str, Any] | None = None,
 ) -> Iterator[Replay]:
-    """Replay episodes one by one.
+    """Replay episodes one by one, as the iterator is asked for them. Arguments are checked at once.
 
     Args:
         trajectory: HDF5 file, its JSON beside it.
@@ -64,25 +66,63 @@ def replay(
 
     Raises:
         DatasetError: the file can't be read, or the control mode can't be converted to.
+        OutputExistsError: ``save`` is there already.
+        RobocasError: ``count`` or ``obs_mode`` is wrong.
     """
+    if count is not None:
+        check_number("count", count, 1)
+    _check_obs_mode(obs_mode)
     data = read_json(trajectory)
     info = data["env_info"]
     recorded_mode = info["env_kwargs"]["control_mode"]
     mode = control_mode or recorded_mode
+    if mode not in {*CONVERTIBLE, recorded_mode}:
+        raise DatasetError(
+            "no control mode to convert to", where=trajectory, expected=f"one of {', '.join(CONVERTIBLE)}", found=mode
+        )
     if mode != recorded_mode and (use_env_states or recorded_mode != "pd_joint_pos"):
         raise DatasetError(
             "only pd_joint_pos recordings can be converted, and not while setting states",
             where=trajectory,
             found=f"{recorded_mode} -> {mode}",
         )
+    open_trajectory(trajectory).close()
     if save is not None:
+        if save.suffix != ".h5":
+            raise DatasetError("a trajectory is an HDF5 file", where=save, expected="a name that ends in .h5")
+        if save.resolve() == trajectory.resolve():
+            raise DatasetError("this is the recording itself", where=save, fix="Choose another name for the replay.")
         claim_output(save, overwrite=overwrite)
     kwargs = {**info["env_kwargs"], "control_mode": mode, "obs_mode": obs_mode, **(env_kwargs or {})}
     if obs_mode == "none":
         kwargs.setdefault("render_backend", "none")
-    torch.set_num_threads(1)  # as where episodes are generated
-    env = gym.make(info["env_id"], **kwargs)
     episodes = data["episodes"][:count]
+    return _replay_all(trajectory, info["env_id"], kwargs, episodes, use_env_states, save, allow_failure)
+
+
+def _check_obs_mode(mode: str) -> None:
+    try:
+        parse_obs_mode_to_struct(mode)
+    except AssertionError as error:
+        raise RobocasError(
+            "no such observation mode",
+            where="obs_mode",
+            expected=f"none, state, state_dict, pointcloud, or some of {', '.join(ALL_VISUAL_TEXTURES)} joined by +",
+            found=mode,
+        ) from error
+
+
+def _replay_all(
+    trajectory: Path,
+    env_id: str,
+    kwargs: dict[str, Any],
+    episodes: list[dict[str, Any]],
+    use_env_states: bool,
+    save: Path | None,
+    allow_failure: bool,
+) -> Iterator[Replay]:
+    torch.set_num_threads(1)  # as where episodes are generated
+    env = gym.make(env_id, **kwargs)
     try:
         if save is None:
             for episode in episodes:

@@ -1,0 +1,81 @@
+"""What is checked before a run begins, so that a mistake is one line and leaves no trace."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config import load_task_config
+from robocas_ms3.demos.episode import EpisodeSettings
+from robocas_ms3.errors import ConfigError, RobocasError
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.tasks.spec import TASKS
+
+SIM_FREQ = 100  # Hz, of the environments' physics
+GREATEST_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
+
+
+def check_number(name: str, value: int, least: int, greatest: int | None = None) -> None:
+    """Check the range of a number.
+
+    Raises:
+        RobocasError: it is outside.
+    """
+    if value < least or (greatest is not None and value > greatest):
+        expected = f"at least {least}" if greatest is None else f"{least} to {greatest}"
+        raise RobocasError("this number is out of range", where=name, expected=expected, found=value)
+
+
+def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int, jobs: int) -> None:
+    """Check what a run is asked for, before anything is written.
+
+    Raises:
+        RobocasError: a number is out of its range, the task can't run the configuration, or there is no such pack.
+    """
+    check_number("episodes", episodes, 1)
+    check_number("seed", first_seed, 0, GREATEST_SEED)
+    check_number("jobs", jobs, 1)
+    check_number("max_attempts", settings.max_attempts, 1)
+    check_number("control_freq", settings.control_freq, 1, SIM_FREQ)
+    if SIM_FREQ % settings.control_freq:
+        raise RobocasError(
+            "the control rate has to divide that of physics",
+            where="control_freq",
+            expected=f"one of {', '.join(str(f) for f in range(1, SIM_FREQ + 1) if SIM_FREQ % f == 0)}",
+            found=settings.control_freq,
+        )
+    config = load_task_config(settings.config)
+    if config.task != settings.task:
+        name = f" {settings.config}" if isinstance(settings.config, str) else ""
+        raise ConfigError(
+            f"{TASKS[settings.task].env_id} can't run the configuration{name}",
+            expected=f"task: {settings.task}",
+            found=f"task: {config.task}",
+        )
+    SceneModel.load(config, load_pack(settings.pack), load_pack("builtin"))
+
+
+def check_same_run(path: Path, run: dict[str, Any]) -> None:
+    """Check that an output was begun with the same settings.
+
+    Args:
+        path: ``run.json`` of the output, which may not be there.
+        run: what it would hold now.
+
+    Raises:
+        RobocasError: they differ.
+    """
+    if not path.is_file():
+        return
+    before = json.loads(path.read_text(encoding="utf-8"))
+    for key, value in json.loads(json.dumps(run)).items():
+        if before.get(key) != value:
+            raise RobocasError(
+                f"{key} differ from those this output was begun with",
+                where=path,
+                expected=before.get(key),
+                found=value,
+                fix="Use the same, another --out, or --overwrite.",
+            )

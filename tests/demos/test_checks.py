@@ -1,0 +1,149 @@
+"""A wrong argument is one line, before anything is written or a bar is shown."""
+
+import json
+
+import h5py
+import pytest
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.demos import generate as module
+from robocas_ms3.demos.checks import SIM_FREQ
+from robocas_ms3.demos.convert_actions import CONVERTIBLE
+from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
+from robocas_ms3.demos.generate import generate
+from robocas_ms3.demos.ledger import Failure
+from robocas_ms3.demos.replay import replay
+from robocas_ms3.errors import OutputExistsError, RobocasError
+from robocas_ms3.files import locked_folder
+from robocas_ms3.tasks.base import RoboCASEnv
+
+SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--seed", "-5"], "seed: this number is out of range (expected 0 to 4294967295, found -5)"),
+        (["--seed", "4294967296"], "found 4294967296)"),
+        (["--control-freq", "7"], "(expected one of 1, 2, 4, 5, 10, 20, 25, 50, 100, found 7)"),
+        (["--control-freq", "0"], "control_freq: this number is out of range (expected 1 to 100, found 0)"),
+        (["--max-attempts", "0"], "max_attempts: this number is out of range (expected at least 1, found 0)"),
+        (["-n", "0"], "episodes: this number is out of range (expected at least 1, found 0)"),
+        (["-n", "-3"], "found -3)"),
+        (["--jobs", "0"], "jobs: this number is out of range (expected at least 1, found 0)"),
+        (["--pack", "nothing"], "nothing: no such asset pack"),
+        (["--config", "pick_table_scatered"], "Did you mean pick_table_scattered"),
+        (
+            ["--config", "search_table_stacked"],
+            "RoboCASPick-v1 can't run the configuration search_table_stacked (expected task: pick, found task: search)",
+        ),
+    ],
+)
+def test_a_wrong_argument_of_generate_leaves_nothing(tmp_path, capsys, words, message):
+    assert run(["generate", "pick", "--out", str(tmp_path / "a" / "out"), *words]) == 1
+    captured = capsys.readouterr()
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1  # no bar
+    assert message in captured.err
+    assert captured.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_rate_of_physics_is_the_environments():
+    assert vars(RoboCASEnv)["_default_sim_config"].fget(None).sim_freq == SIM_FREQ
+
+
+def begun(out, *, ledger=""):
+    """What a run leaves that was killed before it was through with its first seed."""
+    (out / "episodes").mkdir(parents=True)
+    (out / "run.json").write_text(json.dumps({"settings": {"task": "another"}, "first_seed": 7}))
+    (out / "failures.jsonl").write_text(ledger)
+    (out / "episodes" / "seed_000000007.json").write_text("{")
+    (out / "episodes" / "seed_000000007.h5").write_bytes(b"")
+    return out
+
+
+@pytest.fixture
+def hopeless(monkeypatch):
+    """Every seed is given up."""
+
+    def give_up(settings, seeds, folder, jobs):
+        for seed in seeds:
+            yield EpisodeResult(seed, success=False, failures=[Failure(seed, 0, "reach", "far", 0.0)])
+
+    monkeypatch.setattr(module, "_run", give_up)
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_run_that_never_got_anywhere_is_in_nobodys_way(tmp_path, hopeless, resume):
+    out, started = begun(tmp_path / "out"), []
+    with pytest.raises(RobocasError, match="far too many seeds fail"):
+        generate(SETTINGS, out, episodes=1, resume=resume, on_start=lambda: started.append(True))
+    assert started == [True]
+    made = json.loads((out / "run.json").read_text())
+    assert (made["settings"]["task"], made["first_seed"]) == ("pick", 0)
+
+
+def test_what_a_run_has_found_out_stays(tmp_path, hopeless):
+    given_up = json.dumps({"seed": 7, "attempt": -1, "stage": "episode", "reason": "gave_up", "seconds": 0.0})
+    out = begun(tmp_path / "out", ledger=given_up + "\n")
+    with pytest.raises(OutputExistsError):
+        generate(SETTINGS, out, episodes=1)
+    with pytest.raises(RobocasError, match="settings differ"):
+        generate(SETTINGS, out, episodes=1, resume=True)
+    (out / "failures.jsonl").write_text("")
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(OutputExistsError):
+        generate(SETTINGS, out, episodes=1)
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path, hopeless):
+    out = begun(tmp_path / "out")
+    with locked_folder(out), pytest.raises(RobocasError, match="another process is writing here"):
+        generate(SETTINGS, out, episodes=1)
+    assert (out / "run.json").is_file()
+
+
+@pytest.fixture
+def recording(tmp_path):
+    path = tmp_path / "demo" / "trajectory.h5"
+    path.parent.mkdir()
+    h5py.File(path, "w").close()
+    info = {"env_id": "robocas_ms3:RoboCASPick-v1", "env_kwargs": {"control_mode": "pd_joint_pos"}}
+    path.with_suffix(".json").write_text(json.dumps({"env_info": info, "episodes": []}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["-c", "pd_foo"], f"(expected one of {', '.join(CONVERTIBLE)}, found pd_foo)"),
+        (["-o", "foo"], "obs_mode: no such observation mode"),
+        (["--count", "0"], "count: this number is out of range (expected at least 1, found 0)"),
+        (["--save", "x.txt"], "x.txt: a trajectory is an HDF5 file"),
+    ],
+)
+def test_a_wrong_argument_of_replay_is_told_at_once(recording, capsys, words, message):
+    before = sorted(recording.parent.iterdir())
+    assert run(["replay", str(recording.parent), *words]) == 1  # the folder serves as the file
+    err = capsys.readouterr().err
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert message in err
+    assert sorted(recording.parent.iterdir()) == before
+
+
+def test_a_replay_never_replaces_what_it_replays(recording):
+    with pytest.raises(RobocasError, match="the recording itself"):
+        replay(recording, save=recording, overwrite=True)
+    other = recording.with_name("other.h5")
+    other.write_bytes(b"")
+    with pytest.raises(OutputExistsError):
+        replay(recording, save=other)
+    assert recording.is_file()
+
+
+def test_converting_a_folder_names_the_file_in_it(recording, tmp_path, capsys):
+    assert run(["convert", str(recording.parent), "--out", str(tmp_path / "out"), "--no-embeddings"]) == 1
+    assert f"Did you mean {recording}?" in capsys.readouterr().err
