@@ -12,6 +12,8 @@ import tyro
 if TYPE_CHECKING:
     from robocas_ms3.datasets.manage.survey import Survey
 
+_FILE_WIDTH = 200  # columns of the table where it goes into a file
+
 
 @dataclass
 class ImportRobocas:
@@ -93,6 +95,8 @@ def _table(found: Survey) -> None:
         for (outcome, place, problem), numbers in sorted(rows.items()):
             table.add_row(ranges(numbers) or "all", outcome, place, problem)
         console = Console(markup=False, highlight=False)
+        if not console.is_terminal:
+            console.width = _FILE_WIDTH
         console.print(table)
     left_out = len(found.as_json()["left_out"])
     say(f"{found.root}: {found.episodes} episodes, {len(found.taken)} can be taken, {left_out} are left out")

@@ -1,4 +1,4 @@
-"""Checks how a dataset says it was made: ``conversion.json`` and every episode's ``scene.json``."""
+"""Checks how a dataset says it was made: ``conversion.json``, every episode's ``scene.json``, and no episode twice."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.violation import Violation
 from robocas_ms3.errors import DatasetError
 
@@ -67,3 +68,27 @@ def check_scene(folder: Path, arrays: Mapping[str, NDArray]) -> Iterator[Violati
             yield Violation(file, key, "this key", "no such key")
     if scene.get("schema_version") != schema.SCHEMA_VERSION:
         yield Violation(file, "schema_version", str(schema.SCHEMA_VERSION), str(scene.get("schema_version")))
+
+
+def check_ledger(root: Path, episodes: Mapping[int, Mapping[str, NDArray]]) -> Iterator[Violation]:
+    """Check that the ledger lists every episode, and that none has the arrays of another.
+
+    Args:
+        root: the dataset.
+        episodes: number -> arrays of the episodes on disk, as far as they could be read.
+    """
+    try:
+        settings = json.loads((root / FILE).read_text(encoding="utf-8"))
+        ledger = settings["episodes"] if settings.get("schema_version") == schema.SCHEMA_VERSION else None
+    except (OSError, ValueError, KeyError, AttributeError):
+        ledger = None  # said already
+    marks: dict[str, int] = {}
+    for number, arrays in episodes.items():
+        name = schema.episode_folder(number)
+        if isinstance(ledger, dict) and str(number) not in ledger:
+            yield Violation(FILE, f"episodes.{number}", "an entry of every episode", "none")
+        if not arrays:
+            continue
+        first = marks.setdefault(arrays_fingerprint(arrays), number)
+        if first != number:
+            yield Violation(name, "", "each episode once", f"the arrays of {schema.episode_folder(first)}")

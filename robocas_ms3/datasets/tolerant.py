@@ -156,7 +156,7 @@ def arrays_fingerprint(arrays: Mapping[str, NDArray]) -> str:
     for key in _IDENTITY:
         if key in arrays:
             array = arrays[key]
-            data = "\n".join(array.ravel().tolist()).encode() if array.dtype.kind == "U" else array.tobytes()
+            data = "\n".join(map(str, array.ravel().tolist())).encode() if array.dtype.kind == "U" else array.tobytes()
             digest.update(f"{key} {array.shape}\n".encode() + data)
     return digest.hexdigest()
 

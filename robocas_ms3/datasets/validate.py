@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import geometry, schema
 from robocas_ms3.datasets.check_info import check_info
-from robocas_ms3.datasets.check_scene import check_scene, check_settings
+from robocas_ms3.datasets.check_scene import check_ledger, check_scene, check_settings
 from robocas_ms3.datasets.episode import relative_motion, to_matrices, wrap_angle
 from robocas_ms3.datasets.picture_files import PictureHeader, read_header
 from robocas_ms3.datasets.pictures import Pictures
@@ -83,6 +83,7 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
             on_episode(done + 1, len(numbers))
     if len(embedded) > 1:
         violations.append(Violation("", "language_embedding", "in all episodes or none", "in some"))
+    violations += check_ledger(root, loaded)
     violations += check_info(root, loaded)
     steps = sum(len(arrays["ee_pos"]) for arrays in loaded.values() if np.ndim(arrays.get("ee_pos", 0)))
     return Report(len(numbers), steps, violations)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -222,7 +223,7 @@ def _as_far_as_known(dataset: Dataset, entry: Mapping[str, Any]) -> dict[str, An
     env_info = before.get("env_info") or {}
     known = {
         "schema_version": schema.SCHEMA_VERSION,
-        "task": _task(env_info.get("env_id")),
+        "task": task_of(env_info.get("env_id")),
         "env_info": {key: env_info.get(key) for key in ("env_id", "env_kwargs")} if env_info else None,
         "seed": entry["seed"],
         "target": entry["target"],
@@ -240,9 +241,7 @@ def _as_far_as_known(dataset: Dataset, entry: Mapping[str, Any]) -> dict[str, An
     return {key: known.get(key) for key in schema.SCENE}
 
 
-def _task(env_id: str | None) -> str | None:
-    """Name of the task of an environment."""
-    from robocas_ms3.tasks.spec import TASKS
-
-    short = (env_id or "").rpartition(":")[2]
-    return next((name for name, spec in TASKS.items() if spec.env_id == short), None)
+def task_of(env_id: str | None) -> str | None:
+    """Name of the task of an environment, by its id; the registry itself would bring the simulator."""
+    match = re.fullmatch(r"(?:\w+:)?RoboCAS(\w+)-v\d+", env_id or "")
+    return "_".join(re.findall("[A-Z][a-z]*", match[1])).lower() if match else None

@@ -1,0 +1,198 @@
+"""RoboCAS folders with damage: what the validator, the reader, the converter and merging say, and what they leave."""
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from managing import change, edit, files_of, make, read
+from synthetic import RayCaster, write_trajectory
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.info import write_info
+from robocas_ms3.datasets.manage.merging import merge
+from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.validate import validate
+from robocas_ms3.errors import DatasetError
+
+
+class Bomb:
+    """Unpickling this is noticed."""
+
+    def __reduce__(self):
+        return exec, ("raise SystemExit('unpickled')",)
+
+
+def violations(root):
+    return [str(violation) for violation in validate(root).violations]
+
+
+@pytest.fixture
+def bomb(dataset):
+    change(dataset / "episode_0000001", ee_pos=np.array([Bomb()] * 7, object))
+    return dataset
+
+
+def test_pickles_go_off_nowhere(bomb, tmp_path):
+    place = "episode_0000001/episode_info.npz, ee_pos"
+    assert f"{place}: expected an array without pickles, found a pickled object" in violations(bomb)
+    with pytest.raises(DatasetError, match="ee_pos: this array can't be read .found pickled objects.*robocas validate"):
+        _ = Dataset(bomb).episode(1).arrays
+    assert Dataset(bomb).episode(0).steps == 7  # others are not concerned
+    change(bomb / "episode_0000000", rel_pos=np.array([Bomb()] * 7, object))
+    with pytest.raises(DatasetError, match="this episode can't be read.*robocas validate"):
+        merge([bomb], tmp_path / "out")
+    with pytest.raises(DatasetError, match="this episode can't be read"):
+        write_info(bomb)
+
+
+def test_camera_files_with_pickles(dataset):
+    path = dataset / "episode_0000000" / "base_camera" / "intrinsic.npy"
+    np.save(path, np.array([Bomb()], object), allow_pickle=True)
+    with pytest.raises(DatasetError, match="this array can't be read"):
+        Dataset(dataset).episode(0).intrinsic("base_camera")
+    assert any("base_camera/intrinsic.npy: expected a numpy array" in violation for violation in violations(dataset))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\x00" * 64, b"PK\x03\x04cut off", b"\x80\x04N."], ids=["nothing", "zeros", "cut off", "a pickle"]
+)
+def test_an_archive_that_is_none(dataset, content):
+    (dataset / "episode_0000001" / "episode_info.npz").write_bytes(content)
+    assert "episode_0000001/episode_info.npz: expected a numpy archive" in " ".join(violations(dataset))
+    with pytest.raises(DatasetError, match=r"episode_info.npz: not a numpy archive, or a damaged one .found \w+"):
+        _ = Dataset(dataset).episode(1).arrays
+
+
+def test_pictures_through_the_reader(dataset):
+    episode = Dataset(dataset).episode(0)
+    rgb = dataset / "episode_0000000" / "base_camera" / "rgb"
+    (rgb / "0001.png").unlink()
+    (rgb / "0002.png").write_bytes((rgb / "0003.png").read_bytes()[:100])
+    (rgb / "0004.png").write_bytes(b"")
+    with pytest.raises(DatasetError, match="0001.png: can't read this picture .found No such file"):
+        episode.rgb("base_camera", 1)
+    for step in (2, 4):
+        with pytest.raises(DatasetError, match=f"000{step}.png: this picture is damaged"):
+            episode.rgb("base_camera", step)
+    assert episode.rgb("base_camera", 0).shape == (48, 64, 3)
+
+
+def test_json_that_is_none(dataset):
+    (dataset / "episode_0000000" / "scene.json").write_text('{"seed": ')
+    (dataset / "data_info.json").write_text("[]")
+    found = violations(dataset)
+    assert any(v.startswith("episode_0000000/scene.json: expected JSON") for v in found)
+    assert "data_info.json: expected an object, found list" in found
+    with pytest.raises(DatasetError, match="scene.json: this JSON is damaged"):
+        _ = Dataset(dataset).episode(0).scene
+    with pytest.raises(DatasetError, match="data_info.json: this JSON is damaged .expected an object, found list"):
+        _ = Dataset(dataset).info
+
+
+def test_an_episode_twice(dataset):
+    shutil.copytree(dataset / "episode_0000001", dataset / "episode_0000002")
+    found = violations(dataset)
+    assert "episode_0000002: expected each episode once, found the arrays of episode_0000001" in found
+    assert "conversion.json, episodes.2: expected an entry of every episode, found none" in found
+    edit(dataset / "conversion.json", lambda c: c["episodes"].update({"2": c["episodes"]["1"]}))
+    assert "conversion.json, episodes.2: expected each recording once, found that of episode 1" in violations(dataset)
+
+
+def test_schema_versions_that_are_mixed(dataset, trajectory, tmp_path):
+    edit(dataset / "episode_0000000" / "scene.json", lambda scene: scene.update(schema_version=1))
+    assert violations(dataset) == ["episode_0000000/scene.json, schema_version: expected 2, found 1"]
+    edit(dataset / "conversion.json", lambda content: content.pop("schema_version"))
+    assert "conversion.json, schema_version: expected 2 (robocas upgrade), found 1" in violations(dataset)
+    before = files_of(dataset)
+    with pytest.raises(DatasetError, match="another schema version .expected 2, found 1.*robocas upgrade"):
+        convert(trajectory, dataset, append=True, open_source=RayCaster)
+    with pytest.raises(DatasetError, match="another schema version"):
+        merge([dataset], tmp_path / "out")
+    assert files_of(dataset) == before
+
+
+def test_appending_to_a_damaged_dataset_says_which_episode(trajectory, tmp_path):
+    root = make(tmp_path, "ds", (1, 2))
+    (root / "episode_0000000" / "episode_info.npz").write_bytes(b"PK")
+    with pytest.raises(DatasetError, match=r"episode_0000000.*this episode can't be read.*robocas validate"):
+        convert(trajectory, root, append=True, embeddings=False, open_source=RayCaster)
+    assert json.loads((root / "conversion.json").read_text())["episodes"].keys() >= {"0", "1"}
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 600 kB; skipped where it can't be mounted."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", str(folder)], check=False, capture_output=True, text=True
+    )
+    if done.returncode:
+        pytest.skip(f"DISK FULL IS NOT TESTED ON A REAL DISK HERE: no tmpfs can be mounted: {done.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def grow(folder, megabytes=16):
+    subprocess.run(["mount", "-o", f"remount,size={megabytes}m", str(folder)], check=True)
+
+
+def test_a_full_disk_ends_a_merge_which_goes_on_later(small_disk, tmp_path, capsys):
+    parts = [make(tmp_path, name, (seed, seed + 1)) for name, seed in (("a", 1), ("b", 5))]
+    out = small_disk / "out"
+    assert run(["merge", *map(str, parts), "--out", str(out)]) == 1
+    assert capsys.readouterr().err.strip().splitlines()[-1].endswith("No space left on device")
+    left = sorted(path.name for path in out.iterdir())
+    assert left == ["conversion.json", *(f"episode_{n:07d}" for n in range(len(left) - 1))]
+    assert 1 < len(left) < 5
+    grow(small_disk)
+    assert run(["merge", *map(str, parts), "--out", str(out), "--resume"]) == 0
+    merge(parts, tmp_path / "whole")
+    assert files_of(out) == files_of(tmp_path / "whole")
+
+
+def test_a_full_disk_ends_a_conversion_which_goes_on_later(small_disk, tmp_path):
+    trajectory = write_trajectory(tmp_path / "F.h5", seeds=range(5))
+    out = small_disk / "out"
+    with pytest.raises(OSError, match="No space left on device"):
+        convert(trajectory, out, embeddings=False, open_source=RayCaster)
+    left = sorted(path.name for path in out.iterdir())
+    assert left == ["conversion.json", *(f"episode_{n:07d}" for n in range(len(left) - 1))]
+    assert 1 < len(left) < 6
+    grow(small_disk)
+    convert(trajectory, out, embeddings=False, resume=True, open_source=RayCaster)
+    convert(trajectory, tmp_path / "whole", embeddings=False, open_source=RayCaster)
+    assert files_of(out) == files_of(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("moment", range(0, 120, 17))
+def test_a_disk_that_is_full_at_any_file(made, tmp_path, monkeypatch, moment):
+    """The same without a small disk: the n-th file does not fit."""
+    copyfile, calls = shutil.copyfile, []
+
+    def full(*args, **kwargs):
+        calls.append(args)
+        if len(calls) > moment:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(args[1]))
+        return copyfile(*args, **kwargs)
+
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.copyfile", full)
+        if moment < 106:
+            with pytest.raises(OSError, match="No space left"):
+                merge([made], out, link=False)
+            whole = moment // 53
+            if not whole:
+                assert not out.exists()
+            else:
+                assert {path.name for path in out.iterdir()} == {"conversion.json", "episode_0000000"}
+                assert files_of(out / "episode_0000000") == files_of(made / "episode_0000000")
+    merge([made], out, link=False, resume=True)
+    assert validate(out).violations == []
+    assert read(out / "data_info.json") == read(made / "data_info.json")

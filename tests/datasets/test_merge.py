@@ -1,0 +1,194 @@
+import shutil
+
+import pytest
+from managing import die, edit, files_of, make, read
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.datasets.manage.merging import merge
+from robocas_ms3.datasets.manage.output import Placed
+from robocas_ms3.datasets.manage.parts import names_of
+from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.validate import validate
+from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.files import locked_folder
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory):
+    """Two datasets of two episodes, that nobody may change."""
+    folder = tmp_path_factory.mktemp("parts")
+    return make(folder, "a", (10, 11)), make(folder, "b", (20, 21))
+
+
+def spoiled(part, tmp_path):
+    return shutil.copytree(part, tmp_path / part.name)
+
+
+def test_episodes_follow_each_other_and_keep_their_side(parts, tmp_path):
+    a, b = parts
+    out = tmp_path / "out"
+    done = merge([b, a], out)
+    assert (done.written.episodes, done.skipped, done.written.copied) == (4, 0, 0)
+    assert Dataset(out).numbers == [0, 1, 2, 3]
+    for number, (source, old) in enumerate([(b, 0), (b, 1), (a, 0), (a, 1)]):
+        assert files_of(out / f"episode_{number:07d}") == files_of(source / f"episode_{old:07d}")
+    ledger = read(out / "conversion.json")["episodes"]
+    assert [entry["from"] for entry in ledger.values()] == [
+        {"dataset": "b", "episode": 0}, {"dataset": "b", "episode": 1},
+        {"dataset": "a", "episode": 0}, {"dataset": "a", "episode": 1},
+    ]  # fmt: skip
+    assert [entry["seed"] for entry in ledger.values()] == [20, 21, 10, 11]
+    info = read(out / "data_info.json")
+    sides = [read(part / "data_info.json")["val_eps"] for part in (b, a)]
+    assert info["val_eps"] == sorted([*sides[0], *(n + 2 for n in sides[1])])
+    assert sorted(info["train_eps"] + info["val_eps"]) == [0, 1, 2, 3]
+    assert validate(out).violations == []
+
+
+def test_files_are_shared_unless_copied(parts, tmp_path):
+    picture = "episode_0000001/base_camera/rgb/0003.png"
+    merge([parts[0]], tmp_path / "linked")
+    merge([parts[0]], tmp_path / "copied", link=False)
+    inode = (parts[0] / picture).stat().st_ino
+    assert (tmp_path / "linked" / picture).stat().st_ino == inode
+    assert (tmp_path / "copied" / picture).stat().st_ino != inode
+    assert files_of(tmp_path / "linked") == files_of(tmp_path / "copied")
+
+
+def test_links_that_the_file_system_refuses_become_copies(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(18, "Invalid cross-device link")
+
+    (tmp_path / "a").write_text("1")
+    monkeypatch.setattr("os.link", refuse)
+    placed = Placed(link=True)
+    placed.file(tmp_path / "a", tmp_path / "b")
+    assert (placed.linked, placed.copied, placed.link) == (0, 1, False)
+    assert (tmp_path / "b").read_text() == "1"
+
+
+def test_where_a_merged_episode_had_been_before_is_kept(parts, tmp_path):
+    merge(parts, tmp_path / "once")
+    merge([tmp_path / "once"], tmp_path / "twice")
+    entry = read(tmp_path / "twice" / "conversion.json")["episodes"]["3"]
+    assert entry["from"] == {"dataset": "once", "episode": 3, "from": {"dataset": "b", "episode": 1}}
+
+
+def test_names_tell_datasets_apart(tmp_path):
+    roots = [tmp_path / "x" / "ds", tmp_path / "y" / "ds"]
+    assert names_of(roots) == ["x/ds", "y/ds"]
+    assert names_of(roots[:1]) == ["ds"]
+
+
+def test_duplicates(parts, tmp_path):
+    a, b = parts
+    merge([a, b], tmp_path / "ab")
+    with pytest.raises(DatasetError, match="the same recording twice .found 2: b 0 = ab 2, b 1 = ab 3.*--skip-dup"):
+        merge([b, tmp_path / "ab"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    done = merge([b, tmp_path / "ab"], tmp_path / "out", skip_duplicates=True)
+    assert (done.written.episodes, done.skipped) == (4, 2)
+    seeds = [entry["seed"] for entry in read(tmp_path / "out" / "conversion.json")["episodes"].values()]
+    assert seeds == [20, 21, 10, 11]
+    assert validate(tmp_path / "out").violations == []
+
+
+def test_duplicates_of_unknown_recordings_are_told_by_their_arrays(parts, tmp_path):
+    first = spoiled(parts[0], tmp_path)
+    edit(first / "conversion.json", lambda c: [e.update(recording=None) for e in c["episodes"].values()])
+    second = shutil.copytree(first, tmp_path / "again")
+    with pytest.raises(DatasetError, match="the same recording twice .found 2"):
+        merge([first, second], tmp_path / "out")
+
+
+def fails(match, roots, out, **kwargs):
+    with pytest.raises(RobocasError, match=match) as caught:
+        merge(roots, out, **kwargs)
+    assert "\n" not in str(caught.value)
+    assert not out.exists()
+
+
+def test_other_settings(parts, tmp_path):
+    other = make(tmp_path, "fast", (30,), rate_hz=10)
+    fails(
+        "these datasets have other settings .expected rate_hz 5.0 as .*found rate_hz 10.0",
+        [parts[0], other],
+        tmp_path / "out",
+    )
+
+
+def test_other_schema_versions(parts, tmp_path):
+    old = spoiled(parts[0], tmp_path)
+    edit(old / "conversion.json", lambda c: c.pop("schema_version"))
+    fails("expected 2, found 1.*robocas upgrade", [parts[1], old], tmp_path / "out")
+    (old / "conversion.json").unlink()
+    fails("expected 2, found 0.*import-robocas", [parts[1], old], tmp_path / "out")
+    newer = spoiled(parts[1], tmp_path)
+    edit(newer / "conversion.json", lambda c: c.update(schema_version=3))
+    fails("expected 2, found 3.*newer robocas", [newer], tmp_path / "out")
+    edit(newer / "conversion.json", lambda c: c.update(schema_version=2))
+    (newer / "episode_0000001" / "scene.json").unlink()
+    fails("an episode of another schema version .expected 2, found 1", [newer], tmp_path / "out")
+
+
+def test_unfinished_datasets(parts, tmp_path):
+    part = spoiled(parts[0], tmp_path)
+    shutil.rmtree(part / "episode_0000001")
+    fails("not the episodes on disk .found 1 missing", [part], tmp_path / "out")
+    (part / "data_info.json").unlink()
+    fails("this dataset is not finished.*convert --resume", [part], tmp_path / "out")
+    other = spoiled(parts[1], tmp_path)
+    edit(other / "conversion.json", lambda c: c["episodes"].pop("1"))
+    fails("these episodes are not listed .found 1", [other], tmp_path / "out")
+    fails("no dataset here", [tmp_path / "nothing"], tmp_path / "out")
+
+
+def test_a_damaged_episode_stops_it_before_the_end(parts, tmp_path):
+    part = spoiled(parts[0], tmp_path)
+    (part / "episode_0000001" / "episode_info.npz").write_bytes(b"PK")
+    with pytest.raises(DatasetError, match="this episode can't be read"):
+        merge([parts[1], part], tmp_path / "out")
+    assert not (tmp_path / "out" / "data_info.json").exists()
+
+
+def test_the_output(parts, tmp_path):
+    a, b = parts
+    before = files_of(a)
+    for out in (a, a / "inside", a.parent):
+        with pytest.raises(DatasetError, match="the output is an input"):
+            merge([a, b], out, overwrite=True)
+    assert files_of(a) == before
+    merge([a], tmp_path / "out")
+    with pytest.raises(OutputExistsError):
+        merge([a, b], tmp_path / "out")
+    with pytest.raises(DatasetError, match="can't resume: something else was begun here .found other episodes"):
+        merge([a, b], tmp_path / "out", resume=True)
+    merge([a, b], tmp_path / "out", overwrite=True)
+    assert len(Dataset(tmp_path / "out").numbers) == 4
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("years of work")
+    for flag in ("overwrite", "resume"):
+        with pytest.raises(DatasetError):
+            merge([a, b], tmp_path / "mine", **{flag: True})
+    assert (tmp_path / "mine" / "thesis.tex").exists()
+    with locked_folder(tmp_path / "locked"), pytest.raises(RobocasError, match="another process is writing here"):
+        merge([a], tmp_path / "locked")
+
+
+@pytest.mark.parametrize("moment", ["file", "rename", "merge overview"])
+def test_killed_and_resumed_is_as_if_never_killed(parts, tmp_path, moment):
+    whole, out = tmp_path / "whole", tmp_path / "out"
+    assert run(["merge", *map(str, parts), "--out", str(whole)]) == 0
+    die(moment, "merge", *parts, "--out", out)
+    assert not (out / "data_info.json").exists()
+    assert run(["merge", *map(str, parts), "--out", str(out), "--resume"]) == 0
+    assert files_of(out) == files_of(whole)
+    assert validate(out).violations == []
+
+
+def test_command(parts, tmp_path, capsys):
+    words = ["merge", *map(str, parts), str(parts[0]), "--out", str(tmp_path / "out")]
+    assert run(words) == 1
+    assert capsys.readouterr().err.startswith("error: ")
+    assert run([*words, "--skip-duplicates", "--copy"]) == 0
+    assert "4 episodes, 0 files linked, 212 copied, 2 duplicates left out" in capsys.readouterr().out

@@ -1,0 +1,158 @@
+import shutil
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from managing import edit, files_of, make, read
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.datasets.info import split_by_seed
+from robocas_ms3.datasets.manage.merging import merge
+from robocas_ms3.datasets.manage.splitting import Share, cut, groups_of, resplit
+from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.validate import validate
+from robocas_ms3.errors import DatasetError
+
+
+@pytest.fixture(scope="module")
+def six(tmp_path_factory):
+    """A dataset of six seeds, that nobody may change."""
+    return make(tmp_path_factory.mktemp("six"), "six", range(6))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.integers(0, 30), min_size=3, max_size=80),
+    st.sampled_from([[0.9, 0.1], [0.5, 0.5], [0.6, 0.3, 0.1]]),
+)
+def test_groups_are_whole_and_no_part_is_empty(values, shares):
+    groups = {number: str(value) for number, value in enumerate(values)}
+    if len(set(values)) < len(shares):
+        with pytest.raises(DatasetError, match="too few to split"):
+            cut(groups, shares)
+        return
+    parts = cut(groups, shares)
+    assert sorted(number for part in parts for number in part) == list(groups)
+    inside = [{groups[number] for number in part} for part in parts]
+    assert all(inside)
+    assert sum(map(len, inside)) == len(set(values))
+
+
+@pytest.mark.parametrize("count", [2, 10, 47, 200])
+def test_a_tenth_by_seed_is_the_writers_split(count):
+    seeds = {number: 1000 + number for number in range(count)}
+    assert cut({n: str(seed) for n, seed in seeds.items()}, [0.9, 0.1]) == list(split_by_seed(seeds))
+
+
+def test_shares():
+    groups = {number: str(number) for number in range(100)}
+    assert [len(part) for part in cut(groups, [0.7, 0.2, 0.1])] == [70, 20, 10]
+    for wrong in ([1.0], [0.5, 0.6], [1.0, 0.0]):
+        with pytest.raises(DatasetError, match="not shares of a whole"):
+            cut(groups, wrong)
+
+
+def test_training_and_validation_as_datasets(six, tmp_path):
+    train, val = tmp_path / "train", tmp_path / "val"
+    assert run(["split", str(six), "--out-train", str(train), "--out-val", str(val)]) == 0
+    info = read(six / "data_info.json")
+    for out, side, empty in ((train, "train_eps", "val_eps"), (val, "val_eps", "train_eps")):
+        old = info[side]
+        new = read(out / "data_info.json")
+        assert (new[side], new[empty]) == (list(range(len(old))), [])
+        for number, source in enumerate(old):
+            assert files_of(out / f"episode_{number:07d}") == files_of(six / f"episode_{source:07d}")
+            entry = read(out / "conversion.json")["episodes"][str(number)]
+            assert entry["from"] == {"dataset": "six", "episode": source}
+        assert validate(out).violations == []
+
+
+def test_parts_and_back(six, tmp_path, capsys):
+    words = ["split", str(six), "--parts", "0.5", "0.5", "--out", str(tmp_path / "parts")]
+    assert run(words) == 0
+    assert capsys.readouterr().out.count("3 episodes") == 2
+    parts = [tmp_path / "parts" / f"part_{index}" for index in range(2)]
+    assert all(validate(part).violations == [] for part in parts)
+    merge(parts, tmp_path / "back")
+    old, new = (read(root / "conversion.json")["episodes"] for root in (six, tmp_path / "back"))
+    assert sorted(e["seed"] for e in new.values()) == sorted(e["seed"] for e in old.values())
+    seeds = []
+    for root, ledger in ((six, old), (tmp_path / "back", new)):
+        validates = read(root / "data_info.json")["val_eps"]
+        seeds.append({ledger[str(number)]["seed"] for number in validates})
+    assert seeds[0] == seeds[1]
+    assert run(words) == 1
+    assert "the output exists already" in capsys.readouterr().err
+    shutil.rmtree(parts[1])
+    assert run([*words, "--resume"]) == 0
+
+
+def test_by_target_and_task(six, tmp_path):
+    root = shutil.copytree(six, tmp_path / "ds")
+    for number, (task, target) in enumerate([("pick", "cup"), ("pick", "can"), ("search", "cup")] * 2):
+        scene = root / f"episode_{number:07d}" / "scene.json"
+        edit(scene, lambda s, task=task, target=target: s.update(task=task, target={"asset_id": target}))
+    assert run(["split", str(root), "--by", "task", "--out", str(tmp_path / "tasks")]) == 0
+    assert {path.name: len(Dataset(path).numbers) for path in (tmp_path / "tasks").iterdir()} == {
+        "pick": 4,
+        "search": 2,
+    }
+    assert run(["split", str(root), "--in-place", "--by", "target", "--val-share", "0.3"]) == 0
+    info, targets = read(root / "data_info.json"), groups_of(Dataset(root), "target")
+    sides = [{targets[n] for n in info[side]} for side in ("train_eps", "val_eps")]
+    assert sorted(map(len, sides)) == [1, 1]
+    assert not sides[0] & sides[1]
+    assert validate(root).violations == []
+
+
+def test_in_place_writes_two_files_only(six, tmp_path):
+    root = shutil.copytree(six, tmp_path / "ds")
+    before = files_of(root)
+    train, val = resplit(root, Share(0.5))
+    assert (len(train), len(val)) == (3, 3)
+    after = files_of(root)
+    assert {name for name in after if after[name] != before.get(name)} == {"data_info.json", "conversion.json"}
+    assert "first 0.5 of the episodes" in read(root / "conversion.json")["split"]
+    assert validate(root).violations == []
+    again = resplit(root)  # sides stay
+    assert again == (train, val)
+    assert files_of(root) == after
+
+
+def test_in_place_accepts_what_is_there(six, tmp_path):
+    root = shutil.copytree(six, tmp_path / "ds")
+    info = read(root / "data_info.json")
+    gone = info["train_eps"][0]
+    shutil.rmtree(root / f"episode_{gone:07d}")
+    assert validate(root).violations
+    train, val = resplit(root)
+    assert (train, val) == (info["train_eps"][1:], info["val_eps"])
+    assert validate(root).violations == []
+    (root / "data_info.json").unlink()
+    assert sorted(sum(resplit(root), [])) == sorted(train + val)
+
+
+def test_wrong_words(six, tmp_path, capsys):
+    out = str(tmp_path / "out")
+    for words, text in [
+        ([], "how to split?"),
+        (["--out-train", out], "how to split?"),
+        (["--in-place", "--out", out, "--by", "task"], "how to split?"),
+        (["--parts", "0.5", "0.5", "--in-place"], "parts need a folder"),
+        (["--out", out], "what is a part?"),
+        (["--in-place", "--by", "seed"], "how much validates?"),
+        (["--in-place", "--val-share", "1.5"], "not shares of a whole"),
+        (["--parts", "0.9", "0.2", "--out", out], "not shares of a whole"),
+    ]:
+        assert run(["split", str(six), *words]) == 1
+        assert text in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
+
+
+def test_unknown_targets(six, tmp_path):
+    root = shutil.copytree(six, tmp_path / "ds")
+    edit(root / "episode_0000003" / "scene.json", lambda s: s.update(target=None))
+    with pytest.raises(DatasetError, match="episode_0000003.*does not say its target.*upgrade --trajectory"):
+        groups_of(Dataset(root), "target")
+    edit(root / "episode_0000003" / "scene.json", lambda s: s.update(seed=None))
+    assert groups_of(Dataset(root), "seed")[3] == "3"
