@@ -22,6 +22,7 @@ LAYERS = (
     ("planning",),
     ("demos",),
     ("datasets",),
+    ("viewer",),
     ("doctor",),
     ("cli",),
 )

@@ -29,6 +29,7 @@ COMMANDS = (
     "convert",
     "validate",
     "video",
+    "view",
     "merge",
     "split",
     "upgrade",

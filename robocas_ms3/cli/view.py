@@ -1,0 +1,85 @@
+"""``robocas view``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass
+class View:
+    """Look at a trajectory file, a RoboCAS folder or a LeRobot folder in a browser; docs/view.md."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """trajectory.h5 (its JSON beside it), or the folder of a dataset."""
+    port: int = 0
+    """Port of 127.0.0.1 to serve at; 0 takes a free one."""
+    open: bool = True
+    """Open the page in the default browser."""
+    static: Path | None = None
+    """Write a folder that opens from disk instead of serving: this one."""
+    episodes: tuple[int, ...] = ()
+    """With --static: numbers of the episodes to write; default: all."""
+    width: int = 480
+    """With --static: width of the pictures, pixels."""
+    depth: bool = True
+    """With --static: write depth too."""
+    overwrite: bool = False
+    """With --static: replace the folder if it is there."""
+
+
+def main(cfg: View) -> int:
+    """Serve until Ctrl-C, or write; gives the exit code."""
+    from rich.console import Console
+
+    from robocas_ms3.viewer.source import open_source
+
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    source = open_source(cfg.path)
+    if cfg.static is not None:
+        return _write(cfg, cfg.static, source, console)
+    import signal
+    import webbrowser
+
+    from robocas_ms3.viewer.server import Viewer
+
+    with Viewer(source, cfg.port) as server:
+        server.warm_up()
+        console.print(f"{cfg.path} at {server.url} (Ctrl-C ends)")
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # a supervisor's stop is as clean as Ctrl-C
+        if cfg.open:
+            webbrowser.open(server.url)
+        try:
+            server.serve_forever(poll_interval=0.1)
+        except KeyboardInterrupt:
+            console.print("ended")
+    return 0
+
+
+def _write(cfg: View, out: Path, source, console) -> int:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from robocas_ms3.errors import RobocasError
+    from robocas_ms3.files import claim_output
+    from robocas_ms3.viewer.export import export
+
+    ours = (out / "data" / "index.js").is_file()
+    if cfg.overwrite and out.is_dir() and any(out.iterdir()) and not ours:
+        raise RobocasError("this folder was not made by `robocas view`", where=out, fix="It stays; choose another.")
+    claim_output(out, overwrite=False, resume=cfg.overwrite)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        bar = progress.add_task("episodes", total=None)
+        count = export(
+            source,
+            out,
+            episodes=cfg.episodes,
+            width=cfg.width,
+            depth=cfg.depth,
+            on_episode=lambda done, all: progress.update(bar, completed=done, total=all),
+        )
+    console.print(f"{count} episodes: {out / 'index.html'}")
+    return 0

@@ -1,0 +1,1 @@
+"""`robocas view`: trajectories and datasets in a browser, served on this machine or written as a folder."""

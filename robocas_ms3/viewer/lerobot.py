@@ -1,0 +1,118 @@
+"""A LeRobot dataset (v3.0) as the page shows it: those of `robocas convert` in full, others by their columns."""
+
+from __future__ import annotations
+
+import threading
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.lerobot.reader import LeRobotDataset, LeRobotEpisode
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.viewer.arrays import show_arrays
+from robocas_ms3.viewer.failures import of_seed, read_failures, stages
+from robocas_ms3.viewer.pictures import encode_jpeg
+from robocas_ms3.viewer.source import Picture, make_episode, make_index, plot, row
+
+_AT_ONCE = 8  # pictures decoded together: a video opens and seeks slowly, and who looks at one looks at the next
+_KEPT = 64  # such groups in memory
+
+
+class LeRobotSource:
+    """A dataset's folder; pictures are decoded from its videos."""
+
+    def __init__(self, root: Path) -> None:
+        """Open it.
+
+        Raises:
+            DatasetError: it is of another version.
+            MissingExtraError: pyarrow or av is missing.
+        """
+        self.root = root
+        self.dataset = LeRobotDataset(root)
+        self.failures = read_failures(root)
+        self.ours = {feature.key for feature in schema.FEATURES} <= set(self.dataset.info["features"])
+        self._known = frozenset(self.dataset.numbers)
+        self._open = lru_cache(maxsize=16)(self._open_now)
+        self._frames = lru_cache(maxsize=_KEPT)(self._decode)
+        self._decoding = threading.Lock()
+
+    def index(self) -> dict[str, Any]:
+        """From ``meta/episodes`` and, where it is one of ours, the ledger of its conversion."""
+        ledger, rows = self.dataset.settings.get("episodes", {}), []
+        for entry in self.dataset.rows:
+            number = int(entry["episode_index"])
+            made = ledger.get(str(number), {})
+            seed, tasks = made.get("seed"), entry.get("tasks") or [""]
+            rows.append(
+                row(
+                    number,
+                    steps=int(entry["length"]),
+                    instruction=str(tasks[0]),
+                    target=(made.get("target") or {}).get("name", ""),
+                    seed=seed if isinstance(seed, int) else None,
+                    success=made.get("success"),
+                    stages=stages(of_seed(self.failures, seed), {}),
+                )
+            )
+        rate = self.dataset.rate_hz
+        return make_index(self.root, "LeRobot dataset", rate, self.dataset.cameras, self.dataset.has_depth, rows)
+
+    def episode(self, number: int) -> dict[str, Any]:
+        """As a RoboCAS folder shows it, or each numeric column as a plot."""
+        episode, rate = self._open(number), self.dataset.rate_hz
+        if self.ours:
+            scene = episode.scene
+            failures = of_seed(self.failures, scene.get("seed"))
+            return show_arrays(number, episode.arrays, scene, rate, failures)
+        features, skipped = self.dataset.info["features"], {*schema.INDICES, schema.SUBTASK_INDEX.key}
+        plots = []
+        for name, values in episode.columns.items():
+            if name not in skipped and values.ndim == 2 and np.issubdtype(values.dtype, np.number):
+                plots.append(plot(name, "", _names(features.get(name, {}), values.shape[1]), values))
+        tasks = episode.row.get("tasks") or [""]
+        return make_episode(
+            number,
+            instruction=str(tasks[0]),
+            steps=episode.steps,
+            rate_hz=rate,
+            subgoals=[],
+            plots=plots,
+            trace=None,
+            facts={"Robot": self.dataset.info.get("robot_type")},
+        )
+
+    def rgb(self, number: int, camera: str, step: int) -> Picture:
+        """A frame of the video."""
+        return encode_jpeg(self._frame(number, camera, "rgb", step))
+
+    def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
+        """A frame of the depth's video."""
+        return self._frame(number, camera, "depth", step)
+
+    def _frame(self, number: int, camera: str, kind: str, step: int) -> NDArray:
+        if not 0 <= step < self._open(number).steps:
+            raise DatasetError("no such step", where=f"{self.root}, episode {number}", found=step)
+        with self._decoding:
+            return self._frames(number, camera, kind, step // _AT_ONCE)[step % _AT_ONCE]
+
+    def _decode(self, number: int, camera: str, kind: str, group: int) -> list[NDArray]:
+        episode, first = self._open(number), group * _AT_ONCE
+        return list(episode.frames(camera, kind, first, min(_AT_ONCE, episode.steps - first)))
+
+    def _open_now(self, number: int) -> LeRobotEpisode:
+        if number not in self._known:
+            raise DatasetError("no such episode", where=self.root, found=number)
+        return self.dataset.episode(number)
+
+
+def _names(feature: dict[str, Any], width: int) -> list[str]:
+    """Names of a feature's numbers; datasets give a list, a dictionary of lists, or nothing."""
+    names = feature.get("names")
+    if isinstance(names, dict):
+        names = [str(word) for part in names.values() for word in (part if isinstance(part, list) else [part])]
+    return [str(name) for name in names] if names and len(names) == width else [str(i) for i in range(width)]

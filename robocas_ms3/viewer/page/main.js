@@ -1,0 +1,83 @@
+"use strict";
+// Puts the page together: deep links (#episode=12&step=30) and keys.
+
+(async () => {
+  const { byId, element, table, player, plots, space, episode } = robocas;
+  let written = "";
+  let later = 0;
+
+  function follow() {
+    const words = new URLSearchParams(location.hash.slice(1));
+    const number = words.has("episode") ? Number(words.get("episode")) : table.first();
+    if (number === null) return episode.fail("There are no episodes here.");
+    if (!Number.isInteger(number) || number < 0) return episode.fail(`There is no episode ${words.get("episode")}.`);
+    return episode.open(number, Number(words.get("step") || 0));
+  }
+
+  function open(number) {
+    if (number === null || number === episode.number()) return;
+    clearTimeout(later);
+    history.pushState(null, "", `#episode=${number}`);
+    episode.open(number);
+  }
+
+  // Browsers refuse an address that changes with every picture: it follows when things rest.
+  function stepped(step) {
+    plots.cursor(step);
+    space.cursor(step);
+    clearTimeout(later);
+    later = setTimeout(() => {
+      written = `#episode=${episode.number()}&step=${player.step()}`;
+      if (episode.number() !== null && location.hash !== written) history.replaceState(null, "", written);
+    }, 150);
+  }
+
+  const KEYS = {
+    ArrowLeft: (event) => player.by(event.shiftKey ? -10 : -1),
+    ArrowRight: (event) => player.by(event.shiftKey ? 10 : 1),
+    ArrowUp: () => open(table.neighbour(episode.number(), -1)),
+    ArrowDown: () => open(table.neighbour(episode.number(), 1)),
+    Home: () => player.go(0),
+    End: () => player.go(Infinity),
+    " ": () => player.toggle(),
+    d: () => player.flip(),
+  };
+
+  document.addEventListener("keydown", (event) => {
+    const typing = event.target.matches("select, input:not([type=range])");
+    const action = KEYS[event.key];
+    if (typing || !action || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    action(event);
+  });
+
+  function redraw() {
+    plots.redraw();
+    player.recolour();
+    if (episode.number() !== null) {
+      plots.cursor(player.step());
+      space.cursor(player.step());
+    }
+  }
+
+  let index;
+  try {
+    index = await robocas.load("index");
+  } catch (error) {
+    byId("message").textContent = "The index can't be loaded: has `robocas view` ended?";
+    return;
+  }
+  byId("name").textContent = index.name;
+  byId("kind").textContent = `${index.kind}, ${index.rate_hz} Hz`;
+  document.title = index.name;
+  byId("note").hidden = !index.note;
+  byId("note").append(...index.note.split("`").map((part, i) => (i % 2 ? element("code", { textContent: part }) : part)));
+  space.start();
+  player.start(index, stepped);
+  table.start(index, open);
+  window.addEventListener("hashchange", follow);
+  window.addEventListener("popstate", follow);
+  new ResizeObserver(redraw).observe(byId("lower"));
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  follow();
+})();

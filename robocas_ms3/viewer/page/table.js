@@ -1,0 +1,174 @@
+"use strict";
+// The episode table: filters, sorting, and rows made only where they are seen.
+
+robocas.table = (() => {
+  const { byId, element } = robocas;
+  const HEIGHT = 52; // of a row, as in style.css
+  const SPARE = 6; // rows beyond the visible ones
+  let index = null;
+  let shown = []; // rows that pass the filters, sorted
+  let chosen = null;
+  let sort = { key: "n", down: false };
+  let onOpen = () => {};
+  const made = new Map(); // position -> element
+
+  function start(content, open) {
+    index = content;
+    onOpen = open;
+    const values = (key) => [...new Set(index.episodes.flatMap((e) => e[key]).filter((v) => v !== "" && v !== null))].sort();
+    options("f-task", "All tasks", values("task"), 2);
+    options("f-object", "All objects", values("object"), 2);
+    options("f-stage", "Any attempts", values("stages"), 1, "failed at ");
+    options("f-success", "Any outcome", values("success").map((v) => (v ? "success" : "failure")), 1);
+    heads();
+    byId("filters").addEventListener("input", apply);
+    byId("filters").addEventListener("submit", (event) => event.preventDefault());
+    byId("filters").addEventListener("reset", () => setTimeout(apply));
+    byId("rows").addEventListener("scroll", draw, { passive: true });
+    new ResizeObserver(draw).observe(byId("rows"));
+    apply();
+  }
+
+  // A filter with nothing to choose from is left out.
+  function options(id, all, values, least, prefix = "") {
+    const select = byId(id);
+    select.replaceChildren(element("option", { value: "", textContent: all }));
+    for (const value of values) select.append(element("option", { value, textContent: prefix + String(value).replaceAll("_", " ") }));
+    select.hidden = values.length < least;
+  }
+
+  function heads() {
+    const columns = [["", ""], ["n", "#"], ["object", "Object"], ["steps", "Steps"], ["success", "Outcome"]];
+    const box = byId("heads");
+    box.classList.toggle("plain", !index.cameras.length);
+    box.replaceChildren();
+    for (const [key, title] of index.cameras.length ? columns : columns.slice(1)) {
+      if (!key) { box.append(element("span")); continue; }
+      const arrow = sort.key === key ? (sort.down ? " \u2193" : " \u2191") : "";
+      const button = element("button", { textContent: title + arrow, title: `Sort by ${key === "n" ? "episode" : title.toLowerCase()}` });
+      if (key === "n" || key === "steps") button.className = "number";
+      button.onclick = () => {
+        sort = { key, down: sort.key === key && !sort.down };
+        heads();
+        apply();
+      };
+      box.append(button);
+    }
+  }
+
+  function passes() {
+    const words = byId("f-text").value.toLowerCase().split(/\s+/).filter(Boolean);
+    const [task, object, stage, success] = ["f-task", "f-object", "f-stage", "f-success"].map((id) => byId(id).value);
+    const least = parseFloat(byId("f-min").value);
+    const most = parseFloat(byId("f-max").value);
+    return (e) => {
+      const text = `${e.instruction} ${e.object} ${e.n ?? ""} seed:${e.seed}`.toLowerCase();
+      return (
+        words.every((word) => text.includes(word)) &&
+        (!task || e.task === task) &&
+        (!object || e.object === object) &&
+        (!stage || e.stages.includes(stage)) &&
+        (!success || e.success === (success === "success")) &&
+        !(e.steps < least) && // NaN, an empty field, passes all
+        !(e.steps > most)
+      );
+    };
+  }
+
+  function apply() {
+    const { key, down } = sort;
+    const rank = (e) => (e[key] === null || e[key] === "" ? Infinity : e[key]);
+    const order = (a, b) => {
+      const [x, y] = [rank(a), rank(b)];
+      if (x === y) return (a.n ?? Infinity) - (b.n ?? Infinity) || a.seed - b.seed;
+      if (x === Infinity || y === Infinity) return x === Infinity ? 1 : -1; // unknown ones last, either way
+      return (x < y ? -1 : 1) * (down ? -1 : 1);
+    };
+    shown = index.episodes.filter(passes()).sort(order);
+    const all = index.episodes.length;
+    byId("count").textContent = shown.length === all ? `${all} episodes` : `${shown.length} of ${all} episodes`;
+    byId("f-reset").hidden = shown.length === all;
+    byId("spacer").style.height = `${shown.length * HEIGHT}px`;
+    for (const row of made.values()) row.remove();
+    made.clear();
+    draw();
+  }
+
+  function draw() {
+    const box = byId("rows");
+    const first = Math.max(0, Math.floor(box.scrollTop / HEIGHT) - SPARE);
+    const last = Math.min(shown.length, Math.ceil((box.scrollTop + box.clientHeight) / HEIGHT) + SPARE);
+    for (const [position, row] of made) {
+      if (position < first || position >= last) {
+        row.remove();
+        made.delete(position);
+      }
+    }
+    for (let position = first; position < last; position += 1) {
+      if (made.has(position)) continue;
+      const row = makeRow(shown[position]);
+      row.style.top = `${position * HEIGHT}px`;
+      made.set(position, row);
+      byId("spacer").append(row);
+    }
+  }
+
+  function makeRow(e) {
+    const gone = e.n === null;
+    const row = element(gone ? "div" : "a", { class: "row" });
+    row.classList.toggle("plain", !index.cameras.length);
+    row.classList.toggle("gone", gone);
+    row.classList.toggle("chosen", !gone && e.n === chosen);
+    if (!gone) {
+      row.href = `#episode=${e.n}`;
+      row.dataset.episode = e.n;
+      row.onclick = (event) => {
+        if (event.ctrlKey || event.metaKey || event.shiftKey) return;
+        event.preventDefault();
+        onOpen(e.n);
+      };
+    }
+    if (index.cameras.length) {
+      row.append(gone ? element("span") : element("img", { src: `thumbnails/${e.n}.jpg`, alt: "", loading: "lazy" }));
+    }
+    const title = gone ? `seed ${e.seed}, given up` : e.object || e.instruction || `seed ${e.seed ?? "unknown"}`;
+    const attempts = e.attempts > 1 ? `${e.attempts} attempts` : "";
+    const failed = e.stages.length ? `failed at ${e.stages.join(", ").replaceAll("_", " ")}` : "";
+    const second = gone ? [attempts, failed].filter(Boolean).join(", ") : e.instruction;
+    const what = element("div", { class: "what", title: second }, element("div", { textContent: title }), element("div", { textContent: second }));
+    const outcome = element("div", { class: "outcome", title: [attempts, failed].filter(Boolean).join(", ") });
+    if (e.success !== null) outcome.append(element("span", { class: e.success ? "good" : "bad", textContent: e.success ? "success" : "failure" }));
+    if (attempts && !gone) outcome.append(element("div", { class: "faint", textContent: attempts.replace("attempts", "tries") }));
+    row.append(
+      element("span", { class: "number", textContent: gone ? "" : e.n }), what,
+      element("span", { class: "number", textContent: e.steps || "" }), outcome
+    );
+    return row;
+  }
+
+  function choose(number) {
+    chosen = number;
+    for (const row of made.values()) row.classList.toggle("chosen", row.dataset.episode === String(number));
+    const position = shown.findIndex((e) => e.n === number);
+    const box = byId("rows");
+    if (position < 0) return;
+    const top = position * HEIGHT;
+    const above = top - box.scrollTop;
+    const below = top + HEIGHT - box.scrollTop - box.clientHeight;
+    if (above < -HEIGHT || below > HEIGHT) box.scrollTop = top - box.clientHeight / 2; // far away: to the middle
+    else if (above < 0) box.scrollTop = top;
+    else if (below > 0) box.scrollTop += below;
+  }
+
+  // The episode some rows further on among those that pass the filters.
+  function neighbour(number, by) {
+    const real = shown.filter((e) => e.n !== null);
+    const position = real.findIndex((e) => e.n === number);
+    const next = position < 0 ? real[0] : real[position + by];
+    return next ? next.n : null;
+  }
+
+  const find = (number) => index.episodes.find((e) => e.n === number);
+  const first = () => (shown.find((e) => e.n !== null) || { n: null }).n;
+  return { start, choose, neighbour, find, first };
+})();

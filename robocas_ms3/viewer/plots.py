@@ -1,0 +1,45 @@
+"""The plots that trajectories and RoboCAS folders share."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.viewer.source import plot
+
+XYZ = ("x", "y", "z")
+ROLL_PITCH_YAW = ("roll", "pitch", "yaw")
+ARM = tuple(f"j{i}" for i in range(1, 8))
+
+
+def motion_plots(position: NDArray, xyzw: NDArray, arm_joints: NDArray) -> list[dict[str, Any]]:
+    """TCP and joints.
+
+    Args:
+        position: (T, 3) m, TCP in the arm's base.
+        xyzw: (T, 4) its orientation there.
+        arm_joints: (T, 7) rad.
+    """
+    angles = np.degrees(np.unwrap(Rotation.from_quat(xyzw).as_euler("xyz"), axis=0))
+    return [
+        plot("TCP position, arm base", "m", XYZ, position),
+        plot("TCP orientation, arm base", "deg", ROLL_PITCH_YAW, angles),
+        plot("Arm joints", "rad", ARM, arm_joints),
+    ]
+
+
+def gripper_plot(width: NDArray, is_open: NDArray | None, open_width: float = 0.08) -> dict[str, Any]:
+    """Width in mm, and the command as the width that it asks for."""
+    if is_open is None:
+        return plot("Gripper", "mm", ("width",), np.ravel(width)[:, None] * 1000)
+    command = np.where(is_open, open_width, 0.0)
+    return plot("Gripper", "mm", ("width", "command"), np.column_stack([width, command]) * 1000)
+
+
+def base_plot(pose: NDArray) -> list[dict[str, Any]]:
+    """Mobile base (T, 3) x, y in m, yaw in rad; none where it stands still."""
+    moves = len(pose) > 0 and np.ptp(pose, axis=0).max() > 1e-3
+    return [plot("Mobile base, world", "m, rad", ("x", "y", "yaw"), pose)] if moves else []

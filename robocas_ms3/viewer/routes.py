@@ -1,0 +1,136 @@
+"""What each address of the viewer gives. No part of an address ever becomes a path: numbers and known names only.
+
+::
+
+    /                                        the page
+    /page/NAME                               its scripts and style
+    /data/index.js, /data/episode_12.js      robocas.put("index", {...})
+    /pictures/12/base_camera/rgb/30.jpg      a picture; depth in colours
+    /thumbnails/12.jpg
+
+Data travel as scripts, so that the same page also works from files, where a browser fetches nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from typing import Any
+
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.viewer import pictures
+from robocas_ms3.viewer.source import Picture, Source
+
+PAGE_FILES = {
+    "index.html": "text/html; charset=utf-8",
+    "style.css": "text/css; charset=utf-8",
+    "icon.svg": "image/svg+xml",
+    **{
+        f"{name}.js": "text/javascript; charset=utf-8"
+        for name in ("data", "table", "plots", "space", "player", "episode", "main")
+    },
+}
+_NUMBER = r"(0|[1-9][0-9]{0,8})"
+_INDEX = re.compile(r"/data/index\.js")
+_EPISODE = re.compile(rf"/data/episode_{_NUMBER}\.js")
+_PICTURE = re.compile(rf"/pictures/{_NUMBER}/([a-z0-9_.]{{1,80}})/(rgb|depth)/{_NUMBER}\.jpg")
+_THUMBNAIL = re.compile(rf"/thumbnails/{_NUMBER}\.jpg")
+_SCRIPT = "text/javascript; charset=utf-8"
+
+
+@dataclass(frozen=True)
+class Response:
+    """What to send: status, media type, content, and for how many seconds a browser may keep it."""
+
+    status: int
+    kind: str
+    data: bytes
+    keep_s: int = 0
+
+
+class Routes:
+    """Answers of one source; may be asked from several threads."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self._index: dict[str, Any] | None = None
+        self._script = b""
+        self._making = threading.Lock()
+        self._thumbnail = lru_cache(maxsize=4096)(self._make_thumbnail)
+
+    @property
+    def index(self) -> dict[str, Any]:
+        """Of the source, made once."""
+        with self._making:
+            if self._index is None:
+                self._index = self.source.index()
+                self._script = script("index", self._index)
+            return self._index
+
+    def respond(self, path: str) -> Response:
+        """Answer an address, already without its query."""
+        if path in ("/", "/index.html"):
+            return Response(200, PAGE_FILES["index.html"], page_file("index.html"))
+        if path.startswith("/page/") and path[6:] in PAGE_FILES:
+            return Response(200, PAGE_FILES[path[6:]], page_file(path[6:]))
+        try:
+            return self._data(path) or _not_found("nothing here")
+        except DatasetError as error:
+            return _not_found(str(error))
+
+    def _data(self, path: str) -> Response | None:
+        if _INDEX.fullmatch(path):
+            _ = self.index
+            return Response(200, _SCRIPT, self._script)
+        if match := _EPISODE.fullmatch(path):
+            number = int(match[1])
+            return Response(200, _SCRIPT, script(f"episode_{number}", self.source.episode(number)))
+        if match := _THUMBNAIL.fullmatch(path):
+            return _picture(self._thumbnail(int(match[1])))
+        if match := _PICTURE.fullmatch(path):
+            number, camera, kind, step = int(match[1]), match[2], match[3], int(match[4])
+            if camera not in self.index["cameras"]:
+                return None
+            if kind == "rgb":
+                return _picture(self.source.rgb(number, camera, step))
+            return _picture(pictures.depth_picture(self.source.depth(number, camera, step)))
+        return None
+
+    def _make_thumbnail(self, number: int) -> Picture:
+        return make_thumbnail(self.source, self.index, number)
+
+
+def make_thumbnail(source: Source, index: dict[str, Any], number: int) -> Picture:
+    """The first step as the camera sees it that shows most: the static one where there is one.
+
+    Raises:
+        DatasetError: no such episode, or no pictures.
+    """
+    cameras = index["cameras"]
+    if not cameras:
+        raise DatasetError("no pictures", where=source.root)
+    camera = next((name for name in cameras if "static" in name), cameras[0])
+    return pictures.thumbnail(source.rgb(number, camera, 0))
+
+
+def script(name: str, content: Any) -> bytes:
+    """Content as a script that hands it to the page."""
+    text = json.dumps(content, ensure_ascii=True, separators=(",", ":"), allow_nan=False, default=str)
+    return f'robocas.put("{name}",{text});\n'.encode()
+
+
+def page_file(name: str) -> bytes:
+    """One of the page's files."""
+    return files("robocas_ms3.viewer").joinpath("page", name).read_bytes()
+
+
+def _picture(picture: Picture) -> Response:
+    return Response(200, picture.kind, picture.data, keep_s=600)
+
+
+def _not_found(why: str) -> Response:
+    return Response(404, "text/plain; charset=utf-8", (why + "\n").encode())

@@ -1,0 +1,89 @@
+"""Serves the viewer to browsers on this machine, and to nobody else."""
+
+from __future__ import annotations
+
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from urllib.parse import urlsplit
+
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.viewer.routes import Response, Routes
+from robocas_ms3.viewer.source import Source
+
+HOST = "127.0.0.1"
+_POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+
+
+class Viewer(ThreadingHTTPServer):
+    """The server; use it in a ``with`` statement, and ``serve_forever``."""
+
+    daemon_threads = True
+
+    def __init__(self, source: Source, port: int = 0) -> None:
+        """Take a port of 127.0.0.1.
+
+        Args:
+            source: what to show.
+            port: 0 takes a free one.
+
+        Raises:
+            RobocasError: the port is taken.
+        """
+        self.routes = Routes(source)
+        try:
+            super().__init__((HOST, port), _Handler)
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            fix = "Choose another, or leave --port out for a free one."
+            raise RobocasError("can't listen on this port", where=port, found=reason, fix=fix) from error
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{HOST}:{self.server_port}/"
+
+    def warm_up(self) -> None:
+        """Make the index while the browser is still starting."""
+        threading.Thread(target=lambda: self.routes.respond("/data/index.js"), daemon=True).start()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server_version = "robocas"
+    sys_version = ""
+    timeout = 60  # s: idle connections end
+
+    def do_GET(self) -> None:
+        self._answer(body=True)
+
+    def do_HEAD(self) -> None:
+        self._answer(body=False)
+
+    def _answer(self, *, body: bool) -> None:
+        assert isinstance(self.server, Viewer)
+        # A page elsewhere whose name was made to point here (DNS rebinding) must not read the dataset.
+        allowed = {f"{name}:{self.server.server_port}" for name in (HOST, "localhost")}
+        if self.headers.get("Host") not in allowed:
+            response = Response(403, "text/plain; charset=utf-8", b"for this machine only\n")
+        else:
+            try:
+                response = self.server.routes.respond(urlsplit(self.path).path)
+            except Exception as error:  # a broken episode must not end the connection of all others
+                text = f"{type(error).__name__}: {error}\n"
+                response = Response(500, "text/plain; charset=utf-8", text.encode())
+        self.send_response(response.status)
+        self.send_header("Content-Type", response.kind)
+        self.send_header("Content-Length", str(len(response.data)))
+        self.send_header("Cache-Control", f"max-age={response.keep_s}" if response.keep_s else "no-cache")
+        self.send_header("Content-Security-Policy", _POLICY)
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+        self.end_headers()
+        if body:
+            try:
+                self.wfile.write(response.data)
+            except (BrokenPipeError, ConnectionResetError):
+                self.close_connection = True  # the browser moved on to another step
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing: thousands of pictures are no news."""

@@ -1,0 +1,168 @@
+"""A trajectory file of ``robocas generate`` as the page shows it: no pictures, but the objects' motion."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.datasets.episode import invert, planar_base
+from robocas_ms3.datasets.forward import robot_frames
+from robocas_ms3.datasets.provenance import succeeded
+from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.robots import constants as c
+from robocas_ms3.viewer.failures import describe, of_seed, read_failures, stages
+from robocas_ms3.viewer.plots import ARM, ROLL_PITCH_YAW, XYZ, base_plot, gripper_plot, motion_plots
+from robocas_ms3.viewer.source import Picture, make_episode, make_index, make_trace, plot, row
+
+NOTE = "A trajectory file holds states, no pictures: `robocas convert {name} --to robocas --out DIR` renders them."
+_STILL = 0.002  # m: an object that moves less is drawn where it stands
+
+
+class TrajectorySource:
+    """``F.h5`` with ``F.json`` beside it; a step is a state, T = S + 1."""
+
+    def __init__(self, path: Path) -> None:
+        """Open both.
+
+        Raises:
+            DatasetError: a file is missing, damaged, or they do not match.
+        """
+        self.root = path
+        self.file = TrajectoryFile(path)
+        self.failures = read_failures(path.parent)
+        self._position = {int(e["episode_id"]): i for i, e in enumerate(self.file.episodes)}
+        self._reading = threading.Lock()  # HDF5 reads from one thread at a time
+
+    def index(self) -> dict[str, Any]:
+        """From the JSON alone; seeds without an episode, from ``failures.jsonl``, come last."""
+        task, rows, seeds = _task(self.file.env_info), [], set()
+        for episode in self.file.episodes:
+            recorded = episode.get("robocas", {})
+            seed = _seed(episode)
+            seeds.add(seed)
+            failures = of_seed(self.failures, seed)
+            rows.append(
+                row(
+                    int(episode["episode_id"]),
+                    steps=int(episode.get("elapsed_steps", 0)) + 1,
+                    instruction=recorded.get("instruction", ""),
+                    task=task,
+                    target=(recorded.get("target") or {}).get("name", ""),
+                    seed=seed,
+                    success=succeeded(episode),
+                    stages=stages(failures, recorded),
+                    attempts=recorded.get("attempts"),
+                )
+            )
+        for seed, failures in sorted(self.failures.items()):
+            if seed not in seeds and any(failure.gave_up for failure in failures):
+                tried = [failure for failure in failures if not failure.gave_up]
+                named = stages(tried, {}) or ["given up"]
+                rows.append(row(None, task=task, seed=seed, success=False, stages=named, attempts=len(tried)))
+        note = NOTE.format(name=self.root.name)
+        return make_index(self.root, "trajectory file", self.file.control_freq, (), False, rows, note)
+
+    def episode(self, number: int) -> dict[str, Any]:
+        """States as plots, recorded actions, and the paths of TCP and objects."""
+        if number not in self._position:
+            raise DatasetError("no such episode", where=self.root, found=number)
+        position = self._position[number]
+        with self._reading:
+            recording = self.file.recording(position)
+        entry = self.file.episodes[position].get("robocas", {})
+        steps = recording.control_steps + 1
+        joints = recording.joints(np.arange(steps))
+        frames = robot_frames(joints)
+        to_base = invert(frames.arm_base_in_world)
+        tcp = to_base @ frames.tcp_in_world
+        xyzw = Rotation.from_matrix(tcp[:, :3, :3]).as_quat()
+        last = steps - 1
+        return make_episode(
+            number,
+            instruction=recording.instruction,
+            steps=steps,
+            rate_hz=self.file.control_freq,
+            subgoals=[
+                {
+                    "type": goal.goal_type,
+                    "text": goal.goal_description,
+                    "first": goal.first,
+                    "last": last if goal.last == last - 1 else goal.last,  # the last state is its last action's
+                }
+                for goal in recording.subgoals
+            ],
+            plots=[
+                *motion_plots(tcp[:, :3, 3], xyzw, joints.qpos[:, c.ARM_SLICE]),
+                gripper_plot(joints.qpos[:, c.FINGER_SLICE].sum(axis=1), None),
+                *_actions(recording),
+                *base_plot(planar_base(joints)),
+            ],
+            trace=make_trace(frames.tcp_in_world, _objects(recording, entry, to_base[0]), moving=True),
+            facts={
+                "Configuration": self.file.env_info["env_kwargs"].get("config"),
+                "Object pack": self.file.env_info["env_kwargs"].get("pack"),
+                "Recorded with": recording.control_mode,
+                "Relation": entry.get("relation"),
+                **{str(name).capitalize(): value for name, value in (entry.get("facts") or {}).items()},
+            },
+            failures=describe(of_seed(self.failures, recording.seed), entry),
+        )
+
+    def rgb(self, number: int, camera: str, step: int) -> Picture:
+        """There is none."""
+        raise DatasetError("a trajectory file holds no pictures", where=self.root, fix="Use robocas convert.")
+
+    def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
+        """There is none."""
+        raise DatasetError("a trajectory file holds no pictures", where=self.root, fix="Use robocas convert.")
+
+
+def _actions(recording: Recording) -> list[dict[str, Any]]:
+    """Recorded actions: arm, gripper, and base where it moves. The last state has none; it shows the one before."""
+    values = np.concatenate([recording.actions, recording.actions[-1:]])
+    arm = {7: 6, 8: 7, 10: 6, 11: 7}.get(values.shape[1])  # 6: end-effector deltas
+    if arm is None:
+        return [plot("Actions", "", [f"a{i + 1}" for i in range(values.shape[1])], values, steps=True)]
+    names = ARM if arm == 7 else (*XYZ, *ROLL_PITCH_YAW)
+    unit = "rad" if recording.control_mode == "pd_joint_pos" else ""
+    plots = [
+        plot(f"Action: arm, {recording.control_mode}", unit, names, values[:, :arm], steps=True),
+        plot("Action: gripper, 1 opens", "", ("gripper",), values[:, arm : arm + 1], steps=True),
+    ]
+    base = values[:, arm + 1 :]
+    return plots + ([plot("Action: mobile base", "", ("x", "y", "yaw"), base, steps=True)] if base.any() else [])
+
+
+def _objects(recording: Recording, entry: dict[str, Any], world_to_base: NDArray) -> list[dict[str, Any]]:
+    """Paths of actors, thinned to one point where they stand still, without those parked far away."""
+    target = (entry.get("target") or {}).get("slot")
+    named = {f"object_{slot}": str(name).replace("_", " ") for slot, name in enumerate(entry.get("objects") or ())}
+    if target is not None:
+        named[f"object_{target}"] = entry["target"].get("name", "target")
+    found = []
+    for actor, states in recording.states.get("actors", {}).items():
+        path = states[:, :3].astype(float)
+        start = world_to_base[:3, :3] @ path[0] + world_to_base[:3, 3]
+        if np.linalg.norm(start) > 5 or actor in ("ground", "room"):
+            continue
+        still = np.ptp(path, axis=0).max() < _STILL
+        name = named.get(actor, actor.replace("_", " "))
+        found.append({"name": name, "target": actor == f"object_{target}", "path": path[:1] if still else path})
+    return found
+
+
+def _task(env_info: dict[str, Any]) -> str:
+    """``pick`` of ``robocas_ms3:RoboCASOpenPick-v1`` and the like."""
+    name = str(env_info.get("env_id", "")).rpartition(":")[2].removeprefix("RoboCAS").partition("-")[0]
+    return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name).lstrip("_")
+
+
+def _seed(episode: dict[str, Any]) -> int | None:
+    seed = episode.get("episode_seed")
+    return None if seed is None else int(np.ravel(seed)[0])

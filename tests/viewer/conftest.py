@@ -1,0 +1,51 @@
+"""Datasets to look at, without a simulator."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+DATASETS = Path(__file__).resolve().parents[1] / "datasets"
+
+
+@pytest.fixture(scope="session")
+def made_up():
+    """The module that makes trajectories and pictures for the tests of datasets."""
+    if "synthetic" not in sys.modules:
+        spec = importlib.util.spec_from_file_location("synthetic", DATASETS / "synthetic.py")
+        assert spec is not None and spec.loader is not None
+        sys.modules["synthetic"] = module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    return sys.modules["synthetic"]
+
+
+@pytest.fixture(scope="session")
+def run_folder(made_up, tmp_path_factory):
+    """A run of three episodes: seed 4 failed once before, seed 9 was given up."""
+    folder = tmp_path_factory.mktemp("run")
+    path = made_up.write_trajectory(folder / "trajectory.h5", seeds=(3, 4, 5), failed=(1,))
+    metadata = json.loads(path.with_suffix(".json").read_text())
+    metadata["episodes"][1]["robocas"]["attempts"] = 2
+    path.with_suffix(".json").write_text(json.dumps(metadata))
+    failures = [
+        {"seed": 4, "attempt": 0, "stage": "grasp", "reason": "slipped", "seconds": 2.5},
+        {"seed": 9, "attempt": 0, "stage": "reach", "reason": "unreachable", "seconds": 1.0},
+        {"seed": 9, "attempt": -1, "stage": "episode", "reason": "gave_up", "seconds": 0.0},
+    ]
+    (folder / "failures.jsonl").write_text("".join(json.dumps(line) + "\n" for line in failures))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def folder(run_folder, made_up, tmp_path_factory):
+    """The same as a RoboCAS folder of all three, small pictures, nobody may change it."""
+    from robocas_ms3.datasets.convert import convert
+
+    out = tmp_path_factory.mktemp("folder") / "dataset"
+    convert(run_folder / "trajectory.h5", out, open_source=made_up.RayCaster, embeddings=False, include_failed=True)
+    (out / "failures.jsonl").write_bytes((run_folder / "failures.jsonl").read_bytes())
+    return out

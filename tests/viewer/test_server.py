@@ -1,0 +1,145 @@
+"""The local server: what it gives, and what it refuses."""
+
+import http.client
+import json
+import socket
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.viewer.routes import PAGE_FILES
+from robocas_ms3.viewer.server import HOST, Viewer
+from robocas_ms3.viewer.source import open_source
+
+
+@pytest.fixture(scope="module")
+def server(folder):
+    with Viewer(open_source(folder)) as running:
+        threading.Thread(target=running.serve_forever, args=(0.02,), daemon=True).start()
+        yield running
+        running.shutdown()
+
+
+def get(server, path, method="GET", host=None):
+    connection = http.client.HTTPConnection(HOST, server.server_port, timeout=30)
+    connection.putrequest(method, path, skip_host=True)
+    connection.putheader("Host", host or f"{HOST}:{server.server_port}")
+    connection.endheaders()
+    response = connection.getresponse()
+    data = response.read()
+    connection.close()
+    return response, data
+
+
+def content(data: bytes, name: str):
+    head, tail = f'robocas.put("{name}",'.encode(), b");\n"
+    assert data.startswith(head)
+    assert data.endswith(tail)
+    return json.loads(data[len(head) : -len(tail)])
+
+
+def pixels(data: bytes):
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def test_the_page_and_its_files(server):
+    response, data = get(server, "/?x=1")
+    assert response.status == 200
+    assert data.startswith(b"<!doctype html>")
+    for name, kind in PAGE_FILES.items():
+        response, found = get(server, f"/page/{name}")
+        assert (response.status, response.headers["Content-Type"]) == (200, kind)
+        assert found
+        if name != "index.html":
+            assert f"page/{name}".encode() in data, f"{name} is not used"
+    assert b"//" not in data.replace(b"://", b"//").split(b"<body>")[0]  # nothing from elsewhere
+    assert "default-src 'self'" in response.headers["Content-Security-Policy"]
+
+
+def test_data(server, folder):
+    response, data = get(server, "/data/index.js")
+    assert response.headers["Content-Type"].startswith("text/javascript")
+    assert [row["n"] for row in content(data, "index")["episodes"]] == [0, 1, 2]
+    _, data = get(server, "/data/episode_1.js")
+    assert content(data, "episode_1")["steps"] == 7
+
+
+def test_pictures(server, folder):
+    response, data = get(server, "/pictures/1/base_camera/rgb/2.jpg")
+    assert response.headers["Content-Type"] == "image/png"
+    assert data == (folder / "episode_0000001/base_camera/rgb/0002.png").read_bytes()
+    response, data = get(server, "/pictures/1/base_camera/depth/2.jpg")
+    assert response.headers["Content-Type"] == "image/jpeg"
+    assert pixels(data).shape == (48, 64, 3)
+    _, data = get(server, "/thumbnails/1.jpg")
+    assert pixels(data).shape == (72, 96, 3)
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../../../../etc/passwd",
+        "/page/../routes.py",
+        "/page/..%2froutes.py",
+        "/page/%2e%2e/routes.py",
+        "//etc/passwd",
+        "/etc/passwd",
+        "/conversion.json",
+        "/failures.jsonl",
+        "/episode_0000000/episode_info.npz",
+        "/page/",
+        "/page/server.py",
+        "/data/episode_../../x.js",
+        "/data/episode_-1.js",
+        "/data/episode_01.js",
+        "/data/episode_9.js",
+        "/data/episode_99999999999999999999.js",
+        "/data/index.json",
+        "/pictures/0/../rgb/0.jpg",
+        "/pictures/0/..%2f..%2fx/rgb/0.jpg",
+        "/pictures/0/top_camera/rgb/0.jpg",
+        "/pictures/0/base_camera/mask/0.jpg",
+        "/pictures/0/base_camera/rgb/7.jpg",
+        "/pictures/0/base_camera/rgb/0.png",
+        "/pictures/0/base_camera/rgb/0.jpg/",
+        "/pictures/9/base_camera/rgb/0.jpg",
+        "/thumbnails/9.jpg",
+        "/data/index.js%00",
+        "/data/episode_%D9%A1.js",
+    ],
+)
+def test_nothing_else_is_served(server, path):
+    response, data = get(server, path)
+    assert response.status == 404
+    assert b"root:" not in data
+    assert response.headers["Content-Type"].startswith("text/plain")
+
+
+def test_only_for_this_machine(server):
+    assert server.server_address[0] == "127.0.0.1"
+    for host in ("evil.example", f"evil.example:{server.server_port}", HOST):
+        response, data = get(server, "/data/index.js", host=host)
+        assert response.status == 403
+        assert b"episodes" not in data
+    assert get(server, "/", host=f"localhost:{server.server_port}")[0].status == 200
+
+
+def test_it_takes_no_orders(server):
+    for method in ("POST", "PUT", "DELETE"):
+        assert get(server, "/data/index.js", method)[0].status == 501
+    response, data = get(server, "/data/index.js", "HEAD")
+    assert (response.status, data) == (200, b"")
+    assert int(response.headers["Content-Length"]) > 100
+
+
+def test_a_port_that_is_taken(folder):
+    with socket.socket() as taken:
+        taken.bind((HOST, 0))
+        taken.listen()
+        with pytest.raises(RobocasError, match="can't listen"):
+            Viewer(open_source(folder), taken.getsockname()[1])
+    with pytest.raises(RobocasError, match="can't listen"):
+        Viewer(open_source(folder), 70_000)

@@ -1,0 +1,184 @@
+"""What the page is told of trajectories and datasets."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.viewer.source import open_source, plot, rounded
+
+ROW = {"n", "steps", "instruction", "task", "object", "seed", "success", "split", "stages", "attempts"}
+EPISODE = {"n", "instruction", "steps", "times", "subgoals", "plots", "trace", "facts", "failures"}
+
+
+def series(episode, title):
+    (found,) = [p for p in episode["plots"] if p["title"].startswith(title)]
+    return np.column_stack([s["values"] for s in found["series"]])
+
+
+def test_numbers_are_rounded_and_what_json_lacks_becomes_none():
+    assert rounded([[1.000001, -0.000001]]) == [[1.0, 0.0]]
+    assert str(rounded([-0.000001])) == "[0.0]"
+    assert rounded([0.5, np.nan, np.inf]) == [0.5, None, None]
+    assert plot("p", "m", ("x",), np.array([[1.0], [2.0]]))["series"] == [{"name": "x", "values": [1.0, 2.0]}]
+
+
+def test_a_trajectory_lists_episodes_and_seeds_that_were_given_up(run_folder):
+    index = open_source(run_folder / "trajectory.h5").index()
+    assert index == json.loads(json.dumps(index, allow_nan=False))
+    assert all(set(row) == ROW for row in index["episodes"])
+    assert [row["n"] for row in index["episodes"]] == [0, 1, 2, None]
+    assert [row["seed"] for row in index["episodes"]] == [3, 4, 5, 9]
+    assert [row["success"] for row in index["episodes"]] == [True, False, True, False]
+    assert [row["stages"] for row in index["episodes"]] == [[], ["grasp"], [], ["reach"]]
+    assert [row["attempts"] for row in index["episodes"]] == [None, 2, None, 1]
+    assert index["episodes"][0]["task"] == "pick"
+    assert index["episodes"][0]["object"] == "cube 3"
+    assert (index["cameras"], index["depth"], index["rate_hz"]) == ([], False, 20)
+    assert "`robocas convert trajectory.h5" in index["note"]
+
+
+def test_a_run_folder_is_its_trajectory(run_folder):
+    assert open_source(run_folder).index()["kind"] == "trajectory file"
+
+
+def test_an_episode_of_a_trajectory(run_folder, made_up):
+    episode = open_source(run_folder / "trajectory.h5").episode(1)
+    states = made_up.make_states(4)
+    assert set(episode) == EPISODE
+    steps = made_up.STEPS + 1
+    assert episode["steps"] == len(episode["times"]) == steps
+    assert episode["times"][-1] == pytest.approx(made_up.STEPS / 20)
+    assert all(len(s["values"]) == steps for p in episode["plots"] for s in p["series"])
+    robot = states["articulations"]["robocas_mobile_panda"]
+    np.testing.assert_allclose(series(episode, "Arm joints"), robot[:, 16:23], atol=1e-5)
+    np.testing.assert_allclose(series(episode, "Gripper")[:, 0], robot[:, 23:25].sum(axis=1) * 1000, atol=1e-4)
+    np.testing.assert_allclose(series(episode, "Action: arm")[:-1], robot[1:, 16:23], atol=1e-5)
+    np.testing.assert_allclose(series(episode, "Action: gripper")[:, 0], [1] * 9 + [-1] * (steps - 9))
+    # sub-goals cover all states, the last one too
+    assert [(g["first"], g["last"]) for g in episode["subgoals"]] == [(0, 11), (12, steps - 1)]
+    objects = {thing["name"]: thing for thing in episode["trace"]["objects"]}
+    assert set(objects) == {"cube 4", "object 1", "object 2"}
+    assert [name for name, thing in objects.items() if thing["target"]] == ["cube 4"]
+    assert len(objects["cube 4"]["path"]) == steps  # it is lifted
+    assert len(objects["object 1"]["path"]) == 1  # it stands
+    assert objects["cube 4"]["path"][-1][2] == pytest.approx(0.66 + 0.1, abs=1e-4)
+    assert episode["trace"]["moving"]
+    assert [(f["stage"], f["reason"]) for f in episode["failures"]] == [("grasp", "slipped")]
+
+
+def test_the_tcp_of_a_trajectory_is_where_its_joints_put_it(run_folder):
+    """Worked out from the Panda's published Denavit-Hartenberg parameters, for the first state of episode 0."""
+    from scipy.spatial.transform import Rotation
+
+    episode = open_source(run_folder).episode(0)
+    pose = np.eye(4)
+    table = [(0, 0.333, 0), (0, 0, -1), (0, 0.316, 1), (0.0825, 0, 1), (-0.0825, 0.384, -1), (0, 0, 1), (0.088, 0, 1)]
+    for (a, d, quarter), angle in zip(table, series(episode, "Arm joints")[0], strict=True):
+        link = np.eye(4)
+        link[:3, :3] = (
+            Rotation.from_euler("x", quarter * 90, degrees=True) * Rotation.from_euler("z", angle)
+        ).as_matrix()
+        link[:3, 3] = [a, 0, 0] + link[:3, 2] * d
+        pose = pose @ link
+    tcp = pose[:3, 3] + pose[:3, 2] * (0.107 + 0.1334)
+    np.testing.assert_allclose(series(episode, "TCP position")[0], tcp, atol=2e-3)
+    turned = [0.7 - tcp[1], 0.15 + tcp[0], 0.49 + tcp[2]]  # the base at (0.7, 0.15), turned by 90 degrees, 0.49 m up
+    np.testing.assert_allclose(episode["trace"]["tcp"][0], turned, atol=2e-3)
+
+
+def test_a_folder_lists_episodes(folder):
+    index = open_source(folder).index()
+    assert all(set(row) == ROW for row in index["episodes"])
+    assert [row["n"] for row in index["episodes"]] == [0, 1, 2]
+    assert [row["success"] for row in index["episodes"]] == [True, False, True]
+    assert [row["stages"] for row in index["episodes"]] == [[], ["grasp"], []]
+    assert [row["object"] for row in index["episodes"]] == ["cube 3", "cube 4", "cube 5"]
+    assert [row["steps"] for row in index["episodes"]] == [7, 7, 7]
+    assert index["cameras"] == ["base_camera", "gripper_camera", "static_camera"]
+    assert (index["depth"], index["rate_hz"], index["note"]) == (True, 5, "")
+    assert sorted(row["split"] for row in index["episodes"]) == ["train", "train", "val"]
+
+
+def test_an_episode_of_a_folder(folder):
+    episode, arrays = open_source(folder).episode(1), Dataset(folder).episode(1).arrays
+    assert set(episode) == EPISODE
+    np.testing.assert_allclose(series(episode, "TCP position"), arrays["ee_pos"], atol=1e-5)
+    np.testing.assert_allclose(series(episode, "Action: TCP translation"), arrays["rel_pos"] * 1000, atol=1e-5)
+    np.testing.assert_allclose(series(episode, "Gripper")[:, 1], np.where(arrays["gripper_status"], 80, 0))
+    assert episode["subgoals"][0]["first"] == 0
+    assert episode["subgoals"][-1]["last"] == 6
+    assert len(episode["trace"]["tcp"]) == 7
+    assert [f["stage"] for f in episode["failures"]] == ["grasp"]
+
+
+def test_pictures_are_those_of_the_folder(folder):
+    source = open_source(folder)
+    picture = source.rgb(2, "static_camera", 3)
+    assert picture.kind == "image/png"
+    assert picture.data == (folder / "episode_0000002/static_camera/rgb/0003.png").read_bytes()
+    assert (source.depth(2, "base_camera", 0) == Dataset(folder).episode(2).depth("base_camera", 0)).all()
+
+
+@pytest.mark.parametrize("number", [3, 99])
+def test_there_is_no_such_episode(folder, run_folder, number):
+    for path in (folder, run_folder):
+        with pytest.raises(DatasetError, match="no such episode"):
+            open_source(path).episode(number)
+
+
+def test_a_folder_without_our_additions_is_shown_too(folder, tmp_path):
+    bare = shutil.copytree(folder, tmp_path / "bare")
+    for path in [
+        bare / "conversion.json",
+        bare / "data_info.json",
+        bare / "failures.jsonl",
+        *bare.glob("*/scene.json"),
+    ]:
+        path.unlink()
+    source = open_source(bare)
+    (row, *_) = source.index()["episodes"]
+    assert (row["steps"], row["success"], row["seed"], row["split"]) == (7, None, None, "")
+    episode = source.episode(0)
+    assert episode["trace"]["objects"] == []
+    assert episode["instruction"].startswith("grasp the cube 3")
+
+
+def test_damage_is_an_error_of_that_episode_alone(folder, tmp_path):
+    spoilt = shutil.copytree(folder, tmp_path / "spoilt")
+    (spoilt / "episode_0000000/episode_info.npz").write_bytes(b"PK\x03\x04 cut")
+    (spoilt / "episode_0000000/scene.json").write_text("{")
+    source = open_source(spoilt)
+    assert [row["n"] for row in source.index()["episodes"]] == [0, 1, 2]
+    with pytest.raises(DatasetError, match="episode_0000000"):
+        source.episode(0)
+    assert source.episode(1)["n"] == 1
+
+
+def test_a_link_that_leads_out_is_refused(folder, tmp_path):
+    spoilt = shutil.copytree(folder, tmp_path / "spoilt")
+    secret = tmp_path / "secret.png"
+    secret.write_bytes(b"secret")
+    for kind in ("rgb", "depth"):
+        path = spoilt / f"episode_0000001/base_camera/{kind}/0002.png"
+        path.unlink()
+        path.symlink_to(secret)
+    source = open_source(spoilt)
+    with pytest.raises(DatasetError, match="leads out"):
+        source.rgb(1, "base_camera", 2)
+    with pytest.raises(DatasetError, match="leads out"):
+        source.depth(1, "base_camera", 2)
+
+
+def test_nothing_to_view(tmp_path):
+    (tmp_path / "notes.txt").write_text("hello")
+    for path, why in (
+        (tmp_path, "no dataset"),
+        (tmp_path / "notes.txt", "nothing to view"),
+        (tmp_path / "x", "no such"),
+    ):
+        with pytest.raises(DatasetError, match=why):
+            open_source(path)
