@@ -1,4 +1,4 @@
-"""Convert a made-up trajectory to LeRobot and die by SIGKILL on the way: `python dying_lerobot.py MOMENT TRAJECTORY OUT`."""
+"""Convert a made-up trajectory to LeRobot and die by SIGKILL: `python dying_lerobot.py MOMENT TRAJECTORY OUT`."""
 
 import sys
 

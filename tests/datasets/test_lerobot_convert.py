@@ -7,9 +7,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from synthetic import RayCaster, write_trajectory
+
+pytest.importorskip("av", reason="needs the extra 'lerobot'")
+pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
@@ -48,6 +50,7 @@ def test_the_folder_is_that_of_version_3(lerobot):
         "meta/episodes/chunk-000/file-000.parquet",
         "meta/robocas/conversion.json",
         "meta/robocas/episodes.parquet",
+        "meta/robocas/checksums.json",
         "data/chunk-000/file-000.parquet",
     }
     for camera in ("base", "gripper", "static"):

@@ -105,6 +105,8 @@ def assemble(parts: Path, plan: dict[str, Any], fps: int, root: Path, limits: Li
     videos = {camera: packet_times(_video_file(root, "rgb", camera, 0, 0))[1] for camera in cameras}
     write_json(root / schema.INFO_FILE, _info(plan, fps, start, len(tasks), videos, limits))
     write_json(root / schema.CONVERSION_FILE, plan)
+    sums = {str(path.relative_to(root)): schema.checksum(path) for path in schema.content_files(root)}
+    write_json(root / schema.CHECKSUMS_FILE, sums)
 
 
 _FLOATS = {feature.key for feature in schema.FEATURES} | {"timestamp"}

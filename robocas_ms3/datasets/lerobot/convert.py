@@ -14,7 +14,7 @@ from typing import Any, Literal
 import robocas_ms3
 from robocas_ms3.datasets.convert import Conversion, open_env
 from robocas_ms3.datasets.info import split_by_seed
-from robocas_ms3.datasets.lerobot.schema import CONVERSION_FILE, INFO_FILE, Limits, require_extra
+from robocas_ms3.datasets.lerobot.schema import CONTENT, CONVERSION_FILE, INFO_FILE, Limits, require_extra
 from robocas_ms3.datasets.lerobot.sources import EpisodeSource, Request, open_request
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.workers import OpenSource
@@ -27,7 +27,7 @@ Codec = Literal["h264", "av1"]
 PARTS = ".parts"
 """Folder of the episodes done so far; gone when the dataset is there."""
 _PLAN, _JOINED = "plan.json", ".joined"
-_FOLDERS = ("data", "videos", "depth", "meta")  # meta comes last: where it is, the dataset is whole
+_FOLDERS = (*CONTENT, "meta")  # meta comes last: where it is, the dataset is whole
 
 
 def convert_lerobot(

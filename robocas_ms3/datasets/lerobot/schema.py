@@ -9,6 +9,7 @@
     meta/episodes/chunk-000/file-000.parquet    one row an episode: where it is, its tasks, its statistics
     meta/robocas/conversion.json                how the dataset was made, and which episode is which recording; ours
     meta/robocas/episodes.parquet               scene.json and cameras of each episode; ours
+    meta/robocas/checksums.json                 SHA-256 of the files below; ours
     data/chunk-000/file-000.parquet             one row a frame
     videos/<key>/chunk-000/file-000.mp4         RGB, episodes one after the other
     depth/<camera>/chunk-000/file-000.mkv       16-bit depth, FFV1, in the same way; ours, LeRobot does not look there
@@ -18,6 +19,7 @@ Metres and radians; quaternions are xyzw.
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +40,9 @@ TASKS_FILE = "meta/tasks.parquet"
 SUBTASKS_FILE = "meta/subtasks.parquet"
 CONVERSION_FILE = "meta/robocas/conversion.json"
 SCENES_FILE = "meta/robocas/episodes.parquet"
+CHECKSUMS_FILE = "meta/robocas/checksums.json"
+CONTENT = ("data", "videos", "depth")
+"""Folders of the files that grow with the dataset."""
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 DATA_PATH = f"data/{_FILE}.parquet"
 EPISODES_PATH = f"meta/episodes/{_FILE}.parquet"
@@ -232,6 +237,20 @@ def require_extra() -> None:
         raise MissingExtraError(
             f"LeRobot datasets need {' and '.join(missing)}", fix='Run pip install "robocas-ms3[lerobot]".'
         )
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(2**20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def content_files(root: Path) -> list[Path]:
+    """Files of data, videos and depth, sorted."""
+    return sorted(path for name in CONTENT for path in (root / name).rglob("*") if path.is_file())
 
 
 def data_file(root: Path, pattern: str, chunk: int, file: int, **names: str) -> Path:
