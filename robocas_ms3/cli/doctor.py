@@ -37,9 +37,10 @@ def main(cfg: Doctor) -> int:
 
 
 def _print(findings: list[Finding], failed: int) -> None:
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
+
+    from robocas_ms3.cli.tables import table_console
 
     marks = {"ok": "[green]ok[/]", "limited": "[yellow]limited[/]", "fail": "[bold red]FAIL[/]"}
     table = Table("", "what")
@@ -49,7 +50,7 @@ def _print(findings: list[Finding], failed: int) -> None:
     for finding in findings:
         row = (finding.name, finding.found, finding.fix)[: len(table.columns) - 1]
         table.add_row(marks[finding.status], *map(escape, row))
-    console = Console()
+    console = table_console()
     console.print(table)
     limited = sum(finding.status == "limited" for finding in findings)
     verdict = f"{failed} of what is needed fails" if failed else "everything needed works"

@@ -72,9 +72,12 @@ def build(command: Build) -> int:
 
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.config import load_task_config
+    from robocas_ms3.demos.checks import check_number
     from robocas_ms3.scenes.bank import LayoutBank, fill, pairs_of
     from robocas_ms3.scenes.model import SceneModel
 
+    if command.jobs is not None:
+        check_number("jobs", command.jobs, 1)
     objects = None if command.objects is None else objects_seeds(command.objects)
     pairs = pairs_of(seed_range(command.seeds), objects)
     model = SceneModel.load(
@@ -103,9 +106,9 @@ def info(command: Info) -> int:
     """Run ``info``."""
     import json
 
-    from rich.console import Console
     from rich.table import Table
 
+    from robocas_ms3.cli.tables import table_console
     from robocas_ms3.scenes.bank import ABOUT, banks_folder, count_layouts
 
     root = banks_folder(command.folder or "auto")
@@ -118,9 +121,9 @@ def info(command: Info) -> int:
         table.add_row(
             path.parent.name, str(count_layouts(path.parent)), *cells, about["object_pack"]["name"], furniture
         )
-    console = Console()
-    console = console if console.is_terminal else Console(width=180)
-    console.print(table if table.row_count else f"no banks in {root}", soft_wrap=not table.row_count, highlight=False)
+    table_console().print(
+        table if table.row_count else f"no banks in {root}", soft_wrap=not table.row_count, highlight=False
+    )
     return 0
 
 

@@ -68,20 +68,22 @@ def _size(folder: Path) -> int:
 
 
 def _print(found: dict[str, list[dict[str, Any]]]) -> None:
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
+
+    from robocas_ms3.cli.tables import table_console
 
     tables = {
         "tasks": ("name", "env_id", "default_config", "summary"),
         "configs": ("name", "task", "scene", "description"),
         "packs": ("name", "objects", "furniture", "megabytes", "folder"),
     }
-    console = Console()
+    console = table_console()
     for kind, columns in tables.items():
         table = Table(title=kind, title_justify="left", title_style="bold")
         for column in columns:
-            table.add_column(column.replace("_", " "), overflow="fold")
+            name = column in {"name", "env_id", "default_config", "task"}
+            table.add_column(column.replace("_", " "), overflow="fold", no_wrap=name)
         for row in found[kind]:
             values = (row[column] for column in columns)
             table.add_row(*(escape(", ".join(value) if isinstance(value, list) else str(value)) for value in values))

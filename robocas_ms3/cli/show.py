@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -18,11 +18,11 @@ class Show:
     pack: str = "builtin"
     """Object pack: its name, or its folder."""
     seed: int = 0
-    """Seed of the episode."""
+    """Seed of the episode, 0 or more."""
     out: Path = Path("scene")
     """Folder for the pictures."""
-    shader: str = "default"
-    """ManiSkill shader: minimal (fast), default, rt-fast or rt (ray tracing, needs a GPU)."""
+    shader: Literal["minimal", "default", "rt-fast", "rt-med", "rt"] = "default"
+    """ManiSkill shader: minimal (fast), default, or ray tracing (rt..., needs a GPU)."""
 
 
 def main(cfg: Show) -> int:
@@ -32,11 +32,13 @@ def main(cfg: Show) -> int:
 
     import robocas_ms3.tasks  # noqa: F401  (registers the environments)
     from robocas_ms3.config import load_task_config
+    from robocas_ms3.demos.checks import GREATEST_SEED, check_number
     from robocas_ms3.errors import RobocasError
     from robocas_ms3.files import make_folder, replacing
     from robocas_ms3.tasks.spec import TASKS
     from robocas_ms3.tasks.transfer import TransferEnv
 
+    check_number("seed", cfg.seed, 0, GREATEST_SEED)
     config = load_task_config(cfg.config)
     shader = {"shader_pack": cfg.shader}
     env = gym.make(

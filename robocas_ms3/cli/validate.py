@@ -28,12 +28,18 @@ def main(cfg: Validate) -> int:
 
     from robocas_ms3.datasets.validate import validate
 
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        bar = progress.add_task("episodes", total=None, visible=False)
-        report = validate(
-            cfg.dataset,
-            on_episode=lambda done, all: progress.update(bar, completed=done, total=all, visible=True),
-        )
+    progress = Progress(console=Console(stderr=True), transient=True)  # shown when there is something to do
+    bar = progress.add_task("episodes", total=None)
+
+    def on_episode(done: int, count: int) -> None:
+        progress.start()
+        progress.update(bar, completed=done, total=count)
+
+    try:
+        report = validate(cfg.dataset, on_episode=on_episode)
+    finally:
+        if progress.live.is_started:
+            progress.stop()
     console = Console(soft_wrap=True, highlight=False, markup=False)
     if cfg.json:
         console.print(json.dumps(report.as_json(), indent=2, ensure_ascii=False))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import sapien
@@ -86,6 +86,10 @@ class TransferEnv(RoboCASEnv):
             "success": success,
             "disturbed": self._disturbed(poses),
         }
+
+    def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """(N,) float32: 1 where the task has succeeded at this moment, else 0."""
+        return info["success"].float()
 
     def task_stages(self) -> dict[str, torch.Tensor]:
         """What a task adds to the stages: (N,) bool each, of this moment; ``target_held`` (N,) is known then."""

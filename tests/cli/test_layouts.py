@@ -66,3 +66,8 @@ def test_no_banks_is_said(tmp_path, capsys):
     assert run(["layouts", "info", "--folder", str(tmp_path)]) == 0
     assert "no banks in" in capsys.readouterr().out
     assert layouts.seed_range("2:4") == range(2, 4)
+
+
+def test_wrong_numbers_are_one_line(capsys):
+    assert run(["layouts", "build", "pick_table_scattered", "--jobs", "0"]) == 1
+    assert capsys.readouterr().err == "error: jobs: this number is out of range (expected at least 1, found 0)\n"

@@ -42,3 +42,17 @@ def test_a_damaged_pack_does_not_hide_the_others(damaged_pack, capsys):
     assert packs["broken"]["objects"] == []
     assert main(List()) == 0
     assert "damaged" in capsys.readouterr().out
+
+
+def test_names_are_whole_in_a_pipe_and_in_a_narrow_terminal(capsys, monkeypatch):
+    names = [*shipped_configs(), "RoboCASOpenPick-v1"]
+    assert main(List()) == 0
+    piped = capsys.readouterr().out
+    assert [name for name in names if f" {name} " not in piped] == []
+    assert max(map(len, piped.splitlines())) == 200
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "dumb")
+    assert main(List()) == 0
+    narrow = capsys.readouterr().out
+    assert [name for name in names if f" {name} " not in narrow] == []

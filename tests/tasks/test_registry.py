@@ -47,7 +47,9 @@ def test_observations_are_finite_and_batched(env):
         assert info[name].shape == (1,)
         assert info[name].dtype == torch.bool
         assert not info[name].any()
-    assert reward.item() == 0
+    assert (reward.dtype, reward.tolist()) == (torch.float32, [0.0])
+    won = base.compute_sparse_reward(obs, hold(env), {"success": torch.tensor([True])})
+    assert (won.dtype, won.tolist()) == (torch.float32, [1.0])
     assert not terminated.any()
     assert not truncated.any()
     assert info["disturbed"].tolist() == [0]
