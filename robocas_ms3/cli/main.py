@@ -30,6 +30,7 @@ COMMANDS = (
     "validate",
     "video",
     "view",
+    "stats",
     "merge",
     "split",
     "upgrade",

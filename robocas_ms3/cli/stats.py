@@ -1,0 +1,48 @@
+"""``robocas stats``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass
+class Stats:
+    """Count what is in a dataset: lengths, objects, layouts, instructions, actions, sub-goals. Pictures and JSON."""
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """Folder of a RoboCAS dataset, or trajectory.h5 (its failed episodes too)."""
+    out: Path | None = None
+    """Folder to write to; default: DATASET/preview/stats, or TRAJECTORY_stats beside a trajectory."""
+    json: bool = False
+    """Print the JSON; files are written only if --out says where."""
+    rate: float | None = None
+    """Steps a second of a trajectory; default 5. A dataset has its own."""
+
+
+def main(cfg: Stats) -> int:
+    """Count and draw; gives the exit code."""
+    import json
+
+    from rich.console import Console
+
+    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.datasets.schema import PREVIEW_FOLDER
+    from robocas_ms3.datasets.stats import collect
+    from robocas_ms3.datasets.stats_plots import write_stats
+
+    with bar("episodes") as shown:
+        stats = collect(cfg.path, rate_hz=cfg.rate, on_episode=shown.at)
+    default = cfg.path / PREVIEW_FOLDER / "stats" if cfg.path.is_dir() else cfg.path.with_name(f"{cfg.path.stem}_stats")
+    out = cfg.out or (None if cfg.json else default)
+    paths = write_stats(stats, out) if out else []
+    if cfg.json:
+        text = json.dumps(stats.as_json(), indent=2, ensure_ascii=False)
+        Console(soft_wrap=True, highlight=False, markup=False).print(text)
+        return 0
+    pictures = len(paths) - 1
+    say(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {pictures} pictures")
+    return 0
