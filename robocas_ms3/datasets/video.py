@@ -61,11 +61,11 @@ def video_frame(
 ) -> NDArray[np.uint8]:
     """One picture of the video, (H, W, 3) RGB, both even."""
     width, height = panel
-    canvas = Image.new("RGB", (width * len(schema.CAMERAS), height + _BAND), _PAPER)
+    canvas = Image.new("RGB", (width * len(episode.cameras), height + _BAND), _PAPER)
     draw = ImageDraw.Draw(canvas)
-    for index, camera in enumerate(schema.CAMERAS):
-        canvas.paste(_fit(_picture(episode, camera.name, step, kind), panel), (index * width, 0))
-        _label(draw, (index * width + 6, 5), camera.name.replace("_", " "), 14)
+    for index, camera in enumerate(episode.cameras):
+        canvas.paste(_fit(_picture(episode, camera, step, kind), panel), (index * width, 0))
+        _label(draw, (index * width + 6, 5), camera.replace("_", " "), 14)
     arrays = episode.arrays
     state = "open" if arrays["gripper_status"][step] else "closed"
     clock = f"episode {number}   step {step} / {episode.steps - 1}   gripper {state}"
@@ -99,24 +99,25 @@ def contact_sheet(
     dataset = Dataset(Path(root))
     numbers = dataset.numbers[:10] if episodes is None else list(episodes)
     width, height = thumbnail
+    cameras = dataset.episode(numbers[0]).cameras if numbers else ()
     left, caption, gap = 110, 30, 3
-    block = caption + len(schema.CAMERAS) * (height + gap) + 10
+    block = caption + len(cameras) * (height + gap) + 10
     sheet = Image.new("RGB", (left + columns * (width + gap), block * len(numbers)), _PAPER)
     draw = ImageDraw.Draw(sheet)
     for row, number in enumerate(numbers):
         episode = dataset.episode(number)
         top = row * block
         _text(draw, (8, top + 6), f"{number}   {episode.arrays['language_goal']}", 18, _INK, sheet.width - 16)
-        for index, camera in enumerate(schema.CAMERAS):
+        for index, camera in enumerate(cameras):
             y = top + caption + index * (height + gap)
-            for line, word in enumerate(camera.name.split("_")):
+            for line, word in enumerate(camera.split("_")):
                 draw.text((8, y + 6 + 20 * line), word, _FAINT, _font(16))
             for column, step in enumerate(np.linspace(0, episode.steps - 1, columns).round().astype(int)):
                 x = left + column * (width + gap)
-                sheet.paste(_fit(_picture(episode, camera.name, int(step), kind), thumbnail), (x, y))
+                sheet.paste(_fit(_picture(episode, camera, int(step), kind), thumbnail), (x, y))
                 if index == 0:
                     _label(draw, (x + 5, y + 4), f"{step / dataset.rate_hz:.1f} s", 13)
-                if index == len(schema.CAMERAS) - 1:
+                if index == len(cameras) - 1:
                     _label(draw, (x + 5, y + height - 22), str(episode.arrays["step_goal_type"][step]), 13)
     out = Path(out)
     with replacing(out) as tmp:

@@ -17,7 +17,7 @@ from robocas_ms3.datasets.manage.importing import import_robocas
 from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.validate import validate
-from robocas_ms3.datasets.video import contact_sheet
+from robocas_ms3.datasets.video import PANEL, contact_sheet, video_frame
 from robocas_ms3.errors import DatasetError
 
 OURS = ("agv_pose", "rel_agv_pose")
@@ -342,6 +342,8 @@ def test_rgb_alone_and_fewer_cameras(four, tmp_path):
     new = imported(root, tmp_path / "out")
     assert (new.settings["cameras"], new.settings["depth"]) == (["base_camera", "gripper_camera"], False)
     assert validate(new.root).violations == []
+    assert video_frame(new.episode(2), 3).shape[1] == 2 * PANEL[0]
+    contact_sheet(new.root, tmp_path / "sheet.png", columns=2)
 
 
 def test_the_overview(four, tmp_path):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 from robocas_ms3.datasets.manage.findings import FULL_SIZE, Layout, Report
 from robocas_ms3.datasets.picture_files import PictureHeader, read_header
 from robocas_ms3.datasets.reader import Episode
 
 _MOST = 3  # problems named of one camera's pictures
+_READERS = 4  # threads: reading and checksums happen outside Python's lock
 
 
 def check_pictures(episode: Episode, steps: int, report: Report) -> Layout | None:
@@ -37,22 +40,27 @@ def _pictures_of(
 ) -> Iterator[tuple[str, str]]:
     """(file, problem) of one camera's RGB or depth."""
     wanted = {"rgb": (8, 3), "depth": (16, 1)}[kind]
-    names: set[str] = set()
-    for step in range(steps):
-        path = episode.image_path(camera, kind, step)
-        names.add(path.name)
-        place = f"{camera}/{kind}/{path.name}"
-        try:
-            header = read_header(path)
-        except FileNotFoundError:
-            yield place, "missing"
-        except (OSError, ValueError) as error:
-            yield place, str(error)
-        else:
+    paths = [episode.image_path(camera, kind, step) for step in range(steps)]
+    with ThreadPoolExecutor(_READERS) as pool:
+        for path, header in zip(paths, pool.map(_header, paths), strict=True):
+            place = f"{camera}/{kind}/{path.name}"
+            if isinstance(header, str):
+                yield place, header
+                continue
             headers.add(PictureHeader(header.width, header.height, 0, 0))
             if (header.bits, header.channels) != wanted:
                 yield place, f"{header.channels} x {header.bits} bit, not {wanted[1]} x {wanted[0]} bit"
     folder = episode.folder / camera / kind
-    extra = {path.name for path in folder.iterdir()} - names if folder.is_dir() else set()
+    extra = {path.name for path in folder.iterdir()} - {path.name for path in paths} if folder.is_dir() else set()
     if extra:
         report.noted(f"{camera}/{kind}", f"{len(extra)} files beyond the {steps} steps: not taken")
+
+
+def _header(path: Path) -> PictureHeader | str:
+    """A picture's header, or what is wrong with it."""
+    try:
+        return read_header(path)
+    except FileNotFoundError:
+        return "missing"
+    except (OSError, ValueError) as error:
+        return str(error)
