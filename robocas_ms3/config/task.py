@@ -21,23 +21,23 @@ class StrictModel(BaseModel):
 class PoseConfig(StrictModel):
     """A pose in the world: position, and a turn about the vertical."""
 
-    position: Vec3
-    yaw_deg: float = 0.0
+    position: Vec3 = Field(description="x, y, z, m")
+    yaw_deg: float = Field(default=0.0, description="counter-clockwise, seen from above")
 
 
 class RoomConfig(StrictModel):
     """The room: an asset of the furniture pack, standing at the world's origin."""
 
-    asset: str
+    asset: str = Field(description="id in the furniture pack")
     finishes: dict[str, str] = Field(default={}, description="part (wall, floor) -> finish; others: the default")
 
 
 class LightConfig(StrictModel):
     """Lights of the scene."""
 
-    ambient: Annotated[float, Field(ge=0, le=2)] = 0.4
-    directional: Annotated[float, Field(ge=0, le=10)] = 1.0
-    direction: Vec3 = (0.3, 0.6, -1.0)
+    ambient: Annotated[float, Field(ge=0, le=2)] = Field(default=0.4, description="light from everywhere")
+    directional: Annotated[float, Field(ge=0, le=10)] = Field(default=1.0, description="light from one direction")
+    direction: Vec3 = Field(default=(0.3, 0.6, -1.0), description="along which that light shines")
     shadow: bool = Field(default=False, description="doubles the cost of a frame on a CPU")
 
 
@@ -63,8 +63,8 @@ class SurfaceConfig(StrictModel):
 
     furniture: str = Field(description="key in `furniture`")
     name: str = Field(description="surface of that furniture")
-    min_xy: Vec2 | None = Field(default=None, description="none: the whole surface")
-    max_xy: Vec2 | None = None
+    min_xy: Vec2 | None = Field(default=None, description="a corner of the part, m; none: the whole surface")
+    max_xy: Vec2 | None = Field(default=None, description="the corner opposite to min_xy, m")
 
     @model_validator(mode="after")
     def _ordered(self) -> SurfaceConfig:
@@ -80,7 +80,7 @@ class ScatteredLayout(StrictModel):
 
     kind: Literal["scattered"]
     min_gap: Annotated[float, Field(ge=0, le=0.2)] = Field(default=0.01, description="space between two objects, m")
-    max_tries: Annotated[int, Field(ge=1)] = 40_000
+    max_tries: Annotated[int, Field(ge=1)] = Field(default=40_000, description="poses drawn before a seed is given up")
 
 
 class OrderlyLayout(StrictModel):
@@ -95,7 +95,7 @@ class OrderlyLayout(StrictModel):
     column_spacing: Annotated[float, Field(ge=1, le=4)] = Field(
         default=1.3, description="distance of neighbouring columns as a multiple of their width"
     )
-    yaw_jitter_deg: Annotated[float, Field(ge=0, le=45)] = 0.0
+    yaw_jitter_deg: Annotated[float, Field(ge=0, le=45)] = Field(default=0.0, description="greatest turn of an object")
 
 
 class StackedLayout(StrictModel):
@@ -117,7 +117,7 @@ class ObjectsConfig(StrictModel):
     ids: list[str | StrictInt] | Literal["all"] = Field(
         default="all", description="asset ids of the object pack, or their numbers in GraspNet-1Billion"
     )
-    count: Annotated[int, Field(ge=1, le=64)] = 10
+    count: Annotated[int, Field(ge=1, le=64)] = Field(default=10, description="how many of them")
 
 
 class TargetConfig(StrictModel):
@@ -195,16 +195,16 @@ class PoseRandomisation(StrictModel):
     """Something that stands is shifted and turned for every episode."""
 
     position: Annotated[float, Field(ge=0, le=0.5)] = Field(default=0.03, description="greatest shift in x and y, m")
-    yaw_deg: Annotated[float, Field(ge=0, le=180)] = 5.0
+    yaw_deg: Annotated[float, Field(ge=0, le=180)] = Field(default=5.0, description="greatest turn either way")
 
 
 class DistractorConfig(StrictModel):
     """Further objects that are never the target."""
 
-    ids: Ids
+    ids: Ids = Field(description="asset ids of the object pack, or their numbers in GraspNet-1Billion")
     count: Annotated[
         tuple[Annotated[int, Field(ge=0, le=16)], Annotated[int, Field(ge=0, le=16)]], AfterValidator(_rising)
-    ] = (1, 3)
+    ] = Field(default=(1, 3), description="least and greatest number of them")
 
 
 class RandomisationConfig(StrictModel):
@@ -229,8 +229,8 @@ class RandomisationConfig(StrictModel):
 class TaskConfig(StrictModel):
     """One task configuration: a file of ``task_configs/``."""
 
-    task: Literal["pick", "select", "search", "open_pick"]
-    description: str = ""
+    task: Literal["pick", "select", "search", "open_pick"] = Field(description="which task; see tasks.md")
+    description: str = Field(default="", description="one line for `robocas list`")
     support: str = Field(description="what the instruction calls the place the objects are on: 'table'")
     room: RoomConfig
     lights: LightConfig = LightConfig()
