@@ -11,10 +11,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.reader import Dataset
 
 trajectory, out = map(Path, sys.argv[1:])
-convert(trajectory, out, rate_hz=5, embeddings=False, size=(320, 240), overwrite=True)
+convert(trajectory, out, rate_hz=5, embeddings=False, pictures=Pictures(size=(320, 240)), overwrite=True)
 
 info = json.loads((out / "data_info.json").read_text())
 low, high = map(np.array, info["action_space"]["relative_position"])  # 1st and 99th percentile

@@ -174,9 +174,10 @@ class FolderSource:
         path = self.path / schema.episode_folder(number) / schema.EPISODE_FILE
         try:
             with np.load(path, allow_pickle=False) as content:
-                if set(keys) <= set(content.files):
-                    return {key: content[key] for key in keys}
-            made = self._dataset.episode(number).arrays  # makes what upstream's own datasets lack
+                found = {key: content[key] for key in keys if key in content.files}
+            if all(key in found and _is_declared(key, found[key]) for key in keys):
+                return found
+            made = self._dataset.episode(number).arrays  # slower; casts and completes what was made elsewhere
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise DatasetError(
                 "this episode can't be read",
@@ -200,6 +201,14 @@ class FolderSource:
     def episode(self, number: int) -> Episode:
         """An episode's folder, which is not looked at yet."""
         return Episode(self.path / schema.episode_folder(number))
+
+
+_SPECS = {spec.name: spec for spec in schema.EPISODE_INFO}
+
+
+def _is_declared(key: str, array: NDArray) -> bool:
+    """Whether an array has the schema's type and number of axes."""
+    return _SPECS[key].has_dtype(array) and array.ndim == len(_SPECS[key].shape)
 
 
 class _Overview(Dataset):

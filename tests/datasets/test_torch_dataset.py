@@ -358,6 +358,22 @@ def test_damaged_arrays(dataset, change, message):
         first_item(dataset, cameras=())
 
 
+def test_datasets_made_elsewhere(dataset):
+    options = dict(split="all", cameras=(), state=("agv_pose", "gripper_width"))
+    before = list(RoboCASDataset(dataset, **options))
+    for file in dataset.glob("*/episode_info.npz"):
+        arrays = dict(np.load(file))
+        for key in ("rel_pos", "rel_orn", "agv_pose", "rel_agv_pose"):
+            del arrays[key]  # made of the absolute poses
+        arrays["gripper_status"] = arrays["gripper_status"].astype(np.int64)
+        arrays["gripper_width"] = arrays["gripper_width"].astype(np.float64)[:, None]
+        np.savez(file, **arrays)
+    (dataset / "conversion.json").unlink()
+    for one, other in zip(before, RoboCASDataset(dataset, **options), strict=True):
+        assert torch.allclose(one["action"], other["action"], atol=1e-6)
+        assert torch.allclose(one["state"], other["state"], atol=1e-6)
+
+
 def test_missing_pieces(dataset, tmp_path):
     with pytest.raises(DatasetError, match="no dataset here"):
         RoboCASDataset(tmp_path / "nothing")
