@@ -31,6 +31,8 @@ class ImportRobocas:
     """Its steps a second; default: what conversion.json says, 5 where there is none, as in upstream's."""
     turn_eef: bool = True
     """Turn the EEF frame to ManiSkill's TCP where the gripper camera's place says that it is turned."""
+    embeddings: bool = False
+    """Embed instruction and sub-goals where that is missing (needs the extra 'language')."""
     link: bool = False
     """Hard links to the pictures instead of copies."""
     json: bool = False
@@ -52,6 +54,11 @@ def main(cfg: ImportRobocas) -> int:
 
     if cfg.out is not None:
         claim_output(cfg.out, resume=cfg.resume or cfg.overwrite)  # before minutes of reading
+    embed = None
+    if cfg.embeddings:
+        from robocas_ms3.language.embed import TextEmbedder
+
+        embed = TextEmbedder()
     with bar("episodes read") as shown:
         found = survey(cfg.dataset, rate_hz=cfg.rate, turn_eef=cfg.turn_eef, on_episode=shown.at)
     if cfg.json:
@@ -65,6 +72,7 @@ def main(cfg: ImportRobocas) -> int:
             found,
             cfg.out,
             link=cfg.link,
+            embed=embed,
             overwrite=cfg.overwrite,
             resume=cfg.resume,
             on_start=shown.start,

@@ -397,6 +397,31 @@ def test_embeddings_of_all_or_none(dataset, tmp_path):
     assert validate(tmp_path / "none").violations == []
 
 
+def test_embeddings_that_are_missing_can_be_made(dataset, made, tmp_path):
+    (dataset / "conversion.json").unlink()
+    change(dataset / "episode_0000000", language_embedding=None, step_goal_embs=None)
+
+    def embed(texts):
+        vectors = np.zeros((len(texts), 384), np.float32)
+        vectors[range(len(texts)), [sum(map(ord, text)) % 384 for text in texts]] = 1
+        return vectors
+
+    out = tmp_path / "out"
+    import_robocas(survey(dataset), out, embed=embed)
+    assert validate(out).violations == []
+    assert read(out / "conversion.json")["embeddings"] is True
+    arrays = Dataset(out).episode(0).arrays
+    np.testing.assert_array_equal(arrays["step_goal_embs"], embed(arrays["step_lang_goals"].tolist()))
+    old, new = (arrays_of(root / "episode_0000001")["step_goal_embs"] for root in (made, out))
+    np.testing.assert_array_equal(old, new)  # those that are there stay
+    assert set(Dataset(out).episode(0).scene["source"]["derived"]) == {"language_embedding", "step_goal_embs"}
+
+
+def test_no_rate(four):
+    with pytest.raises(DatasetError, match="no such rate"):
+        survey(four, rate_hz=0)
+
+
 def test_ours_with_damage_keeps_what_it_says(dataset, made, tmp_path):
     (dataset / "episode_0000000" / "base_camera" / "rgb" / "0000.png").unlink()
     new = imported(dataset, tmp_path / "out")

@@ -105,6 +105,15 @@ def test_by_target_and_task(six, tmp_path):
     assert validate(root).violations == []
 
 
+def test_names_of_folders_stay_inside(six, tmp_path):
+    root = shutil.copytree(six, tmp_path / "ds")
+    for number in range(6):
+        target = {"asset_id": "../../pack/cup"}
+        edit(root / f"episode_{number:07d}" / "scene.json", lambda s, target=target: s.update(target=target))
+    assert run(["split", str(root), "--by", "target", "--out", str(tmp_path / "targets")]) == 0
+    assert [path.name for path in (tmp_path / "targets").iterdir()] == ["_.._pack_cup"]
+
+
 def test_in_place_writes_two_files_only(six, tmp_path):
     root = shutil.copytree(six, tmp_path / "ds")
     before = files_of(root)
@@ -140,6 +149,7 @@ def test_wrong_words(six, tmp_path, capsys):
         (["--in-place", "--out", out, "--by", "task"], "how to split?"),
         (["--parts", "0.5", "0.5", "--in-place"], "parts need a folder"),
         (["--out", out], "what is a part?"),
+        (["--out-train", out, "--out-val", f"{out}/val"], "two datasets in one folder"),
         (["--in-place", "--by", "seed"], "how much validates?"),
         (["--in-place", "--val-share", "1.5"], "not shares of a whole"),
         (["--parts", "0.9", "0.2", "--out", out], "not shares of a whole"),

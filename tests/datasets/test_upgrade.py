@@ -97,6 +97,14 @@ def test_what_can_not_be_upgraded(old, tmp_path):
         upgrade(root)
 
 
+def test_a_dataset_of_today_stays_as_it_is(old):
+    _, new, _ = old
+    edit(new / "conversion.json", lambda c: c.update(source={"format": "robocas v0"}, more=1))
+    before = files_of(new)
+    assert upgrade(new).described == []
+    assert files_of(new) == before
+
+
 def test_a_task_is_known_by_its_environment():
     from robocas_ms3.tasks.spec import TASKS
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import robocas_ms3
 from robocas_ms3.datasets import schema
@@ -25,6 +26,7 @@ from robocas_ms3.datasets.writer import CameraModel, write_cameras
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder, write_json
 
+Embed = Callable[[list[str]], NDArray[np.float32]]
 REPORT_FILE = "import_report.json"
 SPLIT_RULE = "as in the dataset it was imported from; episodes that were not listed there as by the writer's rule"
 
@@ -34,6 +36,7 @@ def import_robocas(
     out: Path,
     *,
     link: bool = False,
+    embed: Embed | None = None,
     overwrite: bool = False,
     resume: bool = False,
     on_start: Callable[[int], None] | None = None,
@@ -48,6 +51,7 @@ def import_robocas(
         surveyed: of `survey.survey`.
         out: folder of the new dataset; ``import_report.json`` goes there too.
         link: hard links to the pictures where the file system allows; else copies.
+        embed: texts -> (N, 384), for episodes without embeddings; None: these stay without, and so do all.
         overwrite: replace a dataset that is there.
         resume: go on with what was begun.
         on_start: called with the number of episodes to write.
@@ -66,7 +70,8 @@ def import_robocas(
         )
     dataset = Dataset(surveyed.root)
     info = read_info(dataset, [])
-    plan = _plan(dataset, surveyed)
+    embedded = surveyed.embeddings or embed is not None
+    plan = _plan(dataset, surveyed, embedded)
     with begun_output(out, plan, inputs=[surveyed.root], overwrite=overwrite, resume=resume):
         placed = Placed(link)
         missing = [n for n in surveyed.taken if not (out / schema.episode_folder(n)).is_dir()]
@@ -80,6 +85,7 @@ def import_robocas(
                 raise DatasetError(
                     "this episode changed meanwhile", where=surveyed.root / schema.episode_folder(number)
                 )
+            _embeddings(found, embedded, embed)
             with replacing_folder(out / schema.episode_folder(number)) as folder:
                 _write(folder, dataset.episode(number), found, surveyed, placed)
             if on_episode:
@@ -89,7 +95,7 @@ def import_robocas(
     return len(surveyed.taken) - len(missing)
 
 
-def _plan(dataset: Dataset, surveyed: Survey) -> dict[str, Any]:
+def _plan(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any]:
     assert surveyed.layout is not None
     layout = surveyed.layout
     pictures = Pictures(layout.cameras, layout.size, layout.depth, layout.image_format)
@@ -103,7 +109,7 @@ def _plan(dataset: Dataset, surveyed: Survey) -> dict[str, Any]:
         "format": "robocas",
         "schema_version": schema.SCHEMA_VERSION,
         "made_with": {"robocas_ms3": robocas_ms3.__version__},
-        **dataset_settings(surveyed.rate_hz, pictures, surveyed.embeddings),
+        **dataset_settings(surveyed.rate_hz, pictures, embedded),
         "split": SPLIT_RULE,
         "source": {"format": _format(dataset), "dataset": name},
         "episodes": episodes,
@@ -112,6 +118,18 @@ def _plan(dataset: Dataset, surveyed: Survey) -> dict[str, Any]:
 
 def _format(dataset: Dataset) -> str:
     return f"robocas v{schema_version(dataset)}"
+
+
+def _embeddings(found: Found, wanted: bool, embed: Embed | None) -> None:
+    """Add the embeddings of an episode, or take them away."""
+    if wanted and not found.embedded:
+        assert embed is not None
+        found.arrays["language_embedding"] = embed([str(found.arrays["language_goal"])])[0]
+        found.arrays["step_goal_embs"] = embed(found.arrays["step_lang_goals"].tolist())
+        found.derived |= {"language_embedding": "language_goal", "step_goal_embs": "step_lang_goals"}
+    for spec in schema.EPISODE_INFO:
+        if spec.embedding and not wanted:
+            found.arrays.pop(spec.name, None)
 
 
 def _write(folder: Path, episode: Episode, found: Found, surveyed: Survey, placed: Placed) -> None:
@@ -135,8 +153,7 @@ def _write(folder: Path, episode: Episode, found: Found, surveyed: Survey, place
                 source = episode.image_path(camera, kind, step)
                 placed.file(source, schema.image_path(folder, camera, kind, step, layout.image_format))
     write_cameras(folder, cameras)
-    kept = [spec for spec in schema.EPISODE_INFO if surveyed.embeddings or not spec.embedding]
-    arrays = {spec.name: found.arrays[spec.name] for spec in kept if spec.name in found.arrays}
+    arrays = {spec.name: found.arrays[spec.name] for spec in schema.EPISODE_INFO if spec.name in found.arrays}
     np.savez(folder / schema.EPISODE_FILE, **arrays)
     text = json.dumps(_scene(episode, found, surveyed), indent=1, ensure_ascii=False)
     (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")

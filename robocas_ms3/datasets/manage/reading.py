@@ -10,27 +10,26 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import relative_motion, to_matrices
+from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.manage.eef import eef_turn, is_rigid, turn
 from robocas_ms3.datasets.manage.findings import Finding, Found, Report
 from robocas_ms3.datasets.manage.picture_check import check_pictures
 from robocas_ms3.datasets.reader import Dataset, Episode, said_of
 from robocas_ms3.datasets.tolerant import SPECS, complete, derive_motion, load_arrays, planar_motion
 from robocas_ms3.datasets.validate import ANGLE_TOLERANCE, NORM_TOLERANCE, POSITION_TOLERANCE
+from robocas_ms3.demos.sampling import relative_motion
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.language.templates import GOAL_TYPES
 
 ESSENTIAL = (
     "ee_pos",
     "ee_orn",
-    "rel_pos",
-    "rel_orn",
     "gripper_status",
     "language_goal",
     "step_lang_goals",
     "step_goal_type",
 )
-"""Without one of these an episode is of no use."""
+"""Without one of these an episode is of no use; relative motion follows from ee_pos and ee_orn."""
 
 
 def read_episode(

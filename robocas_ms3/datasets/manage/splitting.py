@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,7 +120,14 @@ def resplit(root: Path, share: Share | None = None) -> Sides:
 
 
 def parts_by_side(part: Part, share: Share | None, train: Path, val: Path) -> dict[Path, Sides]:
-    """Training and validation as two datasets: output -> sides of its episodes."""
+    """Training and validation as two datasets: output -> sides of its episodes.
+
+    Raises:
+        DatasetError: both would be one folder, or one in the other.
+    """
+    a, b = train.resolve(), val.resolve()
+    if a == b or a in b.parents or b in a.parents:
+        raise DatasetError("two datasets in one folder", where=val, fix="Choose two that are apart.")
     sides = part.sides if share is None else _sides(part.dataset, share)
     return {train: (sides[0], []), val: ([], sides[1])}
 
@@ -134,7 +142,12 @@ def parts_by_value(part: Part, by: By, share: Share | None, out: Path) -> dict[P
     """A dataset ``out/<value>`` for each task or target object."""
     groups = groups_of(part.dataset, by)
     pieces = {value: [n for n, group in groups.items() if group == value] for value in sorted(set(groups.values()))}
-    return {out / value: _within(part, piece, share) for value, piece in pieces.items()}
+    return {out / _folder_name(value): _within(part, piece, share) for value, piece in pieces.items()}
+
+
+def _folder_name(value: str) -> str:
+    """A value as the name of a folder, whatever a dataset says."""
+    return re.sub(r"[^\w.-]+", "_", value).strip(".") or "_"
 
 
 def write_parts(

@@ -72,10 +72,12 @@ def survey(
         on_episode: called with (done, all) after each.
 
     Raises:
-        DatasetError: there are no episodes.
+        DatasetError: there are no episodes, or no such rate.
     """
     dataset = Dataset(root)
     rate_hz = dataset.rate_hz if rate_hz is None else rate_hz
+    if rate_hz <= 0:
+        raise DatasetError("no such rate", where="rate", expected="> 0 Hz", found=rate_hz)
     findings: list[Finding] = []
     info = read_info(dataset, findings)
     layouts: dict[int, Layout] = {}

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import sample_states, sample_stride
 from robocas_ms3.datasets.manage.parts import check_whole, schema_version, shown
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.plan import dataset_settings
@@ -22,10 +21,12 @@ from robocas_ms3.datasets.reader import Dataset, Episode
 from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
 from robocas_ms3.datasets.workers import OpenSource
 from robocas_ms3.datasets.writer import FrameSource
+from robocas_ms3.demos.sampling import sample_states, sample_stride
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import locked_folder, replacing, write_json
 
 _SAME_JOINTS = 1e-4  # rad
+_IN_SCENES = ("trajectory", "env_info", "control_freq")  # of version 1's conversion.json, in scene.json now
 _SMALLEST = Pictures(cameras=("static_camera",), size=(16, 16), depth=False)
 """What is rendered while scenes are only described: nothing, but the environment wants a size."""
 
@@ -140,9 +141,9 @@ def upgrade(
 
 def _content(before: Mapping[str, Any], settings: Mapping[str, Any], ledger: Mapping[str, Any]) -> dict[str, Any]:
     made_with = {key: value for key, value in before.get("made_with", {}).items() if key != "trajectory"}
-    said = {key: before[key] for key in ("split", "source") if key in before}
-    header = {"format": "robocas", "schema_version": schema.SCHEMA_VERSION, "made_with": made_with}
-    return {**header, **settings, **said, "episodes": ledger}
+    header = {"format": "robocas", "schema_version": schema.SCHEMA_VERSION, "made_with": made_with, **settings}
+    others = {key: value for key, value in before.items() if key not in {*header, *_IN_SCENES, "episodes"}}
+    return {**header, **others, "episodes": ledger}
 
 
 def _settings(dataset: Dataset) -> dict[str, Any]:
