@@ -2,8 +2,10 @@ import shutil
 
 import pytest
 from managing import die, edit, files_of, make, read
+from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
+from robocas_ms3.datasets.convert import convert
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.output import Placed
 from robocas_ms3.datasets.manage.parts import names_of
@@ -192,3 +194,14 @@ def test_command(parts, tmp_path, capsys):
     assert capsys.readouterr().err.startswith("error: ")
     assert run([*words, "--skip-duplicates", "--copy"]) == 0
     assert "4 episodes, 0 files linked, 212 copied, 2 duplicates left out" in capsys.readouterr().out
+
+
+def test_a_merged_dataset_can_be_appended_to(parts, tmp_path):
+    merge(parts, tmp_path / "out")
+    settings = {"embeddings": False, "append": True, "open_source": RayCaster}
+    known = convert(parts[1].with_suffix(".h5"), tmp_path / "out", **settings)
+    assert (known.kept, known.episodes) == (2, [])
+    new = convert(write_trajectory(tmp_path / "c.h5", seeds=(30,)), tmp_path / "out", **settings)
+    assert [episode.number for episode in new.episodes] == [4]
+    assert validate(parts[0]).violations == []  # whose files are shared
+    assert validate(tmp_path / "out").violations == []
