@@ -4,9 +4,11 @@ import json
 import math
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -273,6 +275,21 @@ def test_trajectories_at_another_rate_and_with_failures(trajectory):
     assert float(data[0]["action"][:, :6].abs().max()) <= 1
     with pytest.raises(DatasetError, match="the rate must divide"):
         RoboCASDataset(trajectory, cameras=(), rate_hz=3)
+
+
+def test_trajectories_of_end_effector_actions(trajectory, tmp_path):
+    path = tmp_path / "F.h5"
+    shutil.copy(trajectory, path)
+    entries = trajectory.with_suffix(".json").read_text().replace("pd_joint_pos", "pd_ee_delta_pose")
+    path.with_suffix(".json").write_text(entries)
+    with h5py.File(path, "a") as file:
+        for group in file.values():
+            actions = np.delete(group["actions"][:], 0, axis=1)  # 6 of motion, then the gripper
+            del group["actions"]
+            group["actions"] = actions
+    options = dict(split="all", cameras=(), state=("gripper_status",))
+    for one, other in zip(RoboCASDataset(trajectory, **options), RoboCASDataset(path, **options), strict=True):
+        assert torch.equal(one["action"], other["action"])
 
 
 @pytest.mark.parametrize(
