@@ -93,7 +93,8 @@ def main(cfg: Convert) -> int:
             videos = progress.add_task("videos", total=len(done.episodes) + done.kept)
             write_previews(cfg.out, on_video=lambda _: progress.advance(videos))
     finally:
-        progress.stop()
+        if progress.live.is_started:  # else it would print an empty line
+            progress.stop()
     steps = sum(episode.steps for episode in done.episodes)
     megabytes = sum(episode.size for episode in done.episodes) / 1e6
     each = done.seconds / max(1, len(done.episodes))

@@ -13,6 +13,7 @@ from synthetic import RayCaster, write_trajectory
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
+from robocas_ms3.cli import main
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
@@ -312,3 +313,14 @@ def test_scenes_and_cameras_travel_along(lerobot, trajectory):
     with TrajectoryFile(trajectory) as file:
         robot = file.recording(2).states["articulations"]["robocas_mobile_panda"]
     np.testing.assert_array_equal(episode.arrays["robot_joints"], robot[[0, 4, 8, 12, 16, 20, 22], 16:23])
+
+
+def test_from_the_command_line(made, tmp_path, capsys):
+    command = ["convert", str(made), "--to", "lerobot", "--out", str(tmp_path / "out")]
+    assert main.run([*command, "--append"]) == 1
+    assert capsys.readouterr().err == "error: --append: not for LeRobot datasets. Leave it out.\n"
+    assert main.run([*command, "--codec", "av1", "--cameras", "static_camera", "--no-depth"]) == 0
+    assert "2 episodes, 14 steps" in capsys.readouterr().out
+    assert LeRobotDataset(tmp_path / "out").cameras == ("static_camera",)
+    assert main.run(command) == 1
+    assert "the output exists already" in capsys.readouterr().err

@@ -1,3 +1,6 @@
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -54,6 +57,13 @@ def test_actions_worked_out_by_hand():
     for feature in FEATURES:
         assert columns[feature.key].shape == (3, feature.width)
         assert columns[feature.key].dtype == np.float32
+
+
+def test_the_documentation_names_every_feature():
+    text = (Path(__file__).parents[2] / "docs/lerobot.md").read_text()
+    for feature in FEATURES:
+        assert f"| `{feature.key}` | {feature.width} |" in text
+    assert set(features_json({})) <= set(re.findall(r"`([\w.]+)`", text))
 
 
 def test_no_text_is_an_observation():

@@ -28,8 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import relative_motion, to_matrices
+from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.schema import EPISODE_INFO
+from robocas_ms3.demos.sampling import relative_motion
 from robocas_ms3.errors import DatasetError
 
 CODEBASE_VERSION = "v3.0"

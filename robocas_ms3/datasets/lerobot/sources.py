@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.convert import choose
-from robocas_ms3.datasets.episode import sample_stride
 from robocas_ms3.datasets.lerobot.schema import needed_arrays, whole_rate
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.provenance import fingerprint, scene_record, succeeded
@@ -21,6 +20,7 @@ from robocas_ms3.datasets.reader import Dataset, Episode
 from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.workers import OpenSource
 from robocas_ms3.datasets.writer import CameraModel, FrameSource, Shown, Timing, show_episode
+from robocas_ms3.demos.sampling import sample_stride
 from robocas_ms3.errors import DatasetError
 
 DEFAULT_RATE = 5.0

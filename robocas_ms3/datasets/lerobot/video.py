@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -157,6 +158,8 @@ class Joiner:
                     self._out.mux(packet)
                     found += 1
         except FFmpegError as error:
+            if error.errno == errno.ENOSPC:  # of the file that is written
+                raise
             raise DatasetError("this video is damaged", where=part, found=error.strerror) from error
         if found != frames:
             raise DatasetError("frames are missing in this video", where=part, expected=frames, found=found)
