@@ -6,6 +6,7 @@
 # ROBOCAS_VENV            folder of the virtual environment (default: .venv in the checkout)
 # ROBOCAS_PYTHON          interpreter to make it with (default: the first of python3.12, 3.11, 3.10, python3 that fits)
 # ROBOCAS_SKIP_RENDERER=1 leave rendering as it is
+# ROBOCAS_SKIP_BROWSER=1  install no Chromium for the tests of robocas view
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -73,4 +74,7 @@ fi
 
 if [ "${ROBOCAS_SKIP_RENDERER:-0}" != 1 ]; then
     ROBOCAS_SETUP_PYTHON=$python bash scripts/install_renderer.sh
+fi
+if [ "${ROBOCAS_SKIP_BROWSER:-0}" != 1 ]; then
+    ROBOCAS_SETUP_PYTHON=$python bash scripts/install_browser.sh
 fi

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from functools import lru_cache
 from pathlib import Path
@@ -42,21 +43,26 @@ class LeRobotSource:
         self._decoding = threading.Lock()
 
     def index(self) -> dict[str, Any]:
-        """From ``meta/episodes`` and, where it is one of ours, the ledger of its conversion."""
-        ledger, rows = self.dataset.settings.get("episodes", {}), []
+        """From ``meta/episodes`` and, where it is one of ours, ledger and scenes of its conversion."""
+        settings, scenes, rows = self.dataset.settings, self._scenes(), []
+        ledger = settings.get("episodes") or []
         for entry in self.dataset.rows:
             number = int(entry["episode_index"])
-            made = ledger.get(str(number), {})
-            seed, tasks = made.get("seed"), entry.get("tasks") or [""]
+            scene, made = scenes.get(number, {}), ledger[number] if number < len(ledger) else {}
+            recorded, tasks = scene.get("recorded") or {}, entry.get("tasks") or [""]
+            seed = made.get("seed")
             rows.append(
                 row(
                     number,
                     steps=int(entry["length"]),
                     instruction=str(tasks[0]),
+                    task=scene.get("task") or "",
                     target=(made.get("target") or {}).get("name", ""),
                     seed=seed if isinstance(seed, int) else None,
                     success=made.get("success"),
-                    stages=stages(of_seed(self.failures, seed), {}),
+                    split="" if "val_eps" not in settings else "val" if number in settings["val_eps"] else "train",
+                    stages=stages(of_seed(self.failures, seed), recorded),
+                    attempts=recorded.get("attempts"),
                 )
             )
         rate = self.dataset.rate_hz
@@ -93,6 +99,17 @@ class LeRobotSource:
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
         """A frame of the depth's video."""
         return self._frame(number, camera, "depth", step)
+
+    def _scenes(self) -> dict[int, dict[str, Any]]:
+        """``scene.json`` by episode; empty where the dataset is not one of ours."""
+        import pyarrow.parquet as pq
+
+        path = self.root / schema.SCENES_FILE
+        if not path.is_file():
+            return {}
+        table = pq.read_table(path, columns=["episode_index", "scene"])
+        numbers, texts = (table.column(name).to_pylist() for name in ("episode_index", "scene"))
+        return {int(number): json.loads(text) or {} for number, text in zip(numbers, texts, strict=True)}
 
     def _frame(self, number: int, camera: str, kind: str, step: int) -> NDArray:
         if not 0 <= step < self._open(number).steps:

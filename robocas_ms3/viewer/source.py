@@ -108,7 +108,6 @@ def make_index(
         "cameras": list(cameras),
         "depth": depth,
         "note": note,
-        "picture_suffix": "jpg",
         "episodes": episodes,
     }
 

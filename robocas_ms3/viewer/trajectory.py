@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import invert, planar_base
+from robocas_ms3.datasets.episode import planar_base
 from robocas_ms3.datasets.forward import robot_frames
 from robocas_ms3.datasets.provenance import succeeded
 from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
@@ -76,10 +76,11 @@ class TrajectorySource:
         with self._reading:
             recording = self.file.recording(position)
         entry = self.file.episodes[position].get("robocas", {})
+        config = self.file.env_info["env_kwargs"].get("config")
         steps = recording.control_steps + 1
         joints = recording.joints(np.arange(steps))
         frames = robot_frames(joints)
-        to_base = invert(frames.arm_base_in_world)
+        to_base = np.linalg.inv(frames.arm_base_in_world)
         tcp = to_base @ frames.tcp_in_world
         xyzw = Rotation.from_matrix(tcp[:, :3, :3]).as_quat()
         last = steps - 1
@@ -105,7 +106,7 @@ class TrajectorySource:
             ],
             trace=make_trace(frames.tcp_in_world, _objects(recording, entry, to_base[0]), moving=True),
             facts={
-                "Configuration": self.file.env_info["env_kwargs"].get("config"),
+                "Configuration": config if isinstance(config, str) else None,  # a whole one is too long
                 "Object pack": self.file.env_info["env_kwargs"].get("pack"),
                 "Recorded with": recording.control_mode,
                 "Relation": entry.get("relation"),

@@ -49,3 +49,15 @@ def folder(run_folder, made_up, tmp_path_factory):
     convert(run_folder / "trajectory.h5", out, open_source=made_up.RayCaster, embeddings=False, include_failed=True)
     (out / "failures.jsonl").write_bytes((run_folder / "failures.jsonl").read_bytes())
     return out
+
+
+@pytest.fixture(scope="session")
+def lerobot(folder, tmp_path_factory):
+    """The folder as a LeRobot dataset."""
+    pytest.importorskip("av", reason="needs the extra 'lerobot'")
+    pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
+    from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+
+    out = tmp_path_factory.mktemp("lerobot") / "dataset"
+    convert_lerobot(folder, out, include_failed=True)
+    return out

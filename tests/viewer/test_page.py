@@ -231,6 +231,18 @@ def test_a_trajectory_shows_traces_and_says_how_to_get_pictures(browser, run_fol
     assert browser.errors == []
 
 
+def test_a_lerobot_dataset(browser, lerobot):
+    browser.errors.clear()
+    with serve(lerobot) as server:
+        browser.goto(server.url + "#episode=1&step=4")
+        browser.wait(LOADED)
+        pictures(browser, 1, "rgb", 4)
+        browser.press("d")
+        pictures(browser, 1, "depth", 4)
+        server.shutdown()
+    assert browser.errors == []
+
+
 def test_a_thousand_episodes_are_quick_and_only_seen_rows_are_made(browser, folder, monkeypatch):
     source = open_source(folder)
     index = source.index()

@@ -77,7 +77,7 @@
   table.start(index, open);
   window.addEventListener("hashchange", follow);
   window.addEventListener("popstate", follow);
-  new ResizeObserver(redraw).observe(byId("lower"));
+  new ResizeObserver(() => requestAnimationFrame(redraw)).observe(byId("lower"));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   follow();
 })();

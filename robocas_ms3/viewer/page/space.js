@@ -140,7 +140,7 @@ robocas.space = (() => {
       const size = ctx.measureText(text).width;
       const left = Math.max(3, x + size > width - 4 ? x - size - 14 : x);
       const box = [left, y - 10, left + size, y + 3];
-      if (taken.some((t) => box[0] < t[2] && box[2] > t[0] && box[1] < t[3] && box[3] > t[1])) continue;
+      if (!strong && taken.some((t) => box[0] < t[2] && box[2] > t[0] && box[1] < t[3] && box[3] > t[1])) continue;
       taken.push(box);
       ctx.fillStyle = strong ? colour("bad") : colour("faint");
       ctx.fillText(text, left, y);

@@ -25,7 +25,7 @@ robocas.table = (() => {
     byId("filters").addEventListener("submit", (event) => event.preventDefault());
     byId("filters").addEventListener("reset", () => setTimeout(apply));
     byId("rows").addEventListener("scroll", draw, { passive: true });
-    new ResizeObserver(draw).observe(byId("rows"));
+    new ResizeObserver(() => requestAnimationFrame(draw)).observe(byId("rows"));
     apply();
   }
 
@@ -86,7 +86,7 @@ robocas.table = (() => {
     };
     shown = index.episodes.filter(passes()).sort(order);
     const all = index.episodes.length;
-    byId("count").textContent = shown.length === all ? `${all} episodes` : `${shown.length} of ${all} episodes`;
+    byId("count").textContent = `${shown.length === all ? all : `${shown.length} of ${all}`} ${all === 1 ? "episode" : "episodes"}`;
     byId("f-reset").hidden = shown.length === all;
     byId("spacer").style.height = `${shown.length * HEIGHT}px`;
     for (const row of made.values()) row.remove();

@@ -1,0 +1,71 @@
+"""`robocas view` as a program: serves until Ctrl-C, writes a folder, refuses what it did not make."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from robocas_ms3.cli.main import run
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def trajectory(tmp_path_factory):
+    spec = importlib.util.spec_from_file_location("_synthetic", ROOT / "tests/datasets/synthetic.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.write_trajectory(tmp_path_factory.mktemp("run") / "trajectory.h5", seeds=(3, 4))
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_it_serves_until_it_is_interrupted(trajectory, ending):
+    words = [sys.executable, str(ROOT / "robocas_cli.py"), "view", str(trajectory), "--no-open"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
+        assert process.stdout is not None and process.stderr is not None
+        line = process.stdout.readline()
+        match = re.search(r"http://127\.0\.0\.1:\d+/", line)
+        assert match, line + process.stderr.read()
+        assert b"<!doctype html>" in urllib.request.urlopen(match[0], timeout=30).read()
+        process.send_signal(ending)
+        out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (0, "ended\n", "")
+
+
+def test_it_writes_a_folder(trajectory, tmp_path, capsys):
+    out = tmp_path / "page"
+    assert run(["view", str(trajectory), "--static", str(out)]) == 0
+    assert capsys.readouterr().out.strip() == f"2 episodes: {out / 'index.html'}"
+    assert {path.name for path in out.iterdir()} == {"index.html", "page", "data"}
+    assert run(["view", str(trajectory), "--static", str(out)]) == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert run(["view", str(trajectory), "--static", str(out), "--overwrite", "--episodes", "1"]) == 0
+    assert sorted(path.name for path in (out / "data").iterdir()) == ["episode_1.js", "index.js"]
+
+
+def test_it_replaces_only_what_it_made(trajectory, tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("mine")
+    assert run(["view", str(trajectory), "--static", str(tmp_path), "--overwrite"]) == 1
+    assert "not made by `robocas view`" in capsys.readouterr().err
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_what_is_wrong_is_one_line(trajectory, tmp_path, capsys):
+    assert run(["view", str(tmp_path / "none"), "--no-open"]) == 1
+    assert run(["view", str(trajectory), "--static", str(tmp_path / "x"), "--episodes", "7"]) == 1
+    errors = capsys.readouterr().err.split("\n")
+    errors = [line for line in errors if line]
+    assert len(errors) == 2
+    assert "nothing to view" in errors[0]
+    assert "no such episode" in errors[1]
+    assert not (tmp_path / "x").exists()
