@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from robocas_ms3.viewer.source import plot
 
@@ -23,10 +22,11 @@ def motion_plots(position: NDArray, xyzw: NDArray, arm_joints: NDArray) -> list[
         xyzw: (T, 4) its orientation there.
         arm_joints: (T, 7) rad.
     """
-    angles = np.degrees(np.unwrap(Rotation.from_quat(xyzw).as_euler("xyz"), axis=0))
+    flips = np.cumsum(np.sum(xyzw[1:] * xyzw[:-1], axis=1) < 0) % 2  # q and -q are one orientation: no jumps
+    xyzw = np.concatenate([xyzw[:1], xyzw[1:] * np.where(flips, -1, 1)[:, None]])
     return [
         plot("TCP position, arm base", "m", XYZ, position),
-        plot("TCP orientation, arm base", "deg", ROLL_PITCH_YAW, angles),
+        plot("TCP orientation, arm base", "quaternion", ("x", "y", "z", "w"), xyzw),
         plot("Arm joints", "rad", ARM, arm_joints),
     ]
 
@@ -41,5 +41,6 @@ def gripper_plot(width: NDArray, is_open: NDArray | None, open_width: float = 0.
 
 def base_plot(pose: NDArray) -> list[dict[str, Any]]:
     """Mobile base (T, 3) x, y in m, yaw in rad; none where it stands still."""
+    pose = np.column_stack([pose[:, :2], np.unwrap(pose[:, 2])])
     moves = len(pose) > 0 and np.ptp(pose, axis=0).max() > 1e-3
     return [plot("Mobile base, world", "m, rad", ("x", "y", "yaw"), pose)] if moves else []

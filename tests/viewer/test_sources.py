@@ -8,6 +8,7 @@ import pytest
 
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.viewer.plots import base_plot, motion_plots
 from robocas_ms3.viewer.source import open_source, plot, rounded
 
 ROW = {"n", "steps", "instruction", "task", "object", "seed", "success", "split", "stages", "attempts"}
@@ -24,6 +25,15 @@ def test_numbers_are_rounded_and_what_json_lacks_becomes_none():
     assert str(rounded([-0.000001])) == "[0.0]"
     assert rounded([0.5, np.nan, np.inf]) == [0.5, None, None]
     assert plot("p", "m", ("x",), np.array([[1.0], [2.0]]))["series"] == [{"name": "x", "values": [1.0, 2.0]}]
+
+
+def test_orientation_and_yaw_do_not_jump():
+    turn = np.array([[0.0, 0, 0, 1], [0, 0, -0.1, -0.995], [0, 0, 0.2, 0.98]])
+    (_, orientation, _) = motion_plots(np.zeros((3, 3)), turn, np.zeros((3, 7)))
+    assert [s["values"] for s in orientation["series"]][2:] == [[0.0, 0.1, 0.2], [1.0, 0.995, 0.98]]
+    (base,) = base_plot(np.array([[0, 0, 3.1], [0, 0, -3.1]]))
+    assert base["series"][2]["values"] == [3.1, round(2 * np.pi - 3.1, 5)]
+    assert base_plot(np.ones((3, 3))) == []
 
 
 def test_a_trajectory_lists_episodes_and_seeds_that_were_given_up(run_folder):
