@@ -58,7 +58,7 @@ class Limits:
 
     Attributes:
         data_mb, video_mb: size of a file, 2^20 bytes; LeRobot's own.
-        video_seconds: length of a video. LeRobot looks frames up by float32 seconds and refuses what is off by more than
+        video_seconds: length of a video. LeRobot looks frames up by float32 seconds refuses what is off by more than
             0.1 ms, which float32 resolves up to 1024 s. At rates up to 20 Hz longer videos happen to round the same way
             (checked up to 8192 s), but nothing is gained by them.
     """
