@@ -17,7 +17,7 @@ from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.arrays import show_arrays
 from robocas_ms3.viewer.failures import of_seed, read_failures, stages
 from robocas_ms3.viewer.pictures import encode_jpeg
-from robocas_ms3.viewer.source import Picture, make_episode, make_index, plot, row
+from robocas_ms3.viewer.source import Picture, inside_path, make_episode, make_index, plot, row
 
 _AT_ONCE = 8  # pictures decoded together: a video opens and seeks slowly, and who looks at one looks at the next
 _KEPT = 64  # such groups in memory
@@ -119,6 +119,7 @@ class LeRobotSource:
 
     def _decode(self, number: int, camera: str, kind: str, group: int) -> list[NDArray]:
         episode, first = self._open(number), group * _AT_ONCE
+        inside_path(episode.video(camera, kind)[0], self.root)
         return list(episode.frames(camera, kind, first, min(_AT_ONCE, episode.steps - first)))
 
     def _open_now(self, number: int) -> LeRobotEpisode:

@@ -15,7 +15,7 @@ from robocas_ms3.datasets.reader import Dataset, Episode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.arrays import NEEDED, show_arrays
 from robocas_ms3.viewer.failures import of_seed, read_failures, stages
-from robocas_ms3.viewer.source import Picture, make_index, row
+from robocas_ms3.viewer.source import Picture, inside_path, make_index, row
 
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp"}
 
@@ -32,7 +32,6 @@ class RoboCASSource:
         self.root = root
         self.dataset = Dataset(root)
         self._known = frozenset(self.dataset.numbers)
-        self._inside = root.resolve()
         self.failures = read_failures(root)
         self._open = lru_cache(maxsize=16)(self._open_now)
 
@@ -74,7 +73,7 @@ class RoboCASSource:
 
     def rgb(self, number: int, camera: str, step: int) -> Picture:
         """The file."""
-        path = self._inside_path(self._open(number).image_path(camera, "rgb", step))
+        path = inside_path(self._open(number).image_path(camera, "rgb", step), self.root)
         try:
             return Picture(MEDIA_TYPES[path.suffix], path.read_bytes())
         except OSError as error:
@@ -83,19 +82,13 @@ class RoboCASSource:
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
         """The file, decoded."""
         episode = self._open(number)
-        self._inside_path(episode.image_path(camera, "depth", step))
+        inside_path(episode.image_path(camera, "depth", step), self.root)
         return episode.depth(camera, step)
 
     def _open_now(self, number: int) -> Episode:
         if number not in self._known:
             raise DatasetError("no such episode", where=self.root, found=number)
         return self.dataset.episode(number)
-
-    def _inside_path(self, path: Path) -> Path:
-        """Refuse links that lead out of the dataset."""
-        if not path.resolve().is_relative_to(self._inside):
-            raise DatasetError("this link leads out of the dataset", where=path)
-        return path
 
 
 def _scene(episode: Episode) -> dict[str, Any]:

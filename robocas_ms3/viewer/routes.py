@@ -23,7 +23,7 @@ from typing import Any
 
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer import pictures
-from robocas_ms3.viewer.source import Picture, Source
+from robocas_ms3.viewer.source import CAMERA_NAME, Picture, Source
 
 PAGE_FILES = {
     "index.html": "text/html; charset=utf-8",
@@ -37,7 +37,7 @@ PAGE_FILES = {
 _NUMBER = r"(0|[1-9][0-9]{0,8})"
 _INDEX = re.compile(r"/data/index\.js")
 _EPISODE = re.compile(rf"/data/episode_{_NUMBER}\.js")
-_PICTURE = re.compile(rf"/pictures/{_NUMBER}/([a-z0-9_.]{{1,80}})/(rgb|depth)/{_NUMBER}\.jpg")
+_PICTURE = re.compile(rf"/pictures/{_NUMBER}/({CAMERA_NAME.pattern})/(rgb|depth)/{_NUMBER}\.jpg")
 _THUMBNAIL = re.compile(rf"/thumbnails/{_NUMBER}\.jpg")
 _SCRIPT = "text/javascript; charset=utf-8"
 

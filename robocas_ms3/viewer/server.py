@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import socket
+import sys
 import threading
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 from urllib.parse import urlsplit
 
 from robocas_ms3.errors import RobocasError
@@ -15,9 +19,12 @@ _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancest
 
 
 class Viewer(ThreadingHTTPServer):
-    """The server; use it in a ``with`` statement, and ``serve_forever``."""
+    """The server; use it in a ``with`` statement, and ``serve_forever``.
 
-    daemon_threads = True
+    At its end all its threads have ended: one that the interpreter takes down inside OpenCV takes the process along.
+    """
+
+    daemon_threads = False
 
     def __init__(self, source: Source, port: int = 0) -> None:
         """Take a port of 127.0.0.1.
@@ -30,6 +37,8 @@ class Viewer(ThreadingHTTPServer):
             RobocasError: the port is taken.
         """
         self.routes = Routes(source)
+        self._connections: set[Any] = set()
+        self._warming = threading.Thread(target=self.routes.respond, args=("/data/index.js",), daemon=True)
         try:
             super().__init__((HOST, port), _Handler)
         except (OSError, OverflowError) as error:
@@ -44,7 +53,31 @@ class Viewer(ThreadingHTTPServer):
 
     def warm_up(self) -> None:
         """Make the index while the browser is still starting."""
-        threading.Thread(target=lambda: self.routes.respond("/data/index.js"), daemon=True).start()
+        self._warming.start()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Note the connection, which a browser keeps open."""
+        self._connections.add(request)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Forget it."""
+        self._connections.discard(request)
+        super().shutdown_request(request)
+
+    def server_close(self) -> None:
+        """End: cut the connections, and wait for what is being answered."""
+        for connection in list(self._connections):
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+        super().server_close()
+        if self._warming.is_alive():
+            self._warming.join(5.0)  # an index takes a second or so
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of browsers that went away."""
+        if not isinstance(sys.exc_info()[1], ConnectionError | TimeoutError):
+            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import DatasetError
+
+CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
+"""Cameras of other names, which a dataset made elsewhere may have, are left out: names become addresses and folders."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,7 @@ def make_index(
         "name": path.resolve().name if path.is_dir() else f"{path.resolve().parent.name}/{path.name}",
         "kind": kind,
         "rate_hz": rate_hz,
-        "cameras": list(cameras),
+        "cameras": [name for name in cameras if CAMERA_NAME.fullmatch(name)],
         "depth": depth,
         "note": note,
         "episodes": episodes,
@@ -203,6 +207,17 @@ def make_trace(tcp_in_world: NDArray, objects: Sequence[dict], *, moving: bool) 
         "objects": [{**thing, "path": rounded(thing["path"])} for thing in objects],
         "moving": moving,
     }
+
+
+def inside_path(path: Path, root: Path) -> Path:
+    """The path, unless it is a link that leads out of the dataset.
+
+    Raises:
+        DatasetError: it is.
+    """
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise DatasetError("this link leads out of the dataset", where=path)
+    return path
 
 
 def rounded(values: Any) -> list:

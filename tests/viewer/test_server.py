@@ -135,6 +135,23 @@ def test_it_takes_no_orders(server):
     assert int(response.headers["Content-Length"]) > 100
 
 
+def test_it_ends_though_a_browser_keeps_its_connection(folder):
+    before = set(threading.enumerate())
+    with Viewer(open_source(folder)) as server:
+        server.warm_up()
+        serving = threading.Thread(target=server.serve_forever, args=(0.02,))
+        serving.start()
+        connection = http.client.HTTPConnection(HOST, server.server_port, timeout=30)
+        connection.request("GET", "/thumbnails/0.jpg")
+        connection.getresponse().read()
+        server.shutdown()
+        serving.join()
+    assert set(threading.enumerate()) <= before
+    assert connection.sock is not None
+    assert connection.sock.recv(1) == b""
+    connection.close()
+
+
 def test_a_port_that_is_taken(folder):
     with socket.socket() as taken:
         taken.bind((HOST, 0))

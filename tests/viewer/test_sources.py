@@ -9,7 +9,7 @@ import pytest
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.plots import base_plot, motion_plots
-from robocas_ms3.viewer.source import open_source, plot, rounded
+from robocas_ms3.viewer.source import make_index, open_source, plot, rounded
 
 ROW = {"n", "steps", "instruction", "task", "object", "seed", "success", "split", "stages", "attempts"}
 EPISODE = {"n", "instruction", "steps", "times", "subgoals", "plots", "trace", "facts", "failures"}
@@ -25,6 +25,11 @@ def test_numbers_are_rounded_and_what_json_lacks_becomes_none():
     assert str(rounded([-0.000001])) == "[0.0]"
     assert rounded([0.5, np.nan, np.inf]) == [0.5, None, None]
     assert plot("p", "m", ("x",), np.array([[1.0], [2.0]]))["series"] == [{"name": "x", "values": [1.0, 2.0]}]
+
+
+def test_camera_names_that_would_be_paths_are_left_out(tmp_path):
+    cameras = ("base_camera", "..", "../x", "a/b", "", "cam-1.left", "x" * 81)
+    assert make_index(tmp_path, "kind", 5, cameras, True, [])["cameras"] == ["base_camera", "cam-1.left"]
 
 
 def test_orientation_and_yaw_do_not_jump():
