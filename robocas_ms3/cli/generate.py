@@ -34,6 +34,9 @@ class Generate:
     """Control rate in Hz (the paper's is 5); must divide 100, the rate of physics."""
     max_attempts: int = 20
     """Attempts of the policy before a seed is given up."""
+    replay_rate: int | None = None
+    """Rate in Hz at which an episode's own 7-D actions are tried open loop; an attempt whose actions don't succeed
+    again is undone. 0: no trial. Default: 5, or the control rate where 5 doesn't divide it."""
     keep_recoveries: bool = False
     """Leave failed attempts in the episode, as one continuous motion, instead of undoing them."""
     resume: bool = False
@@ -62,7 +65,12 @@ def main(cfg: Generate) -> int:
     name = cfg.config or TASKS[cfg.task].default_config
     config = recordable_config(load_task_config(name), name if name in shipped_configs() else None)
     out = cfg.out or Path("demos") / f"{Path(name).stem}-{Path(cfg.pack).name}"
-    settings = EpisodeSettings(cfg.task, config, cfg.pack, cfg.control_freq, cfg.max_attempts, cfg.keep_recoveries)
+    rate = cfg.replay_rate
+    if rate is None:
+        rate = 5 if cfg.control_freq % 5 == 0 else cfg.control_freq
+    settings = EpisodeSettings(
+        cfg.task, config, cfg.pack, cfg.control_freq, cfg.max_attempts, cfg.keep_recoveries, rate
+    )
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

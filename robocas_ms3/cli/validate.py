@@ -2,50 +2,119 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from robocas_ms3.errors import DatasetError
+
+if TYPE_CHECKING:
+    from robocas_ms3.datasets.replay_check import ReplayReport
+    from robocas_ms3.datasets.validate import Report
 
 
 @dataclass
 class Validate:
-    """Check a RoboCAS dataset against the schema and list every violation; exit code 1 if there is any."""
+    """Check a RoboCAS or LeRobot dataset and list every violation; exit code 1 if there is any.
+
+    With --replay also play every episode's own 7-D actions open loop in its rebuilt scene, and say how many succeed
+    again and how far the gripper strays.
+    """
 
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset."""
+    replay: bool = False
+    """Play the actions too (RoboCAS folders; simulated, not rendered)."""
     json: bool = False
     """Print a machine-readable report."""
 
 
 def main(cfg: Validate) -> int:
     """Validate; gives the exit code."""
-    import json
-
     from rich.console import Console
-    from rich.progress import Progress
 
     from robocas_ms3.datasets.validate import validate
 
-    progress = Progress(console=Console(stderr=True), transient=True)  # shown when there is something to do
-    bar = progress.add_task("episodes", total=None)
+    is_lerobot = (cfg.dataset / "meta" / "info.json").is_file()
+    if is_lerobot and cfg.replay:
+        raise DatasetError("only RoboCAS folders can be replayed", where=cfg.dataset)
+    with _bar("checking") as advance:
+        check = _validate_lerobot if is_lerobot else validate
+        report = check(cfg.dataset, on_episode=lambda done, count: advance(count))
+    replays = _replay(cfg.dataset) if cfg.replay else None
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    if cfg.json:
+        content = report.as_json() | ({"replay": replays.as_json()} if replays else {})
+        console.print(json.dumps(content, indent=2, ensure_ascii=False))
+        return 1 if report.violations else 0
+    for violation in report.violations:
+        console.print(str(violation))
+    verdict = f"{len(report.violations)} violations" if report.violations else "valid"
+    console.print(f"{cfg.dataset}: {report.episodes} episodes, {report.steps} steps, {verdict}")
+    for line in _lines(replays) if replays else ():
+        console.print(line)
+    return 1 if report.violations else 0
 
-    def on_episode(done: int, count: int) -> None:
+
+def _validate_lerobot(root: Path, *, on_episode: Callable[[int, int], None]) -> Report:
+    from robocas_ms3.datasets.lerobot.check import check_lerobot
+    from robocas_ms3.datasets.validate import Report
+
+    counts = [0, 0]
+
+    def count(done: int, total: int) -> None:
+        counts[0] = done
+        on_episode(done, total)
+
+    violations = check_lerobot(root, on_episode=count)
+    with suppress(OSError, ValueError, KeyError, TypeError):  # told among the violations
+        counts[1] = int(json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))["total_frames"])
+    return Report(counts[0], counts[1], violations)
+
+
+@contextmanager
+def _bar(what: str) -> Iterator[Callable[[int], None]]:
+    """A progress bar on stderr that shows once there is something to do; what it yields is called with the total."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    progress = Progress(console=Console(stderr=True), transient=True)
+    bar = progress.add_task(what, total=None)
+
+    def advance(count: int) -> None:
         progress.start()
-        progress.update(bar, completed=done, total=count)
+        progress.update(bar, advance=1, total=count)
 
     try:
-        report = validate(cfg.dataset, on_episode=on_episode)
+        yield advance
     finally:
         if progress.live.is_started:
             progress.stop()
-    console = Console(soft_wrap=True, highlight=False, markup=False)
-    if cfg.json:
-        console.print(json.dumps(report.as_json(), indent=2, ensure_ascii=False))
-    else:
-        for violation in report.violations:
-            console.print(str(violation))
-        verdict = f"{len(report.violations)} violations" if report.violations else "valid"
-        console.print(f"{cfg.dataset}: {report.episodes} episodes, {report.steps} steps, {verdict}")
-    return 1 if report.violations else 0
+
+
+def _replay(root: Path) -> ReplayReport:
+    from robocas_ms3.datasets.replay_check import replay_dataset
+
+    with _bar("replaying") as advance:
+        return replay_dataset(root, on_episode=lambda episode, count: advance(count))
+
+
+def _lines(report: ReplayReport) -> Iterator[str]:
+    for episode in report.episodes:
+        if episode.skipped:
+            yield f"episode {episode.number}: not replayed: {episode.skipped}"
+        elif not episode.success:
+            strayed = f"strayed {episode.max_error * 1000:.0f} mm at most"
+            yield f"episode {episode.number}: its own actions do not succeed again; {strayed}"
+    for task, of_task in report.by_task().items():
+        if of_task["tried"]:
+            yield (
+                f"{task or 'unknown task'}: {of_task['succeeded']} of {of_task['tried']} replayed episodes succeed again"
+                f" ({of_task['share']:.0%}); tracking error {of_task['mean_error'] * 1000:.1f} mm on average,"
+                f" {of_task['max_error'] * 1000:.0f} mm at most"
+            )

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import sample_stride
 from robocas_ms3.datasets.info import write_info
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.plan import Plan, appended_plan, dataset_settings, new_plan, resumed_plan
@@ -23,6 +22,7 @@ from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.workers import Job, OpenSource, write_all
 from robocas_ms3.datasets.writer import FrameSource, WrittenEpisode
+from robocas_ms3.demos.sampling import sample_stride
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.episode import invert
+from robocas_ms3.demos.sampling import invert
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-from robocas_ms3.datasets.episode import invert
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.trajectory import Recording
 from robocas_ms3.datasets.writer import CameraModel, Frame
+from robocas_ms3.demos.sampling import invert
 from robocas_ms3.errors import DatasetError
 
 _SAME_PLACE = 1e-3  # m

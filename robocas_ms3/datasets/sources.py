@@ -18,18 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import (
-    SubGoal,
-    episode_arrays,
-    gripper_open,
-    sample_states,
-    sample_stride,
-    sample_subgoals,
-)
+from robocas_ms3.datasets.episode import SubGoal, episode_arrays, sample_subgoals
 from robocas_ms3.datasets.info import action_space, split_by_seed
 from robocas_ms3.datasets.provenance import succeeded
 from robocas_ms3.datasets.reader import Dataset, Episode
 from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
+from robocas_ms3.demos.sampling import gripper_open, sample_states, sample_stride
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.robots.constants import OPEN_FINGER, ROBOT_UID
 

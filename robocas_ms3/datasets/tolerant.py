@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import relative_motion, to_matrices, wrap_angle
+from robocas_ms3.datasets.episode import to_matrices, wrap_angle
+from robocas_ms3.demos.sampling import relative_motion
 from robocas_ms3.errors import DatasetError
 
 SPECS = {spec.name: spec for spec in schema.EPISODE_INFO}

@@ -16,10 +16,11 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.datasets import geometry, schema
 from robocas_ms3.datasets.check_info import check_info
 from robocas_ms3.datasets.check_scene import check_ledger, check_scene, check_settings
-from robocas_ms3.datasets.episode import relative_motion, to_matrices, wrap_angle
+from robocas_ms3.datasets.episode import to_matrices, wrap_angle
 from robocas_ms3.datasets.picture_files import PictureHeader, read_header
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.violation import Violation
+from robocas_ms3.demos.sampling import relative_motion
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.language.templates import GOAL_TYPES
 

@@ -15,15 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import (
-    Frames,
-    episode_arrays,
-    gripper_open,
-    sample_states,
-    sample_subgoals,
-)
+from robocas_ms3.datasets.episode import Frames, episode_arrays, sample_subgoals
 from robocas_ms3.datasets.pictures import Pictures, write_picture
 from robocas_ms3.datasets.trajectory import Recording
+from robocas_ms3.demos.sampling import gripper_open, sample_states
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder
 

@@ -46,6 +46,14 @@ def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int
             expected=f"one of {', '.join(str(f) for f in range(1, SIM_FREQ + 1) if SIM_FREQ % f == 0)}",
             found=settings.control_freq,
         )
+    check_number("replay_rate", settings.replay_rate, 0, settings.control_freq)
+    if settings.replay_rate and (settings.control_freq % settings.replay_rate or SIM_FREQ % settings.replay_rate):
+        raise RobocasError(
+            "the rate at which actions are tried again has to divide the control rate and that of physics",
+            where="replay_rate",
+            expected=f"a divisor of {settings.control_freq}, or 0 for no trial",
+            found=settings.replay_rate,
+        )
     config = load_task_config(settings.config)
     if config.task != settings.task:
         name = f" {settings.config}" if isinstance(settings.config, str) else ""

@@ -16,7 +16,9 @@ import torch
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.config import TaskConfig, load_task_config
 from robocas_ms3.demos.ledger import Failure
+from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.demos.record import EpisodeRecorder
+from robocas_ms3.demos.sampling import to_matrices
 from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.planning.executor import Executor, Seconds
 from robocas_ms3.planning.mplib_backend import MplibPlanner
@@ -30,6 +32,8 @@ from robocas_ms3.tasks.spec import TASKS
 
 STANDARD_FREQ = 20  # Hz, at which the tasks' horizons are given
 
+FAR = ("horizon", "replay")  # stages whose failure has its cause farther back than the last checkpoint
+
 
 @dataclass(frozen=True)
 class EpisodeSettings:
@@ -42,6 +46,8 @@ class EpisodeSettings:
         control_freq: Hz.
         max_attempts: attempts a seed has.
         keep_recoveries: leave failed attempts in the record instead of undoing them.
+        replay_rate: Hz; an attempt counts only if its own actions, as a dataset of this rate holds them, succeed again
+            open loop. 0: not tried; nor is it where the base drives, which those actions leave out.
     """
 
     task: str
@@ -50,6 +56,7 @@ class EpisodeSettings:
     control_freq: int = STANDARD_FREQ
     max_attempts: int = 20
     keep_recoveries: bool = False
+    replay_rate: int = 5
 
 
 @dataclass
@@ -104,6 +111,12 @@ class EpisodeGenerator:
         self.reachability = Reachability(str(files.arm_urdf))
         # a scripted policy tries once, from wherever the episode stands, and raises PlanningFailed
         self.policy: Callable[[Arm], None] = import_module(TASKS[settings.task].solver).attempt
+        self.open_loop: OpenLoop | None = None
+        if settings.replay_rate and not config.base_motion:
+            kwargs = {"config": settings.config, "pack": settings.pack}
+            self.open_loop = OpenLoop(
+                {"env_id": TASKS[settings.task].env_id, "env_kwargs": kwargs}, settings.replay_rate
+            )
 
     def generate(self, seed: int, folder: Path, name: str) -> EpisodeResult:
         """Make the episode of a seed, as ``folder/name.h5`` and ``.json``; no files where every attempt failed.
@@ -156,7 +169,7 @@ class EpisodeGenerator:
                     continue
                 except PlanningFailed:
                     pass
-            executor.go_back(far=last.stage == "horizon")  # what took too long will do so again
+            executor.go_back(far=last.stage in FAR)
             recoveries = [kept for kept in recoveries if kept["range"][1] < len(executor.actions)]
         return recoveries
 
@@ -165,12 +178,19 @@ class EpisodeGenerator:
 
         Raises:
             PlanningFailed: the task has not succeeded.
-            EpisodeLost: it took longer than an episode may.
+            EpisodeLost: it took longer than an episode may, or its own actions do not do it again.
         """
         if len(executor.actions) > self.horizon:
             raise EpisodeLost("horizon", "too_long")
         if not executor.flag("success"):
             raise PlanningFailed("episode", "no_success")
+        if self.open_loop is not None:
+            gripper = np.array([action[7] for action in executor.actions])
+            poses = to_matrices(np.array(executor.tcp_in_base, dtype=np.float64))
+            with executor.seconds.spent_on("simulation"):
+                played = self.open_loop.play_recording(executor.seed, poses, gripper, self.settings.control_freq)
+            if not played.success:
+                raise EpisodeLost("replay", "no_success")
 
     @staticmethod
     def _log(result: EpisodeResult, attempt: int, error: PlanningFailed, seconds: float) -> None:
@@ -197,13 +217,16 @@ class EpisodeGenerator:
                 }
                 for segment, after in zip(executor.segments, bounds[1:], strict=True)
             ],
+            "replay_rate": self.settings.replay_rate if self.open_loop is not None else None,
             "facts": {"disturbed": int(executor.info["disturbed"][0]), **executor.facts},
             "seconds": {part: round(value, 3) for part, value in asdict(executor.seconds).items()},
         }
 
     def close(self) -> None:
-        """Close the environment."""
+        """Close the environments."""
         self.env.close()
+        if self.open_loop is not None:
+            self.open_loop.close()
 
 
 def horizon(task: str, control_freq: int) -> int:

@@ -3,8 +3,8 @@
 Actions of ``pd_ee_delta_pose``: (x, y, z, rx, ry, rz) in [-1, 1], all in the current TCP frame. Translation is
 metres / 0.1. Rotation is Euler angles in radians / 0.5, in the convention of ManiSkill's controllers (intrinsic XYZ:
 R = Rx Ry Rz), its norm clipped to 1. A positive angle turns positively about the TCP's axis (ManiSkill's own controller
-turns the other way). They start from the pose that the last action asked for, not from where the arm is: it lags 75 ms
-behind, and deltas of recorded poses that started from there would add the lag up, to centimetres within seconds.
+turns the other way). They start from the pose that the last action asked for, not from where the arm is: what it falls
+short of a target would add up over the steps of recorded poses, to centimetres within seconds.
 """
 
 from __future__ import annotations
@@ -197,7 +197,9 @@ class RoboCASEEPoseController(PDEEPoseController):
 
     Differs from ManiSkill's: rotations have their natural sign; body-frame deltas work on a GPU too, since the target
     pose in the base frame is computed before inverse kinematics; and a target that the arm does not come near to is
-    given up, so that deltas don't pile up while something is in the way.
+    given up, so that deltas don't pile up while something is in the way. Within a control step the drive target of
+    deltas moves evenly, with its velocity, so that the TCP goes evenly from pose to pose, as it did when these poses
+    were recorded, and is there when the step ends.
     """
 
     def _check_gpu_sim_works(self) -> None:
@@ -229,10 +231,40 @@ class RoboCASEEPoseController(PDEEPoseController):
         now, reference = self.ee_pose_at_base, self.reference_pose()
         self._target_pose = self.compute_target_pose(reference, action)
         target = self._solve(self._target_pose, now)
+        last = self._start_qpos if self._target_qpos is None else self._target_qpos
         if target is None:
             target, self._target_pose = self._start_qpos, reference
         self._target_qpos = target
-        self.set_drive_targets(self._target_qpos)
+        if self.config.use_delta:
+            moved = (last - self._start_qpos).abs() > ARM_SET_FROM_OUTSIDE
+            self._start_qpos = torch.where(moved, self._start_qpos, last)
+            self._drive_with(self._start_qpos, (target - self._start_qpos) * self._control_freq)
+        else:
+            self.set_drive_targets(target)
+
+    def before_simulation_step(self) -> None:
+        """Move the drive target of deltas on."""
+        if not self.config.use_delta or self._step >= self._sim_steps or self._target_qpos is None:
+            return
+        self._step += 1
+        self.set_drive_targets(torch.lerp(self._start_qpos, self._target_qpos, self._step / self._sim_steps))
+        if self.scene.gpu_sim_enabled:
+            cast("Any", self.scene.px).gpu_apply_articulation_target_position()
+
+    def _drive_with(self, targets: torch.Tensor, velocities: torch.Tensor) -> None:
+        """Set drive targets and their velocities: an arm that is told its velocity does not lag."""
+        self.set_drive_targets(targets)
+        self.articulation.set_joint_drive_velocity_targets(velocities, self.joints, self.active_joint_indices)
+
+    def reset(self) -> None:
+        """Start from the present configuration, at rest."""
+        super().reset()
+        self._step = self._sim_steps
+        if self.config.use_delta:
+            velocity = torch.zeros_like(self.qpos)
+            if self.scene.gpu_sim_enabled:
+                velocity = velocity[self.scene._reset_mask]
+            self.articulation.set_joint_drive_velocity_targets(velocity, self.joints, self.active_joint_indices)
 
     def reference_pose(self) -> Pose:
         """(N,) poses in the arm's base frame that the next deltas start from."""

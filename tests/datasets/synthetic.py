@@ -9,9 +9,10 @@ import h5py
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import invert, to_matrices, wxyz_to_xyzw
+from robocas_ms3.datasets.episode import to_matrices, wxyz_to_xyzw
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.writer import CameraModel, Frame
+from robocas_ms3.demos.sampling import invert
 
 STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one
 SIZE = (64, 48)

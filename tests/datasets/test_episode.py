@@ -11,18 +11,14 @@ from robocas_ms3.datasets.episode import (
     compose,
     continuous_xyzw,
     episode_arrays,
-    gripper_open,
-    invert,
     planar_base,
-    relative_motion,
-    sample_states,
-    sample_stride,
     sample_subgoals,
     to_matrices,
     wxyz_to_xyzw,
     xyzw_to_wxyz,
 )
 from robocas_ms3.datasets.schema import EPISODE_INFO
+from robocas_ms3.demos.sampling import gripper_open, invert, relative_motion, sample_states, sample_stride
 from robocas_ms3.errors import DatasetError
 
 

@@ -10,6 +10,7 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings, horizon
 from robocas_ms3.demos.generate import generate
+from robocas_ms3.demos.open_loop import OpenLoop, Played
 from robocas_ms3.demos.record import merge, open_trajectory, read_json
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.errors import DatasetError, EpisodeLost, OutputExistsError, PlanningFailed, RobocasError
@@ -153,6 +154,7 @@ def call_it_done(monkeypatch):
     """Let policies that only stir count as successful: what is tested is how attempts are kept or undone."""
     flag = Executor.flag
     monkeypatch.setattr(Executor, "flag", lambda self, name: name == "success" or flag(self, name))
+    monkeypatch.setattr(OpenLoop, "play_recording", lambda *args: Played(True, np.zeros((1, 3)), 0))
 
 
 def waiting(steps):
@@ -274,3 +276,19 @@ def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch):
     assert begun[1] > 4  # what failed stays, and the arm's way out of it
     assert begun[2] == 0  # all of it undone
     assert read_json(tmp_path / "kept.h5")["episodes"][0]["robocas"]["recoveries"] == []
+
+
+def test_an_attempt_whose_own_actions_do_not_succeed_again_is_undone(tmp_path, monkeypatch):
+    generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin"))
+    play, outcomes = OpenLoop.play_recording, []
+
+    def first_fails(*args):
+        outcomes.append(play(*args))
+        return Played(False, np.zeros((1, 3)), 0) if len(outcomes) == 1 else outcomes[-1]
+
+    monkeypatch.setattr(OpenLoop, "play_recording", first_fails)
+    result = generator.generate(1, tmp_path, "again")
+    generator.close()
+    assert result.success
+    assert [(failure.stage, failure.reason) for failure in result.failures] == [("replay", "no_success")]
+    assert read_json(tmp_path / "again.h5")["episodes"][0]["robocas"]["replay_rate"] == 5

@@ -9,10 +9,11 @@ import yaml
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.config import shipped_configs
-from robocas_ms3.datasets.episode import Frames, episode_arrays, planar_base, sample_states, sample_subgoals
+from robocas_ms3.datasets.episode import Frames, episode_arrays, planar_base, sample_subgoals
 from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
 from robocas_ms3.demos.replay import replay
+from robocas_ms3.demos.sampling import sample_states
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.skills.driving import base_at, drive

@@ -1,0 +1,151 @@
+"""Are the data true? Plays every episode's own actions open loop in its rebuilt scene."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.datasets.actions import episode_actions
+from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.demos.open_loop import OpenLoop
+from robocas_ms3.errors import RobocasError
+
+BASE_STILL = 1e-3  # m that the base may move in all: 7-D actions do not move it
+
+
+@dataclass(frozen=True)
+class EpisodeReplay:
+    """What came of one episode.
+
+    Attributes:
+        number: of the episode.
+        task: pick, select, ...; empty: unknown.
+        success: whether the task succeeded again; None: it could not be tried.
+        mean_error, max_error: distance of the TCP from the dataset's, m.
+        clipped: actions beyond what ``pd_ee_delta_pose`` does in a step.
+        skipped: why it could not be tried.
+    """
+
+    number: int
+    task: str
+    success: bool | None
+    mean_error: float = 0.0
+    max_error: float = 0.0
+    clipped: int = 0
+    skipped: str = ""
+
+
+@dataclass(frozen=True)
+class ReplayReport:
+    """What came of a dataset's actions."""
+
+    episodes: list[EpisodeReplay] = field(default_factory=list)
+
+    def by_task(self) -> dict[str, dict[str, Any]]:
+        """For each task: episodes tried, how many succeeded again, tracking errors in m, episodes skipped."""
+        result = {}
+        for task in sorted({episode.task for episode in self.episodes}):
+            of_task = [episode for episode in self.episodes if episode.task == task]
+            tried = [episode for episode in of_task if episode.success is not None]
+            result[task] = {
+                "tried": len(tried),
+                "succeeded": sum(bool(episode.success) for episode in tried),
+                "share": sum(bool(episode.success) for episode in tried) / len(tried) if tried else None,
+                "mean_error": float(np.mean([episode.mean_error for episode in tried])) if tried else None,
+                "max_error": max((episode.max_error for episode in tried), default=None),
+                "skipped": len(of_task) - len(tried),
+            }
+        return result
+
+    def as_json(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {"by_task": self.by_task(), "episodes": [asdict(episode) for episode in self.episodes]}
+
+
+def replay_dataset(
+    root: str | Path,
+    *,
+    numbers: Iterable[int] | None = None,
+    on_episode: Callable[[EpisodeReplay, int], None] = lambda episode, count: None,
+) -> ReplayReport:
+    """Play the 7-D actions of a RoboCAS folder with ``pd_ee_delta_pose`` at the dataset's rate, without any correction.
+
+    Args:
+        root: the dataset.
+        numbers: of episodes; default: all.
+        on_episode: called with each outcome and the number of episodes.
+
+    Raises:
+        DatasetError: there is no dataset, or actions can't be played at its rate.
+    """
+    dataset = Dataset(Path(root))
+    chosen = dataset.numbers if numbers is None else list(numbers)
+    player = _Player(dataset.rate_hz)
+    replays = []
+    try:
+        for number in chosen:
+            replays.append(player.play(number, dataset.episode(number)))
+            on_episode(replays[-1], len(chosen))
+    finally:
+        player.close()
+    return ReplayReport(replays)
+
+
+class _Player:
+    """Keeps the environment from one episode to the next while it is the same."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate_hz = rate_hz
+        self._key, self._open_loop = "", None
+
+    def play(self, number: int, episode: Episode) -> EpisodeReplay:
+        scene, task = episode.scene, str(episode.scene.get("task") or "")
+        reason = _not_playable(episode)
+        if reason:
+            return EpisodeReplay(number, task, None, skipped=reason)
+        arrays = episode.arrays
+        actions = episode_actions(arrays)[:-1].astype(np.float64)
+        turns = Rotation.from_euler("xyz", actions[:, 3:6])
+        open_loop = self._environment(scene["env_info"])
+        try:
+            played = open_loop.play(
+                int(scene["seed"]), scene.get("reset_options") or {}, actions[:, :3], turns, actions[:, 6] > 0.5
+            )
+        except RobocasError as error:
+            return EpisodeReplay(number, task, None, skipped=f"its scene can't be built: {error}")
+        error = np.linalg.norm(played.tcp_in_base - arrays["ee_pos"], axis=1)
+        return EpisodeReplay(
+            number, task, played.success, float(error.mean()), float(error.max()), clipped=played.clipped
+        )
+
+    def _environment(self, env_info: dict[str, Any]) -> OpenLoop:
+        key = json.dumps(env_info, sort_keys=True)
+        if self._open_loop is None or key != self._key:
+            self.close()
+            self._key, self._open_loop = key, OpenLoop(env_info, self._rate_hz)
+        return self._open_loop
+
+    def close(self) -> None:
+        if self._open_loop is not None:
+            self._open_loop.close()
+            self._open_loop = None
+
+
+def _not_playable(episode: Episode) -> str:
+    scene = episode.scene
+    if not scene.get("env_info") or scene.get("seed") is None:
+        return "its scene.json does not say how to build the scene"
+    if not scene.get("success", True):
+        return "it was recorded without success"
+    if len(episode.arrays["ee_pos"]) < 2:
+        return "it has no actions"
+    base = episode.arrays["base_pos"]
+    if np.linalg.norm(base - base[0], axis=1).max() > BASE_STILL:
+        return "its base drives, which 7-D actions leave out"
+    return ""

@@ -1,0 +1,128 @@
+"""Are a demonstration's own actions enough? Plays 7-D dataset actions open loop, at a dataset's rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import robocas_ms3.tasks  # noqa: F401  (registers the environments)
+from robocas_ms3.demos.sampling import Array, gripper_open, relative_motion, sample_states, sample_stride
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.robots.constants import OPEN_FINGER
+from robocas_ms3.robots.controllers import to_ee_delta_action
+from robocas_ms3.tasks.base import RoboCASEnv
+
+CONTROL_MODE = "pd_ee_delta_pose"
+SETTLE_SECONDS = 1.0  # after the last action, held still: what was let go comes to rest
+_OTHERWISE = ("control_mode", "obs_mode", "reward_mode", "render_backend", "render_mode", "sim_backend", "num_envs")
+
+
+@dataclass(frozen=True)
+class Played:
+    """What came of an episode's actions.
+
+    Attributes:
+        success: whether the task succeeded, at some step or within ``SETTLE_SECONDS`` after the last one.
+        tcp_in_base: (T, 3) m, where the TCP was, in the arm's base frame.
+        clipped: actions beyond what one step may do.
+    """
+
+    success: bool
+    tcp_in_base: Array
+    clipped: int
+
+
+class OpenLoop:
+    """An environment that takes dataset actions.
+
+    Args:
+        env_info: ``env_id`` and ``env_kwargs`` of the recording.
+        rate_hz: of the actions; a whole number that divides the rate of physics.
+
+    Raises:
+        DatasetError: no such rate or environment.
+    """
+
+    def __init__(self, env_info: dict[str, Any], rate_hz: float) -> None:
+        if rate_hz < 1 or rate_hz != int(rate_hz) or 100 % int(rate_hz):
+            expected = "a whole number that divides 100"
+            raise DatasetError(
+                "actions can't be played at this rate", where="rate_hz", expected=expected, found=rate_hz
+            )
+        kwargs = {key: value for key, value in env_info["env_kwargs"].items() if key not in _OTHERWISE}
+        kwargs["sim_config"] = {**kwargs.get("sim_config", {}), "control_freq": int(rate_hz)}
+        torch.set_num_threads(1)
+        try:
+            self.env = gym.make(
+                env_info["env_id"],
+                obs_mode="none",
+                reward_mode="none",
+                control_mode=CONTROL_MODE,
+                render_backend="none",
+                **kwargs,
+            )
+        except gym.error.Error as error:
+            raise DatasetError("no such environment", where=env_info["env_id"], found=str(error)) from error
+        self._rate = int(rate_hz)
+
+    def play(
+        self,
+        seed: int,
+        options: dict[str, Any],
+        translations: Array,
+        rotations: Rotation,
+        gripper: NDArray[np.bool_],
+    ) -> Played:
+        """Build an episode's scene and play its actions.
+
+        Args:
+            seed: of the episode.
+            options: further options of its reset.
+            translations: (S, 3) m, of the TCP in its own frame.
+            rotations: (S,) likewise.
+            gripper: (S,) True = open.
+        """
+        env = self.env.unwrapped
+        assert isinstance(env, RoboCASEnv)
+        self.env.reset(seed=seed, options=dict(options))
+        motion = to_ee_delta_action(translations, rotations) if len(translations) else np.zeros((0, 6), np.float32)
+        clipped = int(np.sum(np.abs(motion).max(axis=1, initial=0) > 1))
+        actions = np.column_stack([np.clip(motion, -1, 1), np.where(gripper, 1, -1)]).astype(np.float32)
+        places, success = [env.agent.tcp_in_arm_base.p[0].numpy().copy()], False
+        for action in actions:
+            *_, info = self.env.step(action)
+            places.append(env.agent.tcp_in_arm_base.p[0].numpy().copy())
+            success |= bool(info["success"][0])
+        still = np.append(np.zeros(6), actions[-1, 6] if len(actions) else 1).astype(np.float32)
+        for _ in range(round(SETTLE_SECONDS * self._rate)):
+            if success:
+                break
+            *_, info = self.env.step(still)
+            success |= bool(info["success"][0])
+        return Played(success, np.stack(places).astype(np.float64), clipped)
+
+    def play_recording(
+        self, seed: int, tcp_in_base: Array, gripper: NDArray[np.floating], control_freq: float
+    ) -> Played:
+        """Play what a dataset of this rate would hold of a recording.
+
+        Args:
+            seed: of the episode.
+            tcp_in_base: (S + 1, 4, 4) after the reset and after each control step.
+            gripper: (S,) commands in [-1, 1].
+            control_freq: of the recording, Hz.
+        """
+        samples = sample_states(len(gripper), sample_stride(control_freq, self._rate))
+        motion = relative_motion(tcp_in_base[samples])[:-1]
+        status = gripper_open(gripper, samples, finger_range=(-0.01, OPEN_FINGER), initial_width=2 * OPEN_FINGER)
+        return self.play(seed, {}, motion[:, :3, 3], Rotation.from_matrix(motion[:, :3, :3]), status[1:])
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()

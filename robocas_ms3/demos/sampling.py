@@ -1,0 +1,93 @@
+"""From control steps to the steps of a dataset: which states are kept, and the motion and commands between them.
+
+An episode of S control steps has states 0..S. With a stride of k control steps a dataset step, the states 0, k, 2k, ...
+are kept, and the last state S too, so that the goal is always in the data; where k does not divide S the last dataset
+step alone is shorter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.errors import DatasetError
+
+Array = NDArray[np.float64]
+
+OPEN_WIDTH = 0.04
+"""A gripper commanded wider than this counts as open, m."""
+
+
+def sample_stride(control_freq: float, rate_hz: float) -> int:
+    """Control steps between two dataset steps.
+
+    Raises:
+        DatasetError: the rate does not divide the control frequency.
+    """
+    stride = round(control_freq / rate_hz) if rate_hz > 0 else 0
+    if stride < 1 or abs(stride * rate_hz - control_freq) > 1e-6 * control_freq:
+        rates = [f"{control_freq / k:g}" for k in range(1, 21) if (control_freq / k).is_integer()]
+        raise DatasetError(
+            "the rate must divide the control frequency",
+            where="rate",
+            expected=f"one of {', '.join(rates)} Hz at {control_freq:g} Hz",
+            found=f"{rate_hz:g}",
+        )
+    return stride
+
+
+def sample_states(control_steps: int, stride: int) -> NDArray[np.int64]:
+    """Indices of the states to keep, of ``control_steps + 1``: every ``stride``-th and the last."""
+    indices = np.arange(0, control_steps + 1, stride)
+    return indices if indices[-1] == control_steps else np.append(indices, control_steps)
+
+
+def gripper_open(
+    commands: NDArray[np.floating],
+    samples: NDArray[np.int64],
+    *,
+    finger_range: tuple[float, float],
+    initial_width: float,
+) -> NDArray[np.bool_]:
+    """Gripper command in force at each sampled state: that of the action which led there.
+
+    So ``gripper_status[t + 1]`` is what was commanded between t and t + 1, as the released loader reads it.
+
+    Args:
+        commands: (S,) gripper actions in [-1, 1].
+        samples: (T,) from ``sample_states``.
+        finger_range: target of one finger at -1 and at +1, m.
+        initial_width: of the gripper at reset, m, which is its target until the first action.
+
+    Returns:
+        (T,) bool.
+    """
+    low, high = finger_range
+    finger_targets = low + (np.clip(commands, -1, 1) + 1) / 2 * (high - low)
+    widths = np.concatenate([[initial_width], 2 * finger_targets])
+    return widths[samples] > OPEN_WIDTH + 1e-6
+
+
+def invert(poses: Array) -> Array:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    result = np.zeros_like(poses)
+    rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, poses[..., :3, 3])
+    result[..., 3, 3] = 1
+    return result
+
+
+def relative_motion(poses: Array) -> Array:
+    """(T, 4, 4) ``inv(pose[t]) pose[t + 1]``; the last one is the identity."""
+    return np.concatenate([invert(poses[:-1]) @ poses[1:], np.eye(4)[None]])
+
+
+def to_matrices(poses: Array) -> Array:
+    """(N, 4, 4) of poses (N, 7): x, y, z, qw, qx, qy, qz."""
+    result = np.zeros((len(poses), 4, 4))
+    result[:, :3, :3] = Rotation.from_quat(poses[:, [4, 5, 6, 3]]).as_matrix()
+    result[:, :3, 3] = poses[:, :3]
+    result[:, 3, 3] = 1
+    return result
