@@ -114,7 +114,7 @@ def _lines(report: ReplayReport) -> Iterator[str]:
     for task, of_task in report.by_task().items():
         if of_task["tried"]:
             yield (
-                f"{task or 'unknown task'}: {of_task['succeeded']} of {of_task['tried']} replayed episodes succeed again"
-                f" ({of_task['share']:.0%}); tracking error {of_task['mean_error'] * 1000:.1f} mm on average,"
+                f"{task or 'unknown task'}: {of_task['succeeded']} of {of_task['tried']} replayed episodes succeed"
+                f" again ({of_task['share']:.0%}); tracking error {of_task['mean_error'] * 1000:.1f} mm on average,"
                 f" {of_task['max_error'] * 1000:.0f} mm at most"
             )
