@@ -32,6 +32,7 @@ from robocas_ms3.tasks.spec import TASKS
 
 STANDARD_FREQ = 20  # Hz, at which the tasks' horizons are given
 
+TRIALS = 3  # of an attempt's own actions: as they are, and with noise that any robot has
 FAR = ("horizon", "replay")  # stages whose failure has its cause farther back than the last checkpoint
 
 
@@ -47,7 +48,7 @@ class EpisodeSettings:
         max_attempts: attempts a seed has.
         keep_recoveries: leave failed attempts in the record instead of undoing them.
         replay_rate: Hz; an attempt counts only if its own actions, as a dataset of this rate holds them, succeed again
-            open loop. 0: not tried; nor is it where the base drives, which those actions leave out.
+            open loop, ``TRIALS`` times. 0: not tried; nor is it where the base drives, which those actions leave out.
     """
 
     task: str
@@ -187,10 +188,14 @@ class EpisodeGenerator:
         if self.open_loop is not None:
             gripper = np.array([action[7] for action in executor.actions])
             poses = to_matrices(np.array(executor.tcp_in_base, dtype=np.float64))
-            with executor.seconds.spent_on("simulation"):
-                played = self.open_loop.play_recording(executor.seed, poses, gripper, self.settings.control_freq)
-            if not played.success:
-                raise EpisodeLost("replay", "no_success")
+            for trial in range(TRIALS):
+                noise = np.random.default_rng([executor.seed, trial]) if trial else None
+                with executor.seconds.spent_on("simulation"):
+                    played = self.open_loop.play_recording(
+                        executor.seed, poses, gripper, self.settings.control_freq, noise
+                    )
+                if not played.success:
+                    raise EpisodeLost("replay", "no_success")
 
     @staticmethod
     def _log(result: EpisodeResult, attempt: int, error: PlanningFailed, seconds: float) -> None:

@@ -20,6 +20,7 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 CONTROL_MODE = "pd_ee_delta_pose"
 SETTLE_SECONDS = 1.0  # after the last action, held still: what was let go comes to rest
+NOISE = 1e-5  # m; a dataset's rounding alone makes some heaps fall otherwise
 _OTHERWISE = ("control_mode", "obs_mode", "reward_mode", "render_backend", "render_mode", "sim_backend", "num_envs")
 
 
@@ -108,7 +109,12 @@ class OpenLoop:
         return Played(success, np.stack(places).astype(np.float64), clipped)
 
     def play_recording(
-        self, seed: int, tcp_in_base: Array, gripper: NDArray[np.floating], control_freq: float
+        self,
+        seed: int,
+        tcp_in_base: Array,
+        gripper: NDArray[np.floating],
+        control_freq: float,
+        noise: np.random.Generator | None = None,
     ) -> Played:
         """Play what a dataset of this rate would hold of a recording.
 
@@ -117,11 +123,15 @@ class OpenLoop:
             tcp_in_base: (S + 1, 4, 4) after the reset and after each control step.
             gripper: (S,) commands in [-1, 1].
             control_freq: of the recording, Hz.
+            noise: source of noise of ``NOISE`` that is added to each action's translation; default: none.
         """
         samples = sample_states(len(gripper), sample_stride(control_freq, self._rate))
         motion = relative_motion(tcp_in_base[samples])[:-1]
         status = gripper_open(gripper, samples, finger_range=(-0.01, OPEN_FINGER), initial_width=2 * OPEN_FINGER)
-        return self.play(seed, {}, motion[:, :3, 3], Rotation.from_matrix(motion[:, :3, :3]), status[1:])
+        translations = motion[:, :3, 3].copy()
+        if noise is not None:
+            translations += noise.normal(0, NOISE, translations.shape)
+        return self.play(seed, {}, translations, Rotation.from_matrix(motion[:, :3, :3]), status[1:])
 
     def close(self) -> None:
         """Close the environment."""

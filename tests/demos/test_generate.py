@@ -8,7 +8,7 @@ import pytest
 import torch
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 
-from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings, horizon
+from robocas_ms3.demos.episode import TRIALS, EpisodeGenerator, EpisodeSettings, horizon
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.open_loop import OpenLoop, Played
 from robocas_ms3.demos.record import merge, open_trajectory, read_json
@@ -291,4 +291,5 @@ def test_an_attempt_whose_own_actions_do_not_succeed_again_is_undone(tmp_path, m
     generator.close()
     assert result.success
     assert [(failure.stage, failure.reason) for failure in result.failures] == [("replay", "no_success")]
+    assert len(outcomes) == 1 + TRIALS
     assert read_json(tmp_path / "again.h5")["episodes"][0]["robocas"]["replay_rate"] == 5

@@ -26,7 +26,10 @@ def recorded(tmp_path_factory):
     generator.open_loop.play_recording = listening
     result = generator.generate(SEED, tmp_path_factory.mktemp("recorded"), "one")
     assert result.success
-    yield generator.open_loop, *calls[-1]
+    assert [len(args) for args, _ in calls] == [5, 5, 5]
+    assert [args[4] is None for args, _ in calls] == [True, False, False]
+    (args, played), *_ = calls
+    yield generator.open_loop, args[:4], played
     generator.close()
 
 
@@ -39,6 +42,15 @@ def test_a_demonstrations_own_actions_succeed_again(recorded):
     error = np.linalg.norm(played.tcp_in_base - tcp_in_base[samples, :3, 3], axis=1)
     assert error.mean() < 0.002
     assert error.max() < 0.02
+
+
+def test_noise_moves_the_tcp_a_little(recorded):
+    open_loop, args, played = recorded
+    noisy = open_loop.play_recording(*args, np.random.default_rng(0))
+    difference = np.abs(noisy.tcp_in_base - played.tcp_in_base)[:20]  # before anything is touched
+    assert 1e-6 < difference.max() < 3e-4
+    again = open_loop.play_recording(*args, np.random.default_rng(0))
+    np.testing.assert_array_equal(noisy.tcp_in_base, again.tcp_in_base)
 
 
 def test_with_an_open_gripper_they_do_not(recorded):
