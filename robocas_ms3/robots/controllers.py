@@ -223,24 +223,40 @@ class RoboCASEEPoseController(PDEEPoseController):
         rotation = matrix_to_quaternion(euler_angles_to_matrix(action[:, 3:6], "XYZ"))
         return Pose.create_from_pq(action[:, :3], rotation)
 
+    sets_target_qvel = True
+    _forgotten: torch.Tensor | None = None  # (N,) whose targets count no longer
+
     def set_action(self, action: Any) -> None:
         """Drive the arm towards the pose; where no inverse kinematics is found it stays where it is."""
         action = self._preprocess_action(action)
         self._step = 0
-        self._start_qpos = self.qpos
         now, reference = self.ee_pose_at_base, self.reference_pose()
+        last = self.qpos if self._target_qpos is None else self._target_qpos
+        moved = (last - self.qpos).abs() > ARM_SET_FROM_OUTSIDE
+        if self._forgotten is not None:
+            moved |= self._forgotten[:, None]
+        self._start_qpos = torch.where(moved, self.qpos, last)
         self._target_pose = self.compute_target_pose(reference, action)
         target = self._solve(self._target_pose, now)
-        last = self._start_qpos if self._target_qpos is None else self._target_qpos
         if target is None:
-            target, self._target_pose = self._start_qpos, reference
-        self._target_qpos = target
+            target, self._target_pose = self.qpos, reference
+        self._target_qpos, self._forgotten = target, None
         if self.config.use_delta:
-            moved = (last - self._start_qpos).abs() > ARM_SET_FROM_OUTSIDE
-            self._start_qpos = torch.where(moved, self._start_qpos, last)
             self._drive_with(self._start_qpos, (target - self._start_qpos) * self._control_freq)
         else:
-            self.set_drive_targets(target)
+            self._drive_with(target, torch.zeros_like(target))
+
+    def forget_targets(self, env_idx: torch.Tensor | None = None) -> None:
+        """Let the next action start from where the arm is: its state was set from outside.
+
+        Args:
+            env_idx: of the envs; default: all.
+        """
+        forgotten = torch.zeros(len(self.qpos), dtype=torch.bool, device=self.device)
+        if self._forgotten is not None:
+            forgotten |= self._forgotten
+        forgotten[slice(None) if env_idx is None else env_idx] = True
+        self._forgotten = forgotten
 
     def before_simulation_step(self) -> None:
         """Move the drive target of deltas on."""
@@ -260,11 +276,6 @@ class RoboCASEEPoseController(PDEEPoseController):
         """Start from the present configuration, at rest."""
         super().reset()
         self._step = self._sim_steps
-        if self.config.use_delta:
-            velocity = torch.zeros_like(self.qpos)
-            if self.scene.gpu_sim_enabled:
-                velocity = velocity[self.scene._reset_mask]
-            self.articulation.set_joint_drive_velocity_targets(velocity, self.joints, self.active_joint_indices)
 
     def reference_pose(self) -> Pose:
         """(N,) poses in the arm's base frame that the next deltas start from."""
@@ -275,6 +286,8 @@ class RoboCASEEPoseController(PDEEPoseController):
         distance = torch.linalg.norm(self._target_pose.p - now.p, dim=1)
         cosine = (self._target_pose.q * now.q).sum(dim=1).abs()  # of half the angle between them
         lost = (distance > far) | (cosine < np.cos(turned / 2))
+        if self._forgotten is not None:
+            lost |= self._forgotten
         return Pose.create(torch.where(lost[:, None], now.raw_pose, self._target_pose.raw_pose))
 
     def _solve(self, target: Pose, now: Pose) -> torch.Tensor | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import sapien
@@ -26,6 +26,7 @@ from robocas_ms3.robots.controllers import (
     POSITION_SCALE,
     ROTATION_SCALE,
     HeldJointsControllerConfig,
+    RoboCASEEPoseController,
     RoboCASEEPoseControllerConfig,
     SmoothJointPosControllerConfig,
 )
@@ -178,11 +179,34 @@ class RoboCASMobilePanda(BaseAgent):
             init_qpos: (12,) or (N, 12) for the environments being reset; None leaves the robot where it is.
         """
         super().reset(init_qpos)
+        self._still()
         if init_qpos is not None:
             # Otherwise steps taken before the first action would pull the robot to its former targets.
             joints = self.robot.active_joints
             targets = torch.as_tensor(init_qpos, dtype=torch.float32, device=self.device).reshape(-1, len(joints))
             self.robot.set_joint_drive_targets(targets, joints)
+
+    def set_control_mode(self, control_mode: str | None = None) -> None:
+        """Change the control mode; what the last one told the arm about its velocity is forgotten."""
+        super().set_control_mode(cast("str", control_mode))
+        if hasattr(self, "tcp"):  # not while the robot is being made
+            self._still()
+
+    def _still(self) -> None:
+        """Take back the velocities that the drives were told, of the envs being reset."""
+        joints = self.robot.active_joints
+        self.robot.set_joint_drive_velocity_targets(torch.zeros(1, len(joints), device=self.device), joints)
+
+    def forget_targets(self, env_idx: torch.Tensor | None = None) -> None:
+        """Let the next action start from where the arm is: its state was set from outside.
+
+        Args:
+            env_idx: of the envs; default: all.
+        """
+        controllers: Any = self.controller
+        arm = controllers.controllers["arm"]
+        if isinstance(arm, RoboCASEEPoseController):
+            arm.forget_targets(env_idx)
 
     def get_proprioception(self) -> dict[str, Any]:
         """Joint state, TCP pose in the arm's base frame (N, 7), gripper width (N, 1), controller state."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import sapien
@@ -210,6 +210,11 @@ class RoboCASEnv(SeededEnv):
             self.present[env_idx] = torch.as_tensor(np.stack([layout.present for layout in layouts])).to(self.device)
         for i, layout in zip(env_idx.tolist(), layouts, strict=True):
             self.layouts[i] = layout
+
+    def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
+        """Set the state; the next action starts from there, whatever the last one had asked for."""
+        super().set_state_dict(state, cast("torch.Tensor", env_idx))
+        self.agent.forget_targets(env_idx)
 
     def _pose(self, matrices: list[Array]) -> Any:
         """Batch of poses from 4x4 matrices."""

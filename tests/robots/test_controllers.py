@@ -140,6 +140,42 @@ def test_ee_deltas_start_where_the_arm_is_after_it_was_held_back(make_env):
     assert np.linalg.norm(translation) < 0.02
 
 
+def velocities(agent) -> np.ndarray:
+    return agent.robot.drive_velocities[0].numpy()
+
+
+def test_ee_deltas_tell_the_drives_their_velocity_and_other_modes_take_it_back(make_env):
+    env, agent = make_env("pd_ee_delta_pose", control_freq=5)
+    assert agent.controller.sets_target_qvel  # else a GPU would not hear of it
+    env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
+    assert np.abs(velocities(agent)).max() > 0.05
+    env.step(np.array([0, 0, 0, 0, 0, 0, 1], np.float32))
+    assert np.abs(velocities(agent)).max() < 0.02
+    env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
+    agent.set_control_mode("pd_joint_pos")
+    assert not velocities(agent).any()
+
+
+def test_after_a_reset_the_drives_know_of_no_velocity(make_env):
+    env, agent = make_env("pd_ee_delta_pose", control_freq=5)
+    env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
+    agent.reset(agent.robot.qpos)
+    assert not velocities(agent).any()
+
+
+def test_ee_deltas_start_where_the_arm_is_after_its_state_was_set(make_env):
+    env, agent = make_env("pd_ee_delta_pose", control_freq=5)
+    before, start = agent.robot.qpos.clone(), matrix(agent.tcp.pose)
+    for _ in range(2):
+        env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
+    agent.robot.set_qpos(before)
+    agent.robot.set_qvel(torch.zeros_like(before))
+    agent.forget_targets()
+    env.step(np.zeros(7, np.float32))
+    translation, _ = moved(start, matrix(agent.tcp.pose))
+    assert np.linalg.norm(translation) < 2e-3
+
+
 def test_ee_delta_rotation_is_clipped_by_norm(make_env):
     env, agent = make_env("pd_ee_delta_pose", control_freq=5)
     start = matrix(agent.tcp_in_arm_base)
