@@ -104,8 +104,11 @@ def make_folder(path: Path | str) -> Path:
 def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool = False) -> None:
     """Refuse an output that exists, unless the user said what to do with it.
 
+    What is overwritten disappears at once: a run killed while it deletes leaves no half of it under this name.
+
     Raises:
         OutputExistsError: ``path`` exists and is not empty, and neither flag is set.
+        RobocasError: it can't be moved away.
     """
     path = Path(path)
     taken = path.exists() and not (path.is_dir() and not any(path.iterdir()))
@@ -113,8 +116,28 @@ def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool = Fa
         raise OutputExistsError(
             "the output exists already", where=path, fix="Pass --resume to go on, --overwrite to replace it."
         )
+    for old in path.parent.glob(f".{glob.escape(path.name)}.*.old"):
+        if not (old / "old").exists():  # that of a folder being replaced, which may have to come back
+            shutil.rmtree(old, ignore_errors=True)
     if taken and overwrite:
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+        _remove(path)
+
+
+def _remove(path: Path) -> None:
+    """Delete a file or a folder, which is renamed first."""
+    if not path.is_dir():
+        path.unlink()
+        return
+    target = path.resolve()  # a link to a folder goes on leading to one
+    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=make_folder(target.parent)))
+    try:
+        os.replace(target, old)
+    except OSError as error:
+        old.rmdir()
+        raise RobocasError("can't replace this folder", where=path, found=error.strerror, fix="Choose another.") from error
+    if path.is_symlink():
+        target.mkdir()
+    shutil.rmtree(old, ignore_errors=True)
 
 
 @contextmanager

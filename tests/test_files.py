@@ -38,7 +38,31 @@ def test_existing_output_needs_a_flag(tmp_path):
     claim_output(tmp_path / "out", resume=True)
     assert (tmp_path / "out" / "file").exists()
     claim_output(tmp_path / "out", overwrite=True)
-    assert not (tmp_path / "out").exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_overwritten_disappears_at_once(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "file").write_text("")
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.rmtree", lambda *_, **__: None)  # as if killed there
+        claim_output(out, overwrite=True)
+    assert not out.exists()
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".out.")
+    assert left.name.endswith(".old")
+    claim_output(out)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_link_to_a_folder_goes_on_leading_to_one(tmp_path):
+    (tmp_path / "disk" / "data").mkdir(parents=True)
+    (tmp_path / "disk" / "data" / "file").write_text("")
+    (tmp_path / "out").symlink_to(tmp_path / "disk" / "data")
+    claim_output(tmp_path / "out", overwrite=True)
+    assert (tmp_path / "out").is_symlink()
+    assert [*(tmp_path / "disk").iterdir(), *(tmp_path / "out").iterdir()] == [tmp_path / "disk" / "data"]
 
 
 def test_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path):

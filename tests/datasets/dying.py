@@ -14,6 +14,7 @@ PLACES = {  # moment -> (module, function, which call is the last)
     "arrays": (writer, "write_cameras", 2),
     "rename": (files, "_move_in", 2),
     "overview": (convert, "write_info", 1),
+    "rmtree": (os, "rmdir", 3),  # --overwrite, with two folders of the old one gone
 }
 
 
@@ -32,4 +33,4 @@ def die_at(module, name, last):
 if __name__ == "__main__":
     moment, trajectory, out = sys.argv[1:]
     die_at(*PLACES[moment])
-    convert.convert(trajectory, out, embeddings=False, open_source=RayCaster)
+    convert.convert(trajectory, out, embeddings=False, overwrite=moment == "rmtree", open_source=RayCaster)

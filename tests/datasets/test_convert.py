@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -297,17 +298,20 @@ def test_append_wants_a_dataset_of_the_same_settings(trajectory, tmp_path):
     assert files_of(tmp_path / "out") == before
 
 
-@pytest.mark.parametrize("moment", ["picture", "arrays", "rename", "overview"])
+@pytest.mark.parametrize("moment", ["picture", "arrays", "rename", "overview", "rmtree"])
 def test_killed_and_resumed_is_as_if_never_killed(trajectory, tmp_path, moment):
-    """kill -9 in a process of its own, at four places."""
+    """kill -9 in a process of its own, at five places."""
     run(trajectory, tmp_path / "whole")
     out = tmp_path / "out"
+    if moment == "rmtree":
+        shutil.copytree(tmp_path / "whole", out)
     command = [sys.executable, str(Path(__file__).parent / "dying.py"), moment, str(trajectory), str(out)]
     environment = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}  # there is no simulator in this, only its import
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
     assert done.returncode == -signal.SIGKILL, done.stderr
     run(trajectory, out, resume=True)
     assert files_of(out) == files_of(tmp_path / "whole")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "whole"]
     with pytest.raises(DatasetError, match="no successful"):
         run(write_trajectory(tmp_path / "failed.h5", failed=(0, 1, 2)), out, resume=True)
 
