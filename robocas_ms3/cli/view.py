@@ -49,7 +49,9 @@ def main(cfg: View) -> int:
     with Viewer(source, cfg.port) as server:
         server.warm_up()
         console.print(f"{cfg.path} at {server.url} (Ctrl-C ends)")
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # a supervisor's stop is as clean as Ctrl-C
+        # a supervisor's stop is as clean as Ctrl-C, which is ignored where a shell started this in the background
+        for ending in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(ending, signal.default_int_handler)
         if cfg.open:
             webbrowser.open(server.url)
         try:

@@ -33,12 +33,15 @@ def test_it_serves_until_it_is_interrupted(trajectory, ending):
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
         assert process.stdout is not None and process.stderr is not None
-        line = process.stdout.readline()
-        match = re.search(r"http://127\.0\.0\.1:\d+/", line)
-        assert match, line + process.stderr.read()
-        assert b"<!doctype html>" in urllib.request.urlopen(match[0], timeout=30).read()
-        process.send_signal(ending)
-        out, err = process.communicate(timeout=30)
+        try:
+            line = process.stdout.readline()
+            match = re.search(r"http://127\.0\.0\.1:\d+/", line)
+            assert match, line + process.stderr.read()
+            assert b"<!doctype html>" in urllib.request.urlopen(match[0], timeout=30).read()
+            process.send_signal(ending)
+            out, err = process.communicate(timeout=30)
+        finally:
+            process.kill()  # else a failure would wait for it for ever
     assert (process.returncode, out, err) == (0, "ended\n", "")
 
 
