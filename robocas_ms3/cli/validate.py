@@ -23,13 +23,15 @@ class Validate:
     """Check a RoboCAS or LeRobot dataset and list every violation; exit code 1 if there is any.
 
     With --replay also play every episode's own 7-D actions open loop in its rebuilt scene, and say how many succeed
-    again and how far the gripper strays.
+    again and how far the gripper strays. That changes the exit code only with --min-share.
     """
 
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset."""
     replay: bool = False
     """Play the actions too (RoboCAS folders; simulated, not rendered)."""
+    min_share: float = 0.0
+    """With --replay: exit code 1 where a smaller share of a task's episodes succeeds again (0 to 1)."""
     json: bool = False
     """Print a machine-readable report."""
 
@@ -46,19 +48,23 @@ def main(cfg: Validate) -> int:
     with _bar("checking") as advance:
         check = _validate_lerobot if is_lerobot else validate
         report = check(cfg.dataset, on_episode=lambda done, count: advance(count))
-    replays = _replay(cfg.dataset) if cfg.replay else None
     console = Console(soft_wrap=True, highlight=False, markup=False)
+    if not cfg.json:
+        for violation in report.violations:
+            console.print(str(violation))
+        verdict = f"{len(report.violations)} violations" if report.violations else "valid"
+        console.print(f"{cfg.dataset}: {report.episodes} episodes, {report.steps} steps, {verdict}")
+    content, wrong = report.as_json(), bool(report.violations)
+    if cfg.replay:
+        replays = _replay(cfg.dataset)
+        content["replay"] = replays.as_json()
+        wrong |= any(of_task["tried"] and of_task["share"] < cfg.min_share for of_task in replays.by_task().values())
+        if not cfg.json:
+            for line in _lines(replays):
+                console.print(line)
     if cfg.json:
-        content = report.as_json() | ({"replay": replays.as_json()} if replays else {})
         console.print(json.dumps(content, indent=2, ensure_ascii=False))
-        return 1 if report.violations else 0
-    for violation in report.violations:
-        console.print(str(violation))
-    verdict = f"{len(report.violations)} violations" if report.violations else "valid"
-    console.print(f"{cfg.dataset}: {report.episodes} episodes, {report.steps} steps, {verdict}")
-    for line in _lines(replays) if replays else ():
-        console.print(line)
-    return 1 if report.violations else 0
+    return 1 if wrong else 0
 
 
 def _validate_lerobot(root: Path, *, on_episode: Callable[[int, int], None]) -> Report:

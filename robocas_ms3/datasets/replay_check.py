@@ -16,6 +16,7 @@ from robocas_ms3.datasets.reader import Dataset, Episode
 from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.errors import RobocasError
 
+SAME_PLACE = 1e-3  # m
 BASE_STILL = 1e-3  # m that the base may move in all: 7-D actions do not move it
 
 
@@ -105,20 +106,25 @@ class _Player:
         self._key, self._open_loop = "", None
 
     def play(self, number: int, episode: Episode) -> EpisodeReplay:
-        scene, task = episode.scene, str(episode.scene.get("task") or "")
-        reason = _not_playable(episode)
-        if reason:
-            return EpisodeReplay(number, task, None, skipped=reason)
-        arrays = episode.arrays
-        actions = episode_actions(arrays)[:-1].astype(np.float64)
-        turns = Rotation.from_euler("xyz", actions[:, 3:6])
-        open_loop = self._environment(scene["env_info"])
+        task = ""
         try:
-            played = open_loop.play(
-                int(scene["seed"]), scene.get("reset_options") or {}, actions[:, :3], turns, actions[:, 6] > 0.5
-            )
-        except RobocasError as error:
-            return EpisodeReplay(number, task, None, skipped=f"its scene can't be built: {error}")
+            scene = episode.scene
+            task = str(scene.get("task") or "")
+            reason = _not_playable(episode)
+            if reason:
+                return EpisodeReplay(number, task, None, skipped=reason)
+            arrays = episode.arrays
+            actions = episode_actions(arrays)[:-1].astype(np.float64)
+            turns = Rotation.from_euler("xyz", actions[:, 3:6])
+            open_loop = self._environment(scene["env_info"])
+            open_loop.reset(int(scene["seed"]), scene.get("reset_options") or {})
+            other = _other_scene(scene, open_loop)
+            if other:
+                return EpisodeReplay(number, task, None, skipped=f"its seed builds another scene now: {other}")
+            played = open_loop.play(actions[:, :3], turns, actions[:, 6] > 0.5)
+        except (RobocasError, ValueError, TypeError, KeyError, AttributeError, OSError) as error:
+            found = str(error).strip().splitlines()
+            return EpisodeReplay(number, task, None, skipped=found[0] if found else type(error).__name__)
         error = np.linalg.norm(played.tcp_in_base - arrays["ee_pos"], axis=1)
         return EpisodeReplay(
             number, task, played.success, float(error.mean()), float(error.max()), clipped=played.clipped
@@ -137,11 +143,24 @@ class _Player:
             self._open_loop = None
 
 
+def _other_scene(scene: dict[str, Any], open_loop: OpenLoop) -> str:
+    """What of a rebuilt scene is not as recorded: another pack, configuration or version; empty: nothing."""
+    recorded, built = scene.get("layout") or {}, open_loop.layout
+    if "object_ids" in recorded and list(recorded["object_ids"]) != list(built.object_ids):
+        return "other objects"
+    if "poses" in recorded:
+        places = np.array([pose[:3] for pose in recorded["poses"]], dtype=np.float64)
+        apart = np.linalg.norm(places - built.object_poses[:, :3, 3], axis=1).max()
+        if apart > SAME_PLACE:
+            return f"objects up to {apart * 1000:.0f} mm away"
+    return ""
+
+
 def _not_playable(episode: Episode) -> str:
     scene = episode.scene
     if not scene.get("env_info") or scene.get("seed") is None:
         return "its scene.json does not say how to build the scene"
-    if not scene.get("success", True):
+    if scene.get("success") is False:
         return "it was recorded without success"
     if len(episode.arrays["ee_pos"]) < 2:
         return "it has no actions"

@@ -16,6 +16,7 @@ from robocas_ms3.demos.sampling import Array, gripper_open, relative_motion, sam
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.robots.constants import OPEN_FINGER
 from robocas_ms3.robots.controllers import to_ee_delta_action
+from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.tasks.base import RoboCASEnv
 
 CONTROL_MODE = "pd_ee_delta_pose"
@@ -72,28 +73,36 @@ class OpenLoop:
             raise DatasetError("no such environment", where=env_info["env_id"], found=str(error)) from error
         self._rate = int(rate_hz)
 
-    def play(
-        self,
-        seed: int,
-        options: dict[str, Any],
-        translations: Array,
-        rotations: Rotation,
-        gripper: NDArray[np.bool_],
-    ) -> Played:
-        """Build an episode's scene and play its actions.
+    def reset(self, seed: int, options: dict[str, Any] | None = None) -> None:
+        """Build an episode's scene.
 
         Args:
             seed: of the episode.
             options: further options of its reset.
+        """
+        self.env.reset(seed=seed, options=dict(options or {}))
+
+    @property
+    def layout(self) -> Layout:
+        """Of the scene that was built last."""
+        env = self.env.unwrapped
+        assert isinstance(env, RoboCASEnv)
+        layout = env.layouts[0]
+        assert layout is not None
+        return layout
+
+    def play(self, translations: Array, rotations: Rotation, gripper: NDArray[np.bool_]) -> Played:
+        """Play actions from the reset on.
+
+        Args:
             translations: (S, 3) m, of the TCP in its own frame.
             rotations: (S,) likewise.
             gripper: (S,) True = open.
         """
         env = self.env.unwrapped
         assert isinstance(env, RoboCASEnv)
-        self.env.reset(seed=seed, options=dict(options))
         motion = to_ee_delta_action(translations, rotations) if len(translations) else np.zeros((0, 6), np.float32)
-        clipped = int(np.sum(np.abs(motion).max(axis=1, initial=0) > 1))
+        beyond = (np.abs(motion[:, :3]) > 1).any(axis=1) | (np.linalg.norm(motion[:, 3:], axis=1) > 1)
         actions = np.column_stack([np.clip(motion, -1, 1), np.where(gripper, 1, -1)]).astype(np.float32)
         places, success = [env.agent.tcp_in_arm_base.p[0].numpy().copy()], False
         for action in actions:
@@ -106,7 +115,7 @@ class OpenLoop:
                 break
             *_, info = self.env.step(still)
             success |= bool(info["success"][0])
-        return Played(success, np.stack(places).astype(np.float64), clipped)
+        return Played(success, np.stack(places).astype(np.float64), int(beyond.sum()))
 
     def play_recording(
         self,
@@ -131,7 +140,8 @@ class OpenLoop:
         translations = motion[:, :3, 3].copy()
         if noise is not None:
             translations += noise.normal(0, NOISE, translations.shape)
-        return self.play(seed, {}, translations, Rotation.from_matrix(motion[:, :3, :3]), status[1:])
+        self.reset(seed)
+        return self.play(translations, Rotation.from_matrix(motion[:, :3, :3]), status[1:])
 
     def close(self) -> None:
         """Close the environment."""

@@ -67,8 +67,11 @@ def test_beside_the_object_they_do_not(recorded):
 
 def test_motion_beyond_a_step_is_counted(recorded):
     open_loop, (seed, *_), _ = recorded
-    played = open_loop.play(seed, {}, np.array([[0, 0, -0.15], [0, 0, 0.01]]), Rotation.identity(2), np.ones(2, bool))
-    assert played.clipped == 1
+    open_loop.reset(seed)
+    assert len(open_loop.layout.object_ids) == 10
+    turns = Rotation.from_euler("xyz", [[0, 0, 0], [0, 0, 0], [0.4, 0, 0.4]])  # the last: 0.57 rad in one step
+    played = open_loop.play(np.array([[0, 0, -0.15], [0, 0, 0.01], [0, 0, 0]]), turns, np.ones(3, bool))
+    assert played.clipped == 2
     assert not played.success
 
 

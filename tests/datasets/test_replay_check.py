@@ -1,0 +1,143 @@
+"""What `robocas validate --replay` makes of a dataset; a player that needs no simulator stands for the environment."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.datasets import replay_check
+from robocas_ms3.datasets.replay_check import replay_dataset
+from robocas_ms3.demos.open_loop import Played
+from robocas_ms3.errors import AssetError
+
+
+class Player:
+    """Adds up what it is told: where the TCP goes depends on the actions alone. Seed 5 never succeeds."""
+
+    made: list = []  # noqa: RUF012
+    start = np.zeros(3)
+    layout = SimpleNamespace(object_ids=("cube",) * 3, object_poses=np.tile(np.eye(4), (3, 1, 1)))
+
+    def __init__(self, env_info, rate_hz):
+        if env_info["env_kwargs"].get("pack") == "gone":
+            raise AssetError("no such pack", where="gone")
+        self.rate_hz, self.closed, self.plays = rate_hz, False, []
+        Player.made.append(self)
+
+    def reset(self, seed, options):
+        self.seed, self.options = seed, options
+
+    def play(self, translations, rotations, gripper):
+        self.plays.append((self.seed, translations, rotations, gripper))
+        pose, places = np.eye(4), [np.zeros(3)]
+        for shift, turn in zip(translations, rotations, strict=True):
+            pose[:3, 3] += pose[:3, :3] @ shift
+            pose[:3, :3] = pose[:3, :3] @ turn.as_matrix()
+            places.append(pose[:3, 3].copy())
+        return Played(self.seed != 5, np.array(places), 0)
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture(autouse=True)
+def player(monkeypatch):
+    Player.made = []
+    monkeypatch.setattr(replay_check, "OpenLoop", Player)
+    return Player
+
+
+def edit_scene(dataset, number, **changes):
+    path = dataset / f"episode_{number:07d}" / "scene.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def edit_arrays(dataset, number, **changes):
+    path = dataset / f"episode_{number:07d}" / "episode_info.npz"
+    with np.load(path) as arrays:
+        content = {**arrays, **changes}
+    np.savez(path, **content)
+
+
+def still(dataset, number):
+    """An episode whose TCP stands at the base's origin, so that the player follows it exactly."""
+    steps = 7
+    turn = np.tile([0, 0, 0, 1], (steps, 1)).astype(np.float32)
+    nothing = np.zeros((steps, 3), np.float32)
+    edit_arrays(dataset, number, ee_pos=nothing, rel_pos=nothing, ee_orn=turn, rel_orn=turn)
+
+
+def test_actions_are_the_datasets_own(dataset, player):
+    report = replay_dataset(dataset)
+    (made,) = player.made  # one environment for all episodes of one kind
+    assert (made.rate_hz, made.closed) == (5.0, True)
+    assert [seed for seed, *_ in made.plays] == [3, 5]
+    with np.load(dataset / "episode_0000000" / "episode_info.npz") as arrays:
+        _, translations, rotations, gripper = made.plays[0]
+        np.testing.assert_allclose(translations, arrays["rel_pos"][:-1], atol=1e-7)
+        quaternions = rotations.as_quat(canonical=True)
+        np.testing.assert_allclose(quaternions, arrays["rel_orn"][:-1], atol=1e-6)
+        assert gripper.tolist() == arrays["gripper_status"][1:].tolist()
+    assert [episode.success for episode in report.episodes] == [True, False]
+    of_task = report.by_task()["pick"]
+    assert (of_task["tried"], of_task["succeeded"], of_task["share"], of_task["skipped"]) == (2, 1, 0.5, 0)
+
+
+def test_tracking_error_by_hand(dataset):
+    still(dataset, 0)
+    shifted = np.zeros((7, 3), np.float32)
+    shifted[6] = 0.0, 0.07, 0.0  # the player stays at the origin: 7 cm off at the last of seven steps
+    edit_arrays(dataset, 0, ee_pos=shifted)
+    episode = replay_dataset(dataset, numbers=[0]).episodes[0]
+    assert episode.mean_error == pytest.approx(0.01)
+    assert episode.max_error == pytest.approx(0.07)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"env_info": None}, "does not say how to build the scene"),
+        ({"seed": None}, "does not say how to build the scene"),
+        ({"success": False}, "recorded without success"),
+        ({"layout": {"object_ids": ["cube", "cup", "cube"]}}, "another scene now: other objects"),
+        ({"layout": {"poses": [[0, 0, 0], [0, 0.5, 0], [0, 0, 0]]}}, "another scene now: objects up to 500 mm away"),
+        ({"env_info": {"env_id": "x", "env_kwargs": {"pack": "gone"}}}, "no such pack"),
+    ],
+)
+def test_what_can_not_be_tried_is_named_and_the_rest_goes_on(dataset, changes, reason):
+    edit_scene(dataset, 0, **changes)
+    first, second = replay_dataset(dataset).episodes
+    assert first.success is None
+    assert reason in first.skipped
+    assert second.success is False
+
+
+def test_unknown_success_is_tried(dataset):
+    edit_scene(dataset, 0, success=None)
+    assert replay_dataset(dataset).episodes[0].success is True
+
+
+def test_a_base_that_drives_and_damage_are_named(dataset):
+    moving = np.zeros((7, 3), np.float32)
+    moving[3:, 0] = 0.1
+    edit_arrays(dataset, 0, base_pos=moving)
+    (dataset / "episode_0000001" / "scene.json").write_text("{")
+    first, second = replay_dataset(dataset).episodes
+    assert "its base drives" in first.skipped
+    assert second.success is None
+    assert second.skipped
+
+
+def test_the_command_tells_it_and_may_ask_for_a_share(dataset, capsys):
+    assert run(["validate", str(dataset), "--replay"]) == 0
+    out = capsys.readouterr().out
+    assert "episode 1: its own actions do not succeed again" in out
+    assert "pick: 1 of 2 replayed episodes succeed again (50%)" in out
+    assert run(["validate", str(dataset), "--replay", "--min-share", "0.9"]) == 1
+    assert run(["validate", str(dataset), "--replay", "--min-share", "0.5"]) == 0
+    capsys.readouterr()
+    assert run(["validate", str(dataset), "--replay", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["replay"]["by_task"]["pick"]["share"] == 0.5
