@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -134,7 +135,8 @@ def _remove(path: Path) -> None:
         os.replace(target, old)
     except OSError as error:
         old.rmdir()
-        raise RobocasError("can't replace this folder", where=path, found=error.strerror, fix="Choose another.") from error
+        what = "can't replace this folder"
+        raise RobocasError(what, where=path, found=error.strerror, fix="Choose another.") from error
     if path.is_symlink():
         target.mkdir()
     shutil.rmtree(old, ignore_errors=True)
@@ -144,21 +146,41 @@ def _remove(path: Path) -> None:
 def locked_folder(path: Path | str) -> Iterator[None]:
     """Hold a lock on a folder that may not exist yet; it ends with the process, however that ends.
 
+    If the folder is not there in the end, the parents made for the lock go too.
+
     Raises:
         RobocasError: another process holds it.
     """
     path = Path(path)
-    make_folder(path.parent)
+    new = [folder for folder in path.parents if not folder.exists()]
     lock = path.parent / f".{path.name}.lock"
-    with lock.open("w") as file:
+    try:
+        with _locked(lock, path):
+            try:
+                yield
+            finally:
+                lock.unlink(missing_ok=True)
+    finally:
+        if not path.exists():
+            with suppress(OSError):  # nothing came of it; another run may be in them
+                for folder in new:
+                    folder.rmdir()
+
+
+def _locked(lock: Path, path: Path) -> TextIOWrapper:
+    """Open and lock a file that whoever held it before may just have removed."""
+    while True:
+        make_folder(lock.parent)
+        file = lock.open("w")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
+                    return file
         except OSError as error:
+            file.close()
             raise RobocasError("another process is writing here", where=path, fix="Wait until it is done.") from error
-        try:
-            yield
-        finally:
-            lock.unlink(missing_ok=True)
+        file.close()
 
 
 def write_json(path: Path | str, data: Any) -> None:

@@ -1,9 +1,10 @@
+import fcntl
 import os
 
 import pytest
 
 from robocas_ms3.errors import OutputExistsError, RobocasError
-from robocas_ms3.files import claim_output, make_folder, replacing, replacing_folder, write_json
+from robocas_ms3.files import claim_output, locked_folder, make_folder, replacing, replacing_folder, write_json
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -81,3 +82,29 @@ def test_what_a_killed_run_left_is_swept_up_a_day_later(tmp_path):
     with replacing_folder(tmp_path / "pack"):
         pass
     assert sorted(p.name for p in tmp_path.iterdir()) == [".pack.b.tmp", ".spack.c.tmp", "pack"]
+
+
+def test_a_lock_leaves_no_parents_of_a_folder_that_never_was(tmp_path):
+    with pytest.raises(ZeroDivisionError), locked_folder(tmp_path / "a" / "b" / "out"):
+        _ = 1 / 0
+    assert list(tmp_path.iterdir()) == []
+    with locked_folder(tmp_path / "a" / "out"):
+        make_folder(tmp_path / "a" / "out")
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["out"]
+
+
+def test_a_lock_that_was_removed_meanwhile_is_none(tmp_path, monkeypatch):
+    """The one who held it removes it between another's opening and locking."""
+    lock, whole, calls = tmp_path / ".out.lock", fcntl.flock, []
+
+    def flock(*args):
+        calls.append(args)
+        if len(calls) == 1:
+            lock.unlink()
+        whole(*args)
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with locked_folder(tmp_path / "out"):
+        assert len(calls) == 2
+        with pytest.raises(RobocasError, match="another process"), locked_folder(tmp_path / "out"):
+            pass

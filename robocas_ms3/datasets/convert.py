@@ -96,22 +96,22 @@ def convert(
         stride = sample_stride(file.control_freq, rate_hz)
         chosen = choose(file, include_failed)
         settings = dataset_settings(rate_hz, pictures, embeddings)
-        # Everything that may fail comes before the output is touched.
-        claim_output(out, resume=resume or append or overwrite)
-        if append:
-            plan = appended_plan(out, file, chosen, settings)
-        elif resume:
-            plan = resumed_plan(out, file, chosen, settings)
-        else:
-            plan = new_plan(file, chosen, settings)
-            if overwrite:
-                _check_overwrite(out)
-        if open_source is open_env:
-            from robocas_ms3.datasets.render import require_renderer
+        with locked_folder(out):  # from the plan on: it numbers after what is there
+            # Everything that may fail comes before the output is touched.
+            claim_output(out, resume=resume or append or overwrite)
+            if append:
+                plan = appended_plan(out, file, chosen, settings)
+            elif resume:
+                plan = resumed_plan(out, file, chosen, settings)
+            else:
+                plan = new_plan(file, chosen, settings)
+                if overwrite:
+                    _check_overwrite(out)
+            if open_source is open_env:
+                from robocas_ms3.datasets.render import require_renderer
 
-            require_renderer()
-        vectors = embed_texts(file, chosen) if embeddings else None
-        with locked_folder(out):
+                require_renderer()
+            vectors = embed_texts(file, chosen) if embeddings else None
             claim_output(out, overwrite=overwrite and not (resume or append), resume=True)
             make_folder(out)
             _sweep(out)

@@ -1,7 +1,7 @@
 import shutil
 
 import pytest
-from synthetic import RayCaster, write_trajectory
+from synthetic import RayCaster, made_up_vectors, write_trajectory
 
 from robocas_ms3.datasets.convert import convert
 
@@ -9,18 +9,6 @@ from robocas_ms3.datasets.convert import convert
 @pytest.fixture(scope="session")
 def trajectory(tmp_path_factory):
     return write_trajectory(tmp_path_factory.mktemp("trajectory") / "F.h5", seeds=(3, 4, 5), failed=(1,))
-
-
-def made_up_vectors(file, chosen):
-    """Unit vectors in place of sentence embeddings, which take seconds to load."""
-    import numpy as np
-
-    texts = {
-        text
-        for index in chosen
-        for text in [file.recording(index).instruction, *(g.goal_description for g in file.recording(index).subgoals)]
-    }
-    return {text: np.eye(384, dtype=np.float32)[number] for number, text in enumerate(sorted(texts))}
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from synthetic import STEPS, RayCaster, robot_frames, write_trajectory
+from synthetic import STEPS, RayCaster, made_up_vectors, robot_frames, write_trajectory
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.convert import convert
@@ -171,7 +171,7 @@ def fails(match, trajectory, out, **kwargs):
     with pytest.raises(RobocasError, match=match) as caught:
         run(trajectory, out, **kwargs)
     assert "\n" not in str(caught.value)
-    assert not Path(out).exists()
+    assert not [*out.parent.glob(f"*{out.name}*")]
 
 
 def test_errors_leave_nothing_behind(trajectory, tmp_path):
@@ -319,3 +319,24 @@ def test_killed_and_resumed_is_as_if_never_killed(trajectory, tmp_path, moment):
 def test_two_conversions_into_one_folder_are_refused(trajectory, tmp_path):
     with locked_folder(tmp_path / "out"), pytest.raises(RobocasError, match="another process is writing here"):
         run(trajectory, tmp_path / "out")
+
+
+def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypatch):
+    """A second conversion that begins after the first has made its plan, and would take the same numbers."""
+    out = tmp_path / "out"
+    more = write_trajectory(tmp_path / "more.h5", seeds=(10,))
+    other = write_trajectory(tmp_path / "other.h5", seeds=(11,))
+    monkeypatch.setattr("robocas_ms3.datasets.convert.embed_texts", made_up_vectors)
+    convert(trajectory, out, open_source=RayCaster)
+
+    def meanwhile(file, chosen):
+        with pytest.raises(RobocasError, match="another process is writing here"):
+            convert(other, out, append=True, open_source=RayCaster)
+        return made_up_vectors(file, chosen)
+
+    monkeypatch.setattr("robocas_ms3.datasets.convert.embed_texts", meanwhile)
+    convert(more, out, append=True, open_source=RayCaster)
+    monkeypatch.setattr("robocas_ms3.datasets.convert.embed_texts", made_up_vectors)
+    convert(other, out, append=True, open_source=RayCaster)
+    ledger = json.loads((out / "conversion.json").read_text())["episodes"]
+    assert [entry["seed"] for entry in ledger.values()] == [3, 5, 10, 11]

@@ -76,19 +76,19 @@ def convert_lerobot(
     out, limits = Path(out), limits or Limits()
     request = Request(Path(source), rate_hz, pictures or Pictures(), include_failed, open_source)
     with closing(open_request(request)) as opened:
-        # Everything that may fail comes before the output is touched.
         plan = _plan(opened, opened.entries(), codec)
-        claim_output(out, resume=resume or overwrite)
-        if overwrite and not resume:
-            _check_overwrite(out)
-        if request.open_source is open_env and request.path.is_file():
-            from robocas_ms3.datasets.render import require_renderer
-
-            require_renderer()
         with locked_folder(out):
-            claim_output(out, overwrite=overwrite and not resume, resume=True)
+            # Everything that may fail comes before the output is touched.
+            claim_output(out, resume=resume or overwrite)
             if resume:
                 _check_resume(out, plan)
+            elif overwrite:
+                _check_overwrite(out)
+            if request.open_source is open_env and request.path.is_file():
+                from robocas_ms3.datasets.render import require_renderer
+
+                require_renderer()
+            claim_output(out, overwrite=overwrite and not resume, resume=True)
             written = [] if (out / INFO_FILE).is_file() else _write(
                 request, opened, out, plan, codec, jobs, limits, on_start, on_episode
             )  # fmt: skip

@@ -80,12 +80,12 @@ def begun_output(
     """
     plan = json.loads(json.dumps(plan))
     _check_apart(out, inputs)
-    claim_output(out, resume=resume or overwrite)
-    if resume:
-        _check_begun(out, plan)
-    elif overwrite:
-        _check_dataset(out)
     with locked_folder(out):
+        claim_output(out, resume=resume or overwrite)
+        if resume:
+            _check_begun(out, plan)
+        elif overwrite:
+            _check_dataset(out)
         claim_output(out, overwrite=overwrite and not resume, resume=True)
         make_folder(out)
         try:
