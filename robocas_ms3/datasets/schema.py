@@ -159,7 +159,7 @@ SCENE: dict[str, str] = {
     "control_mode": "of the recorded actions",
     "control_freq": "of the recorded actions, Hz",
     "rate_hz": "of this dataset",
-    "source": "{trajectory, episode_id, recording: SHA-256 of seed and actions}",
+    "source": "{trajectory, episode_id, recording: SHA-256 of seed, control mode, instruction and actions}",
     "recorded": "what the generator said of the episode: template, relation, facts, attempts, seconds",
     "versions": "{package: version} the episode was generated with",
 }
