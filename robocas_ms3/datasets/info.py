@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.episode import SubGoal
 from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.datasets.tolerant import DAMAGED
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import write_json
 
@@ -94,7 +94,7 @@ def summarize(episode: Episode, number: int) -> Summary:
     try:
         with np.load(episode.folder / schema.EPISODE_FILE, allow_pickle=False) as content:
             arrays = {key: content[key] for key in _NEEDED}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (*DAMAGED, KeyError) as error:
         raise DatasetError(
             "this episode can't be read",
             where=episode.folder / schema.EPISODE_FILE,

@@ -51,7 +51,7 @@ def _read_png(path: Path) -> PictureHeader:
     data = path.read_bytes()
     if not data.startswith(_SIGNATURE):
         raise ValueError("not a PNG")
-    offset, header = len(_SIGNATURE), None
+    offset, header, filled = len(_SIGNATURE), None, False
     while offset + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, offset)
         end = offset + 8 + length
@@ -62,7 +62,10 @@ def _read_png(path: Path) -> PictureHeader:
         if kind == b"IHDR":
             width, height, bits, colour = struct.unpack_from(">IIBB", data, offset + 8)
             header = PictureHeader(width, height, bits, _CHANNELS.get(colour, 0))
+        filled = filled or (kind == b"IDAT" and length > 0)
         if kind == b"IEND" and header is not None:
+            if not filled:
+                raise ValueError("PNG without a picture")
             return header
         offset = end + 4
     raise ValueError("PNG cut off")

@@ -6,7 +6,6 @@ be pickled and forked.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +21,7 @@ from robocas_ms3.datasets.episode import SubGoal, episode_arrays, sample_subgoal
 from robocas_ms3.datasets.info import action_space, split_by_seed
 from robocas_ms3.datasets.provenance import succeeded
 from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.datasets.tolerant import DAMAGED
 from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
 from robocas_ms3.demos.sampling import gripper_open, sample_states, sample_stride
 from robocas_ms3.errors import DatasetError
@@ -172,7 +172,7 @@ class FolderSource:
             if all(key in found and _is_declared(key, found[key]) for key in keys):
                 return found
             made = self._dataset.episode(number).arrays  # slower; casts and completes what was made elsewhere
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except (*DAMAGED, KeyError) as error:
             raise DatasetError(
                 "this episode can't be read",
                 where=path,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,8 @@ from robocas_ms3.demos.sampling import relative_motion
 from robocas_ms3.errors import DatasetError
 
 SPECS = {spec.name: spec for spec in schema.EPISODE_INFO}
+DAMAGED = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError)
+"""What numpy raises for a damaged archive; NotImplementedError: damaged flags or method of a member."""
 PICKLED = "pickled objects, which are never loaded"
 _IDENTITY = ("ee_pos", "ee_orn", "robot_joints", "gripper_status", "language_goal", "step_lang_goals")
 
@@ -57,12 +60,12 @@ def load_arrays(path: Path) -> Loaded:
                     continue
                 try:
                     loaded.arrays[key] = cast(SPECS[key], content[key])
-                except (ValueError, zipfile.BadZipFile, EOFError, MemoryError) as error:
+                except (*DAMAGED, MemoryError) as error:
                     text = str(error).splitlines()[0] if str(error) else type(error).__name__
                     loaded.unreadable[key] = PICKLED if "allow_pickle" in text else text
     except FileNotFoundError as error:
         raise DatasetError("no such file", where=path) from error
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+    except DAMAGED as error:
         text = str(error).splitlines()[0] if str(error) else type(error).__name__
         found = PICKLED if "pickle" in text else text
         raise DatasetError("not a numpy archive, or a damaged one", where=path, found=found) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from robocas_ms3.datasets.check_scene import check_ledger, check_scene, check_se
 from robocas_ms3.datasets.episode import to_matrices, wrap_angle
 from robocas_ms3.datasets.picture_files import PictureHeader, read_header
 from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.tolerant import DAMAGED
 from robocas_ms3.datasets.violation import Violation
 from robocas_ms3.demos.sampling import relative_motion
 from robocas_ms3.errors import DatasetError
@@ -103,7 +103,7 @@ def _episode(folder: Path, arrays: dict[str, NDArray], pictures: Pictures) -> It
     except FileNotFoundError:
         yield Violation(file, "", "this file", "no file")
         return
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+    except DAMAGED as error:
         yield Violation(file, "", "a numpy archive", str(error).splitlines()[0] or type(error).__name__)
         return
     steps = _count_steps(arrays)
@@ -228,7 +228,7 @@ def _cameras(folder: Path, cameras: dict[str, tuple[NDArray, NDArray]], pictures
                 continue
             if array.shape != shape or array.dtype.kind != "f":
                 yield Violation(file, "", f"floats of shape {shape}", f"{array.dtype} of shape {array.shape}")
-            elif name == schema.INTRINSIC_FILE and array.min() <= 0:
+            elif name == schema.INTRINSIC_FILE and not (np.isfinite(array) & (array > 0)).all():
                 yield Violation(file, "", "fx, fy, cx, cy > 0", str(array.tolist()))
             elif name != schema.INTRINSIC_FILE and not _is_rigid(array):
                 yield Violation(file, "", "a rigid transform", "another matrix")
@@ -292,7 +292,11 @@ def _geometry(
         for camera in [camera for camera in schema.CAMERAS if camera.name in cameras]:
             intrinsic, pose = cameras[camera.name]
             path = schema.image_path(folder, camera.name, "depth", step)
-            depth = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), dtype=np.uint16)
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            if image is None:
+                yield Violation(f"{folder.name}/{camera.name}/depth/{step:04d}.png", "", "a sound picture", "damage")
+                return
+            depth = np.asarray(image, dtype=np.uint16)
             if not depth.any():
                 yield Violation(f"{folder.name}/{camera.name}/depth/{step:04d}.png", "", "depth", "only zeros")
             seen[-1].append(geometry.View(camera.name, depth, intrinsic, parents[camera.parent] @ pose))

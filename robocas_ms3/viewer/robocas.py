@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.datasets.tolerant import DAMAGED
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.arrays import NEEDED, show_arrays
 from robocas_ms3.viewer.failures import of_seed, read_failures, stages
@@ -105,7 +105,7 @@ def _arrays(episode: Episode) -> dict[str, NDArray]:
         if missing:
             raise ValueError(f"without {', '.join(missing)}")
         return arrays
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except (*DAMAGED, KeyError) as error:
         raise DatasetError(
             "this episode can't be read",
             where=episode.folder,
@@ -118,5 +118,5 @@ def _steps(episode: Episode) -> int:
     try:
         with np.load(episode.folder / schema.EPISODE_FILE, allow_pickle=False) as content:
             return int(content["episode_length"]) if "episode_length" in content else len(content["ee_pos"])
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+    except (*DAMAGED, KeyError):
         return 0

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.datasets.schema import EPISODE_INFO
+from robocas_ms3.datasets.tolerant import load_arrays
 from robocas_ms3.datasets.validate import validate
 from robocas_ms3.errors import DatasetError
 
@@ -110,6 +113,44 @@ def test_a_damaged_archive(dataset):
     data = (dataset / NPZ).read_bytes()
     (dataset / NPZ).write_bytes(data[: len(data) // 2])
     assert any(v.startswith(f"{NPZ}: expected a numpy archive") for v in found(dataset))
+
+
+def damage_member(path):
+    """Change what is deflated, in the first member of an archive."""
+    arrays = dict(np.load(path))
+    np.savez_compressed(path, **arrays)
+    data = bytearray(path.read_bytes())
+    name, extra = struct.unpack_from("<HH", data, 26)
+    data[30 + name + extra] |= 6  # a type of block that deflate does not have
+    path.write_bytes(data)
+
+
+def test_a_damaged_member_of_an_archive(dataset):
+    damage_member(dataset / NPZ)
+    assert any(v.startswith(f"{NPZ}: expected a numpy archive") for v in found(dataset))
+    assert len(load_arrays(dataset / NPZ).unreadable) == 1
+
+
+def chunk(kind, data=b""):
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def test_a_picture_without_pixels(dataset):
+    """Each checksum is right, and there is nothing between header and end."""
+    path = dataset / "episode_0000001" / "base_camera" / "depth" / "0000.png"
+    head = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 64, 48, 16, 0, 0, 0, 0))
+    path.write_bytes(head + chunk(b"IEND"))
+    place = "episode_0000001/base_camera/depth/0000.png"
+    assert found(dataset) == [f"{place}: expected a sound picture, found PNG without a picture"]
+    pixels = chunk(b"IDAT", b"no deflated data")
+    path.write_bytes(head + pixels + chunk(b"IEND"))
+    assert any(place in violation for violation in found(dataset))
+
+
+def test_intrinsics_that_are_no_numbers(dataset):
+    path = dataset / "episode_0000001" / "base_camera" / "intrinsic.npy"
+    change_array(path, lambda intrinsic: intrinsic * [np.nan, 1, 1, 1])
+    assert_only(dataset, "base_camera/intrinsic.npy: expected fx, fy, cx, cy > 0, found [nan")
 
 
 def test_quaternions_that_are_no_rotations(dataset):

@@ -17,6 +17,7 @@ from robocas_ms3.datasets.lerobot.schema import needed_arrays, whole_rate
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.provenance import fingerprint, scene_record, succeeded
 from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.datasets.tolerant import DAMAGED
 from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.workers import OpenSource
 from robocas_ms3.datasets.writer import CameraModel, FrameSource, Shown, Timing, show_episode
@@ -203,7 +204,7 @@ class FolderSource:
                 "seed": episode.scene.get("seed", known.get("seed")),
                 "success": success,
                 "target": episode.scene.get("target", known.get("target")),
-                "recording": episode.scene.get("source", {}).get("recording", known.get("recording", mark)),
+                "recording": (episode.scene.get("source") or {}).get("recording") or known.get("recording") or mark,
             }
             found.append(entry)
         if not found:
@@ -234,7 +235,7 @@ def _arrays(episode: Episode) -> dict[str, NDArray]:
         arrays = episode.arrays
         missing = sorted(needed_arrays() - set(arrays))
         lengths = {len(arrays[key]) for key in needed_arrays() & set(arrays) if arrays[key].ndim}
-    except (OSError, ValueError, EOFError) as error:
+    except DAMAGED as error:
         where = episode.folder / schema.EPISODE_FILE
         fix = "robocas validate says what is wrong."
         raise DatasetError(
