@@ -1,6 +1,7 @@
 """Convert a made-up trajectory to LeRobot and die by SIGKILL: `python dying_lerobot.py MOMENT TRAJECTORY OUT`."""
 
 import sys
+from pathlib import Path
 
 from dying import die_at
 from synthetic import RayCaster
@@ -16,6 +17,7 @@ PLACES = {  # moment -> (module, name of the function or method's owner and it, 
     "table": (tables.RollingTable, "add", 4),
     "overview": (assemble, "write_json", 2),
     "rename": (convert.os, "replace", 3),  # plan, data, videos: the third
+    "joined": (Path, "rmdir", 1),
     "sweep": (convert.shutil, "rmtree", 1),
 }
 

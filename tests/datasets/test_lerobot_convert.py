@@ -1,3 +1,4 @@
+import hashlib
 import json
 import os
 import shutil
@@ -19,6 +20,7 @@ from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.schema import Limits
+from robocas_ms3.datasets.lerobot.sources import FolderSource, Request
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.trajectory import TrajectoryFile
@@ -268,6 +270,19 @@ def test_processes_write_the_same(trajectory, lerobot, tmp_path, monkeypatch):
     assert files_of(tmp_path / "out") == files_of(lerobot)
 
 
+@pytest.mark.parametrize("source", [None, {"recording": None}])
+def test_episodes_of_unknown_recordings_are_told_by_their_arrays(dataset, source):
+    scene = dataset / "episode_0000001" / "scene.json"
+    scene.write_text(json.dumps({**json.loads(scene.read_text()), "source": source}))
+    ledger = dataset / "conversion.json"
+    content = json.loads(ledger.read_text())
+    content["episodes"]["1"]["recording"] = None
+    ledger.write_text(json.dumps(content))
+    entries = FolderSource(Request(dataset, None, Pictures(), False, RayCaster)).entries()
+    expected = hashlib.sha256((dataset / "episode_0000001" / "episode_info.npz").read_bytes()).hexdigest()
+    assert entries[1]["recording"] == expected
+
+
 def test_what_breaks_is_gone_on_with(trajectory, lerobot, tmp_path):
     class Breaking(RayCaster):
         def frames(self, recording, samples):
@@ -285,7 +300,7 @@ def test_what_breaks_is_gone_on_with(trajectory, lerobot, tmp_path):
     assert files_of(out) == files_of(lerobot)
 
 
-@pytest.mark.parametrize("moment", ["frame", "part", "plan", "join", "table", "overview", "rename", "sweep"])
+@pytest.mark.parametrize("moment", ["frame", "part", "plan", "join", "table", "overview", "rename", "joined", "sweep"])
 def test_killed_and_resumed_is_as_if_never_killed(trajectory, lerobot, tmp_path, moment):
     """kill -9 in a process of its own; nothing lies under a final name that is not whole."""
     out = tmp_path / "out"

@@ -92,7 +92,8 @@ def convert_lerobot(
             written = [] if (out / INFO_FILE).is_file() else _write(
                 request, opened, out, plan, codec, jobs, limits, on_start, on_episode
             )  # fmt: skip
-            shutil.rmtree(out / PARTS, ignore_errors=True)
+            for name in (PARTS, _JOINED):
+                shutil.rmtree(out / name, ignore_errors=True)
     return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - begun)
 
 
