@@ -71,7 +71,7 @@ def check_scene(folder: Path, arrays: Mapping[str, NDArray]) -> Iterator[Violati
 
 
 def check_ledger(root: Path, episodes: Mapping[int, Mapping[str, NDArray]]) -> Iterator[Violation]:
-    """Check that the ledger lists every episode, and that none has the arrays of another.
+    """Check that the ledger lists the episodes on disk as they are, and that none has the arrays of another.
 
     Args:
         root: the dataset.
@@ -82,6 +82,11 @@ def check_ledger(root: Path, episodes: Mapping[int, Mapping[str, NDArray]]) -> I
         ledger = settings["episodes"] if settings.get("schema_version") == schema.SCHEMA_VERSION else None
     except (OSError, ValueError, KeyError, AttributeError):
         ledger = None  # said already
+    for number, entry in ledger.items() if isinstance(ledger, dict) else ():
+        if not number.isdecimal() or int(number) not in episodes:
+            yield Violation(FILE, f"episodes.{number}", "the episodes on disk", "no folder (convert with --resume?)")
+        elif isinstance(entry, dict):
+            yield from _told_apart(root / schema.episode_folder(int(number)), entry)
     marks: dict[str, int] = {}
     for number, arrays in episodes.items():
         name = schema.episode_folder(number)
@@ -92,3 +97,17 @@ def check_ledger(root: Path, episodes: Mapping[int, Mapping[str, NDArray]]) -> I
         first = marks.setdefault(arrays_fingerprint(arrays), number)
         if first != number:
             yield Violation(name, "", "each episode once", f"the arrays of {schema.episode_folder(first)}")
+
+
+def _told_apart(folder: Path, entry: Mapping[str, Any]) -> Iterator[Violation]:
+    """Compare an episode's scene with its entry of the ledger; what one of them does not know can't differ."""
+    try:
+        scene = json.loads((folder / schema.SCENE_FILE).read_text(encoding="utf-8"))
+        source = scene.get("source") or {}
+        pairs = {"source.recording": (entry.get("recording"), source.get("recording"))}
+        pairs["seed"] = (entry.get("seed"), scene.get("seed"))
+    except (OSError, ValueError, AttributeError):
+        return  # said already
+    for key, (expected, found) in pairs.items():
+        if None not in (expected, found) and expected != found:
+            yield Violation(f"{folder.name}/{schema.SCENE_FILE}", key, f"{expected} ({FILE})", str(found))

@@ -345,3 +345,24 @@ def test_command(dataset, capsys):
     assert report["violations"] == [
         {"file": NPZ, "key": "speed", "expected": "keys of the schema only", "found": "an unknown key"}
     ]
+
+
+def test_the_ledger_lists_an_episode_that_is_not_there(dataset):
+    path = dataset / "conversion.json"
+    content = json.loads(path.read_text())
+    content["episodes"]["2"] = {**content["episodes"]["1"], "recording": "another"}
+    path.write_text(json.dumps(content))
+    assert_only(dataset, "conversion.json, episodes.2: expected the episodes on disk, found no folder")
+
+
+@pytest.mark.parametrize(
+    ("new", "text"),
+    [
+        ({"seed": 99}, "seed: expected 5 (conversion.json), found 99"),
+        ({"source": {"recording": "x"}}, "recording: expected"),
+    ],
+)
+def test_a_scene_that_is_not_the_ledgers(dataset, new, text):
+    path = dataset / "episode_0000001" / "scene.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **new}))
+    assert_only(dataset, text)

@@ -99,6 +99,8 @@ def cut(groups: Mapping[int, str], shares: Sequence[float]) -> list[list[int]]:
 def resplit(root: Path, share: Share | None = None) -> Sides:
     """Rewrite ``data_info.json`` from the episodes on disk; no episode is touched. Gives the sides.
 
+    ``conversion.json`` forgets episodes that are not there any more.
+
     Args:
         root: the dataset.
         share: how to split; None: every episode keeps its side, new ones are split by the writer's rule.
@@ -113,8 +115,14 @@ def resplit(root: Path, share: Share | None = None) -> Sides:
         if share is not None:
             train, val = cut(groups_of(dataset, share.by), [1 - share.val, share.val])
             sides = (train, val)
-            if dataset.settings:
-                write_json(root / schema.CONVERSION_FILE, {**dataset.settings, "split": share.rule})
+        settings = dataset.settings
+        if settings:
+            there = {str(number) for number in dataset.numbers}
+            kept = {number: entry for number, entry in settings.get("episodes", {}).items() if number in there}
+            rule = {} if share is None else {"split": share.rule}
+            new = {**settings, **rule, **({"episodes": kept} if "episodes" in settings else {})}
+            if new != settings:
+                write_json(root / schema.CONVERSION_FILE, new)
         info = write_info(root, sides)
     return info["train_eps"], info["val_eps"]
 
