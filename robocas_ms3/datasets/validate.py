@@ -74,9 +74,10 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
     violations += wrong
     loaded: dict[int, dict[str, NDArray]] = {}
     embedded: set[bool] = set()
+    sizes: dict[str, tuple[int, int]] = {}  # of each camera, width and height in the first episode
     for done, (number, folder) in enumerate(numbers.items()):
         arrays: dict[str, NDArray] = {}
-        violations += _episode(folder, arrays, pictures)
+        violations += _episode(folder, arrays, pictures, sizes)
         loaded[number] = {k: v for k, v in arrays.items() if not k.endswith(("_embs", "_embedding"))}
         if arrays:
             embedded.add("language_embedding" in arrays)
@@ -90,7 +91,9 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
     return Report(len(numbers), steps, violations)
 
 
-def _episode(folder: Path, arrays: dict[str, NDArray], pictures: Pictures) -> Iterator[Violation]:
+def _episode(
+    folder: Path, arrays: dict[str, NDArray], pictures: Pictures, sizes: dict[str, tuple[int, int]]
+) -> Iterator[Violation]:
     """Check one episode; what could be read of its arrays is put into ``arrays``."""
     file = f"{folder.name}/{schema.EPISODE_FILE}"
     try:
@@ -118,7 +121,7 @@ def _episode(folder: Path, arrays: dict[str, NDArray], pictures: Pictures) -> It
     cameras: dict[str, tuple[NDArray, NDArray]] = {}
     yield from _cameras(folder, cameras, pictures)
     complete = True
-    for violation in _pictures(folder, steps, pictures):
+    for violation in _pictures(folder, steps, pictures, sizes):
         complete = False
         yield violation
     if sound and complete and pictures.depth and len(cameras) == len(pictures.cameras):
@@ -251,8 +254,7 @@ def _is_rigid(matrix: NDArray) -> bool:
     )
 
 
-def _pictures(folder: Path, steps: int, pictures: Pictures) -> Iterator[Violation]:
-    sizes: dict[str, PictureHeader] = {}
+def _pictures(folder: Path, steps: int, pictures: Pictures, sizes: dict[str, tuple[int, int]]) -> Iterator[Violation]:
     for camera in pictures.specs:
         for kind in pictures.kinds:
             directory = folder / camera.name / kind
@@ -273,8 +275,8 @@ def _pictures(folder: Path, steps: int, pictures: Pictures) -> Iterator[Violatio
                 except ValueError as error:
                     yield Violation(f"{shown}/{name}", "", "a sound picture", str(error))
                     continue
-                first = sizes.setdefault(camera.name, header)
-                expected = PictureHeader(first.width, first.height, bits, channels)
+                width, height = pictures.size or sizes.setdefault(camera.name, (header.width, header.height))
+                expected = PictureHeader(width, height, bits, channels)
                 if header != expected:
                     yield Violation(f"{shown}/{name}", "", str(expected), str(header))
 

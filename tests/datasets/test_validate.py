@@ -366,3 +366,10 @@ def test_a_scene_that_is_not_the_ledgers(dataset, new, text):
     path = dataset / "episode_0000001" / "scene.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **new}))
     assert_only(dataset, text)
+
+
+def test_pictures_of_another_size_than_the_first_episodes(dataset):
+    for kind in ("rgb", "depth"):
+        for path in (dataset / "episode_0000001" / "base_camera" / kind).iterdir():
+            cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:40])
+    assert any("expected 64 x 48, 3 x 8 bit, found 64 x 40, 3 x 8 bit" in violation for violation in found(dataset))
