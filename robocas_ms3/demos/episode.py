@@ -32,7 +32,7 @@ from robocas_ms3.tasks.spec import TASKS
 
 STANDARD_FREQ = 20  # Hz, at which the tasks' horizons are given
 
-TRIALS = 3  # of an attempt's own actions: as they are, and with noise that any robot has
+TRIALS = 2  # of an attempt's own actions: as they are, and with noise that any robot has
 FAR = ("horizon", "replay")  # stages whose failure has its cause farther back than the last checkpoint
 
 
