@@ -62,6 +62,14 @@ def test_seed_0_is_a_seed_like_any_other(make_planner):
     assert digests[0] == digests[1]
 
 
+# Where programs run in real time, busy ones that did not step down would take the machine for ever.
+BUSY = """
+import os
+if hasattr(os, "sched_setscheduler"):
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+while True:
+    pass
+"""
 CHILD = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -79,7 +87,7 @@ def test_in_another_process_under_load(make_planner, panda_files):
     planner.seed(7)
     here = session(planner)
     command = [sys.executable, "-c", CHILD, str(Path(__file__).parent), panda_files.arm_urdf, panda_files.arm_srdf]
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
+    busy = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(os.cpu_count() or 1)]
     try:
         # The number of threads must not matter either.
         environment = {**os.environ, "OMP_NUM_THREADS": "2"}
