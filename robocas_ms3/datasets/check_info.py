@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.info import action_space
+from robocas_ms3.datasets.tolerant import SPECS, is_declared
 from robocas_ms3.datasets.violation import Violation
 from robocas_ms3.language.templates import GOAL_TYPES
 
@@ -76,18 +77,19 @@ def _split(info: dict[str, Any], there: set[int]) -> Iterator[Violation]:
 
 def _entry(key: str, number: str, value: Any, arrays: Mapping[str, NDArray]) -> Iterator[Violation]:
     shown = f"{key}.{number}"
-    if key == "ep_length" and "episode_length" in arrays:
+    sound = {name for name, array in arrays.items() if name in SPECS and is_declared(name, array)}
+    if key == "ep_length" and "episode_length" in sound:
         if value != int(arrays["episode_length"]):
             yield Violation(FILE, shown, str(int(arrays["episode_length"])), str(value))
-    elif key == "language_goal" and "language_goal" in arrays:
+    elif key == "language_goal" and "language_goal" in sound:
         if value != str(arrays["language_goal"]):
             yield Violation(FILE, shown, repr(str(arrays["language_goal"])), repr(value))
-    elif key == "step_goals" and {"step_lang_goals", "step_goal_type"} <= set(arrays):
+    elif key == "step_goals" and {"step_lang_goals", "step_goal_type"} <= sound:
         try:
             goals = [
                 (g["goal_type"], g["goal_description"], int(g["goal_range"][0]), int(g["goal_range"][1])) for g in value
             ]
-        except (KeyError, TypeError, IndexError, ValueError):
+        except (KeyError, TypeError, IndexError, ValueError, OverflowError):
             yield Violation(FILE, shown, "goal_type, goal_range [first, last], goal_description", str(value)[:80])
             return
         yield from _goals(shown, goals, arrays)
@@ -103,7 +105,7 @@ def _goals(shown: str, goals: list[tuple[str, str, int, int]], arrays: Mapping[s
             yield Violation(FILE, shown, f"a range from {next_step}", f"[{first}, {last}]")
             return
         next_step = last + 1
-        if set(texts[first : last + 1]) != {text} or set(kinds[first : last + 1]) != {kind}:
+        if any(goal != (kind, text) for goal in zip(kinds[first : last + 1], texts[first : last + 1], strict=True)):
             steps = f"steps {first} to {last}"
             yield Violation(FILE, shown, f"the sub-goal that {schema.EPISODE_FILE} has at {steps}", repr(text))
     if next_step != len(texts):
@@ -111,7 +113,7 @@ def _goals(shown: str, goals: list[tuple[str, str, int, int]], arrays: Mapping[s
 
 
 def _ranges(found: Any, episodes: Mapping[int, Mapping[str, NDArray]]) -> Iterator[Violation]:
-    complete = [a for a in episodes.values() if {"rel_pos", "rel_orn"} <= set(a) and a["rel_orn"].ndim == 2]
+    complete = [a for a in episodes.values() if all(np.ndim(a.get(key, 0)) == 2 for key in ("rel_pos", "rel_orn"))]
     try:
         expected = action_space([a["rel_pos"] for a in complete], [a["rel_orn"] for a in complete])
     except ValueError:
@@ -123,6 +125,5 @@ def _ranges(found: Any, episodes: Mapping[int, Mapping[str, NDArray]]) -> Iterat
             values = np.zeros(0)
         if values.shape != (2, 3):
             yield Violation(FILE, f"action_space.{key}", "[1st percentile (3), 99th percentile (3)]", str(found)[:80])
-        elif np.abs(values - rows).max() > RANGE_TOLERANCE:
-            worst = np.abs(values - rows).max()
+        elif not (worst := np.abs(values - rows).max()) <= RANGE_TOLERANCE:  # NaN too
             yield Violation(FILE, f"action_space.{key}", "percentiles of the episodes", f"off by {worst:.3g}")

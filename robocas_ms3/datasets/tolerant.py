@@ -97,6 +97,11 @@ def cast(spec: schema.ArraySpec, array: Any) -> NDArray:
     return array.astype(spec.dtype)
 
 
+def is_declared(key: str, array: NDArray) -> bool:
+    """Whether an array has the schema's type and number of axes."""
+    return SPECS[key].has_dtype(array) and array.ndim == len(SPECS[key].shape)
+
+
 def complete(loaded: Loaded, said: Mapping[str, Any], rate_hz: float) -> None:
     """Make what is missing of what is there; it is named in ``loaded.derived``.
 

@@ -1,6 +1,7 @@
 """A clean dataset has no violations; each way of spoiling it is reported by file, key and reason."""
 
 import json
+import math
 import shutil
 import struct
 import zlib
@@ -97,11 +98,25 @@ def test_unknown_keys(dataset):
         ("gripper_width", np.full(7, np.nan, np.float32), "expected finite numbers, found 7 others"),
         ("step_lang_goals", np.array([b"x"] * 7), "expected str, found |S1"),
         ("language_embedding", np.ones(512, np.float32), "expected shape (384,), found shape (512,)"),
+        ("episode_length", np.array([7, 7]), "expected shape (), found shape (2,)"),
+        ("episode_length", np.array(np.nan), "expected int64, found float64"),
+        ("episode_length", np.array(10**9), "expected 1 to 10000 steps, found 1000000000"),
+        ("episode_length", np.array(0), "expected 1 to 10000 steps, found 0"),
+        ("rel_pos", np.array(0, np.float32), "expected shape (7, 3), found shape ()"),
+        ("step_goal_type", np.array(3), "expected str, found int64"),
     ],
 )
 def test_types_and_shapes(dataset, key, value, text):
     change(dataset, **{key: value})
     assert any(violation.startswith(f"{NPZ}, {key}: {text}") for violation in found(dataset))
+
+
+def test_an_episode_without_steps(dataset):
+    change(dataset, **{key: array[:0] for key, array in arrays_of(dataset).items() if array.shape[:1] == (7,)})
+    change(dataset, episode_length=np.array(0))
+    violations = found(dataset)
+    assert f"{NPZ}, episode_length: expected 1 to 10000 steps, found 0" in violations
+    assert any("rgb/0000.png: expected 0 pictures" in violation for violation in violations)
 
 
 def test_pickles_are_not_loaded(dataset):
@@ -317,7 +332,10 @@ def assert_depth(violations, camera):
         (lambda info: info["step_goals"]["0"][0].update(goal_type="dance"), "step_goals.0: expected one of find the"),
         (lambda info: info["step_goals"]["0"][0].pop("goal_range"), "step_goals.0: expected goal_type, goal_range"),
         (lambda info: info["action_space"].pop("relative_rotation"), "action_space.relative_rotation: expected [1st"),
+        (lambda info: info["step_goals"]["0"][0].update(goal_range=[0, math.inf]), "step_goals.0: expected goal_type"),
+        (lambda info: info["step_goals"]["0"][0].update(goal_description=["x"]), "step_goals.0: expected the sub-goal"),
         (lambda info: info["action_space"]["relative_position"][0].__setitem__(0, 9.0), "expected percentiles of the"),
+        (lambda info: info["action_space"]["relative_position"][0].__setitem__(0, math.nan), "percentiles of the"),
     ],
 )
 def test_data_info(dataset, edit, text):

@@ -12,18 +12,6 @@ from robocas_ms3.datasets.tolerant import SPECS, derive_motion
 _CAMERA_OFFSET = (0.03, 0.07)  # m: the gripper camera's distance from the hand's axis, 0.05
 
 
-def is_rigid(matrix: NDArray) -> bool:
-    """Whether a matrix is a rigid transform, (4, 4)."""
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        return False
-    rotation = matrix[:3, :3]
-    return bool(
-        np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
-        and np.linalg.det(rotation) > 0
-        and np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-6)
-    )
-
-
 def eef_turn(camera_in_ee: NDArray) -> int:
     """By how much an EEF frame has to be turned about its z to be ManiSkill's TCP: 0, 90, 180 or -90 degrees.
 

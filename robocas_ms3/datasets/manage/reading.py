@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.episode import to_matrices
-from robocas_ms3.datasets.manage.eef import eef_turn, is_rigid, turn
+from robocas_ms3.datasets.manage.eef import eef_turn, turn
 from robocas_ms3.datasets.manage.findings import Finding, Found, Report
 from robocas_ms3.datasets.manage.picture_check import check_pictures
 from robocas_ms3.datasets.reader import Dataset, Episode, said_of
+from robocas_ms3.datasets.rigid import NORM_TOLERANCE, POSITION_TOLERANCE, is_rigid, same
 from robocas_ms3.datasets.tolerant import SPECS, complete, derive_motion, load_arrays, planar_motion
-from robocas_ms3.datasets.validate import ANGLE_TOLERANCE, NORM_TOLERANCE, POSITION_TOLERANCE
 from robocas_ms3.demos.sampling import relative_motion
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.language.templates import GOAL_TYPES
@@ -165,18 +164,12 @@ def _motion(arrays: dict[str, NDArray], keys: tuple[str, str, str, str], report:
         derive_motion(arrays, keys)
         report.mended(file, "the last row was not the identity")
     else:
-        wrong = int(np.sum(~_near(expected, stored)))
+        wrong = int(np.sum(~same(expected, stored)))
         report.bad(file, f"not the motion of {position}, {orientation}: {wrong} of {len(stored)} rows differ")
 
 
-def _near(a: NDArray, b: NDArray) -> NDArray[np.bool_]:
-    turn = Rotation.from_matrix(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3]).magnitude()
-    shift = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
-    return (shift <= POSITION_TOLERANCE) & (turn <= ANGLE_TOLERANCE)
-
-
 def _same(a: NDArray, b: NDArray) -> bool:
-    return len(a) > 0 and bool(_near(a, b).all())
+    return len(a) > 0 and bool(same(a, b).all())
 
 
 def _cameras(episode: Episode, found: Found, report: Report, turn_eef: bool) -> None:
