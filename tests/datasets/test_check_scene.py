@@ -1,0 +1,210 @@
+"""Each way of spoiling ``scene.json`` and ``conversion.json`` is one violation, by key, what is expected and found."""
+
+import json
+import re
+
+import pytest
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.scene_values import Scene, check_values, one_seed, sound
+from robocas_ms3.datasets.validate import validate
+
+FILE = "episode_0000001/scene.json"
+POSE = [0.5, 0.8, 0.6, 1.0, 0.0, 0.0, 0.0]
+RECOVERY = {"range": [0, 4], "stage": "grasp", "reason": "slipped"}
+WHOLE = {
+    "schema_version": 2,
+    "task": "pick",
+    "env_info": {"env_id": "robocas_ms3:RoboCASPick-v1", "env_kwargs": {"pack": "builtin"}},
+    "seed": 7,
+    "reset_options": {},
+    "config": {"task": "pick"},
+    "layout": {"object_ids": ["a", "b"], "poses": [POSE, POSE], "present": [True, False], "robot_pose": POSE},
+    "objects": [{"slot": 0, "id": "a", "name": "an a"}],
+    "target": {"slot": 0, "asset_id": "a", "name": "an a"},
+    "success": True,
+    "control_mode": "pd_joint_pos",
+    "control_freq": 20,
+    "rate_hz": 5.0,
+    "source": {"trajectory": "trajectory.h5", "episode_id": 1, "recording": "00ff"},
+    "recorded": {
+        "facts": {"disturbed": 0},
+        "attempts": 2,
+        "recoveries": [RECOVERY],
+    },
+    "versions": {"numpy": "1.26.4"},
+}
+ANY_OBJECT = ("reset_options", "config", "layout", "source", "recorded", "versions")
+NULLABLE = set(schema.SCENE) - {"schema_version", "rate_hz", "source"}
+
+
+def change(root, name, **new):
+    path = root / name
+    path.write_text(json.dumps({**json.loads(path.read_text()), **new}))
+
+
+def said(violation):
+    return violation.key, violation.expected, violation.found
+
+
+def test_the_declared_keys_are_those_of_the_schema():
+    assert list(Scene.model_fields) == list(WHOLE) == list(schema.SCENE)
+
+
+def test_what_is_whole_has_no_violations():
+    assert check_values(WHOLE) == []
+    assert sound(WHOLE) == (WHOLE, "")
+
+
+def test_what_nobody_knows_is_null():
+    """Of datasets made elsewhere: only version, rate and source are known."""
+    known = {"schema_version": 2, "rate_hz": 5.0, "source": {"recording": None, "format": "upstream", "missing": []}}
+    assert check_values({key: known.get(key) for key in schema.SCENE}) == []
+
+
+@pytest.mark.parametrize("key", schema.SCENE)
+def test_each_key_is_missed(key):
+    without = {name: value for name, value in WHOLE.items() if name != key}
+    assert [said(v) for v in check_values(without)] == [(key, "this key", "no such key")]
+    assert sound(without) == (without, "")  # an older file, which can be shown as far as it goes
+
+
+@pytest.mark.parametrize("key", schema.SCENE)
+def test_values_of_another_kind(key):
+    for value in ("x", 7.5, True, ["x"], {"x": 1}, None, float("nan")):
+        fits = {
+            str: key in ("task", "control_mode"),
+            float: key in ("control_freq", "rate_hz") and value == 7.5,
+            bool: key == "success",
+            list: False,
+            dict: key in ANY_OBJECT,
+            type(None): key in NULLABLE,
+        }[type(value)]
+        violations = check_values({**WHOLE, key: value})
+        assert {v.key.split(".")[0] for v in violations} == (set() if fits else {key}), value
+        usable, damage = sound({**WHOLE, key: value})
+        assert set(WHOLE) - set(usable) == (set() if fits else {key})
+        assert (f"scene.json, {key}" in damage) is not fits
+
+
+@pytest.mark.parametrize(
+    ("new", "key", "expected", "found"),
+    [
+        ({"schema_version": 1}, "schema_version", "2", "1"),
+        ({"task": ["pick"]}, "task", "text", '["pick"]'),
+        ({"env_info": {"env_kwargs": {}}}, "env_info.env_id", "this key", "no such key"),
+        ({"env_info": {"env_id": "x", "env_kwargs": "x"}}, "env_info.env_kwargs", "an object", '"x"'),
+        ({"seed": "7"}, "seed", "an integer, or a list of one", '"7"'),
+        ({"seed": [1, 2]}, "seed", "an integer, or a list of one", "[1, 2]"),
+        ({"seed": 7.0}, "seed", "an integer, or a list of one", "7.0"),
+        ({"reset_options": []}, "reset_options", "an object", "[]"),
+        ({"config": "pick_table"}, "config", "an object", '"pick_table"'),
+        ({"layout": {"object_ids": "ab"}}, "layout.object_ids", "a list", '"ab"'),
+        ({"layout": {"object_ids": ["a", 3]}}, "layout.object_ids.1", "text", "3"),
+        ({"layout": {"poses": [POSE[:6]]}}, "layout.poses.0", "7 values", "6"),
+        ({"layout": {"poses": [["x"] * 7] * 9}}, "layout.poses.0.0", "a number", '"x"'),
+        ({"layout": {"robot_pose": [*POSE[:6], None]}}, "layout.robot_pose.6", "a number", "null"),
+        ({"layout": {"object_ids": ["a"], "poses": []}}, "", "", ""),
+        (
+            {"layout": {"object_ids": ["a"], "poses": [POSE, POSE]}},
+            "layout.poses",
+            "1, as many as object_ids",
+            "2",
+        ),
+        (
+            {"layout": {"object_ids": ["a"], "present": [True, False]}},
+            "layout.present",
+            "1, as many as object_ids",
+            "2",
+        ),
+        ({"layout": {"present": [1]}}, "layout.present.0", "true or false", "1"),
+        ({"objects": {"0": "a"}}, "objects", "a list", '{"0": "a"}'),
+        ({"objects": [{"slot": 0, "id": "a"}]}, "objects.0.name", "this key", "no such key"),
+        ({"objects": [{"slot": -1, "id": "a", "name": "a"}]}, "objects.0.slot", "greater than or equal to 0", "-1"),
+        ({"target": {"slot": "0", "asset_id": "a", "name": "a"}}, "target.slot", "an integer", '"0"'),
+        ({"success": 1}, "success", "true or false", "1"),
+        ({"control_mode": 3}, "control_mode", "text", "3"),
+        ({"control_freq": "20"}, "control_freq", "a number", '"20"'),
+        ({"rate_hz": 0}, "rate_hz", "greater than 0", "0"),
+        ({"rate_hz": float("inf")}, "rate_hz", "a finite number", "Infinity"),
+        ({"source": {"episode_id": "1"}}, "source.episode_id", "an integer", '"1"'),
+        ({"recorded": {"attempts": "two"}}, "recorded.attempts", "an integer", '"two"'),
+        ({"recorded": {"facts": [1]}}, "recorded.facts", "an object", "[1]"),
+        ({"recorded": {"recoveries": [RECOVERY | {"range": [3]}]}}, "recorded.recoveries.0.range", "2 values", "1"),
+        ({"versions": ["1"]}, "versions", "an object", '["1"]'),
+    ],
+)  # fmt: skip
+def test_one_violation_a_fault(new, key, expected, found):
+    assert [said(v) for v in check_values({**WHOLE, **new})] == ([(key, expected, found)] if key else [])
+
+
+def test_two_faults_are_two_violations():
+    assert [v.key for v in check_values({**WHOLE, "seed": "x", "objects": 5})] == ["seed", "objects"]
+
+
+def test_long_values_are_cut():
+    (violation,) = check_values({**WHOLE, "seed": "x" * 500})
+    assert len(violation.found) == 60
+
+
+@pytest.mark.parametrize(
+    ("value", "seed"), [(3, 3), ([3], 3), ([3, 4], None), (True, None), ("3", None), (3.0, None), ([], None)]
+)
+def test_seeds(value, seed):
+    assert one_seed(value) == seed
+
+
+def test_scenes_that_are_no_objects():
+    assert sound(None) == ({}, "")
+    assert sound([1]) == ({}, "scene.json: expected an object, found [1]")
+
+
+@pytest.mark.parametrize(
+    ("name", "new", "text"),
+    [
+        (FILE, {"seed": "five"}, f'{FILE}, seed: expected an integer, or a list of one, found "five"'),
+        (FILE, {"seed": [99]}, f"{FILE}, seed: expected 5 (conversion.json), found 99"),
+        (FILE, {"rate_hz": 10}, f"{FILE}, rate_hz: expected 5.0 (conversion.json), found 10"),
+        (FILE, {"rate_hz": "5"}, f'{FILE}, rate_hz: expected a number, found "5"'),
+        (FILE, {"recorded": {"facts": {"x": float("nan")}}}, f"{FILE}: expected JSON, which knows finite numbers only"),
+        ("conversion.json", {"rate_hz": None}, "conversion.json, rate_hz: expected a number, found null"),
+        ("conversion.json", {"image_size": [64]}, "conversion.json, image_size: expected 2 values, found 1"),
+        ("conversion.json", {"cameras": "base_camera"}, "conversion.json, cameras: expected a list"),
+        ("conversion.json", {"cameras": []}, "conversion.json: expected settings of a dataset, found cameras: no such"),
+        ("conversion.json", {"depth": "yes"}, 'conversion.json, depth: expected true or false, found "yes"'),
+        ("conversion.json", {"episodes": []}, "conversion.json, episodes: expected an object, found []"),
+        ("conversion.json", {"episodes": {"0": {}, "1": 3}}, "conversion.json, episodes.1: expected an object"),
+    ],
+)  # fmt: skip
+def test_validate_says_it_once(dataset, name, new, text):
+    change(dataset, name, **new)
+    (violation,) = validate(dataset).violations
+    assert str(violation).startswith(text)
+
+
+def test_a_seed_in_a_list_is_that_seed(dataset):
+    change(dataset, FILE, seed=[5])
+    assert validate(dataset).violations == []
+
+
+def test_another_rate_in_conversion_json_is_said_of_each_episode(dataset):
+    change(dataset, "conversion.json", rate_hz=10.0)
+    found = [str(violation) for violation in validate(dataset).violations]
+    assert len(found) == 2
+    assert all(re.search(r"rate_hz: expected 10.0 \(conversion.json\), found 5.0", text) for text in found)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        (FILE, "[1]", f"{FILE}: expected an object, found list"),
+        (FILE, "{", f"{FILE}: expected JSON"),
+        (FILE, "null", f"{FILE}: expected an object, found NoneType"),
+        ("conversion.json", "[]", "conversion.json: expected an object, found list"),
+        ("conversion.json", '{"schema_version": 2', "conversion.json: expected settings of a dataset"),
+    ],
+)
+def test_files_that_hold_something_else(dataset, name, text, said):
+    (dataset / name).write_text(text)
+    (violation,) = validate(dataset).violations
+    assert str(violation).startswith(said)
