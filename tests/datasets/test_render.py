@@ -11,6 +11,7 @@ import pytest
 from robocas_ms3.cli.convert import Convert, main
 from robocas_ms3.datasets import geometry
 from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.render import EnvFrames
 from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.validate import validate
@@ -76,7 +77,7 @@ def recording(recorded):
 @pytest.fixture(scope="module")
 def source(recorded, recording):
     with TrajectoryFile(recorded[0]) as file:
-        frames = EnvFrames(file.env_info, "pd_joint_pos", SIZE)
+        frames = EnvFrames(file.env_info, "pd_joint_pos", Pictures(size=SIZE))
     frames.load(recording)
     yield frames
     frames.close()
@@ -160,7 +161,7 @@ def test_a_scene_that_is_another_leaves_nothing_behind(recorded, tmp_path):
     metadata["episodes"][0]["episode_seed"] = 12
     (tmp_path / "F.json").write_text(json.dumps(metadata))
     with pytest.raises(DatasetError, match="episode 0, seed 12, object_0: the seed builds another scene"):
-        convert(path, tmp_path / "out", embeddings=False, size=SIZE)
+        convert(path, tmp_path / "out", embeddings=False, pictures=Pictures(size=SIZE))
     assert {entry.name for entry in tmp_path.iterdir()} == {"F.h5", "F.json"}
 
 
