@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,64 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES, episode_actions
+from robocas_ms3.datasets.described import counted, described, histogram, rounded
 from robocas_ms3.datasets.episode_facts import Facts, facts_reader
+from robocas_ms3.datasets.layout_map import LayoutMap, layout_map
 from robocas_ms3.datasets.sources import open_source
 
-Array = NDArray[np.float64]
-
-CELL = 0.05  # m, of the layouts' heat maps
-MARGIN = 0.3  # m around the region that layouts are sampled in; heaps slide out of it
-BINS = 41  # of the actions' histograms; odd, so that standing still has a bin of its own
 STILL = (1e-3, np.deg2rad(0.5))  # m and rad a step below which the gripper counts as standing still
-
-
-@dataclass(frozen=True)
-class LayoutMap:
-    """Where objects stood at the beginning of the episodes of one configuration.
-
-    Attributes:
-        frame: of the positions: a piece of furniture's, or the world's.
-        region: [min_xy, max_xy] that layouts are sampled in, m; None: not known.
-        x_edges, y_edges: of the cells, m.
-        counts: (nx, ny) objects in each cell.
-        outside: objects farther from the region than ``MARGIN``, in no cell.
-        targets: (N, 2) m, of the episodes' targets.
-        episodes: that were counted.
-    """
-
-    frame: str
-    region: list[list[float]] | None
-    x_edges: Array
-    y_edges: Array
-    counts: NDArray[np.int64]
-    outside: int
-    targets: Array
-    episodes: int
-
-    @property
-    def coverage(self) -> float | None:
-        """Share of the region's cells that an object's centre was ever in; None without a region."""
-        if self.region is None:
-            return None
-        (x0, y0), (x1, y1) = self.region
-        x, y = (self.x_edges[:-1] + self.x_edges[1:]) / 2, (self.y_edges[:-1] + self.y_edges[1:]) / 2
-        inside = np.outer((x > x0) & (x < x1), (y > y0) & (y < y1))
-        return float(np.mean(self.counts[inside] > 0)) if inside.any() else None
-
-    def as_json(self) -> dict[str, Any]:
-        """Its form in ``stats.json``."""
-        return {
-            "frame": self.frame,
-            "region": self.region,
-            "episodes": self.episodes,
-            "objects": int(self.counts.sum()) + self.outside,
-            "outside": self.outside,
-            "coverage": _rounded(self.coverage),
-            "x_edges": _rounded(self.x_edges),
-            "y_edges": _rounded(self.y_edges),
-            "counts": self.counts.tolist(),
-            "targets": _rounded(self.targets),
-        }
 
 
 @dataclass
@@ -166,10 +114,10 @@ class Stats:
                 name: {**described(column), **histogram(column)}
                 for name, column in zip(ACTION_NAMES, self.actions.T, strict=True)
             },
-            "still": _rounded(float(still.mean())) if len(still) else None,
+            "still": rounded(float(still.mean())) if len(still) else None,
             "gripper_changes": described(self.gripper_changes),
             "subgoals": {
-                kind: {**described(np.array(steps) / self.rate_hz), "share": _rounded(sum(steps) / self.steps)}
+                kind: {**described(np.array(steps) / self.rate_hz), "share": rounded(sum(steps) / self.steps)}
                 for kind, steps in sorted(self.subgoals.items())
             },
         }
@@ -224,58 +172,3 @@ def _count(stats: Stats, facts: Facts) -> None:
     for counter, value in ((stats.templates, facts.template), (stats.relations, facts.relation)):
         if value:
             counter[value] += 1
-
-
-def layout_map(parts: list[Facts]) -> LayoutMap:
-    """Heat map of the layouts of one configuration, in its furniture's frame where that is known for all."""
-    surface = parts[0].surface
-    if surface is None or any(part.surface != surface for part in parts):
-        surface = None
-    placed = [part.positions if surface is None else surface.place(part.positions) for part in parts]
-    points = np.concatenate(placed)
-    targets = [xy[part.target_index] for part, xy in zip(parts, placed, strict=True) if part.target_index is not None]
-    region = surface.region if surface else None
-    low, high = np.asarray(region) if region else (points.min(0), points.max(0))
-    near = points[((points >= low - MARGIN) & (points <= high + MARGIN)).all(axis=1)]
-    x_edges, y_edges = (_edges(low[axis], high[axis], near[:, axis]) for axis in (0, 1))
-    counts = np.histogramdd(near, bins=(x_edges, y_edges))[0].astype(np.int64)
-    where = surface.label if surface else "world"
-    outside = len(points) - int(counts.sum())
-    return LayoutMap(where, region, x_edges, y_edges, counts, outside, np.array(targets).reshape(-1, 2), len(parts))
-
-
-def _edges(low: float, high: float, points: Array) -> Array:
-    """Edges of equal cells of about ``CELL`` that divide [low, high], and as many more as the points need."""
-    cell = (high - low) / max(1, round((high - low) / CELL)) if high - low > CELL / 2 else CELL
-    before = np.ceil((low - points.min(initial=low)) / cell - 1e-9)
-    after = np.ceil((points.max(initial=high) - low) / cell - 1e-9)
-    return low + cell * np.arange(-int(before), max(1, int(after)) + 1)
-
-
-def counted(counter: Mapping[str, int]) -> dict[str, int]:
-    """The most frequent first, those of one frequency by name."""
-    return dict(sorted(counter.items(), key=lambda item: (-item[1], item[0])))
-
-
-def described(values: Iterable[float] | NDArray) -> dict[str, Any]:
-    """Count, mean, deviation and percentiles."""
-    array = np.asarray(list(values) if not isinstance(values, np.ndarray) else values, dtype=np.float64)
-    if not len(array):
-        return {"count": 0}
-    low, p1, p10, median, p90, p99, high = np.percentile(array, [0, 1, 10, 50, 90, 99, 100])
-    found = dict(mean=array.mean(), std=array.std(), min=low, p1=p1, p10=p10, median=median, p90=p90, p99=p99, max=high)
-    return {"count": len(array), **{key: _rounded(float(value)) for key, value in found.items()}}
-
-
-def histogram(values: NDArray) -> dict[str, Any]:
-    """Counts over equal bins, symmetric about 0 for what moves both ways, from 0 on for what does not."""
-    if not len(values):
-        return {"edges": [], "counts": []}
-    reach = float(np.abs(values).max()) or 1.0
-    edges = np.array([-0.5, 0.5, 1.5]) if set(np.unique(values)) <= {0, 1} else np.linspace(-reach, reach, BINS + 1)
-    return {"edges": _rounded(edges), "counts": np.histogram(values, edges)[0].tolist()}
-
-
-def _rounded(value: Any) -> Any:
-    """Six digits after the point are enough."""
-    return None if value is None else np.round(value, 6).tolist()

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.datasets.actions import ACTION_NAMES
-from robocas_ms3.datasets.stats import LayoutMap, Stats, counted, histogram
+from robocas_ms3.datasets.described import counted, histogram
+from robocas_ms3.datasets.layout_map import LayoutMap
+from robocas_ms3.datasets.stats import Stats
 from robocas_ms3.errors import MissingExtraError
 from robocas_ms3.files import make_folder, replacing, write_json
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.demos.sampling import Array, gripper_open, relative_motion, sample_states, sample_stride
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.robots.constants import OPEN_FINGER
+from robocas_ms3.robots.constants import FINGER_TARGETS, OPEN_FINGER
 from robocas_ms3.robots.controllers import to_ee_delta_action
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.tasks.base import RoboCASEnv
@@ -136,7 +136,7 @@ class OpenLoop:
         """
         samples = sample_states(len(gripper), sample_stride(control_freq, self._rate))
         motion = relative_motion(tcp_in_base[samples])[:-1]
-        status = gripper_open(gripper, samples, finger_range=(-0.01, OPEN_FINGER), initial_width=2 * OPEN_FINGER)
+        status = gripper_open(gripper, samples, finger_range=FINGER_TARGETS, initial_width=2 * OPEN_FINGER)
         translations = motion[:, :3, 3].copy()
         if noise is not None:
             translations += noise.normal(0, NOISE, translations.shape)

@@ -26,6 +26,8 @@ ARM_LIMITS = (
 FINGER_LIMITS = ((0.0, 0.04), (0.0, 0.04))
 OPEN_FINGER = 0.04
 """Joint position of a finger of the open gripper, m."""
+FINGER_TARGETS = (-0.01, OPEN_FINGER)
+"""Target of a finger at the gripper actions -1 and +1, m: beyond closed, so that thin objects are pressed too."""
 
 ARM_REST = (0.0, -1.02, 0.0, -2.51, 0.0, 1.35, 0.78)
 ARM_EVALUATION_START = (-0.0276, 0.1581, 0.0, -1.8899, -0.0688, 2.7705, 0.7514)

@@ -129,8 +129,8 @@ class RoboCASMobilePanda(BaseAgent):
         mimic: dict[str, Any] = {self.gripper_joint_names[1]: {"joint": self.gripper_joint_names[0]}}
         gripper = PDJointPosMimicControllerConfig(
             self.gripper_joint_names,
-            lower=-0.01,  # beyond closed, so that thin objects are pressed too
-            upper=c.OPEN_FINGER,
+            lower=c.FINGER_TARGETS[0],
+            upper=c.FINGER_TARGETS[1],
             stiffness=self.gripper_stiffness,
             damping=self.gripper_damping,
             force_limit=self.gripper_force_limit,

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.convert import open_env
 from robocas_ms3.datasets.manage.parts import check_whole, schema_version, shown
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.plan import dataset_settings
@@ -68,13 +69,6 @@ class _Source:
         if self.shown is not None:
             self.shown.close()
             self.shown = None
-
-
-def open_env(env_info: dict[str, Any], control_mode: str, pictures: Pictures) -> FrameSource:
-    """Build scenes in the environment that recorded them."""
-    from robocas_ms3.datasets.render import EnvFrames
-
-    return EnvFrames(env_info, control_mode, pictures)
 
 
 def upgrade(
