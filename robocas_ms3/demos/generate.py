@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import shutil
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 
 from robocas_ms3.demos.checks import check_arguments, check_same_run
-from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeResult, EpisodeSettings
+from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.ledger import Failure, Ledger, count_by_stage
 from robocas_ms3.demos.record import merge, open_trajectory, read_json
+from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
 
 _BEGINNINGS = {"run.json", "failures.jsonl", "episodes"}  # of a run that has not finished a seed yet
-_worker: EpisodeGenerator | Exception | None = None
 
 
 @dataclass(frozen=True)
@@ -117,22 +116,28 @@ def _generate_in(
     on_result: Callable[[EpisodeResult], None],
 ) -> Summary:
     shards, ledger = make_folder(out / "episodes"), Ledger(out / "failures.jsonl")
-    results = _finished(out, shards, ledger)
-    ledger.keep_only({result.seed for result in results})
-    seeds = _seeds(first_seed, {result.seed for result in results})
-    results = [r for r in results if r.seed >= first_seed]
+    earlier = _finished(out, shards, ledger)
+    ledger.keep_only(set(earlier))
+    missing = (seed for seed in count(first_seed) if seed not in earlier)
+    results: list[EpisodeResult] = []
+    good = 0
     try:
-        if sum(r.success for r in results) < episodes:
-            for result in _run(settings, seeds, shards, jobs):
-                lines = list(result.failures)
-                if not result.success:
-                    lines.append(Failure(result.seed, -1, "episode", "gave_up", 0.0))
-                ledger.append(lines)
-                results.append(result)
-                on_result(result)
-                good = sum(r.success for r in results)
+        with closing(generate_seeds(settings, missing, shards, jobs)) as new:
+            for seed in count(first_seed):
                 if good >= episodes:
                     break
+                if seed in earlier:
+                    results.append(earlier[seed])
+                    good += earlier[seed].success
+                    continue
+                result = next(new)
+                lines = list(result.failures)
+                if not result.success:
+                    lines.append(Failure(seed, -1, "episode", "gave_up", 0.0))
+                ledger.append(lines)
+                results.append(result)
+                good += result.success
+                on_result(result)
                 if len(results) - good > max(20, 3 * good):
                     raise RobocasError(
                         "far too many seeds fail",
@@ -141,114 +146,60 @@ def _generate_in(
                         fix=f"See {ledger.path.name}; a smaller objects.count may help.",
                     )
     except RobocasError:
-        if not results:
+        if not (results or earlier):
             shutil.rmtree(out)  # it never began
         raise
-    finally:
-        results.sort(key=lambda r: r.seed)
-    return _finish(out, shards, ledger, results)
+    return _finish(out, shards, ledger, results, earlier)
 
 
-def _seeds(first: int, done: set[int]) -> Iterator[int]:
-    seed = first
-    while True:
-        if seed not in done:
-            yield seed
-        seed += 1
-
-
-def shard_name(seed: int) -> str:
-    """Name of an episode's file before merging."""
-    return f"seed_{seed:09d}"
-
-
-def _run(settings: EpisodeSettings, seeds: Iterator[int], folder: Path, jobs: int) -> Iterator[EpisodeResult]:
-    """Results in the order of the seeds."""
-    if jobs <= 1:
-        generator = EpisodeGenerator(settings)
-        try:
-            for seed in seeds:
-                yield generator.generate(seed, folder, shard_name(seed))
-        finally:
-            generator.close()
-        return
-    context = multiprocessing.get_context("spawn")  # neither PhysX nor torch survives a fork
-    pending: list[tuple[int, Future[EpisodeResult] | None]] = []
-    crashes: dict[int, int] = {}
-    while True:
-        # A crash of a worker (mplib's C++) breaks the pool: make a new one and run what was under way again.
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(settings,)) as pool:
-            try:
-                pending = [(seed, pool.submit(_generate, seed, folder)) for seed, _ in pending]
-                while True:
-                    while len(pending) < 2 * jobs:
-                        seed = next(seeds)
-                        pending.append((seed, pool.submit(_generate, seed, folder)))
-                    seed, future = pending[0]
-                    assert future is not None
-                    result = future.result()
-                    pending.pop(0)
-                    yield result
-            except BrokenProcessPool:
-                seed = pending[0][0]
-                crashes[seed] = crashes.get(seed, 0) + 1
-                if crashes[seed] >= 2:
-                    pending.pop(0)
-                    failure = Failure(seed, 0, "worker", "crashed", 0.0)
-                    yield EpisodeResult(seed, success=False, attempts=1, failures=[failure])
-            except GeneratorExit:
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
-
-
-def _start_worker(settings: EpisodeSettings) -> None:
-    global _worker  # noqa: PLW0603  (one generator a process)
-    try:
-        _worker = EpisodeGenerator(settings)
-    except Exception as error:  # noqa: BLE001  (raised by the first task: an initializer's own error breaks the pool)
-        _worker = error
-
-
-def _generate(seed: int, folder: Path) -> EpisodeResult:
-    if isinstance(_worker, Exception):
-        raise _worker
-    assert _worker is not None
-    return _worker.generate(seed, folder, shard_name(seed))
-
-
-def _finished(out: Path, shards: Path, ledger: Ledger) -> list[EpisodeResult]:
+def _finished(out: Path, shards: Path, ledger: Ledger) -> dict[int, EpisodeResult]:
     """Seeds that an earlier run dealt with: in the merged file, in files of their own, or given up."""
-    results = {}
-    sources = [out / "trajectory.h5"] if (out / "trajectory.h5").is_file() else []
-    for path in [*sources, *sorted(shards.glob("seed_*.h5"))]:
+    results = {failure.seed: EpisodeResult(failure.seed, success=False) for failure in ledger.read() if failure.gave_up}
+    for path in sorted(shards.glob("seed_*.h5")):
         try:
-            for episode in read_json(path)["episodes"]:
-                seed = int(episode["episode_seed"])
-                # the block is written last: without it the episode was cut short
-                if "robocas" in episode:
-                    result = EpisodeResult(seed, True, int(episode["elapsed_steps"]), episode["robocas"]["attempts"])
-                    for part, value in episode["robocas"]["seconds"].items():
-                        setattr(result.seconds, part, value)
-                    results[seed] = result
             open_trajectory(path).close()
+            results |= _recorded(path)
         except RobocasError:
-            if path in sources:
-                raise
-            results.pop(int(path.stem.removeprefix("seed_")), None)
             path.unlink()
-    for failure in ledger.read():
-        if failure.gave_up:
-            results[failure.seed] = EpisodeResult(failure.seed, success=False)
-    return list(results.values())
+    return results | _merged(out)
 
 
-def _finish(out: Path, shards: Path, ledger: Ledger, results: list[EpisodeResult]) -> Summary:
+def _recorded(path: Path) -> dict[int, EpisodeResult]:
+    """Seed -> what came of it, of each episode in a file."""
+    results = {}
+    for episode in read_json(path)["episodes"]:
+        # the block is written last: without it the episode was cut short
+        if "robocas" in episode:
+            seed = int(episode["episode_seed"])
+            results[seed] = EpisodeResult(seed, True, int(episode["elapsed_steps"]), episode["robocas"]["attempts"])
+            for part, value in episode["robocas"]["seconds"].items():
+                setattr(results[seed].seconds, part, value)
+    return results
+
+
+def _merged(out: Path) -> dict[int, EpisodeResult]:
+    """What the merged file holds."""
+    path = out / "trajectory.h5"
+    if not path.is_file():
+        return {}
+    data = read_json(path)
+    with open_trajectory(path) as file:
+        there = [episode for episode in data["episodes"] if f"traj_{episode['episode_id']}" in file]
+    if len(there) < len(data["episodes"]):  # a merge was killed between its two files
+        write_json(path.with_suffix(".json"), {**data, "episodes": there})
+    return _recorded(path)
+
+
+def _finish(
+    out: Path, shards: Path, ledger: Ledger, results: list[EpisodeResult], earlier: dict[int, EpisodeResult]
+) -> Summary:
+    trajectory, merged = out / "trajectory.h5", _merged(out)
+    beyond = range(results[-1].seed + 1, max(merged, default=-1) + 1)  # more are there than were asked for
+    results = [*results, *(earlier[seed] for seed in beyond if seed in earlier)]
     good = [r for r in results if r.success]
-    trajectory = out / "trajectory.h5"
-    wanted = [shards / f"{shard_name(r.seed)}.h5" for r in good]
-    new = [path for path in wanted if path.is_file()]
+    new = [shards / f"{shard_name(r.seed)}.h5" for r in good if r.seed not in merged]
     if new:
-        merge(([trajectory] if trajectory.is_file() else []) + new, trajectory)
+        merge(([trajectory] if merged else []) + new, trajectory)
     shutil.rmtree(shards)
     parts = ("reset", "planning", "simulation")
     seconds = {p: round(float(np.mean([getattr(r.seconds, p) for r in results] or [0])), 3) for p in parts}

@@ -71,7 +71,7 @@ def hopeless(monkeypatch):
         for seed in seeds:
             yield EpisodeResult(seed, success=False, failures=[Failure(seed, 0, "reach", "far", 0.0)])
 
-    monkeypatch.setattr(module, "_run", give_up)
+    monkeypatch.setattr(module, "generate_seeds", give_up)
 
 
 @pytest.mark.parametrize("resume", [False, True])

@@ -1,0 +1,158 @@
+"""Neither an interruption nor a crash of a worker changes what a run ends with: runs on recordings of no content."""
+
+import json
+import shutil
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from types import SimpleNamespace
+
+import h5py
+import pytest
+
+from robocas_ms3.demos import generate as module
+from robocas_ms3.demos import workers
+from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
+from robocas_ms3.demos.generate import generate
+from robocas_ms3.demos.ledger import Failure
+from robocas_ms3.demos.record import read_json
+from robocas_ms3.demos.workers import generate_seeds, shard_name
+
+SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
+HOPELESS = 2  # a seed without an episode
+
+
+def record(folder, seed):
+    """The file of an episode that a worker has finished."""
+    path = folder / f"{shard_name(seed)}.h5"
+    with h5py.File(path, "w") as file:
+        file.create_group("traj_0").attrs["seed"] = seed
+    seconds = {"reset": 1.0, "planning": 2.0, "simulation": 3.0}
+    episode = {"episode_id": 0, "episode_seed": seed, "elapsed_steps": 10 + seed}
+    episode["robocas"] = {"attempts": 1, "seconds": seconds}
+    path.with_suffix(".json").write_text(json.dumps({"env_info": {}, "episodes": [episode]}))
+
+
+@pytest.fixture(autouse=True)
+def made(monkeypatch):
+    """Seeds that were generated, in the order in which they were."""
+    seeds_made = []
+
+    def make(settings, seeds, folder, jobs):
+        for seed in seeds:
+            seeds_made.append(seed)
+            if seed == HOPELESS:
+                yield EpisodeResult(seed, success=False, failures=[Failure(seed, 0, "reach", "far", 0.0)])
+            else:
+                record(folder, seed)
+                yield EpisodeResult(seed, True, 10 + seed, 1)
+
+    monkeypatch.setattr(module, "generate_seeds", make)
+    return seeds_made
+
+
+def seeds_of(out):
+    """Seeds of the episodes in the merged file; its JSON and its HDF5 agree."""
+    episodes = read_json(out / "trajectory.h5")["episodes"]
+    with h5py.File(out / "trajectory.h5") as file:
+        assert sorted(file) == sorted(f"traj_{episode['episode_id']}" for episode in episodes)
+        assert [file[f"traj_{e['episode_id']}"].attrs["seed"] for e in episodes] == [
+            e["episode_seed"] for e in episodes
+        ]
+    return [episode["episode_seed"] for episode in episodes]
+
+
+def begun(out, shards, given_up=()):
+    """A run that was killed: workers had finished some seeds, not all of them in their order."""
+    run = {"settings": vars(SETTINGS), "first_seed": 0}
+    (out / "episodes").mkdir(parents=True)
+    (out / "run.json").write_text(json.dumps(run))
+    lines = [
+        {"seed": seed, "attempt": -1, "stage": "episode", "reason": "gave_up", "seconds": 0.0} for seed in given_up
+    ]
+    (out / "failures.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    for seed in shards:
+        record(out / "episodes", seed)
+
+
+@pytest.mark.parametrize(
+    ("shards", "given_up", "missing"),
+    [((0, 1), (), [2, 3]), ((0, 1, 5), (), [2, 3]), ((0, 4, 6), (2,), [1, 3]), ((1, 3, 4), (), [0, 2])],
+)
+def test_seeds_that_workers_had_finished_ahead_are_in_nobodys_place(tmp_path, made, shards, given_up, missing):
+    out = tmp_path / "out"
+    begun(out, shards, given_up)
+    summary = generate(SETTINGS, out, episodes=3, resume=True)
+    assert made == missing
+    assert seeds_of(out) == [0, 1, 3]
+    assert (summary.episodes, summary.seeds, summary.gave_up) == (3, 4, [HOPELESS])
+    assert not (out / "episodes").exists()
+
+
+def test_killed_when_all_was_merged_already(tmp_path, made):
+    out = tmp_path / "out"
+    generate(SETTINGS, out, episodes=2)
+    begun(out.with_name("again"), (0, 1))
+    shutil.move(out.with_name("again") / "episodes", out)  # they had not been removed yet
+    generate(SETTINGS, out, episodes=3, resume=True)
+    assert seeds_of(out) == [0, 1, 3]
+    assert made == [0, 1, 2, 3]
+
+
+def test_killed_between_the_two_merged_files(tmp_path, made):
+    out = tmp_path / "out"
+    generate(SETTINGS, out, episodes=2)
+    (out / "episodes").mkdir()
+    record(out / "episodes", 3)
+    data = read_json(out / "trajectory.h5")
+    ahead = {**data["episodes"][0], "episode_id": 2, "episode_seed": 3}
+    (out / "trajectory.json").write_text(json.dumps({**data, "episodes": [*data["episodes"], ahead]}))
+    generate(SETTINGS, out, episodes=3, resume=True)
+    assert seeds_of(out) == [0, 1, 3]
+    assert made == [0, 1, 2]
+
+
+def test_fewer_than_there_are(tmp_path, made):
+    out = tmp_path / "out"
+    before = generate(SETTINGS, out, episodes=4)
+    after = generate(SETTINGS, out, episodes=2, resume=True)
+    assert seeds_of(out) == [0, 1, 3, 4]
+    assert (after.episodes, after.seeds, after.gave_up) == (before.episodes, before.seeds, before.gave_up)
+    assert made == [0, 1, 2, 3, 4]
+
+
+class Pool:
+    """All that is under way fails as soon as a seed which crashes is; of another seed it was dead before."""
+
+    crashing, found_dead = 5, {7}  # noqa: RUF012
+
+    def __init__(self, *_, **__):
+        self.under_way = []
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def shutdown(self, **_):
+        pass
+
+    def submit(self, _, seed, folder):
+        if seed in Pool.found_dead:
+            Pool.found_dead = set()
+            raise BrokenProcessPool
+        self.under_way.append(seed)
+        return SimpleNamespace(result=lambda: self.result(seed))
+
+    def result(self, seed):
+        if Pool.crashing in self.under_way:
+            raise BrokenProcessPool
+        return EpisodeResult(seed, success=True)
+
+
+def test_a_crash_costs_no_seed_but_its_own(monkeypatch):
+    monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
+    results = generate_seeds(SETTINGS, iter(range(100)), Path(), 2)
+    first = [next(results) for _ in range(10)]
+    assert [result.seed for result in first] == list(range(10))
+    assert [result.seed for result in first if not result.success] == [5]
