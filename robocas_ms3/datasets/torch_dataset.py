@@ -5,26 +5,23 @@ What upstream's training loader computes, and what it leaves open: docs/training
 
 from __future__ import annotations
 
-import os
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.utils.data import get_worker_info
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.actions import ACTION_ARRAYS, ActionScale, episode_actions
-from robocas_ms3.datasets.reader import Episode
+from robocas_ms3.datasets.actions import ActionScale
+from robocas_ms3.datasets.sample_arrays import check_holds, read_episode, type_index
+from robocas_ms3.datasets.sample_pictures import PictureStack
 from robocas_ms3.datasets.sampling import SampleIndex, balancing_weights
 from robocas_ms3.datasets.sources import Split, open_source
 from robocas_ms3.datasets.windows import Padding, Window
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.language.templates import GOAL_TYPES
 
 UPSTREAM_CAMERAS = ("base_camera", "gripper_camera")
 UPSTREAM_SIZE = (320, 256)
@@ -114,7 +111,8 @@ class RoboCASDataset(torch.utils.data.Dataset):
         if size is not None and (len(size) != 2 or min(size) < 1):
             raise DatasetError("no such size", where="size", expected="width and height >= 1", found=size)
         self.source = open_source(path, rate_hz=rate_hz, include_failed=include_failed)
-        self._check_content()
+        check_holds(self.source, self.cameras, depth=depth, embedding=embedding)
+        self._pictures = PictureStack(self.cameras, size, float_images)
         self.episodes: list[int] = self.source.split(split)
         """Numbers of the split's episodes, sorted."""
         if not self.episodes:
@@ -140,40 +138,11 @@ class RoboCASDataset(torch.utils.data.Dataset):
             self.scale = ActionScale.of(self.source.action_space() if action_space is None else action_space, path)
         self._cached_episodes = max(1, cached_episodes)
         self._cache: OrderedDict[int, dict[str, Any]] = OrderedDict()
-        self._keys = (*ACTION_ARRAYS, *self.state, "language_goal")
-        self._keys += ("step_lang_goals", "step_goal_type") * subgoals
-        self._keys += ("language_embedding",) * embedding + ("step_goal_embs",) * (embedding and subgoals)
-        self._process = -1
-
-    def _check_content(self) -> None:
-        source = self.source
-        pictures = [camera.name for camera in schema.CAMERAS if camera.name in source.cameras]
-        wrong = [camera for camera in self.cameras if camera not in pictures]
-        if wrong and not pictures:
-            raise DatasetError(
-                "there are no pictures here",
-                where=source.path,
-                expected="cameras=()",
-                found=f"cameras={self.cameras}",
-                fix="Pass cameras=(), or make pictures with robocas convert.",
-            )
-        if wrong or len(set(self.cameras)) < len(self.cameras):
-            expected = f"some of {', '.join(pictures)}, each once"
-            raise DatasetError("no such camera", where=source.path, expected=expected, found=", ".join(self.cameras))
-        if self.depth and not (source.has_depth and self.cameras):
-            found = "no cameras" if source.has_depth else "no depth"
-            raise DatasetError("there is no depth here", where=source.path, found=found, fix="Pass depth=False.")
-        if self.embedding and not source.has_embeddings:
-            raise DatasetError(
-                "there are no embeddings here",
-                where=source.path,
-                fix="Pass embedding=False, or convert the trajectory with embeddings.",
-            )
 
     def _stages_of(self, number: int, steps: range) -> NDArray[np.int8]:
         stages = np.full(self.source.lengths[number], -1, dtype=np.int8)
         for goal in self.source.goals(number):
-            stages[goal.first : goal.last + 1] = _type_index(goal.goal_type)
+            stages[goal.first : goal.last + 1] = type_index(goal.goal_type)
         return stages[steps.start : steps.stop]
 
     def __len__(self) -> int:
@@ -236,16 +205,16 @@ class RoboCASDataset(torch.utils.data.Dataset):
         for key in ("state", "subgoal_type", "subgoal_embedding"):
             if key in episode:
                 sample[key] = self._rows(episode[key], observed, nothing=-1 if key == "subgoal_type" else 0)
-        for key in ("instruction", "language_embedding"):
-            if key in episode:
-                sample[key] = episode[key]
+        sample["instruction"] = episode["instruction"]
+        if self.embedding:
+            sample["language_embedding"] = torch.from_numpy(episode["language_embedding"].copy())
         if self.subgoals:
             sample["subgoal"] = episode["texts"][step]
         if self.cameras:
-            self._settle_process()
-            sample["rgb"] = self._pictures(episode["pictures"], observed, "rgb")
+            zero = self.window.padding == "zero"
+            sample["rgb"] = self._pictures.read(episode["pictures"], observed, "rgb", zero=zero)
             if self.depth:
-                sample["depth"] = self._pictures(episode["pictures"], observed, "depth")
+                sample["depth"] = self._pictures.read(episode["pictures"], observed, "depth", zero=zero)
         return sample if self.transform is None else self.transform(sample)
 
     def _actions(self, episode: Mapping[str, Any], acted: NDArray[np.int64], last: int) -> torch.Tensor:
@@ -267,73 +236,11 @@ class RoboCASDataset(torch.utils.data.Dataset):
             rows[observed < 0] = nothing
         return torch.from_numpy(rows)
 
-    def _pictures(self, episode: Episode, observed: NDArray[np.int64], kind: Literal["rgb", "depth"]) -> torch.Tensor:
-        steps = np.maximum(observed, 0)
-        decoded = {int(s): self._stack(episode, int(s), kind) for s in np.unique(steps)}
-        shapes = {picture.shape for picture in decoded.values()}
-        if len(shapes) > 1:
-            raise DatasetError(
-                "pictures differ in size", where=episode.folder, found=sorted(shapes), fix="Pass a size."
-            )
-        stack = np.stack([decoded[int(step)] for step in steps])
-        if self.window.padding == "zero":
-            stack[observed < 0] = 0
-        return torch.from_numpy(stack)
-
-    def _stack(self, episode: Episode, step: int, kind: Literal["rgb", "depth"]) -> NDArray:
-        """One step's pictures, cameras first: (C, 3, h, w) or (C, h, w)."""
-        shots = []
-        for camera in self.cameras:
-            picture = episode.rgb(camera, step) if kind == "rgb" else episode.depth(camera, step)
-            if (picture.ndim, picture.dtype) != ((3, np.uint8) if kind == "rgb" else (2, np.uint16)):
-                raise DatasetError(
-                    "not a picture of this kind",
-                    where=episode.image_path(camera, kind, step),
-                    expected="(H, W, 3) uint8" if kind == "rgb" else "(H, W) uint16",
-                    found=f"{picture.shape} {picture.dtype}",
-                )
-            shots.append(_resize(picture, self.size))
-        if len({shot.shape for shot in shots}) > 1:
-            found = [shot.shape for shot in shots]
-            raise DatasetError("cameras differ in size", where=episode.folder, found=found, fix="Pass a size.")
-        stack = np.stack(shots)
-        if kind == "depth":
-            return stack.astype(np.float32) / 1000
-        stack = np.ascontiguousarray(stack.transpose(0, 3, 1, 2))
-        return stack.astype(np.float32) / 255 if self.float_images else stack
-
     def _episode(self, number: int) -> dict[str, Any]:
         if number in self._cache:
             self._cache.move_to_end(number)
             return self._cache[number]
-        arrays = self.source.arrays(number, self._keys)
-        length = self.source.lengths[number]
-        where = f"{self.source.path}, episode {number}"
-        for key, array in arrays.items():
-            if key not in {"language_goal", "language_embedding"} and len(array) != length:
-                raise DatasetError(
-                    "another length than the overview says",
-                    where=f"{where}, {key}",
-                    expected=length,
-                    found=len(array),
-                )
-            if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise DatasetError("not a number", where=f"{where}, {key}", fix="robocas validate says more.")
-        made: dict[str, Any] = {
-            "action": episode_actions(arrays),
-            "first_command": float(arrays["gripper_status"][0]),
-            "instruction": str(arrays["language_goal"]),
-        }
-        if self.state:
-            columns = [arrays[key].reshape(length, -1) for key in self.state]
-            made["state"] = np.concatenate(columns, axis=1).astype(np.float32)
-        if self.embedding:
-            made["language_embedding"] = torch.from_numpy(arrays["language_embedding"])
-        if self.subgoals:
-            made["texts"] = arrays["step_lang_goals"].tolist()
-            made["subgoal_type"] = np.array([_type_index(kind) for kind in arrays["step_goal_type"].tolist()])
-            if self.embedding:
-                made["subgoal_embedding"] = arrays["step_goal_embs"]
+        made = read_episode(self.source, number, self.state, embedding=self.embedding, subgoals=self.subgoals)
         if self.cameras:
             made["pictures"] = self.source.episode(number)
         self._cache[number] = made
@@ -341,35 +248,11 @@ class RoboCASDataset(torch.utils.data.Dataset):
             self._cache.popitem(last=False)
         return made
 
-    def _settle_process(self) -> None:
-        """In a worker: one thread for OpenCV, whose pool does not survive a fork."""
-        if self._process != os.getpid():
-            self._process = os.getpid()
-            if get_worker_info() is not None:
-                cv2.setNumThreads(0)
-
     def __getstate__(self) -> dict[str, Any]:
         """Leave the cache behind."""
-        return {**self.__dict__, "_cache": OrderedDict(), "_process": -1}
+        return {**self.__dict__, "_cache": OrderedDict()}
 
 
 def _check_choice(where: str, found: object, known: Sequence[str]) -> None:
     if found not in known:
         raise DatasetError("no such choice", where=where, expected=f"one of {', '.join(known)}", found=found)
-
-
-def _type_index(goal_type: str) -> int:
-    return _TYPE_INDEX.get(goal_type, -1)
-
-
-_TYPE_INDEX: dict[str, int] = {kind: index for index, kind in enumerate(GOAL_TYPES)}
-
-
-def _resize(picture: NDArray, size: tuple[int, int] | None) -> NDArray:
-    """Scale to width and height: RGB by areas, depth by the nearest pixel, which mixes no distances."""
-    if size is None or picture.shape[1::-1] == tuple(size):
-        return picture
-    smaller = size[0] <= picture.shape[1] and size[1] <= picture.shape[0]
-    if picture.ndim == 2:
-        return cv2.resize(picture, size, interpolation=cv2.INTER_NEAREST_EXACT)
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
