@@ -1,0 +1,154 @@
+"""Takes trajectories through every format and back, and compares; prints JSON.
+
+python benchmarks/round_trip.py demos/pick/trajectory.h5 demos/select/trajectory.h5 --out round_trip
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.lerobot.check import check_lerobot
+from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
+from robocas_ms3.datasets.manage.importing import import_robocas
+from robocas_ms3.datasets.manage.merging import merge
+from robocas_ms3.datasets.manage.parts import open_part
+from robocas_ms3.datasets.manage.splitting import parts_by_value, write_parts
+from robocas_ms3.datasets.manage.survey import survey
+from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.validate import validate
+
+_NOT_UPSTREAMS = {"agv_pose", "rel_agv_pose", "language_embedding", "step_goal_embs"}
+
+
+@dataclass
+class Benchmark:
+    """HDF5 to RoboCAS, to LeRobot, to upstream's form and back; all merged, and split by task again."""
+
+    trajectories: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Files F.h5 in folders named as their task."""
+    out: Path
+    """Folder for the datasets; must not exist."""
+    size: tuple[int, int] | None = None
+    """Of the pictures; default 640 480."""
+
+
+def main(cfg: Benchmark) -> None:
+    """Run it."""
+    cfg.out.mkdir(parents=True)
+    report: dict[str, Any] = {}
+    roots: list[Path] = []
+    for path in cfg.trajectories:
+        name = path.parent.name
+        roots.append(cfg.out / f"{name}_robocas")
+        report[name] = _one(path, roots[-1], cfg.size)
+        print(name, json.dumps(report[name]), file=sys.stderr)
+    merged = cfg.out / "merged"
+    with _timed(report, "merge"):
+        merge(roots, merged)
+    report["merge"]["violations"] = len(validate(merged).violations)
+    with _timed(report, "split"):
+        part = open_part(merged)
+        write_parts(part, parts_by_value(part, "task", None, cfg.out / "split"), share=None)
+    report["split"]["episodes_changed"] = sum(
+        _different(Dataset(root), Dataset(cfg.out / "split" / root.name.removesuffix("_robocas"))) for root in roots
+    )
+    print(json.dumps(report, indent=2))
+
+
+def _one(trajectory: Path, ours: Path, size: tuple[int, int] | None) -> dict[str, Any]:
+    """One trajectory through the formats."""
+    report: dict[str, Any] = {}
+    base = str(ours).removesuffix("_robocas")
+    with _timed(report, "robocas"):
+        convert(trajectory, ours, pictures=Pictures(size=size), embeddings=False)
+    report["robocas"] |= {"episodes": len(Dataset(ours).numbers), "violations": len(validate(ours).violations)}
+    for kind, source in (("from_hdf5", trajectory), ("from_robocas", ours)):
+        root = Path(f"{base}_lerobot_{kind}")
+        with _timed(report, f"lerobot_{kind}"):
+            convert_lerobot(source, root, pictures=Pictures(size=size if kind == "from_hdf5" else None))
+        report[f"lerobot_{kind}"] |= _compare(Dataset(ours), LeRobotDataset(root))
+        report[f"lerobot_{kind}"]["violations"] = len(check_lerobot(root, decode=True))
+    theirs, back = Path(f"{base}_upstream"), Path(f"{base}_imported")
+    _as_upstream(ours, theirs)
+    with _timed(report, "import"):
+        import_robocas(survey(theirs), back, link=True)
+    changed = _different(Dataset(ours), Dataset(back))
+    report["import"] |= {"episodes_changed": changed, "violations": len(validate(back).violations)}
+    return report
+
+
+@contextmanager
+def _timed(report: dict[str, Any], name: str) -> Iterator[None]:
+    begun = time.perf_counter()
+    yield
+    report[name] = {"seconds": round(time.perf_counter() - begun, 1)}
+
+
+def _compare(ours: Dataset, theirs: LeRobotDataset) -> dict[str, Any]:
+    """How LeRobot's episodes differ from RoboCAS' ones: arrays, depth, and RGB, which its codec changes a little."""
+    errors, depth, wrong = [], 0, 0
+    for number in ours.numbers:
+        a, b = ours.episode(number), theirs.episode(number)
+        wrong += not _same_arrays(a.arrays, b.arrays) or a.scene != b.scene
+        for camera in a.cameras:
+            for step, (rgb, mm) in enumerate(zip(b.frames(camera), b.frames(camera, "depth"), strict=True)):
+                depth += not np.array_equal(mm, a.depth(camera, step))
+                errors.append(np.abs(rgb.astype(np.int16) - a.rgb(camera, step)).mean())
+    return {
+        "episodes_changed": wrong,
+        "depth_pictures_changed": depth,
+        "rgb_mean_error_levels": round(float(np.mean(errors)), 2),
+        "rgb_worst_picture_levels": round(float(np.max(errors)), 2),
+    }
+
+
+def _different(a: Dataset, b: Dataset) -> int:
+    """How many episodes differ, in the order of their numbers: arrays to 1e-6, files of pictures byte for byte."""
+    if len(a.numbers) != len(b.numbers):
+        return max(len(a.numbers), len(b.numbers))
+    wrong = 0
+    for one, other in zip(map(a.episode, a.numbers), map(b.episode, b.numbers), strict=True):
+        pictures = {path.relative_to(one.folder) for path in one.folder.rglob("*.png")}
+        same = pictures == {path.relative_to(other.folder) for path in other.folder.rglob("*.png")}
+        same = same and all((one.folder / p).read_bytes() == (other.folder / p).read_bytes() for p in pictures)
+        wrong += not same or not _same_arrays(one.arrays, other.arrays)
+    return wrong
+
+
+def _same_arrays(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
+    if a.keys() != b.keys():
+        return False
+    numeric = [key for key in a if a[key].dtype.kind in "fiu"]
+    close = all(a[key].shape == b[key].shape and np.allclose(a[key], b[key], rtol=0, atol=1e-6) for key in numeric)
+    return close and all(np.array_equal(a[key], b[key]) for key in a.keys() - numeric)
+
+
+def _as_upstream(root: Path, out: Path) -> None:
+    """Leave what upstream writes, under the paper's names."""
+    ours = (schema.SCENE_FILE, schema.CONVERSION_FILE, "cam_pose_wrt_*")
+    shutil.copytree(root, out, copy_function=os.link, ignore=shutil.ignore_patterns(*ours))
+    for path in out.glob(f"*/{schema.EPISODE_FILE}"):
+        with np.load(path) as loaded:
+            kept = {key: loaded[key] for key in loaded.files if key not in _NOT_UPSTREAMS}
+        path.unlink()  # it is a link
+        np.savez(path, **kept)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Benchmark))
