@@ -1,4 +1,7 @@
-"""A progress bar on stderr that appears when there is something to do, so that an error is one line."""
+"""A progress bar on stderr that appears when there is something to do, so that an error is one line.
+
+Where stderr is no terminal there is none, and no blank line either.
+"""
 
 from __future__ import annotations
 
@@ -30,15 +33,22 @@ class Bar:
             self.start(count)
         self.progress.update(self.progress.task_ids[0], completed=done)
 
+    def next_of(self, count: int) -> None:
+        """One more of all is done."""
+        if not self.progress.task_ids:
+            self.start(count)
+        self.advance()
+
 
 @contextmanager
-def bar(description: str) -> Iterator[Bar]:
-    """Yield a bar, and end it."""
+def bar(description: str, *, transient: bool = False) -> Iterator[Bar]:
+    """Yield a bar, and end it; a transient one goes when it is done."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    progress = Progress(*columns, console=Console(stderr=True))
+    console = Console(stderr=True)
+    progress = Progress(*columns, console=console, transient=transient, disable=not console.is_interactive)
     try:
         yield Bar(progress, description)
     finally:

@@ -57,31 +57,21 @@ class Convert:
 
 def main(cfg: Convert) -> int:
     """Convert, with a progress bar; gives the exit code."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
+    from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.datasets.convert import convert
     from robocas_ms3.datasets.pictures import Pictures
     from robocas_ms3.datasets.video import write_previews
 
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    progress = Progress(*columns, console=console)  # shown when there is something to do: an error is one line
-
-    def start(count: int) -> None:
-        progress.add_task("episodes", total=count)
-        progress.start()
-
-    common: dict[str, Any] = {
-        "pictures": Pictures(cfg.cameras, cfg.size, cfg.depth, cfg.image_format),
-        "include_failed": cfg.include_failed,
-        "overwrite": cfg.overwrite,
-        "resume": cfg.resume,
-        "jobs": cfg.jobs,
-        "on_start": start,
-        "on_episode": lambda _: progress.advance(progress.task_ids[0]),
-    }
-    try:
+    with bar("episodes") as shown:
+        common: dict[str, Any] = {
+            "pictures": Pictures(cfg.cameras, cfg.size, cfg.depth, cfg.image_format),
+            "include_failed": cfg.include_failed,
+            "overwrite": cfg.overwrite,
+            "resume": cfg.resume,
+            "jobs": cfg.jobs,
+            "on_start": shown.start,
+            "on_episode": shown.advance,
+        }
         if cfg.to == "lerobot":
             done = _to_lerobot(cfg, common)
         else:
@@ -89,22 +79,33 @@ def main(cfg: Convert) -> int:
             done = convert(
                 cfg.trajectory, cfg.out, rate_hz=rate, embeddings=cfg.embeddings, append=cfg.append, **common
             )
-        if cfg.video and cfg.to == "robocas":
-            videos = progress.add_task("videos", total=len(done.episodes) + done.kept)
-            write_previews(cfg.out, on_video=lambda _: progress.advance(videos))
-    finally:
-        if progress.live.is_started:  # else it would print an empty line
-            progress.stop()
+    if cfg.video and cfg.to == "robocas":
+        with bar("videos") as shown:
+            shown.start(len(done.episodes) + done.kept)
+            write_previews(cfg.out, on_video=shown.advance)
     steps = sum(episode.steps for episode in done.episodes)
     megabytes = sum(episode.size for episode in done.episodes) / 1e6
     each = done.seconds / max(1, len(done.episodes))
     kept = f", {done.kept} kept" if done.kept else ""
-    Console().print(
-        f"{cfg.out}: {len(done.episodes)} episodes{kept}, {steps} steps, {megabytes:.0f} MB, {each:.1f} s an episode",
-        soft_wrap=True,
-        highlight=False,
-    )
+    say(f"{cfg.out}: {len(done.episodes)} episodes{kept}, {steps} steps, {megabytes:.0f} MB, {each:.1f} s an episode")
+    if done.episodes:
+        say(parts(done, cfg))
     return 0
+
+
+def parts(done: Conversion, cfg: Convert) -> str:
+    """Where the time of an episode went, in the process that wrote it."""
+    spent, count = done.timing, len(done.episodes)
+    beside = ""
+    if cfg.to == "robocas":
+        waited = f", which waited {spent.wait / count:.1f}" if spent.wait / count >= 0.05 else ""
+        beside = f" (beside rendering{waited})"
+    processes = min(cfg.jobs, count)
+    shared = f", {processes} at a time" if processes > 1 else ""
+    return (
+        f"load {spent.load / count:.1f}, render {spent.render / count:.1f}, encode {spent.encode / count:.1f}{beside},"
+        f" write {spent.write / count:.1f} s an episode{shared}"
+    )
 
 
 def _to_lerobot(cfg: Convert, common: dict[str, Any]) -> Conversion:

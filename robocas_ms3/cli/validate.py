@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from robocas_ms3.cli.bars import bar
 from robocas_ms3.errors import DatasetError
 
 if TYPE_CHECKING:
@@ -45,9 +46,9 @@ def main(cfg: Validate) -> int:
     is_lerobot = (cfg.dataset / "meta" / "info.json").is_file()
     if is_lerobot and cfg.replay:
         raise DatasetError("only RoboCAS folders can be replayed", where=cfg.dataset)
-    with _bar("checking") as advance:
+    with bar("checking", transient=True) as shown:
         check = _validate_lerobot if is_lerobot else validate
-        report = check(cfg.dataset, on_episode=lambda done, count: advance(count))
+        report = check(cfg.dataset, on_episode=shown.at)
     console = Console(soft_wrap=True, highlight=False, markup=False)
     if not cfg.json:
         for violation in report.violations:
@@ -83,31 +84,11 @@ def _validate_lerobot(root: Path, *, on_episode: Callable[[int, int], None]) -> 
     return Report(counts[0], counts[1], violations)
 
 
-@contextmanager
-def _bar(what: str) -> Iterator[Callable[[int], None]]:
-    """A progress bar on stderr that shows once there is something to do; what it yields is called with the total."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    progress = Progress(console=Console(stderr=True), transient=True)
-    bar = progress.add_task(what, total=None)
-
-    def advance(count: int) -> None:
-        progress.start()
-        progress.update(bar, advance=1, total=count)
-
-    try:
-        yield advance
-    finally:
-        if progress.live.is_started:
-            progress.stop()
-
-
 def _replay(root: Path) -> ReplayReport:
     from robocas_ms3.datasets.replay_check import replay_dataset
 
-    with _bar("replaying") as advance:
-        return replay_dataset(root, on_episode=lambda episode, count: advance(count))
+    with bar("replaying", transient=True) as shown:
+        return replay_dataset(root, on_episode=lambda _, count: shown.next_of(count))
 
 
 def _lines(report: ReplayReport) -> Iterator[str]:

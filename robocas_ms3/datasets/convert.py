@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import logging
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -14,17 +14,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.failures import add_failures
 from robocas_ms3.datasets.info import write_info
+from robocas_ms3.datasets.output import check_overwrite, kept_if_begun, sweep
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.plan import Plan, appended_plan, dataset_settings, new_plan, resumed_plan
 from robocas_ms3.datasets.provenance import succeeded
 from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.timing import Timing
 from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.workers import Job, OpenSource, write_all
 from robocas_ms3.datasets.writer import FrameSource, WrittenEpisode
 from robocas_ms3.demos.sampling import sample_stride
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -35,11 +40,18 @@ class Conversion:
         episodes: the new ones, by number.
         kept: how many of the trajectory's were there already (``resume``, ``append``).
         seconds: for everything.
+        joining: of these, for what comes after the episodes.
     """
 
     episodes: list[WrittenEpisode]
     kept: int
     seconds: float
+    joining: float = 0.0
+
+    @property
+    def timing(self) -> Timing:
+        """Sum over the new episodes, whichever process wrote them; ``write`` with the joining."""
+        return sum((episode.timing for episode in self.episodes), start=Timing(write=self.joining))
 
 
 def open_env(env_info: dict[str, Any], control_mode: str, pictures: Pictures) -> FrameSource:
@@ -68,9 +80,10 @@ def convert(
     """Write a RoboCAS dataset from a trajectory file.
 
     Killed at any moment, it goes on with ``resume`` (or the same ``append`` again), and ends as if it had not been.
+    Warns where the actions were tried at another rate than that of the dataset.
 
     Args:
-        trajectory: ``F.h5`` with ``F.json`` beside it.
+        trajectory: ``F.h5`` with ``F.json`` beside it; a ``failures.jsonl`` in the same folder goes along.
         out: the dataset's folder.
         rate_hz: steps a second; divides the control frequency.
         pictures: which ones; default: RGB as PNG and depth of all cameras, 640 x 480.
@@ -106,15 +119,16 @@ def convert(
             else:
                 plan = new_plan(file, chosen, settings)
                 if overwrite:
-                    _check_overwrite(out)
+                    check_overwrite(out)
             if open_source is open_env:
                 from robocas_ms3.datasets.render import require_renderer
 
                 require_renderer()
+            warn_untried(file, chosen, rate_hz)
             vectors = embed_texts(file, chosen) if embeddings else None
             claim_output(out, overwrite=overwrite and not (resume or append), resume=True)
             make_folder(out)
-            _sweep(out)
+            sweep(out)
             missing = [task for task in plan.tasks if not (out / schema.episode_folder(task[0])).is_dir()]
             if on_start:
                 on_start(len(missing))
@@ -129,18 +143,15 @@ def _write(
 ) -> list[WrittenEpisode]:
     written: list[WrittenEpisode] = []
     before = _split_before(job.out)
-    try:
+    with kept_if_begun(job.out):
         write_json(job.out / schema.CONVERSION_FILE, plan.content)
         with closing(write_all(job, jobs)) as episodes:
             for episode in episodes:
                 written.append(episode)
                 if on_episode:
                     on_episode(episode)
+        add_failures(job.trajectory.parent, job.out)
         write_info(job.out, before)
-    except BaseException:
-        if not any(job.out.glob("episode_*")):
-            shutil.rmtree(job.out, ignore_errors=True)  # nothing came of it
-        raise
     return written
 
 
@@ -150,12 +161,6 @@ def _split_before(out: Path) -> tuple[list[int], list[int]]:
         return [], []
     info = Dataset(out).info
     return info.get("train_eps", []), info.get("val_eps", [])
-
-
-def _sweep(out: Path) -> None:
-    """Remove what a killed conversion left half written; nobody else writes here, the folder is locked."""
-    for leftover in [*out.glob(".*.tmp*"), *out.glob(".*.old")]:
-        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
 
 
 def choose(file: TrajectoryFile, include_failed: bool) -> list[int]:
@@ -176,12 +181,14 @@ def choose(file: TrajectoryFile, include_failed: bool) -> list[int]:
     return chosen
 
 
-def _check_overwrite(out: Path) -> None:
-    """Delete datasets only, whatever folder was named by mistake."""
-    marks = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
-    if out.is_dir() and any(out.iterdir()) and not any((out / mark).is_file() for mark in marks):
-        raise DatasetError(
-            "refusing to overwrite what is not a dataset", where=out, expected=" or ".join(marks), fix="Choose another."
+def warn_untried(file: TrajectoryFile, chosen: list[int], rate_hz: float) -> None:
+    """Say so where the recordings' actions were tried open loop, but at another rate than the dataset's."""
+    tried = {file.episodes[index].get("robocas", {}).get("replay_rate") for index in chosen} - {None, 0}
+    others = sorted(rate for rate in tried if abs(rate - rate_hz) > 1e-9)
+    if others:
+        _log.warning(
+            "actions were tried at %s Hz; at %g Hz they were not: robocas validate --replay tells (of RoboCAS folders)",
+            *(" and ".join(f"{rate:g}" for rate in others), rate_hz),
         )
 
 

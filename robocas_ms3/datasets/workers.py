@@ -1,14 +1,10 @@
-"""Writes many episodes, in this process or in several."""
+"""Writes many episodes of a trajectory, in this process or in several."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import threading
 from collections.abc import Callable, Generator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.pool import do_all
 from robocas_ms3.datasets.provenance import scene_record
+from robocas_ms3.datasets.timing import Timing
 from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.writer import FrameSource, WrittenEpisode, write_episode
-from robocas_ms3.errors import DatasetError
 
 OpenSource = Callable[[dict[str, Any], str, Pictures], FrameSource]
 """Makes a frame source from ``env_info``, control mode and what is to be rendered."""
@@ -56,28 +53,7 @@ def write_all(job: Job, processes: int) -> Generator[WrittenEpisode, None, None]
     Raises:
         DatasetError: an episode can't be written, or a process died.
     """
-    if processes <= 1 or len(job.tasks) < 2:
-        writer = _Writer(job)
-        try:
-            yield from map(writer.write, job.tasks)
-        finally:
-            writer.close()
-        return
-    pool = ProcessPoolExecutor(
-        min(processes, len(job.tasks)),
-        mp_context=multiprocessing.get_context("spawn"),  # a renderer does not survive a fork
-        initializer=_start_worker,
-        initargs=(job,),
-    )
-    try:
-        for future in as_completed([pool.submit(_write, task) for task in job.tasks]):
-            yield future.result()
-    except BrokenProcessPool as error:
-        raise DatasetError(
-            "a worker process died", where=job.out, fix="Is memory short? Pass --resume and fewer --jobs."
-        ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
+    return do_all(partial(_Writer, job), job.tasks, processes, job.out)
 
 
 class _Writer:
@@ -89,13 +65,14 @@ class _Writer:
         self.source: FrameSource | None = None
         self.control_mode = ""
 
-    def write(self, task: tuple[int, int]) -> WrittenEpisode:
-        job, (number, index) = self.job, task
-        recording = self.file.recording(index)
-        if self.source is None or recording.control_mode != self.control_mode:
-            self._close_source()
-            self.source = job.open_source(self.file.env_info, recording.control_mode, job.pictures)
-            self.control_mode = recording.control_mode
+    def do(self, task: tuple[int, int]) -> WrittenEpisode:
+        job, (number, index), timing = self.job, task, Timing()
+        with timing.measure("total"), timing.measure("load"):
+            recording = self.file.recording(index)
+            if self.source is None or recording.control_mode != self.control_mode:
+                self._close_source()
+                self.source = job.open_source(self.file.env_info, recording.control_mode, job.pictures)
+                self.control_mode = recording.control_mode
         return write_episode(
             job.out,
             number,
@@ -105,6 +82,7 @@ class _Writer:
             pictures=job.pictures,
             describe=lambda scene: scene_record(self.file, index, recording, scene, job.rate_hz),
             embed=self._embed(),
+            timing=timing,
         )
 
     def _embed(self) -> Callable[[list[str]], NDArray[np.float32]] | None:
@@ -119,27 +97,3 @@ class _Writer:
     def close(self) -> None:
         self._close_source()
         self.file.close()
-
-
-_writer: _Writer | None = None
-
-
-def _start_worker(job: Job) -> None:
-    global _writer  # noqa: PLW0603  (state of a worker process)
-    # One thread a process: several that render in software on all cores get in each other's way.
-    os.environ.setdefault("LP_NUM_THREADS", "1")
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
-    _writer = _Writer(job)
-
-
-def _leave_with_parent() -> None:
-    """A worker whose parent was killed would wait for work for ever."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _write(task: tuple[int, int]) -> WrittenEpisode:
-    assert _writer is not None
-    return _writer.write(task)

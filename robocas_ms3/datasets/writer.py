@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.episode import Frames, episode_arrays, sample_subgoals
 from robocas_ms3.datasets.pictures import Pictures, write_picture
+from robocas_ms3.datasets.timing import Timing
 from robocas_ms3.datasets.trajectory import Recording
 from robocas_ms3.demos.sampling import gripper_open, sample_states
 from robocas_ms3.errors import DatasetError
@@ -82,17 +83,6 @@ class FrameSource(Protocol):
         ...
 
 
-@dataclass
-class Timing:
-    """Where the time of an episode went, s. Encoding overlaps rendering, on other threads."""
-
-    load: float = 0.0
-    render: float = 0.0
-    encode: float = 0.0
-    wait: float = 0.0
-    total: float = 0.0
-
-
 @dataclass(frozen=True)
 class Shown:
     """A rendered episode, all but its pictures.
@@ -141,14 +131,13 @@ def show_episode(
         DatasetError: too long for four digits, or the scene can't be shown.
     """
     timing = timing or Timing()
-    begun = time.perf_counter()
     samples = sample_states(recording.control_steps, stride)
     subgoals = sample_subgoals(recording.subgoals, samples)
     if len(samples) > schema.MAX_STEPS:
         where = f"episode {recording.episode_id}"
         raise DatasetError("too many steps", where=where, expected=f"<= {schema.MAX_STEPS}", found=len(samples))
-    source.load(recording)
-    timing.load += time.perf_counter() - begun
+    with timing.measure("load"):
+        source.load(recording)
     poses = []
     begun = time.perf_counter()
     for step, frame in enumerate(source.frames(recording, samples)):
@@ -156,15 +145,16 @@ def show_episode(
         poses.append((frame.tcp_in_world, frame.arm_base_in_world))
         on_frame(step, frame)
         begun = time.perf_counter()
-    tcp, base = (np.stack(column) for column in zip(*poses, strict=True))
-    joints = recording.joints(samples)
-    status = gripper_open(
-        recording.actions[:, source.gripper_column],
-        samples,
-        finger_range=source.finger_range,
-        initial_width=float(joints.qpos[0, 10:12].sum()),
-    )
-    arrays = episode_arrays(Frames(tcp, base), joints, status, recording.instruction, subgoals, embed)
+    with timing.measure("write"):
+        tcp, base = (np.stack(column) for column in zip(*poses, strict=True))
+        joints = recording.joints(samples)
+        status = gripper_open(
+            recording.actions[:, source.gripper_column],
+            samples,
+            finger_range=source.finger_range,
+            initial_width=float(joints.qpos[0, 10:12].sum()),
+        )
+        arrays = episode_arrays(Frames(tcp, base), joints, status, recording.instruction, subgoals, embed)
     return Shown(arrays, source.cameras(), source.scene())
 
 
@@ -178,6 +168,7 @@ def write_episode(
     pictures: Pictures,
     describe: Callable[[dict[str, Any]], dict[str, Any]],
     embed: Callable[[list[str]], NDArray] | None = None,
+    timing: Timing | None = None,
 ) -> WrittenEpisode:
     """Render a recording and write its folder.
 
@@ -190,24 +181,26 @@ def write_episode(
         pictures: which ones.
         describe: makes ``scene.json`` of what the source says of the scene.
         embed: texts -> (N, 384); None leaves the embeddings out.
+        timing: of the episode so far; what this took is added to it.
 
     Raises:
         DatasetError: too long for four digits, or a file can't be written.
     """
-    started = time.perf_counter()
-    timing = Timing()
+    started, timing = time.perf_counter(), timing or Timing()
     with replacing_folder(root / schema.episode_folder(number)) as folder:
         for camera in pictures.cameras:
             for kind in pictures.kinds:
                 (folder / camera / kind).mkdir(parents=True)
         with _Encoders(folder, pictures, timing) as encoders:
             shown = show_episode(recording, source, stride=stride, embed=embed, on_frame=encoders.add, timing=timing)
+        begun = time.perf_counter()
         write_cameras(folder, {name: shown.cameras[name] for name in pictures.cameras})
         np.savez(folder / schema.EPISODE_FILE, **shown.arrays)
         text = json.dumps(describe(shown.scene), indent=1, ensure_ascii=False)
         (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
         size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    timing.total = time.perf_counter() - started
+    timing.write += time.perf_counter() - begun  # with the folder's renaming
+    timing.total += time.perf_counter() - started
     return WrittenEpisode(number, len(shown.arrays["ee_pos"]), size, timing)
 
 
@@ -250,7 +243,6 @@ class _Encoders:
         self._collect(_MAX_WAITING)
 
     def _collect(self, limit: int) -> None:
-        begun = time.perf_counter()
-        while len(self._waiting) > limit:
-            self._timing.encode += self._waiting.popleft().result()
-        self._timing.wait += time.perf_counter() - begun
+        with self._timing.measure("wait"):
+            while len(self._waiting) > limit:
+                self._timing.encode += self._waiting.popleft().result()

@@ -18,9 +18,10 @@ from robocas_ms3.cli import main
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+from robocas_ms3.datasets.lerobot.folder import FolderSource
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
+from robocas_ms3.datasets.lerobot.request import Request
 from robocas_ms3.datasets.lerobot.schema import Limits
-from robocas_ms3.datasets.lerobot.sources import FolderSource, Request
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.trajectory import TrajectoryFile

@@ -14,8 +14,10 @@ from typing import Any, Literal
 import robocas_ms3
 from robocas_ms3.datasets.convert import Conversion, open_env
 from robocas_ms3.datasets.info import split_by_seed
+from robocas_ms3.datasets.lerobot.request import EpisodeSource, Request
 from robocas_ms3.datasets.lerobot.schema import CONTENT, CONVERSION_FILE, INFO_FILE, Limits, require_extra
-from robocas_ms3.datasets.lerobot.sources import EpisodeSource, Request, open_request
+from robocas_ms3.datasets.lerobot.sources import open_request
+from robocas_ms3.datasets.output import check_overwrite, kept_if_begun, sweep
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.workers import OpenSource
 from robocas_ms3.datasets.writer import WrittenEpisode
@@ -83,18 +85,26 @@ def convert_lerobot(
             if resume:
                 _check_resume(out, plan)
             elif overwrite:
-                _check_overwrite(out)
+                check_overwrite(out, (INFO_FILE, PARTS), "a LeRobot dataset")
             if request.open_source is open_env and request.path.is_file():
                 from robocas_ms3.datasets.render import require_renderer
 
                 require_renderer()
             claim_output(out, overwrite=overwrite and not resume, resume=True)
-            written = [] if (out / INFO_FILE).is_file() else _write(
-                request, opened, out, plan, codec, jobs, limits, on_start, on_episode
-            )  # fmt: skip
+            written, joining = [], 0.0
+            if not (out / INFO_FILE).is_file():
+                parts = make_folder(out / PARTS)
+                with kept_if_begun(out, parts):
+                    _sweep(out)
+                    if not (parts / _PLAN).is_file():
+                        write_json(parts / _PLAN, plan)
+                    written = _stage(request, parts, plan, jobs, on_start, on_episode)
+                    staged = time.perf_counter()
+                    _join(out, plan, opened.fps, limits)
+                    joining = time.perf_counter() - staged
             for name in (PARTS, _JOINED):
                 shutil.rmtree(out / name, ignore_errors=True)
-    return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - begun)
+    return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - begun, joining)
 
 
 def _plan(source: EpisodeSource, entries: list[dict[str, Any]], codec: str) -> dict[str, Any]:
@@ -120,55 +130,47 @@ def _seed(seed: Any) -> int:
     return int(seed[0] if isinstance(seed, list) else seed)
 
 
-def _write(
+def _stage(
     request: Request,
-    source: EpisodeSource,
-    out: Path,
+    parts: Path,
     plan: dict[str, Any],
-    codec: str,
     jobs: int,
-    limits: Limits,
     on_start: Callable[[int], None] | None,
     on_episode: Callable[[WrittenEpisode], None] | None,
 ) -> list[WrittenEpisode]:
-    from robocas_ms3.datasets.lerobot.assemble import assemble
+    """Write the parts that are missing; gives them by number."""
     from robocas_ms3.datasets.lerobot.stage import StageJob, part_folder, stage_all
 
-    parts = make_folder(out / PARTS)
+    missing = [(i, e["source"]) for i, e in enumerate(plan["episodes"]) if not part_folder(parts, i).is_dir()]
+    if on_start:
+        on_start(len(missing))
     written: list[WrittenEpisode] = []
-    try:
-        _sweep(out)
-        if not (parts / _PLAN).is_file():
-            write_json(parts / _PLAN, plan)
-        entries = enumerate(plan["episodes"])
-        missing = [(i, e["source"]) for i, e in entries if not part_folder(parts, i).is_dir()]
-        if on_start:
-            on_start(len(missing))
-        with closing(stage_all(StageJob(request, parts, codec, missing), source, jobs)) as episodes:
-            for episode in episodes:
-                written.append(episode)
-                if on_episode:
-                    on_episode(episode)
-        joined = make_folder(out / _JOINED)
-        assemble(parts, plan, source.fps, joined, limits)
-        for name in _FOLDERS:
-            if (joined / name).is_dir():
-                os.replace(joined / name, out / name)
-        joined.rmdir()
-    except BaseException:
-        if not any(parts.glob("episode_*")):
-            shutil.rmtree(out, ignore_errors=True)  # nothing came of it
-        raise
+    with closing(stage_all(StageJob(request, parts, plan["settings"]["codec"], missing), jobs)) as episodes:
+        for episode in episodes:
+            written.append(episode)
+            if on_episode:
+                on_episode(episode)
     return sorted(written, key=lambda episode: episode.number)
 
 
+def _join(out: Path, plan: dict[str, Any], fps: int, limits: Limits) -> None:
+    """Make the dataset of the parts."""
+    from robocas_ms3.datasets.lerobot.assemble import assemble
+
+    joined = make_folder(out / _JOINED)
+    assemble(out / PARTS, plan, fps, joined, limits)
+    for name in _FOLDERS:
+        if (joined / name).is_dir():
+            os.replace(joined / name, out / name)
+    joined.rmdir()
+
+
 def _sweep(out: Path) -> None:
-    """Remove what a killed conversion left half written; nobody else writes here, the folder is locked."""
+    """Remove what a killed conversion left half written or half joined."""
     for name in (_JOINED, *_FOLDERS):
         if (out / name).is_dir():
             shutil.rmtree(out / name)
-    for leftover in [*(out / PARTS).glob(".*.tmp*"), *(out / PARTS).glob(".*.old")]:
-        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+    sweep(out / PARTS)
 
 
 def _check_resume(out: Path, plan: dict[str, Any]) -> None:
@@ -205,13 +207,3 @@ def _check_resume(out: Path, plan: dict[str, Any]) -> None:
             found=f"{len(plan['episodes'])}",
             fix="Pass --overwrite to begin again.",
         )
-
-
-def _check_overwrite(out: Path) -> None:
-    """Delete LeRobot datasets only, whatever folder was named by mistake."""
-    marks = (INFO_FILE, PARTS)
-    if out.is_dir() and any(out.iterdir()) and not any((out / mark).exists() for mark in marks):
-        raise DatasetError(
-            "refusing to overwrite what is not a LeRobot dataset", where=out, expected=" or ".join(marks),
-            fix="Choose another.",
-        )  # fmt: skip

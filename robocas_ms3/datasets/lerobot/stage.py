@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
-import threading
 import time
 from collections.abc import Generator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +16,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from robocas_ms3.datasets.lerobot.request import EpisodeSource, Request
 from robocas_ms3.datasets.lerobot.schema import SUBGOAL_TYPE, frame_columns
-from robocas_ms3.datasets.lerobot.sources import EpisodeSource, Request, open_request
+from robocas_ms3.datasets.lerobot.sources import open_request
 from robocas_ms3.datasets.lerobot.stats import Levels
 from robocas_ms3.datasets.lerobot.tables import column
 from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder
+from robocas_ms3.datasets.pool import do_all
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.datasets.writer import Timing, WrittenEpisode
+from robocas_ms3.datasets.timing import Timing
+from robocas_ms3.datasets.writer import WrittenEpisode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder
 
@@ -61,36 +60,26 @@ def video_name(camera: str, kind: str, codec: str) -> str:
     return f"{kind}_{camera}{CODINGS[codec if kind == 'rgb' else 'depth'].suffix}"
 
 
-def stage_all(job: StageJob, source: EpisodeSource, processes: int) -> Generator[WrittenEpisode, None, None]:
+def stage_all(job: StageJob, processes: int) -> Generator[WrittenEpisode, None, None]:
     """Write parts; gives each episode when it is done, in any order.
-
-    Args:
-        job: what to write.
-        source: open already, for this process.
-        processes: how many work.
 
     Raises:
         DatasetError: an episode can't be written, or a process died.
     """
-    if processes <= 1 or len(job.tasks) < 2:
-        for index, number in job.tasks:
-            yield stage_episode(job, source, index, number)
-        return
-    pool = ProcessPoolExecutor(
-        min(processes, len(job.tasks)),
-        mp_context=multiprocessing.get_context("spawn"),  # a renderer does not survive a fork
-        initializer=_start_worker,
-        initargs=(job,),
-    )
-    try:
-        for future in as_completed([pool.submit(_stage, *task) for task in job.tasks]):
-            yield future.result()
-    except BrokenProcessPool as error:
-        raise DatasetError(
-            "a worker process died", where=job.parts, fix="Is memory short? Pass --resume and fewer --jobs."
-        ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
+    return do_all(partial(_Stager, job), job.tasks, processes, job.parts)
+
+
+class _Stager:
+    """One process's share: keeps the source open from one episode to the next."""
+
+    def __init__(self, job: StageJob) -> None:
+        self.job, self.source = job, open_request(job.request)
+
+    def do(self, task: tuple[int, int]) -> WrittenEpisode:
+        return stage_episode(self.job, self.source, *task)
+
+    def close(self) -> None:
+        self.source.close()
 
 
 def stage_episode(job: StageJob, source: EpisodeSource, index: int, number: int) -> WrittenEpisode:
@@ -99,11 +88,11 @@ def stage_episode(job: StageJob, source: EpisodeSource, index: int, number: int)
     Raises:
         DatasetError: it can't be shown or written.
     """
-    begun, timing = time.perf_counter(), Timing()
+    started, timing = time.perf_counter(), Timing()
     with replacing_folder(part_folder(job.parts, index)) as folder:
         with _Videos(folder, job.codec, source.fps, timing) as videos:
             shown = source.play(number, videos.add, timing)
-        arrays = shown.arrays
+        begun, arrays = time.perf_counter(), shown.arrays
         steps = int(arrays["episode_length"])
         if videos.steps != steps:
             raise DatasetError("pictures and arrays differ in length", where=number, expected=steps, found=videos.steps)
@@ -129,7 +118,8 @@ def stage_episode(job: StageJob, source: EpisodeSource, index: int, number: int)
         }
         (folder / EPISODE_FILE).write_text(json.dumps(about, ensure_ascii=False), encoding="utf-8")
         size = sum(file.stat().st_size for file in folder.iterdir())
-    timing.total = time.perf_counter() - begun
+    timing.write += time.perf_counter() - begun  # with the folder's renaming
+    timing.total += time.perf_counter() - started
     return WrittenEpisode(index, steps, size, timing)
 
 
@@ -147,19 +137,17 @@ class _Videos:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        begun = time.perf_counter()
-        self._stack.__exit__(*error)
-        self._timing.encode += time.perf_counter() - begun
+        with self._timing.measure("encode"):
+            self._stack.__exit__(*error)
 
     def add(self, step: int, rgb: dict[str, NDArray], depth: dict[str, NDArray]) -> None:
-        begun = time.perf_counter()
-        for kind, shots in (("rgb", rgb), ("depth", depth)):
-            for camera, picture in shots.items():
-                self._encoder(kind, camera, picture).add(picture)
-                if kind == "rgb":
-                    self.levels.setdefault(camera, Levels()).add(picture)
+        with self._timing.measure("encode"):
+            for kind, shots in (("rgb", rgb), ("depth", depth)):
+                for camera, picture in shots.items():
+                    self._encoder(kind, camera, picture).add(picture)
+                    if kind == "rgb":
+                        self.levels.setdefault(camera, Levels()).add(picture)
         self.steps = step + 1
-        self._timing.encode += time.perf_counter() - begun
 
     def _encoder(self, kind: str, camera: str, picture: NDArray) -> Encoder:
         if (kind, camera) not in self._encoders:
@@ -169,29 +157,3 @@ class _Videos:
             encoder = self._stack.enter_context(Encoder(path, coding, self._fps, (width, height)))
             self._encoders[kind, camera] = encoder
         return self._encoders[kind, camera]
-
-
-_job: StageJob | None = None
-_source: EpisodeSource | None = None
-
-
-def _start_worker(job: StageJob) -> None:
-    global _job, _source  # noqa: PLW0603  (state of a worker process)
-    # One thread a process: several that render in software on all cores get in each other's way.
-    os.environ.setdefault("LP_NUM_THREADS", "1")
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
-    _job, _source = job, open_request(job.request)
-
-
-def _leave_with_parent() -> None:
-    """A worker whose parent was killed would wait for work for ever."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _stage(index: int, number: int) -> WrittenEpisode:
-    assert _job is not None
-    assert _source is not None
-    return stage_episode(_job, _source, index, number)

@@ -50,6 +50,7 @@ CODINGS = {
     "depth": Coding("ffv1", "gray16le", ".mkv", {"level": "3", "slices": "4", "slicecrc": "1", "g": "1"}),
 }
 _CONTAINER = {"fflags": "+bitexact"}  # no dates and random numbers in the file
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 class Encoder:
@@ -158,7 +159,7 @@ class Joiner:
                     self._out.mux(packet)
                     found += 1
         except FFmpegError as error:
-            if error.errno == errno.ENOSPC:  # of the file that is written
+            if error.errno in _FULL:  # it is the file that is written
                 raise
             raise DatasetError("this video is damaged", where=part, found=error.strerror) from error
         if found != frames:

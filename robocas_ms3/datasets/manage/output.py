@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.output import check_overwrite, kept_if_begun, sweep
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
 
@@ -85,17 +86,13 @@ def begun_output(
         if resume:
             _check_begun(out, plan)
         elif overwrite:
-            _check_dataset(out)
+            check_overwrite(out)
         claim_output(out, overwrite=overwrite and not resume, resume=True)
         make_folder(out)
-        try:
-            _sweep(out)
+        with kept_if_begun(out):
+            sweep(out)
             write_json(out / schema.CONVERSION_FILE, plan)
             yield out
-        except BaseException:
-            if not any(out.glob("episode_*")):
-                shutil.rmtree(out, ignore_errors=True)  # nothing came of it
-            raise
 
 
 def _check_apart(out: Path, inputs: Sequence[Path]) -> None:
@@ -121,18 +118,3 @@ def _check_begun(out: Path, plan: Mapping[str, Any]) -> None:
             found=f"other {', '.join(different)}",
             fix="Pass --overwrite, or the inputs and options of before.",
         )
-
-
-def _check_dataset(out: Path) -> None:
-    """Delete datasets only, whatever folder was named by mistake."""
-    marks = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
-    if out.is_dir() and any(out.iterdir()) and not any((out / mark).is_file() for mark in marks):
-        raise DatasetError(
-            "refusing to overwrite what is not a dataset", where=out, expected=" or ".join(marks), fix="Choose another."
-        )
-
-
-def _sweep(out: Path) -> None:
-    """Remove what a killed run left half written; nobody else writes here, the folder is locked."""
-    for leftover in [*out.glob(".*.tmp*"), *out.glob(".*.old")]:
-        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()

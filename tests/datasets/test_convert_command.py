@@ -1,0 +1,110 @@
+"""What ``robocas convert`` and ``robocas validate`` print."""
+
+import json
+import re
+from functools import partial
+
+import pytest
+from synthetic import RayCaster, write_trajectory
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.datasets import convert as conversion
+from robocas_ms3.datasets.writer import WrittenEpisode
+
+SECONDS = r"\d+\.\d"
+
+
+@pytest.fixture
+def made_up_pictures(monkeypatch):
+    monkeypatch.setattr(conversion, "convert", partial(conversion.convert, open_source=RayCaster))
+
+
+def test_the_parts_of_the_time_come_last(trajectory, made_up_pictures, tmp_path, capsys):
+    command = ["convert", str(trajectory), "--out", str(tmp_path / "out"), "--no-embeddings", "--no-video"]
+    assert run(command) == 0
+    printed = capsys.readouterr()
+    first, last = printed.out.splitlines()
+    assert first.startswith(f"{tmp_path / 'out'}: 2 episodes, 14 steps, ")
+    beside = rf"\(beside rendering(, which waited {SECONDS})?\)"
+    parts = rf"load {SECONDS}, render {SECONDS}, encode {SECONDS} {beside}, write {SECONDS} s an episode"
+    assert re.fullmatch(parts, last), last
+    assert printed.err == ""  # no bar, no blank line where stderr is no terminal
+    assert run([*command, "--resume"]) == 0
+    assert re.fullmatch(r".*: 0 episodes, 2 kept, .*\n", capsys.readouterr().out)
+
+
+def test_seconds_are_those_of_an_episode(monkeypatch, tmp_path, capsys):
+    def convert(*args, **kwargs):
+        timing = conversion.Timing(load=1, render=5, encode=3, wait=0.4, write=0.1, total=7)
+        return conversion.Conversion([WrittenEpisode(n, 7, 100, timing) for n in range(4)], 0, 30.0, joining=2.0)
+
+    monkeypatch.setattr(conversion, "convert", convert)
+    assert run(["convert", "F.h5", "--out", str(tmp_path / "out"), "--no-video", "--jobs", "2"]) == 0
+    expected = (
+        "load 1.0, render 5.0, encode 3.0 (beside rendering, which waited 0.4), write 0.6 s an episode, 2 at a time"
+    )
+    assert capsys.readouterr().out.splitlines()[1] == expected
+
+
+def test_of_lerobot_encoding_is_not_beside_rendering(made, tmp_path, capsys):
+    pytest.importorskip("av", reason="needs the extra 'lerobot'")
+    pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
+    assert run(["convert", str(made), "--to", "lerobot", "--out", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr()
+    parts = rf"load {SECONDS}, render 0\.0, encode {SECONDS}, write {SECONDS} s an episode"
+    assert re.fullmatch(parts, printed.out.splitlines()[-1])
+    assert printed.err == ""
+    assert run(["validate", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr() == (f"{tmp_path / 'out'}: 2 episodes, 14 steps, valid\n", "")
+
+
+def test_validate_prints_nothing_but_its_lines(made, capsys):
+    assert run(["validate", str(made)]) == 0
+    assert capsys.readouterr() == (f"{made}: 2 episodes, 14 steps, valid\n", "")
+
+
+def tried(path, *rates):
+    """A trajectory whose recordings' actions were tried at these rates; "unknown" by versions that knew no trials."""
+    write_trajectory(path, seeds=tuple(range(len(rates))))
+    content = json.loads(path.with_suffix(".json").read_text())
+    for episode, rate in zip(content["episodes"], rates, strict=True):
+        if rate != "unknown":
+            episode["robocas"]["replay_rate"] = rate
+    path.with_suffix(".json").write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("rates", "rate_hz", "said"),
+    [
+        ((5, 5), 5, ""),
+        ((5, 5), 10, "actions were tried at 5 Hz; at 10 Hz they were not: robocas validate --replay tells"),
+        ((5, 10), 10, "actions were tried at 5 Hz; at 10 Hz they were not: robocas validate --replay tells"),
+        ((5, 20), 10, "actions were tried at 5 and 20 Hz; at 10 Hz they were not: robocas validate --replay tells"),
+        ((None, 0), 10, ""),  # not tried at any rate: the base drives, or nobody wanted it
+        (("unknown", "unknown"), 10, ""),
+    ],
+)
+@pytest.mark.parametrize("to", ["robocas", "lerobot"])
+def test_actions_that_were_tried_at_another_rate(tmp_path, caplog, to, rates, rate_hz, said):
+    trajectory = tried(tmp_path / "F.h5", *rates)
+    if to == "robocas":
+        conversion.convert(trajectory, tmp_path / "out", rate_hz=rate_hz, embeddings=False, open_source=RayCaster)
+    else:
+        pytest.importorskip("av", reason="needs the extra 'lerobot'")
+        pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
+        from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+
+        convert_lerobot(trajectory, tmp_path / "out", rate_hz=rate_hz, open_source=RayCaster)
+    warnings = [record.getMessage() for record in caplog.records if record.name.startswith("robocas_ms3")]
+    assert len(warnings) == bool(said)
+    assert not said or warnings[0].startswith(said)
+
+
+def test_only_the_recordings_that_are_converted_count(tmp_path, caplog):
+    path = tried(tmp_path / "F.h5", 5, 10)
+    content = json.loads(path.with_suffix(".json").read_text())
+    content["episodes"][0]["success"] = False
+    path.with_suffix(".json").write_text(json.dumps(content))
+    conversion.convert(path, tmp_path / "out", rate_hz=10, embeddings=False, open_source=RayCaster)
+    assert caplog.records == []

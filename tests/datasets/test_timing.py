@@ -1,0 +1,106 @@
+"""Where the time of a conversion goes, by a clock that stands still but where the test moves it."""
+
+import time
+from collections import Counter
+
+import pytest
+from synthetic import RayCaster
+
+from robocas_ms3.datasets import convert as conversion
+from robocas_ms3.datasets import writer
+from robocas_ms3.datasets.timing import Timing
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(time, "perf_counter", clock)
+    return clock
+
+
+def slow(function, clock, seconds):
+    """The same, but it takes so long."""
+
+    def slower(*args, **kwargs):
+        clock.now += seconds
+        return function(*args, **kwargs)
+
+    return slower
+
+
+def slow_source(clock):
+    class Slow(RayCaster):
+        def __init__(self, *args):
+            super().__init__(*args)
+            clock.now += 5  # once, however many episodes
+
+        def load(self, recording):
+            clock.now += 3
+
+        def frames(self, recording, samples):
+            for frame in super().frames(recording, samples):
+                clock.now += 2
+                yield frame
+
+    return Slow
+
+
+def test_sums_and_parts():
+    total = sum([Timing(load=1, wait=2), Timing(load=0.5, write=4, total=9)], start=Timing(render=3))
+    assert total == Timing(load=1.5, render=3, wait=2, write=4, total=9)
+
+
+def test_what_fails_is_measured_too(clock):
+    timing = Timing(load=1)
+    with pytest.raises(ValueError, match="no"), timing.measure("load"), timing.measure("total"):
+        clock.now += 2
+        raise ValueError("no")
+    assert timing == Timing(load=3, total=2)
+
+
+def test_of_a_robocas_dataset(trajectory, tmp_path, monkeypatch, clock):
+    calls = Counter()
+
+    def encode(path, picture):
+        calls[picture.ndim] += 1
+        return 0.5
+
+    monkeypatch.setattr(writer, "write_picture", encode)
+    monkeypatch.setattr(writer, "write_cameras", slow(writer.write_cameras, clock, 0.25))
+    monkeypatch.setattr(writer.np, "savez", slow(writer.np.savez, clock, 0.5))
+    done = conversion.convert(trajectory, tmp_path / "out", embeddings=False, open_source=slow_source(clock))
+    assert calls == {3: 2 * 7 * 3, 2: 2 * 7 * 3}
+    # two episodes of 7 steps, three cameras of two kinds; encoding is beside the rest and not in the total
+    expected = Timing(load=5 + 2 * 3, render=2 * 7 * 2, encode=2 * 42 * 0.5, write=2 * 0.75, total=5 + 2 * (3 + 14.75))
+    assert done.timing == expected
+    assert done.seconds == expected.total
+    assert [episode.timing.load for episode in done.episodes] == [8, 3]
+    again = conversion.convert(trajectory, tmp_path / "out", embeddings=False, open_source=RayCaster, resume=True)
+    assert again.timing == Timing()
+
+
+def test_of_a_lerobot_dataset(trajectory, made, tmp_path, monkeypatch, clock):
+    pytest.importorskip("av", reason="needs the extra 'lerobot'")
+    pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
+    from robocas_ms3.datasets.lerobot import assemble, folder, stage
+    from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+
+    monkeypatch.setattr(stage.Encoder, "add", slow(stage.Encoder.add, clock, 0.5))
+    monkeypatch.setattr(stage.pq, "write_table", slow(stage.pq.write_table, clock, 0.25))
+    monkeypatch.setattr(assemble, "assemble", slow(assemble.assemble, clock, 10))
+    done = convert_lerobot(trajectory, tmp_path / "out", open_source=slow_source(clock))
+    assert done.joining == 10 + 2 * 0.25  # with the tables of tasks and sub-goals
+    parts = {"encode": 2 * 42 * 0.5, "write": 2 * 0.25 + done.joining}
+    assert done.timing == Timing(load=11, render=28, **parts, total=11 + 28 + 42 + 0.5)
+    assert done.seconds == done.timing.total + done.joining
+    # of a dataset pictures are read, not rendered
+    monkeypatch.setattr(folder.Episode, "rgb", slow(folder.Episode.rgb, clock, 1))
+    done = convert_lerobot(made, tmp_path / "again")
+    assert done.timing == Timing(load=2 * 7 * 3, **parts, total=42 + 42 + 0.5)
