@@ -102,10 +102,15 @@ def make_folder(path: Path | str) -> Path:
     return path
 
 
-def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool = False) -> None:
+def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool | None = False) -> None:
     """Refuse an output that exists, unless the user said what to do with it.
 
     What is overwritten disappears at once: a run killed while it deletes leaves no half of it under this name.
+
+    Args:
+        path: of the output.
+        overwrite: whether to replace it.
+        resume: whether to go on with it; None where that can't be done.
 
     Raises:
         OutputExistsError: ``path`` exists and is not empty, and neither flag is set.
@@ -114,9 +119,8 @@ def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool = Fa
     path = Path(path)
     taken = path.exists() and not (path.is_dir() and not any(path.iterdir()))
     if taken and not (overwrite or resume):
-        raise OutputExistsError(
-            "the output exists already", where=path, fix="Pass --resume to go on, --overwrite to replace it."
-        )
+        ways = ("" if resume is None else "--resume to go on, ") + "--overwrite to replace it"
+        raise OutputExistsError("the output exists already", where=path, fix=f"Pass {ways}.")
     for old in path.parent.glob(f".{glob.escape(path.name)}.*.old"):
         if not (old / "old").exists():  # that of a folder being replaced, which may have to come back
             shutil.rmtree(old, ignore_errors=True)

@@ -36,6 +36,8 @@ def test_existing_output_needs_a_flag(tmp_path):
     (tmp_path / "out" / "file").write_text("")
     with pytest.raises(OutputExistsError, match="--resume.*--overwrite"):
         claim_output(tmp_path / "out")
+    with pytest.raises(OutputExistsError, match=r"exists already\. Pass --overwrite to replace it\.$"):
+        claim_output(tmp_path / "out", resume=None)  # it can't be gone on with
     claim_output(tmp_path / "out", resume=True)
     assert (tmp_path / "out" / "file").exists()
     claim_output(tmp_path / "out", overwrite=True)

@@ -66,7 +66,7 @@ def replay(
 
     Raises:
         DatasetError: the file can't be read, or the control mode can't be converted to.
-        OutputExistsError: ``save`` is there already.
+        OutputExistsError: ``save``, or the JSON that would be beside it, is there already.
         RobocasError: ``count`` or ``obs_mode`` is wrong.
     """
     if count is not None:
@@ -92,7 +92,8 @@ def replay(
             raise DatasetError("a trajectory is an HDF5 file", where=save, expected="a name that ends in .h5")
         if save.resolve() == trajectory.resolve():
             raise DatasetError("this is the recording itself", where=save, fix="Choose another name for the replay.")
-        claim_output(save, overwrite=overwrite)
+        for path in (save, save.with_suffix(".json")):
+            claim_output(path, overwrite=overwrite, resume=None)
     kwargs = {**info["env_kwargs"], "control_mode": mode, "obs_mode": obs_mode, **(env_kwargs or {})}
     if obs_mode == "none":
         kwargs.setdefault("render_backend", "none")

@@ -139,9 +139,14 @@ def test_a_replay_never_replaces_what_it_replays(recording):
         replay(recording, save=recording, overwrite=True)
     other = recording.with_name("other.h5")
     other.write_bytes(b"")
-    with pytest.raises(OutputExistsError):
+    with pytest.raises(OutputExistsError, match=r"the output exists already\. Pass --overwrite to replace it\.$"):
         replay(recording, save=other)
+    notes = recording.with_name("run.json")  # as `robocas generate` leaves one
+    notes.write_text("{}")
+    with pytest.raises(OutputExistsError, match=r"run\.json: the output exists already"):
+        replay(recording, save=notes.with_suffix(".h5"))
     assert recording.is_file()
+    assert notes.read_text() == "{}"
 
 
 def test_converting_a_folder_names_the_file_in_it(recording, tmp_path, capsys):
