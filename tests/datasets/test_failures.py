@@ -44,9 +44,12 @@ def test_nothing_went_wrong(tmp_path):
 
 
 def test_a_run_that_was_cut_off(tmp_path):
-    """Its last line has no end; what is appended later must not run into it."""
-    for name, text in (("out", '{"seed": 1, "att'), ("run", json.dumps(vars(SLIPPED)))):
+    """Half a line stays out; a line without an end is not run into by what is appended later."""
+    for name, text in (("run", json.dumps(vars(SLIPPED)) + '\n{"seed": 1, "att'), ("more", json.dumps(vars(LOST)))):
         (tmp_path / name).mkdir()
         (tmp_path / name / "failures.jsonl").write_text(text)
-    add_failures(tmp_path / "run", tmp_path / "out")
-    assert Ledger(tmp_path / "out" / "failures.jsonl").read() == [SLIPPED]
+    (tmp_path / "out").mkdir()
+    for name in ("more", "run"):
+        add_failures(tmp_path / name, tmp_path / "out")
+    expected = "".join(json.dumps(vars(failure)) + "\n" for failure in (LOST, SLIPPED))
+    assert (tmp_path / "out" / "failures.jsonl").read_text() == expected
