@@ -75,7 +75,7 @@ def _write(cfg: View, out: Path, source, console) -> int:
     claim_output(out, overwrite=False, resume=cfg.overwrite)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         bar = progress.add_task("episodes", total=None)
-        count = export(
+        count, damaged = export(
             source,
             out,
             episodes=cfg.episodes,
@@ -83,5 +83,7 @@ def _write(cfg: View, out: Path, source, console) -> int:
             depth=cfg.depth,
             on_episode=lambda done, all: progress.update(bar, completed=done, total=all),
         )
+    for number, wrong in damaged.items():
+        console.print(f"episode {number} is damaged: {wrong}")
     console.print(f"{count} episodes: {out / 'index.html'}")
     return 0

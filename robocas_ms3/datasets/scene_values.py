@@ -117,6 +117,7 @@ class Scene(_Part):
     versions: dict[str, Any] | None
 
 
+_UNKNOWN = {**dict.fromkeys(schema.SCENE), "schema_version": schema.SCHEMA_VERSION, "rate_hz": 1.0, "source": {}}
 _EXPECTED = {
     "missing": "this key",
     "int_type": "an integer",
@@ -159,11 +160,11 @@ def check_rate(content: Mapping[str, Any]) -> list[Violation]:
     return _check(_Rated, content, "")
 
 
-def sound(scene: Any) -> tuple[dict[str, Any], str]:
+def sound(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, Any], str]:
     """What of a ``scene.json`` can be used, and what is wrong with the rest; a missing key is nothing wrong here."""
     if not isinstance(scene, Mapping):
-        return {}, "" if scene is None else f"{schema.SCENE_FILE}: expected an object, found {_shown(scene)}"
-    wrong = [violation for violation in check_values(scene) if violation.key.partition(".")[0] in scene]
+        return {}, "" if scene is None else f"{file}: expected an object, found {_shown(scene)}"
+    wrong = check_values({**_UNKNOWN, **scene}, file)
     spoilt = {violation.key.partition(".")[0] for violation in wrong}
     return {key: value for key, value in scene.items() if key not in spoilt}, "; ".join(map(str, wrong))
 

@@ -35,10 +35,16 @@ def show_arrays(
     Args:
         number: of the episode.
         a: arrays by the schema's keys; all of `NEEDED`.
-        scene: ``scene.json``; empty where there is none.
+        scene: ``scene.json`` without values that are wrong; empty where there is none.
         rate_hz: steps a second.
         failures: known of its seed.
+
+    Raises:
+        ValueError: they contradict each other.
     """
+    lengths = {len(a[key]) for key in NEEDED}
+    if len(lengths) > 1:
+        raise ValueError(f"arrays of different lengths: {sorted(lengths)}")
     recorded = scene.get("recorded") or {}
     turns = np.degrees(Rotation.from_quat(a["rel_orn"]).as_euler("xyz"))
     goals = runs([str(v) for v in a["step_goal_type"]], [str(v) for v in a["step_lang_goals"]])

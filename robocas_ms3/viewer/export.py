@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, replacing_folder
 from robocas_ms3.viewer import pictures
+from robocas_ms3.viewer.damage import readable
 from robocas_ms3.viewer.routes import PAGE_FILES, make_thumbnail, page_file, script
-from robocas_ms3.viewer.source import Picture, Source
+from robocas_ms3.viewer.source import Picture, Source, read_episode
 
 WIDTH = 480
 """Pixels of a written picture; a static page is for sharing, so it is kept small."""
@@ -24,8 +26,10 @@ def export(
     width: int = WIDTH,
     depth: bool = True,
     on_episode: Callable[[int, int], None] = lambda done, all: None,
-) -> int:
-    """Write ``index.html`` and all it needs; gives the number of episodes.
+) -> tuple[int, dict[int, str]]:
+    """Write ``index.html`` and all it needs.
+
+    What is damaged is left out; the table of the page says so.
 
     Args:
         source: what to show.
@@ -35,8 +39,11 @@ def export(
         depth: whether depth is written too.
         on_episode: told (done, all).
 
+    Returns:
+        The number of episodes, and of the damaged ones, what is wrong.
+
     Raises:
-        DatasetError: an episode is not there or can't be read.
+        DatasetError: an episode that was asked for is not there.
     """
     index = source.index()
     known = [entry["n"] for entry in index["episodes"] if entry["n"] is not None]
@@ -51,29 +58,52 @@ def export(
             target = folder / name if name == "index.html" else make_folder(folder / "page") / name
             target.write_bytes(page_file(name))
         make_folder(folder / "data")
-        (folder / "data" / "index.js").write_bytes(script("index", index))
+        damaged = {entry["n"]: entry["damage"] for entry in index["episodes"] if entry["damage"]}
         for done, number in enumerate(chosen):
             on_episode(done, len(chosen))
-            _write_episode(source, index, number, folder, width)
+            wrong = _write_episode(source, index, number, folder, width)
+            if wrong:
+                damaged[number] = "; ".join(filter(None, (damaged.get(number), wrong)))
+        index["episodes"] = [{**entry, "damage": damaged.get(entry["n"], "")} for entry in index["episodes"]]
+        (folder / "data" / "index.js").write_bytes(script("index", index))
         on_episode(len(chosen), len(chosen))
-    return len(chosen)
+    return len(chosen), damaged
 
 
-def _write_episode(source: Source, index: dict[str, Any], number: int, folder: Path, width: int) -> None:
-    content = source.episode(number)
+def _write_episode(source: Source, index: dict[str, Any], number: int, folder: Path, width: int) -> str:
+    """Write one, and say what of it can't be read."""
+    lost = ""
+    if index["cameras"]:
+        lost = _write(folder / "thumbnails" / f"{number}.jpg", lambda: make_thumbnail(source, index, number))
+    try:
+        content = read_episode(source, number)
+    except DatasetError as error:
+        return f"{error.what}, {error.found}"
     (folder / "data" / f"episode_{number}.js").write_bytes(script(f"episode_{number}", content))
-    if not index["cameras"]:
-        return
-    _write(make_folder(folder / "thumbnails") / f"{number}.jpg", make_thumbnail(source, index, number))
     for camera in index["cameras"]:
         place = folder / "pictures" / str(number) / camera
         for step in range(content["steps"]):
-            rgb = pictures.shrunk(source.rgb(number, camera, step), width)
-            _write(make_folder(place / "rgb") / f"{step}.jpg", rgb)
+            lost = _write(place / "rgb" / f"{step}.jpg", partial(_rgb, source, number, camera, step, width)) or lost
             if index["depth"]:
-                coloured = pictures.depth_picture(source.depth(number, camera, step), width)
-                _write(make_folder(place / "depth") / f"{step}.jpg", coloured)
+                depth = partial(_depth, source, number, camera, step, width)
+                lost = _write(place / "depth" / f"{step}.jpg", depth) or lost
+    return lost
 
 
-def _write(path: Path, picture: Picture) -> None:
-    path.write_bytes(picture.data)
+def _rgb(source: Source, number: int, camera: str, step: int, width: int) -> Picture:
+    return pictures.shrunk(source.rgb(number, camera, step), width)
+
+
+def _depth(source: Source, number: int, camera: str, step: int, width: int) -> Picture:
+    return pictures.depth_picture(source.depth(number, camera, step), width)
+
+
+def _write(path: Path, make: Callable[[], Picture]) -> str:
+    """Write a picture, or say why there is none."""
+    try:
+        with readable(path.name):
+            picture = make()
+    except DatasetError as error:
+        return f"pictures: {error.what}"
+    (make_folder(path.parent) / path.name).write_bytes(picture.data)
+    return ""

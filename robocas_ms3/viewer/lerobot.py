@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset, LeRobotEpisode
+from robocas_ms3.datasets.scene_values import one_seed
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.viewer import damage
 from robocas_ms3.viewer.arrays import show_arrays
-from robocas_ms3.viewer.failures import of_seed, read_failures, stages
+from robocas_ms3.viewer.damage import ledger_entry, readable, table
+from robocas_ms3.viewer.failures import Failures, stages
 from robocas_ms3.viewer.pictures import encode_jpeg
 from robocas_ms3.viewer.source import Picture, inside_path, make_episode, make_index, plot, row
 
@@ -27,53 +30,61 @@ class LeRobotSource:
     """A dataset's folder; pictures are decoded from its videos."""
 
     def __init__(self, root: Path) -> None:
-        """Open it.
+        """Open it; damaged additions of ours are left out, and the page says so.
 
         Raises:
-            DatasetError: it is of another version.
+            DatasetError: it is of another version, or damaged.
             MissingExtraError: pyarrow or av is missing.
         """
         self.root = root
-        self.dataset = LeRobotDataset(root)
-        self.failures = read_failures(root)
-        self.ours = {feature.key for feature in schema.FEATURES} <= set(self.dataset.info["features"])
-        self._known = frozenset(self.dataset.numbers)
+        self.failures = Failures.read(root)
+        with readable(root):
+            self.dataset = LeRobotDataset(root)
+            self.ours = {feature.key for feature in schema.FEATURES} <= set(self.dataset.info["features"])
+            self._known = frozenset(self.dataset.numbers)
+            self._pictures = self.dataset.rate_hz, self.dataset.cameras, self.dataset.has_depth
+        self._settings, wrong = table(lambda: self.dataset.settings, schema.CONVERSION_FILE)
+        self._note = " ".join(filter(None, (wrong, self.failures.note)))
         self._open = lru_cache(maxsize=16)(self._open_now)
         self._frames = lru_cache(maxsize=_KEPT)(self._decode)
         self._decoding = threading.Lock()
 
     def index(self) -> dict[str, Any]:
         """From ``meta/episodes`` and, where it is one of ours, ledger and scenes of its conversion."""
-        settings, scenes, rows = self.dataset.settings, self._scenes(), []
-        ledger = settings.get("episodes") or []
-        for entry in self.dataset.rows:
-            number = int(entry["episode_index"])
-            scene, made = scenes.get(number, {}), ledger[number] if number < len(ledger) else {}
-            recorded, tasks = scene.get("recorded") or {}, entry.get("tasks") or [""]
-            seed = made.get("seed")
-            rows.append(
-                row(
-                    number,
-                    steps=int(entry["length"]),
-                    instruction=str(tasks[0]),
-                    task=scene.get("task") or "",
-                    target=(made.get("target") or {}).get("name", ""),
-                    seed=seed if isinstance(seed, int) else None,
-                    success=made.get("success"),
-                    split="" if "val_eps" not in settings else "val" if number in settings["val_eps"] else "train",
-                    stages=stages(of_seed(self.failures, seed), recorded),
-                    attempts=recorded.get("attempts"),
-                )
-            )
-        rate = self.dataset.rate_hz
-        return make_index(self.root, "LeRobot dataset", rate, self.dataset.cameras, self.dataset.has_depth, rows)
+        texts, wrong = table(self._scenes, schema.SCENES_FILE)
+        val = self._settings.get("val_eps")
+        rows = [self._row(entry, texts, val if isinstance(val, list) else None) for entry in self.dataset.rows]
+        rows += self.failures.given_up(rows)
+        note = " ".join(filter(None, (wrong, self._note)))
+        rate_hz, cameras, has_depth = self._pictures
+        return make_index(self.root, "LeRobot dataset", rate_hz, cameras, has_depth, rows, note)
+
+    def _row(self, entry: dict[str, Any], texts: dict[int, str], val: list | None) -> dict[str, Any]:
+        number = int(entry["episode_index"])
+        scene, wrong = damage.scene(lambda: json.loads(texts.get(number, "null")))
+        made, wrong_made = ledger_entry(self._settings.get("episodes"), number, schema.CONVERSION_FILE)
+        recorded, tasks = scene.get("recorded") or {}, entry.get("tasks") or [""]
+        seed = one_seed(made.get("seed"))
+        return row(
+            number,
+            steps=int(entry["length"]),
+            instruction=str(tasks[0]),
+            task=scene.get("task") or "",
+            target=(made.get("target") or {}).get("name", ""),
+            seed=seed,
+            success=made.get("success"),
+            split="" if val is None else "val" if number in val else "train",
+            stages=stages(self.failures.of_seed(seed), recorded),
+            attempts=recorded.get("attempts"),
+            damage="; ".join(filter(None, (wrong, wrong_made))),
+        )
 
     def episode(self, number: int) -> dict[str, Any]:
         """As a RoboCAS folder shows it, or each numeric column as a plot."""
         episode, rate = self._open(number), self.dataset.rate_hz
         if self.ours:
-            scene = episode.scene
-            failures = of_seed(self.failures, scene.get("seed"))
+            scene, _ = damage.scene(lambda: episode.scene)  # the table says what is wrong
+            failures = self.failures.of_seed(one_seed(scene.get("seed")))
             return show_arrays(number, episode.arrays, scene, rate, failures)
         features, skipped = self.dataset.info["features"], {*schema.INDICES, schema.SUBTASK_INDEX.key}
         plots = []
@@ -100,16 +111,16 @@ class LeRobotSource:
         """A frame of the depth's video."""
         return self._frame(number, camera, "depth", step)
 
-    def _scenes(self) -> dict[int, dict[str, Any]]:
-        """``scene.json`` by episode; empty where the dataset is not one of ours."""
+    def _scenes(self) -> dict[int, str]:
+        """Text of ``scene.json`` by episode; empty where the dataset is not one of ours."""
         import pyarrow.parquet as pq
 
         path = self.root / schema.SCENES_FILE
         if not path.is_file():
             return {}
-        table = pq.read_table(path, columns=["episode_index", "scene"])
-        numbers, texts = (table.column(name).to_pylist() for name in ("episode_index", "scene"))
-        return {int(number): json.loads(text) or {} for number, text in zip(numbers, texts, strict=True)}
+        found = pq.read_table(path, columns=["episode_index", "scene"])
+        numbers, texts = (found.column(name).to_pylist() for name in ("episode_index", "scene"))
+        return {int(number): text for number, text in zip(numbers, texts, strict=True)}
 
     def _frame(self, number: int, camera: str, kind: str, step: int) -> NDArray:
         if not 0 <= step < self._open(number).steps:

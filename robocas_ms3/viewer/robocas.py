@@ -11,12 +11,16 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.datasets.scene_values import one_seed
 from robocas_ms3.datasets.tolerant import DAMAGED
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.viewer import damage
 from robocas_ms3.viewer.arrays import NEEDED, show_arrays
-from robocas_ms3.viewer.failures import of_seed, read_failures, stages
+from robocas_ms3.viewer.damage import entry_of, integer, ledger_entry, rate_of, readable, table, text
+from robocas_ms3.viewer.failures import Failures, stages
 from robocas_ms3.viewer.source import Picture, inside_path, make_index, row
 
+RATE_HZ = 5.0  # upstream's
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp"}
 
 
@@ -24,7 +28,7 @@ class RoboCASSource:
     """A dataset's folder; pictures are handed on as they are stored."""
 
     def __init__(self, root: Path) -> None:
-        """Open it.
+        """Open it; damaged overviews are left out, and the page says so.
 
         Raises:
             DatasetError: there are no episodes.
@@ -32,44 +36,53 @@ class RoboCASSource:
         self.root = root
         self.dataset = Dataset(root)
         self._known = frozenset(self.dataset.numbers)
-        self.failures = read_failures(root)
+        self.failures = Failures.read(root)
+        self._info, wrong_info = table(lambda: self.dataset.info, schema.DATA_INFO_FILE)
+        self._settings, wrong_settings = table(lambda: self.dataset.settings, schema.CONVERSION_FILE)
+        self.rate_hz, wrong_rate = rate_of(self._settings, schema.CONVERSION_FILE, RATE_HZ)
+        self._note = " ".join(filter(None, (wrong_settings, wrong_rate, wrong_info, self.failures.note)))
         self._open = lru_cache(maxsize=16)(self._open_now)
 
     def index(self) -> dict[str, Any]:
-        """From the dataset's own overviews and each ``scene.json``; arrays are read only where both are silent."""
-        info, ledger = self.dataset.info, self.dataset.settings.get("episodes", {})
-        val = set(info.get("val_eps", ()))
-        rows = []
-        for number in self.dataset.numbers:
-            episode = Episode(self.root / schema.episode_folder(number))
-            scene, entry = _scene(episode), ledger.get(str(number), {})
-            recorded = scene.get("recorded") or {}
-            seed = scene.get("seed", entry.get("seed"))
-            failures = of_seed(self.failures, seed)
-            rows.append(
-                row(
-                    number,
-                    steps=info.get("ep_length", {}).get(str(number)) or _steps(episode),
-                    instruction=info.get("language_goal", {}).get(str(number), ""),
-                    task=scene.get("task") or "",
-                    target=(scene.get("target") or entry.get("target") or {}).get("name", ""),
-                    seed=seed,
-                    success=scene.get("success", entry.get("success")),
-                    split="" if not info else "val" if number in val else "train",
-                    stages=stages(failures, recorded),
-                    attempts=recorded.get("attempts"),
-                )
-            )
+        """From the dataset's own overviews and each ``scene.json``; arrays are read only where both are silent.
+
+        Seeds without an episode, from ``failures.jsonl``, come last.
+        """
+        val = self._info.get("val_eps")
+        val = {number for number in val if type(number) is int} if isinstance(val, list) else set()
+        rows = [self._row(number, val) for number in self.dataset.numbers]
         first = self.dataset.episode(self.dataset.numbers[0])
-        rate = self.dataset.rate_hz
-        return make_index(self.root, "RoboCAS folder", rate, first.cameras, first.has_depth, rows)
+        rows += self.failures.given_up(rows)
+        return make_index(self.root, "RoboCAS folder", self.rate_hz, first.cameras, first.has_depth, rows, self._note)
+
+    def _row(self, number: int, val: set[int]) -> dict[str, Any]:
+        episode = Episode(self.root / schema.episode_folder(number))
+        scene, wrong = damage.scene(lambda: episode.scene)
+        entry, wrong_entry = ledger_entry(self._settings.get("episodes"), number, schema.CONVERSION_FILE)
+        recorded = scene.get("recorded") or {}
+        seed = one_seed(scene.get("seed", entry.get("seed")))
+        said = integer(entry_of(self._info.get("ep_length"), number)) or 0
+        steps, wrong_steps = (said, "") if said > 0 else _steps(episode)
+        return row(
+            number,
+            steps=steps,
+            instruction=text(entry_of(self._info.get("language_goal"), number)),
+            task=scene.get("task") or "",
+            target=(scene.get("target") or entry.get("target") or {}).get("name", ""),
+            seed=seed,
+            success=scene.get("success", entry.get("success")),
+            split="" if not self._info else "val" if number in val else "train",
+            stages=stages(self.failures.of_seed(seed), recorded),
+            attempts=recorded.get("attempts"),
+            damage="; ".join(filter(None, (wrong, wrong_entry, wrong_steps))),
+        )
 
     def episode(self, number: int) -> dict[str, Any]:
         """Arrays as plots, sub-goals, and the TCP's path among the objects where they stood at the start."""
         episode = self._open(number)
-        scene = _scene(episode)
-        failures = of_seed(self.failures, scene.get("seed"))
-        return show_arrays(number, _arrays(episode), scene, self.dataset.rate_hz, failures)
+        scene, _ = damage.scene(lambda: episode.scene)  # the table says what is wrong
+        failures = self.failures.of_seed(one_seed(scene.get("seed")))
+        return show_arrays(number, _arrays(episode), scene, self.rate_hz, failures)
 
     def rgb(self, number: int, camera: str, step: int) -> Picture:
         """The file."""
@@ -91,13 +104,6 @@ class RoboCASSource:
         return self.dataset.episode(number)
 
 
-def _scene(episode: Episode) -> dict[str, Any]:
-    try:
-        return episode.scene
-    except DatasetError:
-        return {}  # the validator reports it; what else the episode has can still be seen
-
-
 def _arrays(episode: Episode) -> dict[str, NDArray]:
     try:
         arrays = episode.arrays
@@ -114,9 +120,12 @@ def _arrays(episode: Episode) -> dict[str, NDArray]:
         ) from error
 
 
-def _steps(episode: Episode) -> int:
+def _steps(episode: Episode) -> tuple[int, str]:
     try:
-        with np.load(episode.folder / schema.EPISODE_FILE, allow_pickle=False) as content:
-            return int(content["episode_length"]) if "episode_length" in content else len(content["ee_pos"])
-    except (*DAMAGED, KeyError):
-        return 0
+        with (
+            readable(schema.EPISODE_FILE),
+            np.load(episode.folder / schema.EPISODE_FILE, allow_pickle=False) as content,
+        ):
+            return int(content["episode_length"]) if "episode_length" in content else len(content["ee_pos"]), ""
+    except DatasetError as error:
+        return 0, f"{error.where}: {error.what}, {error.found}"

@@ -17,13 +17,14 @@ import json
 import re
 import threading
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.resources import files
 from typing import Any
 
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer import pictures
-from robocas_ms3.viewer.source import CAMERA_NAME, Picture, Source
+from robocas_ms3.viewer.damage import without_nan
+from robocas_ms3.viewer.source import CAMERA_NAME, Picture, Source, read_episode
 
 PAGE_FILES = {
     "index.html": "text/html; charset=utf-8",
@@ -88,7 +89,7 @@ class Routes:
             return Response(200, _SCRIPT, self._script)
         if match := _EPISODE.fullmatch(path):
             number = int(match[1])
-            return Response(200, _SCRIPT, script(f"episode_{number}", self.source.episode(number)))
+            return Response(200, _SCRIPT, script(f"episode_{number}", read_episode(self.source, number)))
         if match := _THUMBNAIL.fullmatch(path):
             return _picture(self._thumbnail(int(match[1])))
         if match := _PICTURE.fullmatch(path):
@@ -119,7 +120,11 @@ def make_thumbnail(source: Source, index: dict[str, Any], number: int) -> Pictur
 
 def script(name: str, content: Any) -> bytes:
     """Content as a script that hands it to the page."""
-    text = json.dumps(content, ensure_ascii=True, separators=(",", ":"), allow_nan=False, default=str)
+    write = partial(json.dumps, ensure_ascii=True, separators=(",", ":"), allow_nan=False, default=str)
+    try:
+        text = write(content)
+    except ValueError:
+        text = write(without_nan(content))
     return f'robocas.put("{name}",{text});\n'.encode()
 
 

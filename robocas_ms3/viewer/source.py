@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.viewer.damage import readable
 
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
 """Cameras of other names, which a dataset made elsewhere may have, are left out: names become addresses and folders."""
@@ -91,6 +92,20 @@ def open_source(path: Path | str) -> Source:
     )
 
 
+def read_episode(source: Source, number: int) -> dict[str, Any]:
+    """One episode of a source, whatever may be wrong with it.
+
+    Raises:
+        DatasetError: there is none of this number, or it can't be read.
+    """
+    where = f"{source.root.name}, episode {number}"
+    with readable(where):
+        content = source.episode(number)
+    if content["steps"] < 1:
+        raise DatasetError("this episode has no steps", where=where)
+    return content
+
+
 def make_index(
     path: Path, kind: str, rate_hz: float, cameras: Sequence[str], depth: bool, episodes: list[dict], note: str = ""
 ) -> dict[str, Any]:
@@ -128,8 +143,11 @@ def row(
     split: str = "",
     stages: Sequence[str] = (),
     attempts: int | None = None,
+    damage: str = "",
 ) -> dict[str, Any]:
-    """A line of the table; ``number`` None is a seed that was given up, ``stages`` where attempts at it failed."""
+    """A line of the table: ``number`` None is a seed that was given up, ``stages`` where attempts at it failed, ``damage``
+    what of the episode is wrong and therefore not shown.
+    """
     return {
         "n": number,
         "steps": steps,
@@ -141,6 +159,7 @@ def row(
         "split": split,
         "stages": sorted(set(stages)),
         "attempts": attempts,
+        "damage": damage,
     }
 
 

@@ -13,10 +13,12 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.datasets.episode import planar_base
 from robocas_ms3.datasets.forward import robot_frames
 from robocas_ms3.datasets.provenance import succeeded
+from robocas_ms3.datasets.scene_values import one_seed, sound
 from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.robots import constants as c
-from robocas_ms3.viewer.failures import describe, of_seed, read_failures, stages
+from robocas_ms3.viewer.damage import integer, readable, text
+from robocas_ms3.viewer.failures import Failures, describe, stages
 from robocas_ms3.viewer.plots import ARM, ROLL_PITCH_YAW, XYZ, base_plot, gripper_plot, motion_plots
 from robocas_ms3.viewer.source import Picture, make_episode, make_index, make_trace, plot, row
 
@@ -34,38 +36,35 @@ class TrajectorySource:
             DatasetError: a file is missing, damaged, or they do not match.
         """
         self.root = path
-        self.file = TrajectoryFile(path)
-        self.failures = read_failures(path.parent)
-        self._position = {int(e["episode_id"]): i for i, e in enumerate(self.file.episodes)}
+        self.failures = Failures.read(path.parent)
+        with readable(path):
+            self.file = TrajectoryFile(path)
+            self._position = {int(e["episode_id"]): i for i, e in enumerate(self.file.episodes)}
+            self._kwargs = dict(self.file.env_info["env_kwargs"])
         self._reading = threading.Lock()  # HDF5 reads from one thread at a time
 
     def index(self) -> dict[str, Any]:
         """From the JSON alone; seeds without an episode, from ``failures.jsonl``, come last."""
-        task, rows, seeds = _task(self.file.env_info), [], set()
+        task, rows = _task(self.file.env_info), []
         for episode in self.file.episodes:
-            recorded = episode.get("robocas", {})
-            seed = _seed(episode)
-            seeds.add(seed)
-            failures = of_seed(self.failures, seed)
+            recorded, wrong = _entry(episode)
+            seed = one_seed(episode.get("episode_seed"))
             rows.append(
                 row(
                     int(episode["episode_id"]),
-                    steps=int(episode.get("elapsed_steps", 0)) + 1,
-                    instruction=recorded.get("instruction", ""),
+                    steps=(integer(episode.get("elapsed_steps")) or 0) + 1,
+                    instruction=recorded["instruction"],
                     task=task,
-                    target=(recorded.get("target") or {}).get("name", ""),
+                    target=(recorded["target"] or {}).get("name", ""),
                     seed=seed,
                     success=succeeded(episode),
-                    stages=stages(failures, recorded),
+                    stages=stages(self.failures.of_seed(seed), recorded),
                     attempts=recorded.get("attempts"),
+                    damage=wrong,
                 )
             )
-        for seed, failures in sorted(self.failures.items()):
-            if seed not in seeds and any(failure.gave_up for failure in failures):
-                tried = [failure for failure in failures if not failure.gave_up]
-                named = stages(tried, {}) or ["given up"]
-                rows.append(row(None, task=task, seed=seed, success=False, stages=named, attempts=len(tried)))
-        note = NOTE.format(name=self.root.name)
+        rows += self.failures.given_up(rows)
+        note = f"{NOTE.format(name=self.root.name)} {self.failures.note}".strip()
         return make_index(self.root, "trajectory file", self.file.control_freq, (), False, rows, note)
 
     def episode(self, number: int) -> dict[str, Any]:
@@ -75,8 +74,8 @@ class TrajectorySource:
         position = self._position[number]
         with self._reading:
             recording = self.file.recording(position)
-        entry = self.file.episodes[position].get("robocas", {})
-        config = self.file.env_info["env_kwargs"].get("config")
+        entry, _ = _entry(self.file.episodes[position])  # the table says what is wrong
+        config = self._kwargs.get("config")
         steps = recording.control_steps + 1
         joints = recording.joints(np.arange(steps))
         frames = robot_frames(joints)
@@ -107,12 +106,12 @@ class TrajectorySource:
             trace=make_trace(frames.tcp_in_world, _objects(recording, entry, to_base[0]), moving=True),
             facts={
                 "Configuration": config if isinstance(config, str) else None,  # a whole one is too long
-                "Object pack": self.file.env_info["env_kwargs"].get("pack"),
+                "Object pack": self._kwargs.get("pack"),
                 "Recorded with": recording.control_mode,
                 "Relation": entry.get("relation"),
                 **{str(name).capitalize(): value for name, value in (entry.get("facts") or {}).items()},
             },
-            failures=describe(of_seed(self.failures, recording.seed), entry),
+            failures=describe(self.failures.of_seed(recording.seed), entry),
         )
 
     def rgb(self, number: int, camera: str, step: int) -> Picture:
@@ -142,10 +141,10 @@ def _actions(recording: Recording) -> list[dict[str, Any]]:
 
 def _objects(recording: Recording, entry: dict[str, Any], world_to_base: NDArray) -> list[dict[str, Any]]:
     """Paths of actors, thinned to one point where they stand still, without those parked far away."""
-    target = (entry.get("target") or {}).get("slot")
+    target = (entry["target"] or {}).get("slot")
     named = {f"object_{slot}": str(name).replace("_", " ") for slot, name in enumerate(entry.get("objects") or ())}
     if target is not None:
-        named[f"object_{target}"] = entry["target"].get("name", "target")
+        named[f"object_{target}"] = entry["target"]["name"]
     found = []
     for actor, states in recording.states.get("actors", {}).items():
         path = states[:, :3].astype(float)
@@ -164,6 +163,10 @@ def _task(env_info: dict[str, Any]) -> str:
     return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name).lstrip("_")
 
 
-def _seed(episode: dict[str, Any]) -> int | None:
-    seed = episode.get("episode_seed")
-    return None if seed is None else int(np.ravel(seed)[0])
+def _entry(episode: dict[str, Any]) -> tuple[dict[str, Any], str]:
+    """What the generator said of an episode, without values that are wrong, and those in words."""
+    said = episode.get("robocas")
+    known = said if isinstance(said, dict) else {}
+    entry, wrong = sound({"recorded": said, "target": known.get("target")}, "its entry of the JSON")
+    instruction = text(known.get("instruction"))
+    return {**(entry.get("recorded") or {}), "target": entry.get("target"), "instruction": instruction}, wrong

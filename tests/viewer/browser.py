@@ -27,7 +27,17 @@ FLAGS = (
     "--remote-debugging-pipe",
 )
 PATIENCE = 60.0  # s; the machine may be busy
-_KEYS = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Home": 36, "End": 35, " ": 32, "d": 68}
+_KEYS = {
+    "ArrowLeft": 37,
+    "ArrowUp": 38,
+    "ArrowRight": 39,
+    "ArrowDown": 40,
+    "Home": 36,
+    "End": 35,
+    " ": 32,
+    "d": 68,
+    "D": 68,
+}
 
 
 def find_chromium() -> str | None:
@@ -103,8 +113,9 @@ class Browser:
     def text(self, selector: str) -> str:
         return self.run(f"document.querySelector({json.dumps(selector)}).textContent")
 
-    def press(self, key: str, *, shift: bool = False) -> None:
-        code = {"key": key, "windowsVirtualKeyCode": _KEYS[key], "modifiers": 8 if shift else 0}
+    def press(self, key: str, *, shift: bool = False, modifiers: int = 0) -> None:
+        """A key; ``modifiers`` 1 Alt, 2 Ctrl, 4 Meta."""
+        code = {"key": key, "windowsVirtualKeyCode": _KEYS[key], "modifiers": modifiers | (8 if shift else 0)}
         self.send("Input.dispatchKeyEvent", type="rawKeyDown", **code)
         self.send("Input.dispatchKeyEvent", type="keyUp", **code)
 

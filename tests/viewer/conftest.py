@@ -60,4 +60,5 @@ def lerobot(folder, tmp_path_factory):
 
     out = tmp_path_factory.mktemp("lerobot") / "dataset"
     convert_lerobot(folder, out, include_failed=True)
+    (out / "failures.jsonl").write_bytes((folder / "failures.jsonl").read_bytes())
     return out

@@ -1,6 +1,8 @@
 """The page in a real browser: filters, episodes, keys, depth, deep links, from the server and from files."""
 
+import json
 import os
+import shutil
 import threading
 import time
 
@@ -44,7 +46,7 @@ def url(folder):
 @pytest.fixture(scope="module")
 def static(folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("static") / "page"
-    assert export(open_source(folder), out, width=32) == 3
+    assert export(open_source(folder), out, width=32) == (3, {})
     return (out / "index.html").as_uri()
 
 
@@ -74,8 +76,9 @@ def pictures(browser, number, kind, at):
 
 
 def test_it_opens_with_the_table_and_the_first_episode(page):
-    assert page.run(ROWS) == "0,1,2"
-    assert page.text("#count") == "3 episodes"
+    assert page.run(ROWS) == "0,1,2,none"
+    assert page.text("#count") == "3 episodes, 1 seed given up"
+    assert page.text(".row.gone .what").startswith("seed 9, given upfailed at reach")
     assert page.text("#instruction") == "grasp the cube 3 on the table and move it to the basket"
     assert page.text("#summary").startswith("Episode 0 \u00b7 pick \u00b7 seed 3 \u00b7 7 steps, 1.2 s")
     pictures(page, 0, "rgb", 0)
@@ -86,18 +89,23 @@ def test_it_opens_with_the_table_and_the_first_episode(page):
 
 def test_filters(page):
     page.choose("#f-success", "failure")
-    page.wait(f"{ROWS} === '1'")
-    assert page.text("#count") == "1 of 3 episodes"
+    page.wait(f"{ROWS} === '1,none'")
+    assert page.text("#count") == "1 of 3 episodes, 1 seed given up"
     page.click("#f-reset")
-    page.wait(f"{ROWS} === '0,1,2'")
+    page.wait(f"{ROWS} === '0,1,2,none'")
     page.choose("#f-stage", "grasp")
     page.wait(f"{ROWS} === '1'")
+    assert page.text("#count") == "1 of 3 episodes, 0 of 1 seed given up"
     page.click("#f-reset")
-    page.wait(f"{ROWS} === '0,1,2'")
+    page.wait(f"{ROWS} === '0,1,2,none'")
+    page.choose("#f-stage", "reach")
+    page.wait(f"{ROWS} === 'none'")
+    page.click("#f-reset")
+    page.wait(f"{ROWS} === '0,1,2,none'")
     page.choose("#f-object", "cube 5")
     page.wait(f"{ROWS} === '2'")
     page.click("#f-reset")
-    page.wait(f"{ROWS} === '0,1,2'")
+    page.wait(f"{ROWS} === '0,1,2,none'")
     page.type("#f-text", "CUBE 4")
     page.wait(f"{ROWS} === '1'")
     page.type("#f-min", "8")
@@ -106,9 +114,9 @@ def test_filters(page):
 
 def test_sorting(page):
     page.click("#heads button:nth-of-type(1)")
-    page.wait(f"{ROWS} === '2,1,0'")
+    page.wait(f"{ROWS} === '2,1,0,none'")
     page.click("#heads button:nth-of-type(4)")
-    page.wait(f"{ROWS} === '1,0,2'")
+    page.wait(f"{ROWS} === '1,none,0,2'")
 
 
 def test_an_episode_is_opened_by_a_click(page):
@@ -161,6 +169,14 @@ def test_depth(page):
     page.press("ArrowRight")
     pictures(page, 0, "depth", 1)
     page.press("d")
+    pictures(page, 0, "rgb", 1)
+    page.press("D", shift=True)
+    pictures(page, 0, "depth", 1)
+    page.press("D")  # with caps lock
+    pictures(page, 0, "rgb", 1)
+    for modifiers in (1, 2, 4):  # Alt, Ctrl, Meta: the browser's own keys
+        page.press("d", modifiers=modifiers)
+    assert page.run("document.querySelector('#v-rgb').getAttribute('aria-pressed')") == "true"
     pictures(page, 0, "rgb", 1)
     assert page.run("document.querySelector('#v-rgb').getAttribute('aria-pressed')") == "true"
 
@@ -229,6 +245,41 @@ def test_a_trajectory_shows_traces_and_says_how_to_get_pictures(browser, run_fol
         assert browser.text("#clock").startswith("step 22 / 22")
         server.shutdown()
     assert browser.errors == []
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_a_damaged_episode_is_shown_as_such(browser, folder, tmp_path, static):
+    spoilt = shutil.copytree(folder, tmp_path / "spoilt")
+    for number, new in ((0, {"recorded": "x", "layout": {"poses": 3}}), (1, {"seed": {}, "objects": 7, "target": []})):
+        path = spoilt / f"episode_000000{number}/scene.json"
+        path.write_text(json.dumps({**json.loads(path.read_text()), **new}))
+    (spoilt / "episode_0000002/scene.json").write_text("[]")
+    (spoilt / "episode_0000002/episode_info.npz").write_bytes(b"PK")
+    browser.errors.clear()
+    with serve(spoilt) as server:
+        url = server.url
+        if static:
+            export(open_source(spoilt), tmp_path / "page", width=32)
+            url = (tmp_path / "page/index.html").as_uri()
+        browser.goto(url)
+        browser.wait(LOADED)
+        assert browser.text("#damage") == (
+            "Damaged and left out: scene.json, layout.poses: expected a list, found 3;"
+            ' scene.json, recorded: expected an object, found "x"'
+        )
+        assert browser.run("getComputedStyle(document.querySelector('#damage')).display") == "block"
+        browser.choose("#f-success", "damaged")
+        browser.wait(f"{ROWS} === '0,1,2'")
+        assert "damaged" in browser.text(".row[data-episode='1'] .outcome")
+        assert "objects: expected a list, found 7" in browser.text(".row[data-episode='1'] .what")
+        browser.press("ArrowDown")
+        browser.wait("document.querySelector('#instruction').textContent.includes('cube 4')")
+        pictures(browser, 1, "rgb", 0)
+        assert browser.errors == []
+        browser.press("ArrowDown")
+        browser.wait("document.querySelector('#episode').hidden")
+        assert browser.text("#message").startswith("Episode 2 can't be shown: scene.json: this JSON is damaged")
+        server.shutdown()
 
 
 def test_a_lerobot_dataset(browser, lerobot):

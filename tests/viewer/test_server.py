@@ -62,7 +62,7 @@ def test_the_page_and_its_files(server):
 def test_data(server, folder):
     response, data = get(server, "/data/index.js")
     assert response.headers["Content-Type"].startswith("text/javascript")
-    assert [row["n"] for row in content(data, "index")["episodes"]] == [0, 1, 2]
+    assert [row["n"] for row in content(data, "index")["episodes"]] == [0, 1, 2, None]
     _, data = get(server, "/data/episode_1.js")
     assert content(data, "episode_1")["steps"] == 7
 

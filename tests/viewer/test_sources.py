@@ -11,7 +11,7 @@ from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.plots import base_plot, motion_plots
 from robocas_ms3.viewer.source import make_index, open_source, plot, rounded
 
-ROW = {"n", "steps", "instruction", "task", "object", "seed", "success", "split", "stages", "attempts"}
+ROW = {"n", "steps", "instruction", "task", "object", "seed", "success", "split", "stages", "attempts", "damage"}
 EPISODE = {"n", "instruction", "steps", "times", "subgoals", "plots", "trace", "facts", "failures"}
 
 
@@ -108,14 +108,16 @@ def test_the_tcp_of_a_trajectory_is_where_its_joints_put_it(run_folder):
 def test_a_folder_lists_episodes(folder):
     index = open_source(folder).index()
     assert all(set(row) == ROW for row in index["episodes"])
-    assert [row["n"] for row in index["episodes"]] == [0, 1, 2]
-    assert [row["success"] for row in index["episodes"]] == [True, False, True]
-    assert [row["stages"] for row in index["episodes"]] == [[], ["grasp"], []]
-    assert [row["object"] for row in index["episodes"]] == ["cube 3", "cube 4", "cube 5"]
-    assert [row["steps"] for row in index["episodes"]] == [7, 7, 7]
+    assert [row["n"] for row in index["episodes"]] == [0, 1, 2, None]  # the last one is a seed that was given up
+    assert [row["seed"] for row in index["episodes"]] == [3, 4, 5, 9]
+    assert [row["success"] for row in index["episodes"]] == [True, False, True, False]
+    assert [row["stages"] for row in index["episodes"]] == [[], ["grasp"], [], ["reach"]]
+    assert [row["object"] for row in index["episodes"]] == ["cube 3", "cube 4", "cube 5", ""]
+    assert [row["steps"] for row in index["episodes"]] == [7, 7, 7, 0]
+    assert {row["damage"] for row in index["episodes"]} == {""}
     assert index["cameras"] == ["base_camera", "gripper_camera", "static_camera"]
     assert (index["depth"], index["rate_hz"], index["note"]) == (True, 5, "")
-    assert sorted(row["split"] for row in index["episodes"]) == ["train", "train", "val"]
+    assert sorted(row["split"] for row in index["episodes"]) == ["", "train", "train", "val"]
 
 
 def test_an_episode_of_a_folder(folder):
@@ -167,7 +169,10 @@ def test_damage_is_an_error_of_that_episode_alone(folder, tmp_path):
     (spoilt / "episode_0000000/episode_info.npz").write_bytes(b"PK\x03\x04 cut")
     (spoilt / "episode_0000000/scene.json").write_text("{")
     source = open_source(spoilt)
-    assert [row["n"] for row in source.index()["episodes"]] == [0, 1, 2]
+    rows = source.index()["episodes"]
+    assert [row["n"] for row in rows] == [0, 1, 2, None]
+    assert rows[0]["damage"].startswith("scene.json: this JSON is damaged")
+    assert [row["damage"] for row in rows[1:]] == ["", "", ""]
     with pytest.raises(DatasetError, match="episode_0000000"):
         source.episode(0)
     assert source.episode(1)["n"] == 1

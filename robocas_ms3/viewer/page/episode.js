@@ -13,7 +13,9 @@ robocas.episode = (() => {
     try {
       content = await robocas.load(`episode_${number}`);
     } catch (error) {
-      if (wanted === number) fail(table.find(number) ? `Episode ${number} can't be shown: it is damaged or gone.` : `There is no episode ${number}.`);
+      const entry = table.find(number);
+      const why = entry && (entry.damage ? `: ${entry.damage}.` : ": it is damaged or gone.");
+      if (wanted === number) fail(why ? `Episode ${number} can't be shown${why}` : `There is no episode ${number}.`);
       return undefined;
     }
     if (wanted !== number) return undefined; // another was asked for meanwhile
@@ -54,6 +56,8 @@ robocas.episode = (() => {
     if (entry.success !== null && entry.success !== undefined) {
       byId("summary").append(" \u00b7 ", element("span", { class: entry.success ? "good" : "bad", textContent: entry.success ? "success" : "failure" }));
     }
+    byId("damage").hidden = !entry.damage;
+    byId("damage").textContent = entry.damage ? `Damaged and left out: ${entry.damage}` : "";
     byId("facts").replaceChildren(
       ...Object.entries(content.facts).flatMap(([name, value]) => [
         element("dt", { textContent: name.replaceAll("_", " ") }),

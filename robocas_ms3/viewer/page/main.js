@@ -45,7 +45,7 @@
 
   document.addEventListener("keydown", (event) => {
     const typing = event.target.matches("select, input:not([type=range])");
-    const action = KEYS[event.key];
+    const action = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key]; // D too, as with caps lock
     if (typing || !action || event.ctrlKey || event.metaKey || event.altKey) return;
     event.preventDefault();
     action(event);

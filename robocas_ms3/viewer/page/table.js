@@ -19,7 +19,8 @@ robocas.table = (() => {
     options("f-task", "All tasks", values("task"), 2);
     options("f-object", "All objects", values("object"), 2);
     options("f-stage", "Any attempts", values("stages"), 1, "failed at ");
-    options("f-success", "Any outcome", values("success").map((v) => (v ? "success" : "failure")), 1);
+    const damaged = index.episodes.some((e) => e.damage) ? ["damaged"] : [];
+    options("f-success", "Any outcome", [...values("success").map((v) => (v ? "success" : "failure")), ...damaged], 1);
     heads();
     byId("filters").addEventListener("input", apply);
     byId("filters").addEventListener("submit", (event) => event.preventDefault());
@@ -68,7 +69,7 @@ robocas.table = (() => {
         (!task || e.task === task) &&
         (!object || e.object === object) &&
         (!stage || e.stages.includes(stage)) &&
-        (!success || e.success === (success === "success")) &&
+        (!success || (success === "damaged" ? e.damage : e.success === (success === "success"))) &&
         !(e.steps < least) && // NaN, an empty field, passes all
         !(e.steps > most)
       );
@@ -85,13 +86,21 @@ robocas.table = (() => {
       return (x < y ? -1 : 1) * (down ? -1 : 1);
     };
     shown = index.episodes.filter(passes()).sort(order);
-    const all = index.episodes.length;
-    byId("count").textContent = `${shown.length === all ? all : `${shown.length} of ${all}`} ${all === 1 ? "episode" : "episodes"}`;
-    byId("f-reset").hidden = shown.length === all;
+    const gone = (e) => e.n === null;
+    const lost = counted(gone, "seed");
+    byId("count").textContent = counted((e) => !gone(e), "episode") + (lost ? `, ${lost} given up` : "");
+    byId("f-reset").hidden = shown.length === index.episodes.length;
     byId("spacer").style.height = `${shown.length * HEIGHT}px`;
     for (const row of made.values()) row.remove();
     made.clear();
     draw();
+  }
+
+  // "3 episodes", "1 of 3 episodes"; nothing where there are no seeds that were given up.
+  function counted(which, name) {
+    const [some, all] = [shown.filter(which).length, index.episodes.filter(which).length];
+    if (!all && name !== "episode") return "";
+    return `${some === all ? all : `${some} of ${all}`} ${name}${all === 1 ? "" : "s"}`;
   }
 
   function draw() {
@@ -134,11 +143,12 @@ robocas.table = (() => {
     const title = gone ? `seed ${e.seed}, given up` : e.object || e.instruction || `seed ${e.seed ?? "unknown"}`;
     const attempts = e.attempts > 1 ? `${e.attempts} attempts` : "";
     const failed = e.stages.length ? `failed at ${e.stages.join(", ").replaceAll("_", " ")}` : "";
-    const second = gone ? [attempts, failed].filter(Boolean).join(", ") : e.instruction;
+    const second = gone ? [attempts, failed].filter(Boolean).join(", ") : e.damage || e.instruction;
     const what = element("div", { class: "what", title: second }, element("div", { textContent: title }), element("div", { textContent: second }));
     const outcome = element("div", { class: "outcome", title: [attempts, failed].filter(Boolean).join(", ") });
     if (e.success !== null) outcome.append(element("span", { class: e.success ? "good" : "bad", textContent: e.success ? "success" : "failure" }));
-    if (attempts && !gone) outcome.append(element("div", { class: "faint", textContent: attempts.replace("attempts", "tries") }));
+    if (e.damage) outcome.append(element("div", { class: "bad", textContent: "damaged", title: e.damage }));
+    else if (attempts && !gone) outcome.append(element("div", { class: "faint", textContent: attempts.replace("attempts", "tries") }));
     row.append(
       element("span", { class: "number", textContent: gone ? "" : e.n }), what,
       element("span", { class: "number", textContent: e.steps || "" }), outcome

@@ -1,0 +1,92 @@
+"""Reads what may be damaged: what can be used of it, and what is wrong with the rest, in words for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from robocas_ms3.datasets.scene_values import check_rate, sound
+from robocas_ms3.datasets.tolerant import DAMAGED
+from robocas_ms3.errors import DatasetError
+
+_WRONG = (*DAMAGED, ArithmeticError, AttributeError, AssertionError, LookupError, RecursionError, TypeError)
+"""What comes of values of another kind than expected."""
+
+
+@contextmanager
+def readable(where: object) -> Iterator[None]:
+    """Turn whatever damage may raise into an error that says where it is.
+
+    Raises:
+        DatasetError: something could not be read.
+    """
+    try:
+        yield
+    except _WRONG as error:
+        text = str(error).strip().splitlines()
+        found = f"{type(error).__name__}: {text[0]}" if text else type(error).__name__
+        fix = "robocas validate says what is wrong."
+        raise DatasetError("damaged, can't be shown", where=where, found=found, fix=fix) from error
+
+
+def table(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str]:
+    """A JSON object of a dataset; empty where it is damaged, with the reason."""
+    try:
+        with readable(name):
+            found = read()
+    except DatasetError as error:
+        return {}, f"`{name}` is damaged: {error.found}."
+    return (found, "") if isinstance(found, dict) else ({}, f"`{name}` is damaged: it holds no object.")
+
+
+def scene(read: Callable[[], Any], name: str = "scene.json") -> tuple[dict[str, Any], str]:
+    """A ``scene.json``, or what else has some of its keys, without the values that are wrong, and those in words."""
+    try:
+        with readable(name):
+            return sound(read(), name)
+    except DatasetError as error:
+        return {}, f"{name}: {error.what}, {error.found}"
+
+
+def rate_of(settings: Mapping[str, Any], name: str, default: float) -> tuple[float, str]:
+    """Steps a second, and what is wrong with what the settings say of it."""
+    wrong = check_rate(settings)
+    if not wrong:
+        return float(settings["rate_hz"]), ""
+    said = f"`rate_hz` of `{name}`: expected {wrong[0].expected}, found {wrong[0].found}; {default:g} Hz is assumed."
+    return default, said if "rate_hz" in settings else ""
+
+
+def ledger_entry(entries: Any, number: int, name: str) -> tuple[dict[str, Any], str]:
+    """Seed, success and target as the settings of a dataset say them of an episode, in a table or a list."""
+    listed = isinstance(entries, list) and number < len(entries)
+    found = entries[number] if listed else entry_of(entries, number)
+    if not isinstance(found, Mapping):
+        return sound(found, name)
+    return sound({key: found[key] for key in ("seed", "success", "target") if key in found}, name)
+
+
+def entry_of(entries: Any, number: int) -> Any:
+    """What a table by number has of an episode, None where it has nothing."""
+    return entries.get(str(number)) if isinstance(entries, dict) else None
+
+
+def integer(value: Any) -> int | None:
+    """A whole number that is one; None for others."""
+    return value if type(value) is int else None
+
+
+def text(value: Any) -> str:
+    """A text that is one; empty for others."""
+    return value if isinstance(value, str) else ""
+
+
+def without_nan(value: Any) -> Any:
+    """The same with None where a number is not finite, as JSON knows no other."""
+    if isinstance(value, dict):
+        return {key: without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
