@@ -48,7 +48,8 @@ class EpisodeSettings:
         max_attempts: attempts a seed has.
         keep_recoveries: leave failed attempts in the record instead of undoing them.
         replay_rate: Hz; an attempt counts only if its own actions, as a dataset of this rate holds them, succeed again
-            open loop, ``TRIALS`` times. 0: not tried; nor is it where the base drives, which those actions leave out.
+            open loop, ``TRIALS`` times, and none goes beyond [-1, 1]. 0: not tried; nor is it where the base drives,
+            which those actions leave out.
     """
 
     task: str
@@ -179,7 +180,8 @@ class EpisodeGenerator:
 
         Raises:
             PlanningFailed: the task has not succeeded.
-            EpisodeLost: it took longer than an episode may, or its own actions do not do it again.
+            EpisodeLost: it took longer than an episode may, or its own actions do not do it again, or not within the
+                range of ``pd_ee_delta_pose``.
         """
         if len(executor.actions) > self.horizon:
             raise EpisodeLost("horizon", "too_long")
@@ -194,6 +196,8 @@ class EpisodeGenerator:
                     played = self.open_loop.play_recording(
                         executor.seed, poses, gripper, self.settings.control_freq, noise
                     )
+                if played.clipped:
+                    raise EpisodeLost("replay", "clipped")
                 if not played.success:
                     raise EpisodeLost("replay", "no_success")
 

@@ -32,7 +32,8 @@ class Played:
     Attributes:
         success: whether the task succeeded, at some step or within ``SETTLE_SECONDS`` after the last one.
         tcp_in_base: (T, 3) m, where the TCP was, in the arm's base frame.
-        clipped: actions beyond what one step may do.
+        clipped: actions beyond what one step may do: a component of the translation, or the norm of the rotation,
+            outside [-1, 1].
     """
 
     success: bool

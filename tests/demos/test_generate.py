@@ -278,18 +278,22 @@ def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch):
     assert read_json(tmp_path / "kept.h5")["episodes"][0]["robocas"]["recoveries"] == []
 
 
-def test_an_attempt_whose_own_actions_do_not_succeed_again_is_undone(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("spoiled", "reason"),
+    [(Played(False, np.zeros((1, 3)), 0), "no_success"), (Played(True, np.zeros((1, 3)), 1), "clipped")],
+)
+def test_an_attempt_whose_own_actions_do_not_succeed_again_is_undone(tmp_path, monkeypatch, spoiled, reason):
     generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin"))
     play, outcomes = OpenLoop.play_recording, []
 
-    def first_fails(*args):
+    def first_is_spoiled(*args):
         outcomes.append(play(*args))
-        return Played(False, np.zeros((1, 3)), 0) if len(outcomes) == 1 else outcomes[-1]
+        return spoiled if len(outcomes) == 1 else outcomes[-1]
 
-    monkeypatch.setattr(OpenLoop, "play_recording", first_fails)
+    monkeypatch.setattr(OpenLoop, "play_recording", first_is_spoiled)
     result = generator.generate(1, tmp_path, "again")
     generator.close()
     assert result.success
-    assert [(failure.stage, failure.reason) for failure in result.failures] == [("replay", "no_success")]
+    assert [(failure.stage, failure.reason) for failure in result.failures] == [("replay", reason)]
     assert len(outcomes) == 1 + TRIALS
     assert read_json(tmp_path / "again.h5")["episodes"][0]["robocas"]["replay_rate"] == 5
