@@ -143,11 +143,9 @@ def row(
     split: str = "",
     stages: Sequence[str] = (),
     attempts: int | None = None,
-    damage: str = "",
+    damage: str = "",  # what of the episode is wrong, and therefore not shown
 ) -> dict[str, Any]:
-    """A line of the table: ``number`` None is a seed that was given up, ``stages`` where attempts at it failed, ``damage``
-    what of the episode is wrong and therefore not shown.
-    """
+    """A line of the table; ``number`` None is a seed that was given up, ``stages`` where attempts at it failed."""
     return {
         "n": number,
         "steps": steps,

@@ -46,6 +46,19 @@ def find_chromium() -> str | None:
     return named or next((path for path in map(shutil.which, NAMES) if path), None)
 
 
+def require_chromium() -> str:
+    """Its program. Without one: a skip, on CI a failure, as setup installs it there."""
+    import pytest
+
+    program = find_chromium()
+    if program is not None:
+        return program
+    missing = "no Chromium: scripts/setup.sh installs Debian's, or set ROBOCAS_CHROMIUM"
+    if os.environ.get("CI", "").lower() in ("", "0", "false"):
+        pytest.skip(missing)
+    pytest.fail(missing, pytrace=False)
+
+
 class Browser:
     """One browser with one page; use it in a ``with`` statement."""
 

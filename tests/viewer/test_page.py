@@ -1,13 +1,12 @@
 """The page in a real browser: filters, episodes, keys, depth, deep links, from the server and from files."""
 
 import json
-import os
 import shutil
 import threading
 import time
 
 import pytest
-from browser import Browser, find_chromium
+from browser import Browser, require_chromium
 
 from robocas_ms3.viewer.export import export
 from robocas_ms3.viewer.server import Viewer
@@ -20,12 +19,7 @@ ROWS = "[...document.querySelectorAll('#rows .row')].map(row => row.dataset.epis
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    """Without Chromium a skip; on CI a failure, as setup installs it there."""
-    program = find_chromium()
-    if program is None:
-        missing = "no Chromium: scripts/setup.sh installs Debian's, or set ROBOCAS_CHROMIUM"
-        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(missing)
-    with Browser(program, tmp_path_factory.mktemp("profile")) as running:
+    with Browser(require_chromium(), tmp_path_factory.mktemp("profile")) as running:
         yield running
 
 

@@ -1,0 +1,150 @@
+"""How quickly the page of `robocas view` stands, by a real Chromium; prints JSON, in seconds.
+
+python benchmarks/view.py --episodes 1000
+
+``first_paint`` and ``first_contentful_paint`` are the browser's own, from when it is sent to the address; so are the
+other times of the page. ``server`` is from the command to its address, most of it Python's start.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.pictures import Pictures
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT / "tests" / "viewer"), str(ROOT / "tests" / "datasets")]
+THUMBNAILS = "[...document.querySelectorAll('.row img')]"
+CAMERAS = "[...document.querySelectorAll('#cameras img')]"
+LOADED = "every(img => img.complete && img.naturalWidth)"
+
+
+@dataclass
+class Benchmark:
+    """Open a page of many episodes."""
+
+    episodes: int = 1000
+    """How many."""
+    dataset: Path | None = None
+    """RoboCAS folder whose episodes are multiplied; default: made-up ones of 7 steps, 640 x 480, with depth."""
+    runs: int = 3
+    """How often; each with a new server and a new browser."""
+
+
+def main(cfg: Benchmark) -> None:
+    """Run it."""
+    with tempfile.TemporaryDirectory(prefix="robocas-view-") as folder:
+        source = cfg.dataset or _made_up(Path(folder))
+        dataset = Path(folder) / "dataset"
+        _multiply(shutil.copytree(source, Path(folder) / "source"), dataset, cfg.episodes)
+        runs = [_measure(dataset, cfg.episodes, Path(folder) / f"profile_{run}") for run in range(cfg.runs)]
+    medians = {name: round(statistics.median(run[name] for run in runs), 3) for name in runs[0]}
+    print(json.dumps({"episodes": cfg.episodes, "median": medians, "runs": runs}, indent=2))
+
+
+def _made_up(folder: Path) -> Path:
+    import synthetic  # pyright: ignore[reportMissingImports]
+
+    trajectory = synthetic.write_trajectory(folder / "trajectory.h5")
+    convert(
+        trajectory,
+        folder / "made_up",
+        open_source=synthetic.RayCaster,
+        embeddings=False,
+        pictures=Pictures(size=(640, 480)),
+    )
+    return folder / "made_up"
+
+
+def _multiply(source: Path, out: Path, count: int) -> None:
+    """A dataset whose pictures and arrays are links to those of a few episodes; seeds and failures are its own."""
+    settings = json.loads((source / schema.CONVERSION_FILE).read_text())
+    info = json.loads((source / schema.DATA_INFO_FILE).read_text())
+    numbers = sorted(settings["episodes"], key=int)
+    tables: dict[str, dict[str, Any]] = {"ep_length": {}, "language_goal": {}, "step_goals": {}}
+    entries = {}
+    for number in range(count):
+        of = numbers[number % len(numbers)]
+        before, after = (root / schema.episode_folder(n) for root, n in ((source, int(of)), (out, number)))
+        shutil.copytree(before, after, copy_function=os.link)
+        scene = json.loads((before / schema.SCENE_FILE).read_text())
+        if number % 10 == 3:
+            recovery = {"range": [0, 40], "stage": ("grasp", "lift")[number // 10 % 2], "reason": "slipped"}
+            scene["recorded"] = {**(scene["recorded"] or {}), "attempts": 2, "recoveries": [recovery]}
+        (after / schema.SCENE_FILE).unlink()
+        (after / schema.SCENE_FILE).write_text(json.dumps({**scene, "seed": number, "success": number % 17 != 5}))
+        entries[str(number)] = {**settings["episodes"][of], "seed": number}
+        for name, table in tables.items():
+            table[str(number)] = info[name][of]
+    split = {"train_eps": list(range(count - count // 10)), "val_eps": list(range(count - count // 10, count))}
+    (out / schema.CONVERSION_FILE).write_text(json.dumps({**settings, "episodes": entries}))
+    (out / schema.DATA_INFO_FILE).write_text(json.dumps({**info, **tables, **split}))
+
+
+def _measure(dataset: Path, count: int, profile: Path) -> dict[str, float]:
+    from browser import Browser, require_chromium  # pyright: ignore[reportMissingImports]
+
+    with Browser(require_chromium(), profile) as browser:
+        begun = time.perf_counter()
+        command = [sys.executable, str(ROOT / "robocas_cli.py"), "view", str(dataset), "--no-open"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+            assert server.stdout is not None
+            found = {}
+            try:
+                address = re.search(r"http\S+", server.stdout.readline())
+                assert address, "robocas view told no address"
+                found["server"] = time.perf_counter() - begun
+                found.update(_page(browser, address[0], count))
+            finally:
+                server.terminate()
+    return {name: round(value, 3) for name, value in found.items()}
+
+
+def _page(browser: Any, url: str, count: int) -> dict[str, float]:
+    browser.send("Page.navigate", url=url)
+    browser.wait("document.querySelectorAll('#rows .row').length")
+    table = browser.run("performance.now() / 1000")
+    assert browser.text("#count").startswith(f"{count} episodes")
+    browser.wait(f"{CAMERAS}.length && {CAMERAS}.{LOADED}")
+    pictures = browser.run("performance.now() / 1000")
+    browser.wait(f"{THUMBNAILS}.slice(0, 12).{LOADED}")
+    thumbnails = browser.run("performance.now() / 1000")
+    paints = browser.run("performance.getEntriesByType('paint').map(entry => [entry.name, entry.startTime / 1000])")
+    loads = browser.run(
+        "performance.getEntriesByType('resource').filter(entry => entry.name.includes('thumbnails'))"
+        ".map(entry => entry.duration / 1000)"
+    )
+    begun = time.perf_counter()
+    browser.click(".row[data-episode='5']")
+    browser.wait("document.querySelector('#summary').textContent.startsWith('Episode 5 ')")
+    opened = time.perf_counter() - begun
+    browser.wait(f"{CAMERAS}.every(img => img.src.includes('/pictures/5/')) && {CAMERAS}.{LOADED}")
+    return {
+        **{name.replace("-", "_"): seconds for name, seconds in paints},
+        "table": table,
+        "pictures": pictures,
+        "thumbnails_in_view": thumbnails,
+        "a_thumbnail_median": statistics.median(loads),
+        "a_thumbnail_slowest": max(loads),
+        "click_to_episode": opened,
+        "click_to_pictures": time.perf_counter() - begun,
+    }
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Benchmark))
