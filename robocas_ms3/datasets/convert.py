@@ -183,7 +183,8 @@ def choose(file: TrajectoryFile, include_failed: bool) -> list[int]:
 
 def warn_untried(file: TrajectoryFile, chosen: list[int], rate_hz: float) -> None:
     """Say so where the recordings' actions were tried open loop, but at another rate than the dataset's."""
-    tried = {file.episodes[index].get("robocas", {}).get("replay_rate") for index in chosen} - {None, 0}
+    said = [file.episodes[index].get("robocas", {}).get("replay_rate") for index in chosen]
+    tried = {float(rate) for rate in said if isinstance(rate, int | float) and rate}  # else not tried, or not known
     others = sorted(rate for rate in tried if abs(rate - rate_hz) > 1e-9)
     if others:
         _log.warning(

@@ -83,6 +83,7 @@ def tried(path, *rates):
         ((5, 20), 10, "actions were tried at 5 and 20 Hz; at 10 Hz they were not: robocas validate --replay tells"),
         ((None, 0), 10, ""),  # not tried at any rate: the base drives, or nobody wanted it
         (("unknown", "unknown"), 10, ""),
+        (([5], "5"), 10, ""),  # not ours
     ],
 )
 @pytest.mark.parametrize("to", ["robocas", "lerobot"])
