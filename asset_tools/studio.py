@@ -18,6 +18,7 @@ Colour = tuple[float, float, float]  # 0 to 1
 
 PAPER = (244, 244, 241)  # behind everything
 OVERSAMPLING = 2
+_SHADER = str(Path(sapien.__file__).parent / "vulkan_shader" / "default")
 MARGIN = 1.06  # of the frame around what it shows
 
 
@@ -60,7 +61,8 @@ class Studio:
         self._scene.set_ambient_light([0.45, 0.45, 0.45])
         self._sun = self._scene.add_directional_light([0, 0, -1], [1.7, 1.7, 1.7])
         self._fill = self._scene.add_directional_light([0, 0, -1], [0.6, 0.6, 0.6])
-        self._camera = sapien.render.RenderCameraComponent(size * OVERSAMPLING, size * OVERSAMPLING)
+        # By name: environments made in this process set another shader and format of pictures for all cameras.
+        self._camera = sapien.render.RenderCameraComponent(size * OVERSAMPLING, size * OVERSAMPLING, _SHADER)
         holder = sapien.Entity()
         holder.add_component(self._camera)
         self._scene.add_entity(holder)
@@ -74,7 +76,8 @@ class Studio:
         self._aim(points, np.radians(azimuth), np.radians(elevation))
         self._scene.update_render()
         self._camera.take_picture()
-        rgba = np.clip(self._camera.get_picture("Color"), 0, 1)
+        rgba = self._camera.get_picture("Color")
+        rgba = np.clip(rgba, 0, 1) if rgba.dtype.kind == "f" else rgba / 255
         for entity in entities:
             self._scene.remove_entity(entity)
         flat = rgba[..., :3] * 255 * rgba[..., 3:] + np.array(PAPER) * (1 - rgba[..., 3:])

@@ -8,4 +8,6 @@ bin=$(cd "${ROBOCAS_VENV:-.venv}" && pwd)/bin
 "$bin/ruff" check .
 "$bin/ruff" format --check .
 "$bin/basedpyright" --pythonpath "$bin/python"
-"$bin/python" -m pytest "$@"
+# A process a core, with one thread each: the tensors are small, and threads of several processes get in each other's way.
+export OMP_NUM_THREADS=1
+"$bin/python" -m pytest -n auto --maxprocesses 4 --dist loadfile "$@"

@@ -194,7 +194,7 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
         def on_made(made: Made) -> None:
             progress.advance(bar)
             if made.asset is None:
-                progress.console.print(f"left out: {made.error}", highlight=False)
+                progress.console.print(f"left out: {made.error}", highlight=False, soft_wrap=True)
 
         write_pack(
             jobs,
