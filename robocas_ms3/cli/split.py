@@ -49,7 +49,8 @@ def main(cfg: Split) -> int:
     from robocas_ms3.datasets.manage.splitting import Share, resplit, write_parts
 
     check(cfg)
-    share = None if cfg.val_share is None else Share(cfg.val_share, cfg.by or "seed")
+    whole = cfg.out is not None and not cfg.parts  # each part is one task or target, which can't be cut by itself
+    share = None if cfg.val_share is None else Share(cfg.val_share, "seed" if whole else cfg.by or "seed")
     if cfg.in_place:
         train, val = resplit(cfg.dataset, share)
         say(f"{cfg.dataset}: {len(train)} episodes train, {len(val)} validate")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.info import action_space
-from robocas_ms3.datasets.tolerant import SPECS, is_declared
+from robocas_ms3.datasets.tolerant import SPECS, first_line, is_declared
 from robocas_ms3.datasets.violation import Violation
 from robocas_ms3.language.templates import GOAL_TYPES
 
@@ -33,7 +33,7 @@ def check_info(root: Path, episodes: Mapping[int, Mapping[str, NDArray]]) -> Ite
         yield Violation(FILE, "", "this file", "no file")
         return
     except (OSError, ValueError) as error:
-        yield Violation(FILE, "", "JSON", str(error).splitlines()[0])
+        yield Violation(FILE, "", "JSON", first_line(error))
         return
     if not isinstance(info, dict):
         yield Violation(FILE, "", "an object", type(info).__name__)

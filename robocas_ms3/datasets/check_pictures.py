@@ -14,6 +14,7 @@ from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.picture_files import PictureHeader, read_header
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.rigid import is_rigid
+from robocas_ms3.datasets.tolerant import first_line
 from robocas_ms3.datasets.violation import Violation
 
 _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
@@ -36,7 +37,7 @@ def check_cameras(folder: Path, cameras: dict[str, tuple[NDArray, NDArray]], pic
                 yield Violation(file, "", "this file", "no file")
                 continue
             except (OSError, ValueError, EOFError) as error:
-                yield Violation(file, "", "a numpy array", str(error).splitlines()[0])
+                yield Violation(file, "", "a numpy array", first_line(error))
                 continue
             if array.shape != shape or array.dtype.kind != "f":
                 yield Violation(file, "", f"floats of shape {shape}", f"{array.dtype} of shape {array.shape}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -136,7 +137,7 @@ def of_recording(file: TrajectoryFile, index: int) -> Facts:
     config = file.env_info["env_kwargs"].get("config")
     return Facts(
         recording.instruction,
-        task=_task(str(file.env_info["env_id"])),
+        task=task_of(str(file.env_info["env_id"])) or UNKNOWN,
         config=_config_name(file.env_info, None),
         success=succeeded(entry),
         template=said.get("instruction_template") or "",
@@ -162,17 +163,17 @@ def _place(slots: list[int], slot: int | None) -> int | None:
     return slots.index(slot) if slot in slots else None
 
 
-def _task(env_id: str) -> str:
-    """``robocas_ms3:RoboCASOpenPick-v1`` is open_pick."""
-    name = env_id.rpartition(":")[2].partition("-")[0].removeprefix("RoboCAS")
-    return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name).lstrip("_") or UNKNOWN
+def task_of(env_id: str | None) -> str | None:
+    """Name of the task of an environment, by its id; the registry itself would bring the simulator."""
+    match = re.fullmatch(r"(?:\w+:)?RoboCAS(\w+)-v\d+", env_id or "")
+    return "_".join(re.findall("[A-Z][a-z]*", match[1])).lower() if match else None
 
 
 def _config_name(env_info: Mapping[str, Any], task: str | None) -> str:
     config = (env_info.get("env_kwargs") or {}).get("config")
     if isinstance(config, str):
         return Path(config).stem
-    name = task or _task(str(env_info.get("env_id", "")))
+    name = task or task_of(str(env_info.get("env_id"))) or UNKNOWN
     return f"{name} (own configuration)" if config else name
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.episode import SubGoal
 from robocas_ms3.datasets.reader import Dataset, Episode
-from robocas_ms3.datasets.tolerant import DAMAGED, is_declared
+from robocas_ms3.datasets.tolerant import DAMAGED, first_line, is_declared
 from robocas_ms3.errors import DatasetError
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class FolderSource:
             raise DatasetError(
                 "this episode can't be read",
                 where=path,
-                found=getattr(error, "strerror", None) or str(error).splitlines()[0],
+                found=getattr(error, "strerror", None) or first_line(error),
                 fix="robocas validate says what is wrong.",
             ) from error
         missing = [key for key in keys if key not in made]

@@ -64,10 +64,14 @@ def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]
         (index into ``steps``, camera, expected, found) of each broken law, each law once a camera.
     """
     told: set[tuple[str, str]] = set()
-    agreement = {view.camera: 0.0 for views in steps for view in views}
+    agreement: dict[str, float] = {}  # of cameras that others may agree with
     for index, views in enumerate(steps):
         clouds = {view.camera: view.points() for view in views}
         broken = [law for view in views for law in _floor(view.camera, clouds[view.camera])]
+        seen = {camera for camera, points in clouds.items() if len(points) >= MIN_POINTS}
+        for camera in clouds:
+            if seen - {camera}:
+                agreement.setdefault(camera, 0.0)
         for view in views:
             for other in views:
                 if other is view:
@@ -76,7 +80,7 @@ def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]
                 if count < MIN_POINTS:
                     continue
                 for camera in (view.camera, other.camera):
-                    agreement[camera] = max(agreement[camera], agree)
+                    agreement[camera] = max(agreement.get(camera, 0.0), agree)
                 if through > SEEN_THROUGH:
                     found = f"{through:.0%} of {count} points seen through"
                     broken.append((view.camera, f"no looking through what {other.camera} sees", found))

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.datasets.tolerant import first_line
 from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.errors import RobocasError
 
@@ -122,10 +123,9 @@ class _Player:
             if other:
                 return EpisodeReplay(number, task, None, skipped=f"its seed builds another scene now: {other}")
             played = open_loop.play(actions[:, :3], turns, actions[:, 6] > 0.5)
-        except (RobocasError, ValueError, TypeError, KeyError, AttributeError, OSError) as error:
-            found = str(error).strip().splitlines()
-            return EpisodeReplay(number, task, None, skipped=found[0] if found else type(error).__name__)
-        error = np.linalg.norm(played.tcp_in_base - arrays["ee_pos"], axis=1)
+            error = np.linalg.norm(played.tcp_in_base - arrays["ee_pos"], axis=1)
+        except (RobocasError, ValueError, TypeError, KeyError, IndexError, AttributeError, OSError) as error:
+            return EpisodeReplay(number, task, None, skipped=first_line(error))
         return EpisodeReplay(
             number, task, played.success, float(error.mean()), float(error.max()), clipped=played.clipped
         )
@@ -148,11 +148,16 @@ def _other_scene(scene: dict[str, Any], open_loop: OpenLoop) -> str:
     recorded, built = scene.get("layout") or {}, open_loop.layout
     if "object_ids" in recorded and list(recorded["object_ids"]) != list(built.object_ids):
         return "other objects"
-    if "poses" in recorded:
-        places = np.array([pose[:3] for pose in recorded["poses"]], dtype=np.float64)
-        apart = np.linalg.norm(places - built.object_poses[:, :3, 3], axis=1).max()
-        if apart > SAME_PLACE:
-            return f"objects up to {apart * 1000:.0f} mm away"
+    for key, what, poses in (
+        ("poses", "objects", built.object_poses),
+        ("robot_pose", "the robot", built.robot_pose),
+        ("basket_pose", "the basket", built.basket_pose),
+    ):
+        if recorded.get(key):
+            places = np.reshape([pose[:3] for pose in np.atleast_2d(recorded[key])], (-1, 3)).astype(np.float64)
+            apart = np.linalg.norm(places - np.reshape(poses, (-1, 4, 4))[:, :3, 3], axis=1).max()
+            if apart > SAME_PLACE:
+                return f"{what} up to {apart * 1000:.0f} mm away"
     return ""
 
 
@@ -164,6 +169,8 @@ def _not_playable(episode: Episode) -> str:
         return "it was recorded without success"
     if len(episode.arrays["ee_pos"]) < 2:
         return "it has no actions"
+    if not all(np.isfinite(episode.arrays[key]).all() for key in ("rel_pos", "rel_orn", "ee_pos", "base_pos")):
+        return "its arrays hold NaN or infinity"  # which the simulation would keep
     base = episode.arrays["base_pos"]
     if np.linalg.norm(base - base[0], axis=1).max() > BASE_STILL:
         return "its base drives, which 7-D actions leave out"

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, episode_actions
 from robocas_ms3.datasets.sources import Source
+from robocas_ms3.datasets.tolerant import first_line
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.language.templates import GOAL_TYPES
 
@@ -52,6 +54,23 @@ def type_index(goal_type: str) -> int:
     return _TYPE_INDEX.get(goal_type, -1)
 
 
+def checked_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.float32]:
+    """Actions (T, 7) of an episode, see `episode_actions`.
+
+    Raises:
+        DatasetError: its arrays do not make actions: NaN, quaternions of length 0, different lengths.
+    """
+    for key in ACTION_ARRAYS:
+        if not np.isfinite(arrays[key]).all():
+            raise DatasetError("not a number", where=f"{where}, {key}", fix="robocas validate says more.")
+    try:
+        return episode_actions(arrays)
+    except ValueError as error:
+        raise DatasetError(
+            "these arrays make no actions", where=where, found=first_line(error), fix="robocas validate says more."
+        ) from error
+
+
 def read_episode(
     source: Source, number: int, state: Sequence[str], *, embedding: bool, subgoals: bool
 ) -> dict[str, Any]:
@@ -88,7 +107,7 @@ def read_episode(
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise DatasetError("not a number", where=f"{where}, {key}", fix="robocas validate says more.")
     made: dict[str, Any] = {
-        "action": episode_actions(arrays),
+        "action": checked_actions(arrays, where),
         "first_command": float(arrays["gripper_status"][0]),
         "instruction": str(arrays["language_goal"]),
     }

@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES, episode_actions
+from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES
 from robocas_ms3.datasets.described import counted, described, histogram, rounded
 from robocas_ms3.datasets.episode_facts import Facts, facts_reader
 from robocas_ms3.datasets.layout_map import LayoutMap, layout_map
+from robocas_ms3.datasets.sample_arrays import checked_actions
 from robocas_ms3.datasets.sources import open_source
+from robocas_ms3.errors import DatasetError
 
 STILL = (1e-3, np.deg2rad(0.5))  # m and rad a step below which the gripper counts as standing still
 
@@ -138,6 +140,8 @@ def collect(
     """
     source = open_source(path, rate_hz=rate_hz, include_failed=True)
     numbers = source.split("all")
+    if not numbers:
+        raise DatasetError("no episodes to count", where=path)
     stats = Stats(source.path, source.rate_hz, {side: len(source.split(side)) for side in ("train", "val")})
     actions: list[NDArray[np.float32]] = []
     places: dict[str, list[Facts]] = defaultdict(list)
@@ -147,7 +151,7 @@ def collect(
             _count(stats, facts)
             for goal in source.goals(number):
                 stats.subgoals[goal.goal_type].append(goal.last - goal.first + 1)
-            moves = episode_actions(source.arrays(number, ACTION_ARRAYS))[:-1]
+            moves = checked_actions(source.arrays(number, ACTION_ARRAYS), f"{source.path}, episode {number}")[:-1]
             actions.append(moves)
             stats.gripper_changes.append(int(np.count_nonzero(np.diff(moves[:, 6]))))
             stats.lengths[facts.task].append(source.lengths[number])

@@ -26,6 +26,11 @@ PICKLED = "pickled objects, which are never loaded"
 _IDENTITY = ("ee_pos", "ee_orn", "robot_joints", "gripper_status", "language_goal", "step_lang_goals")
 
 
+def first_line(error: Exception) -> str:
+    """What an error says, in one line; its type where it says nothing."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+
+
 @dataclass
 class Loaded:
     """What could be read.
@@ -61,12 +66,12 @@ def load_arrays(path: Path) -> Loaded:
                 try:
                     loaded.arrays[key] = cast(SPECS[key], content[key])
                 except (*DAMAGED, MemoryError) as error:
-                    text = str(error).splitlines()[0] if str(error) else type(error).__name__
+                    text = first_line(error)
                     loaded.unreadable[key] = PICKLED if "allow_pickle" in text else text
     except FileNotFoundError as error:
         raise DatasetError("no such file", where=path) from error
     except DAMAGED as error:
-        text = str(error).splitlines()[0] if str(error) else type(error).__name__
+        text = first_line(error)
         found = PICKLED if "pickle" in text else text
         raise DatasetError("not a numpy archive, or a damaged one", where=path, found=found) from error
     return loaded

@@ -16,7 +16,7 @@ from robocas_ms3.datasets.check_info import check_info
 from robocas_ms3.datasets.check_pictures import check_cameras, check_depth, check_pictures
 from robocas_ms3.datasets.check_scene import check_ledger, check_scene, check_settings
 from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.tolerant import DAMAGED, is_declared
+from robocas_ms3.datasets.tolerant import DAMAGED, first_line, is_declared
 from robocas_ms3.datasets.violation import Violation
 from robocas_ms3.errors import DatasetError
 
@@ -91,13 +91,14 @@ def _episode(
             for key in content.files:
                 try:
                     arrays[key] = content[key]
-                except ValueError:
-                    yield Violation(file, key, "an array without pickles", "a pickled object")
+                except (ValueError, MemoryError) as error:  # pickled, of no such shape, of more numbers than there are
+                    found = "a pickled object" if "pickle" in str(error) else first_line(error)
+                    yield Violation(file, key, "an array without pickles", found)
     except FileNotFoundError:
         yield Violation(file, "", "this file", "no file")
         return
     except DAMAGED as error:
-        yield Violation(file, "", "a numpy archive", str(error).splitlines()[0] or type(error).__name__)
+        yield Violation(file, "", "a numpy archive", first_line(error))
         return
     steps = _count_steps(arrays)
     sound = True

@@ -36,12 +36,27 @@ def test_compare_by_hand():
 
 
 def test_floor():
-    assert [law[2] for law in check([[overhead(1.0, depth=1.1)]])] == [
-        "nothing below the floor",
-        "floor at height 0",
-        "depth that agrees with another camera's",
-    ]
+    below = ["nothing below the floor", "floor at height 0"]
+    assert [law[2] for law in check([[overhead(1.0, depth=1.1)]])] == below
     assert [law[2] for law in check([[overhead(1.0, depth=0.9)]])][0] == "floor at height 0"
+
+
+def test_where_nobody_can_agree_nobody_has_to():
+    alone = overhead(1.0)
+    assert list(check([[alone]])) == []
+    blind = View("blind", np.zeros((80, 80), np.uint16), alone.intrinsic, alone.camera_in_world)
+    assert [law[1] for law in check([[alone, blind]])] == ["blind"]
+    tiny = View("tiny", alone.depth[:9, :9], np.full(4, 4.5), alone.camera_in_world)  # 81 points
+    assert list(check([[tiny, View("too", tiny.depth, tiny.intrinsic, tiny.camera_in_world)]])) == []
+
+
+def test_a_camera_that_looks_elsewhere_agrees_with_nobody():
+    away = overhead(1.0, shift=50.0)
+    away = View("away", away.depth, away.intrinsic, away.camera_in_world)
+    assert {law[1:3] for law in check([[overhead(1.0), away]])} == {
+        ("overhead", "depth that agrees with another camera's"),
+        ("away", "depth that agrees with another camera's"),
+    }
 
 
 def test_two_right_views_and_one_wrong():

@@ -381,6 +381,14 @@ def test_an_episode_twice(four, tmp_path):
     assert imported(root, tmp_path / "out").numbers == [0, 1, 2, 3]
 
 
+def test_an_episode_twice_of_which_the_first_can_not_be_taken(four, tmp_path):
+    root = shutil.copytree(four, tmp_path / "four")
+    shutil.copytree(root / "episode_0000001", root / "episode_0000009")
+    for path in (root / "episode_0000001").glob("*/*/*.png"):
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:40])
+    assert sorted(survey(root).taken) == [0, 2, 3, 9]
+
+
 def test_embeddings_of_all_or_none(dataset, tmp_path):
     (dataset / "conversion.json").unlink()
     assert imported(dataset, tmp_path / "all").settings["embeddings"] is True

@@ -18,7 +18,12 @@ class Player:
 
     made: list = []  # noqa: RUF012
     start = np.zeros(3)
-    layout = SimpleNamespace(object_ids=("cube",) * 3, object_poses=np.tile(np.eye(4), (3, 1, 1)))
+    layout = SimpleNamespace(
+        object_ids=("cube",) * 3,
+        object_poses=np.tile(np.eye(4), (3, 1, 1)),
+        robot_pose=np.eye(4),
+        basket_pose=np.eye(4),
+    )
 
     def __init__(self, env_info, rate_hz):
         if env_info["env_kwargs"].get("pack") == "gone":
@@ -103,11 +108,29 @@ def test_tracking_error_by_hand(dataset):
         ({"success": False}, "recorded without success"),
         ({"layout": {"object_ids": ["cube", "cup", "cube"]}}, "another scene now: other objects"),
         ({"layout": {"poses": [[0, 0, 0], [0, 0.5, 0], [0, 0, 0]]}}, "another scene now: objects up to 500 mm away"),
+        ({"layout": {"robot_pose": [0.2, 0, 0, 1, 0, 0, 0]}}, "another scene now: the robot up to 200 mm away"),
+        ({"layout": {"basket_pose": [0, 0, 0.1, 1, 0, 0, 0]}}, "another scene now: the basket up to 100 mm away"),
         ({"env_info": {"env_id": "x", "env_kwargs": {"pack": "gone"}}}, "no such pack"),
     ],
 )
 def test_what_can_not_be_tried_is_named_and_the_rest_goes_on(dataset, changes, reason):
     edit_scene(dataset, 0, **changes)
+    first, second = replay_dataset(dataset).episodes
+    assert first.success is None
+    assert reason in first.skipped
+    assert second.success is False
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"rel_pos": np.full((7, 3), np.nan, np.float32)}, "its arrays hold NaN"),
+        ({"ee_pos": np.zeros((5, 3), np.float32)}, "operands could not be broadcast"),
+        ({"rel_orn": np.zeros((7, 4), np.float32)}, "zero norm"),
+    ],
+)
+def test_arrays_that_can_not_be_played_cost_no_other_episode(dataset, changes, reason):
+    edit_arrays(dataset, 0, **changes)
     first, second = replay_dataset(dataset).episodes
     assert first.success is None
     assert reason in first.skipped

@@ -8,7 +8,7 @@ from managing import edit, files_of, make, read
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.info import split_by_seed
 from robocas_ms3.datasets.manage.merging import merge
-from robocas_ms3.datasets.manage.splitting import Share, cut, groups_of, resplit
+from robocas_ms3.datasets.manage.splitting import Share, cut, folder_names, groups_of, resplit
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.validate import validate
 from robocas_ms3.errors import DatasetError
@@ -42,6 +42,16 @@ def test_groups_are_whole_and_no_part_is_empty(values, shares):
 def test_a_tenth_by_seed_is_the_writers_split(count):
     seeds = {number: 1000 + number for number in range(count)}
     assert cut({n: str(seed) for n, seed in seeds.items()}, [0.9, 0.1]) == list(split_by_seed(seeds))
+
+
+def test_a_tenth_of_the_episodes_is_not_always_a_tenth_of_the_seeds():
+    seeds = {number: number // 5 for number in range(50)}  # ten of five episodes each
+    assert [len(side) for side in split_by_seed(seeds)] == [45, 5]
+    assert [len(side) for side in cut({n: str(seed) for n, seed in seeds.items()}, [0.9, 0.1])] == [45, 5]
+    seeds |= {number: 100 + number for number in range(50, 60)}  # and ten of one
+    assert [len(side) for side in split_by_seed(seeds)] != [
+        len(s) for s in cut({n: str(s) for n, s in seeds.items()}, [0.9, 0.1])
+    ]
 
 
 def test_shares():
@@ -91,12 +101,20 @@ def test_by_target_and_task(six, tmp_path):
     root = shutil.copytree(six, tmp_path / "ds")
     for number, (task, target) in enumerate([("pick", "cup"), ("pick", "can"), ("search", "cup")] * 2):
         scene = root / f"episode_{number:07d}" / "scene.json"
-        edit(scene, lambda s, task=task, target=target: s.update(task=task, target={"asset_id": target}))
+        whole = {"slot": 0, "asset_id": target, "name": target}
+        edit(scene, lambda s, task=task, whole=whole: s.update(task=task, target=whole))
     assert run(["split", str(root), "--by", "task", "--out", str(tmp_path / "tasks")]) == 0
     assert {path.name: len(Dataset(path).numbers) for path in (tmp_path / "tasks").iterdir()} == {
         "pick": 4,
         "search": 2,
     }
+    anew = tmp_path / "anew"
+    assert run(["split", str(root), "--by", "task", "--out", str(anew), "--val-share", "0.3"]) == 0
+    assert {path.name: len(read(path / "data_info.json")["val_eps"]) for path in anew.iterdir()} == {
+        "pick": 1,
+        "search": 1,
+    }
+    assert "seeds in the order of sha256(seed)" in read(anew / "pick" / "conversion.json")["split"]
     assert run(["split", str(root), "--in-place", "--by", "target", "--val-share", "0.3"]) == 0
     info, targets = read(root / "data_info.json"), groups_of(Dataset(root), "target")
     sides = [{targets[n] for n in info[side]} for side in ("train_eps", "val_eps")]
@@ -112,6 +130,14 @@ def test_names_of_folders_stay_inside(six, tmp_path):
         edit(root / f"episode_{number:07d}" / "scene.json", lambda s, target=target: s.update(target=target))
     assert run(["split", str(root), "--by", "target", "--out", str(tmp_path / "targets")]) == 0
     assert [path.name for path in (tmp_path / "targets").iterdir()] == ["_.._pack_cup"]
+
+
+def test_two_values_never_share_a_folder():
+    names = folder_names(["a b", "a_b", "c"])
+    assert len(set(names.values())) == 3
+    assert names["c"] == "c"
+    assert names["a b"].startswith("a_b-")
+    assert folder_names(["a b", "c"])["a b"] == "a_b"
 
 
 def test_in_place_writes_two_files_only(six, tmp_path):

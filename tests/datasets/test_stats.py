@@ -136,6 +136,27 @@ def test_damaged_scene(told):
         collect(told)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "reason"),
+    [("rel_pos", np.nan, "rel_pos: not a number"), ("rel_orn", 0.0, "these arrays make no actions .found .*zero norm")],
+)
+def test_actions_that_are_none(told, key, value, reason):
+    path = told / "episode_0000001" / "episode_info.npz"
+    with np.load(path) as content:
+        arrays = dict(content)
+    arrays[key][2] = value
+    np.savez(path, **arrays)
+    with pytest.raises(DatasetError, match=f"episode 1.*{reason}"):
+        collect(told)
+
+
+def test_no_episodes(told):
+    info = {"train_eps": [], "val_eps": [], "ep_length": {}}
+    (told / "data_info.json").write_text(json.dumps(info))
+    with pytest.raises(DatasetError, match="no episodes to count"):
+        collect(told)
+
+
 def test_without_matplotlib(made, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(MissingExtraError, match=r"robocas-ms3\[plots\]"):

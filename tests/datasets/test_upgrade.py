@@ -81,6 +81,14 @@ def test_another_trajectory(old, tmp_path):
     assert files_of(root) == before
 
 
+def test_two_trajectories_of_one_name(old, tmp_path):
+    root, _, trajectory = old
+    before = files_of(root)
+    with pytest.raises(DatasetError, match="trajectories of one name can't be told apart"):
+        upgrade(root, trajectories=[trajectory, tmp_path / "other" / trajectory.name])
+    assert files_of(root) == before
+
+
 def test_what_can_not_be_upgraded(old, tmp_path):
     root, _, _ = old
     with pytest.raises(DatasetError, match="no dataset here"):

@@ -386,6 +386,15 @@ def test_a_scene_that_is_not_the_ledgers(dataset, new, text):
     assert_only(dataset, text)
 
 
+def test_one_camera_has_none_to_agree_with(dataset):
+    path = dataset / "conversion.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "cameras": ["static_camera"]}))
+    for name in ("base_camera", "gripper_camera"):
+        for folder in dataset.glob(f"*/{name}"):
+            shutil.rmtree(folder)
+    assert found(dataset) == []
+
+
 def test_pictures_of_another_size_than_the_first_episodes(dataset):
     for kind in ("rgb", "depth"):
         for path in (dataset / "episode_0000001" / "base_camera" / kind).iterdir():

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -108,8 +109,8 @@ def resplit(root: Path, share: Share | None = None) -> Sides:
     Raises:
         DatasetError: there is no dataset, or it can't be split so.
     """
-    dataset = Dataset(root)
     with locked_folder(root):
+        dataset = Dataset(root)
         before = dataset.info
         sides: Sides = (list(before.get("train_eps", [])), list(before.get("val_eps", [])))
         if share is not None:
@@ -150,12 +151,18 @@ def parts_by_value(part: Part, by: By, share: Share | None, out: Path) -> dict[P
     """A dataset ``out/<value>`` for each task or target object."""
     groups = groups_of(part.dataset, by)
     pieces = {value: [n for n, group in groups.items() if group == value] for value in sorted(set(groups.values()))}
-    return {out / _folder_name(value): _within(part, piece, share) for value, piece in pieces.items()}
+    names = folder_names(pieces)
+    return {out / names[value]: _within(part, piece, share) for value, piece in pieces.items()}
 
 
-def _folder_name(value: str) -> str:
-    """A value as the name of a folder, whatever a dataset says."""
-    return re.sub(r"[^\w.-]+", "_", value).strip(".") or "_"
+def folder_names(values: Iterable[str]) -> dict[str, str]:
+    """Names of folders for values, whatever a dataset says; no two have the same."""
+    plain = {value: re.sub(r"[^\w.-]+", "_", value).strip(".") or "_" for value in values}
+    shared = Counter(plain.values())
+    return {
+        value: name if shared[name] == 1 else f"{name}-{hashlib.sha256(value.encode()).hexdigest()[:8]}"
+        for value, name in plain.items()
+    }
 
 
 def write_parts(

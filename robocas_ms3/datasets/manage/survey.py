@@ -83,17 +83,13 @@ def survey(
     layouts: dict[int, Layout] = {}
     lengths: dict[int, int] = {}
     embedded: set[int] = set()
-    marks: dict[str, int] = {}
+    marks: dict[int, str] = {}
     for done, number in enumerate(dataset.numbers):
         found = read_episode(dataset, number, info, findings, rate_hz=rate_hz, turn_eef=turn_eef)
-        if found is not None:
-            first = marks.setdefault(arrays_fingerprint(found.arrays), number)
-            if first != number:
-                name = schema.episode_folder(number)
-                findings.append(Finding(number, name, f"the same as episode {first}", "left out"))
-            elif found.layout is not None:
-                lengths[number], layouts[number] = found.steps, found.layout
-                embedded |= {number} if found.embedded else set()
+        if found is not None and found.layout is not None:
+            lengths[number], layouts[number] = found.steps, found.layout
+            marks[number] = arrays_fingerprint(found.arrays)
+            embedded |= {number} if found.embedded else set()
         if on_episode:
             on_episode(done + 1, len(dataset.numbers))
     layout = Counter(layouts.values()).most_common(1)[0][0] if layouts else None
@@ -101,6 +97,13 @@ def survey(
         if other != layout:
             name = schema.episode_folder(number)
             findings.append(Finding(number, name, f"pictures of {other}; most are of {layout}", "left out"))
+            del lengths[number]
+    firsts: dict[str, int] = {}
+    for number in list(lengths):  # of those that can be taken the first one is
+        first = firsts.setdefault(marks[number], number)
+        if first != number:
+            name = schema.episode_folder(number)
+            findings.append(Finding(number, name, f"the same as episode {first}", "left out"))
             del lengths[number]
     embeddings = bool(lengths) and embedded >= set(lengths)
     if not embeddings and embedded & set(lengths):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -14,6 +14,7 @@ import numpy as np
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.convert import open_env
+from robocas_ms3.datasets.episode_facts import task_of
 from robocas_ms3.datasets.manage.parts import check_whole, schema_version, shown
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.plan import dataset_settings
@@ -94,20 +95,13 @@ def upgrade(
     Raises:
         DatasetError: there is no dataset, it is upstream's or of a newer version, unfinished, or not of these files.
     """
-    dataset = Dataset(root)
-    version = schema_version(dataset)
-    if version == 0:
-        raise DatasetError(
-            "a dataset made elsewhere", where=root, found="no conversion.json", fix="Run robocas import-robocas."
-        )
-    if version > schema.SCHEMA_VERSION:
-        raise DatasetError(
-            "a dataset of a newer version", where=root, expected=f"<= {schema.SCHEMA_VERSION}", found=version
-        )
-    if not trajectories:
-        check_whole(dataset)
+    _check_names(trajectories)
     with ExitStack() as stack:
         stack.enter_context(locked_folder(root))
+        dataset = Dataset(root)
+        version = _version(dataset)
+        if not trajectories:
+            check_whole(dataset)
         sources: dict[str, _Source] = {}
         for path in trajectories:
             source = _Source(stack.enter_context(TrajectoryFile(path)), open_source)
@@ -129,8 +123,31 @@ def upgrade(
         content = _content(dataset.settings, settings, ledger)
         if content != dataset.settings:
             write_json(root / schema.CONVERSION_FILE, content)  # last: until then the dataset is of the old version
-    lacking = [n for n in dataset.numbers if Dataset(root).episode(n).scene.get("layout") is None]
+    lacking = [n for n in dataset.numbers if dataset.episode(n).scene.get("layout") is None]
     return Upgraded(version, todo, lacking)
+
+
+def _check_names(trajectories: Sequence[Path]) -> None:
+    """Datasets say of which file an episode is by its name alone."""
+    names = Counter(path.name for path in trajectories)
+    twice = [path for path in trajectories if names[path.name] > 1]
+    if twice:
+        raise DatasetError(
+            "trajectories of one name can't be told apart",
+            where=", ".join(map(str, twice)),
+            fix="Upgrade with one of them at a time, each dataset before it is merged.",
+        )
+
+
+def _version(dataset: Dataset) -> int:
+    version = schema_version(dataset)
+    if version == 0:
+        fix = "Run robocas import-robocas."
+        raise DatasetError("a dataset made elsewhere", where=dataset.root, found="no conversion.json", fix=fix)
+    if version > schema.SCHEMA_VERSION:
+        expected = f"<= {schema.SCHEMA_VERSION}"
+        raise DatasetError("a dataset of a newer version", where=dataset.root, expected=expected, found=version)
+    return version
 
 
 def _content(before: Mapping[str, Any], settings: Mapping[str, Any], ledger: Mapping[str, Any]) -> dict[str, Any]:
@@ -189,7 +206,7 @@ def _record(
     samples = sample_states(recording.control_steps, stride)
     joints = recording.joints(samples).qpos[:, 3:10]
     found = episode.arrays.get("robot_joints")
-    if found is None or found.shape != joints.shape or np.abs(found - joints).max() > _SAME_JOINTS:
+    if found is None or found.shape != joints.shape or not np.abs(found - joints).max() <= _SAME_JOINTS:  # NaN too
         raise DatasetError(
             "this episode is not of that trajectory",
             where=episode.folder,
@@ -234,9 +251,3 @@ def _as_far_as_known(dataset: Dataset, entry: Mapping[str, Any]) -> dict[str, An
         "versions": before.get("made_with", {}).get("trajectory"),
     }
     return {key: known.get(key) for key in schema.SCENE}
-
-
-def task_of(env_id: str | None) -> str | None:
-    """Name of the task of an environment, by its id; the registry itself would bring the simulator."""
-    match = re.fullmatch(r"(?:\w+:)?RoboCAS(\w+)-v\d+", env_id or "")
-    return "_".join(re.findall("[A-Z][a-z]*", match[1])).lower() if match else None
