@@ -4,9 +4,11 @@ import json
 import math
 import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -411,6 +413,25 @@ def test_missing_pieces(dataset, tmp_path):
     (dataset / "data_info.json").write_text("{")
     with pytest.raises(DatasetError, match="damaged"):
         RoboCASDataset(dataset)
+
+
+def test_the_documentations_code_runs(made, tmp_path, monkeypatch):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "dataset").symlink_to(made)
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "training.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    names: dict = {"torch": torch}
+    for block in blocks:
+        exec(block.replace("num_workers=8", "num_workers=0"), names)  # noqa: S102
+    batch = names["batch"]
+    assert batch["rgb"].shape == (6, 6, 2, 3, 256, 320)  # all there is, of 64
+    assert batch["action"].shape == (6, 6, 7)
+    shapes = {"rgb.flatten(-4, -3)": (6, 6, 256, 320), "torch.cat(rgb.unbind(-4), dim=-2)": (6, 3, 512, 320)}
+    for expression, shape in shapes.items():
+        assert expression in page
+        assert eval(expression, names, {"rgb": batch["rgb"][0]}).shape == shape
+        assert eval(expression, names, {"rgb": batch["rgb"]}).shape == (6, *shape)
 
 
 def test_the_package_alone_brings_no_torch():
