@@ -22,7 +22,11 @@ def motion_plots(position: NDArray, xyzw: NDArray, arm_joints: NDArray) -> list[
         xyzw: (T, 4) its orientation there.
         arm_joints: (T, 7) rad.
     """
-    flips = np.cumsum(np.sum(xyzw[1:] * xyzw[:-1], axis=1) < 0) % 2  # q and -q are one orientation: no jumps
+    if len(xyzw) and xyzw[0][np.abs(xyzw[0]).argmax()] < 0:
+        xyzw = -xyzw
+    flips = (
+        np.cumsum(np.sum(xyzw[1:] * xyzw[:-1], axis=1) < 0) % 2
+    )  # q and -q are one orientation: no jumps, one choice
     xyzw = np.concatenate([xyzw[:1], xyzw[1:] * np.where(flips, -1, 1)[:, None]])
     return [
         plot("TCP position, arm base", "m", XYZ, position),

@@ -36,6 +36,8 @@ def test_orientation_and_yaw_do_not_jump():
     turn = np.array([[0.0, 0, 0, 1], [0, 0, -0.1, -0.995], [0, 0, 0.2, 0.98]])
     (_, orientation, _) = motion_plots(np.zeros((3, 3)), turn, np.zeros((3, 7)))
     assert [s["values"] for s in orientation["series"]][2:] == [[0.0, 0.1, 0.2], [1.0, 0.995, 0.98]]
+    (_, other, _) = motion_plots(np.zeros((3, 3)), -turn, np.zeros((3, 7)))
+    assert other == orientation  # whichever of the two a recording begins with
     (base,) = base_plot(np.array([[0, 0, 3.1], [0, 0, -3.1]]))
     assert base["series"][2]["values"] == [3.1, round(2 * np.pi - 3.1, 5)]
     assert base_plot(np.ones((3, 3))) == []

@@ -32,6 +32,9 @@
     }, 150);
   }
 
+  // Lines break between the words of a command, not within its options.
+  const code = (text) => element("code", {}, ...text.split(" ").flatMap((word) => [element("span", { textContent: word }), " "]).slice(0, -1));
+
   const KEYS = {
     ArrowLeft: (event) => player.by(event.shiftKey ? -10 : -1),
     ArrowRight: (event) => player.by(event.shiftKey ? 10 : 1),
@@ -71,7 +74,7 @@
   byId("kind").textContent = `${index.kind}, ${index.rate_hz} Hz`;
   document.title = index.name;
   byId("note").hidden = !index.note;
-  byId("note").append(...index.note.split("`").map((part, i) => (i % 2 ? element("code", { textContent: part }) : part)));
+  byId("note").append(...index.note.split("`").map((part, i) => (i % 2 ? code(part) : part)));
   space.start();
   player.start(index, stepped);
   table.start(index, open);

@@ -40,7 +40,7 @@ robocas.space = (() => {
     goals = episode.subgoals;
     byId("space-box").hidden = !trace;
     if (!trace) return;
-    byId("space-note").textContent = trace.objects.length ? (trace.moving ? "" : "objects where they stood at the start") : "";
+    byId("space-note").textContent = trace.objects.length ? (trace.moving ? "" : "objects at the start") : "";
     const points = [...trace.tcp, ...trace.objects.flatMap((thing) => thing.path)];
     const low = [0, 1, 2].map((axis) => points.reduce((a, p) => Math.min(a, p[axis]), Infinity));
     const high = [0, 1, 2].map((axis) => points.reduce((a, p) => Math.max(a, p[axis]), -Infinity));
@@ -138,13 +138,19 @@ robocas.space = (() => {
     for (const [text, x, y, strong] of labels.sort((a, b) => b[3] - a[3] || b[4] - a[4])) {
       ctx.font = `${strong ? "600 12px" : "11px"} system-ui, sans-serif`;
       const size = ctx.measureText(text).width;
-      const left = Math.max(3, x + size > width - 4 ? x - size - 14 : x);
-      const box = [left, y - 10, left + size, y + 3];
+      const [left, base] = place(x, y, size, width);
+      const box = [left, base - 10, left + size, base + 3];
       if (!strong && taken.some((t) => box[0] < t[2] && box[2] > t[0] && box[1] < t[3] && box[3] > t[1])) continue;
       taken.push(box);
       ctx.fillStyle = strong ? colour("bad") : colour("faint");
-      ctx.fillText(text, left, y);
+      ctx.fillText(text, left, base);
     }
+  }
+
+  // Right of the dot, else left of it, else above.
+  function place(x, y, size, width) {
+    if (x + size <= width - 4) return [x, y];
+    return x - size - 14 >= 3 ? [x - size - 14, y] : [Math.max(3, width - 4 - size), y - 13];
   }
 
   function axes(ctx, height) {
