@@ -42,7 +42,6 @@ class FolderSource:
         try:
             self.lengths = {int(number): int(length) for number, length in self.info["ep_length"].items()}
             self._split = {side: [int(n) for n in self.info[f"{side}_eps"]] for side in ("train", "val")}
-            self.rate_hz = overview.rate_hz
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise DatasetError(
                 "this overview is damaged",
@@ -52,7 +51,19 @@ class FolderSource:
                 fix="robocas validate says what is wrong.",
             ) from error
         first = Episode(path / schema.episode_folder(min(self.lengths, default=0)))  # where there are no settings
-        self.cameras = tuple(settings["cameras"]) if "cameras" in settings else first.cameras
+        try:
+            self.rate_hz = overview.rate_hz
+            if not 0 < self.rate_hz < np.inf:
+                raise ValueError(f"rate_hz {self.rate_hz}")
+            self.cameras = tuple(settings["cameras"]) if "cameras" in settings else first.cameras
+        except (TypeError, ValueError) as error:
+            raise DatasetError(
+                "these settings are damaged",
+                where=path / schema.CONVERSION_FILE,
+                expected="rate_hz > 0, a list of cameras",
+                found=first_line(error),
+                fix="robocas validate says what is wrong.",
+            ) from error
         self.has_depth = bool(settings["depth"]) if "depth" in settings else first.has_depth
         self.has_embeddings = bool(settings.get("embeddings", True))
 

@@ -415,6 +415,14 @@ def test_missing_pieces(dataset, tmp_path):
         RoboCASDataset(dataset)
 
 
+@pytest.mark.parametrize("change", [{"rate_hz": 0}, {"rate_hz": math.nan}, {"rate_hz": "fast"}, {"cameras": 3}])
+def test_settings_that_are_damaged(dataset, change):
+    path = dataset / "conversion.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(DatasetError, match=r"conversion\.json: these settings are damaged"):
+        RoboCASDataset(dataset, cameras=())
+
+
 def test_the_documentations_code_runs(made, tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "dataset").symlink_to(made)
