@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, PlainValidator, ValidationError
-from pydantic_core import ErrorDetails, PydanticCustomError
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.violation import Violation
@@ -22,7 +21,7 @@ def one_seed(value: Any) -> int | None:
 
 def _seed(value: Any) -> Any:
     if value is not None and one_seed(value) is None:
-        raise PydanticCustomError("seed", "an integer, or a list of one")
+        raise ValueError("an integer, or a list of one")
     return value
 
 
@@ -181,7 +180,7 @@ def _check(model: type[_Part], content: Mapping[str, Any], file: str) -> list[Vi
     return []
 
 
-def _violation(file: str, details: ErrorDetails) -> Violation:
+def _violation(file: str, details: Mapping[str, Any]) -> Violation:
     key = ".".join(map(str, details["loc"]))
     kind, context = details["type"], details.get("ctx", {})
     if kind == "missing":
@@ -189,7 +188,7 @@ def _violation(file: str, details: ErrorDetails) -> Violation:
     if kind in ("too_short", "too_long"):
         limit = context.get("min_length", context.get("max_length"))
         return Violation(file, key, f"{limit} values", f"{context['actual_length']}")
-    expected = _EXPECTED.get(kind) or details["msg"].removeprefix("Input should be ")
+    expected = _EXPECTED.get(kind) or details["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     return Violation(file, key, expected, _shown(details["input"]))
 
 
