@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from robocas_ms3.demos.sampling import stored_actions
 from robocas_ms3.errors import DatasetError
 
 ACTION_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
@@ -24,14 +24,7 @@ def episode_actions(arrays: Mapping[str, NDArray]) -> NDArray[np.float32]:
     Position and turn are ``rel_pos[t]`` and ``rel_orn[t]`` as Euler angles about the fixed axes x, y, z (scipy's
     "xyz", the convention of ``action_space``); the gripper command is ``gripper_status[t + 1]``.
     """
-    status = np.asarray(arrays["gripper_status"], dtype=np.float64)
-    actions = np.zeros((len(status), 7))
-    actions[:-1, :3] = arrays["rel_pos"][:-1]
-    if len(status) > 1:
-        actions[:-1, 3:6] = Rotation.from_quat(np.asarray(arrays["rel_orn"][:-1], np.float64)).as_euler("xyz")
-    actions[:-1, 6] = status[1:]
-    actions[-1, 6] = status[-1]
-    return actions.astype(np.float32)
+    return stored_actions(arrays["rel_pos"], arrays["rel_orn"], arrays["gripper_status"])
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.demos.sampling import invert, relative_motion
+from robocas_ms3.demos.sampling import invert, stored_motion
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.robots.forward import link_poses
 
 Array = NDArray[np.float64]
 
@@ -45,7 +46,7 @@ class SubGoal:
 
 @dataclass(frozen=True)
 class Frames:
-    """Poses of links at the sampled states, as the simulator has them.
+    """Poses of links at the sampled states.
 
     Attributes:
         tcp_in_world: (T, 4, 4).
@@ -69,6 +70,11 @@ class Joints:
     qpos: Array
     qvel: Array
     root_in_world: Array
+
+
+def robot_frames(joints: Joints) -> Frames:
+    """Link poses by forward kinematics."""
+    return Frames(*link_poses(joints.root_in_world, joints.qpos))
 
 
 def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> list[SubGoal]:
@@ -177,22 +183,23 @@ def episode_arrays(
         embed: texts -> (N, 384); None leaves the embeddings out.
     """
     ee_in_base = invert(frames.arm_base_in_world) @ frames.tcp_in_world
-    ee_motion, base_motion = relative_motion(ee_in_base), relative_motion(frames.arm_base_in_world)
+    rel_pos, rel_orn = stored_motion(ee_in_base)
+    base_rel_pos, base_rel_orn = stored_motion(frames.arm_base_in_world)
     agv = planar_base(joints)
     agv_motion = np.concatenate([np.diff(agv, axis=0), np.zeros((1, 3))])
     agv_motion[:, 2] = wrap_angle(agv_motion[:, 2])
     texts = [goal.goal_description for goal in subgoals for _ in range(goal.last - goal.first + 1)]
     values = {
-        "rel_pos": ee_motion[:, :3, 3],
-        "rel_orn": Rotation.from_matrix(ee_motion[:, :3, :3]).as_quat(canonical=True),
+        "rel_pos": rel_pos,
+        "rel_orn": rel_orn,
         "ee_pos": ee_in_base[:, :3, 3],
         "ee_orn": continuous_xyzw(ee_in_base),
         "robot_joints": joints.qpos[:, 3:10],
         "arm_joint_vel": joints.qvel[:, 3:10],
         "base_pos": frames.arm_base_in_world[:, :3, 3],
         "base_orn": continuous_xyzw(frames.arm_base_in_world),
-        "base_rel_pos": base_motion[:, :3, 3],
-        "base_rel_orn": Rotation.from_matrix(base_motion[:, :3, :3]).as_quat(canonical=True),
+        "base_rel_pos": base_rel_pos,
+        "base_rel_orn": base_rel_orn,
         "gripper_width": joints.qpos[:, 10] + joints.qpos[:, 11],
         "gripper_status": gripper_status,
         "agv_pose": agv,

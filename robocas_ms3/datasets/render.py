@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
+from robocas_ms3.datasets.episode import robot_frames
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.trajectory import Recording
 from robocas_ms3.datasets.writer import CameraModel, Frame
@@ -116,20 +117,21 @@ class EnvFrames:
 
     def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[Frame]:
         """Show some of the states, in order; ``load`` comes first."""
-        for index in samples:
-            yield self.frame(recording.state(int(index)))
+        links = robot_frames(recording.joints(samples))
+        for index, tcp, base in zip(samples, links.tcp_in_world, links.arm_base_in_world, strict=True):
+            yield self._frame(recording.state(int(index)), tcp, base)
 
-    def frame(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> Frame:
+    def _frame(self, state: dict[str, dict[str, NDArray[np.float32]]], tcp: NDArray, base: NDArray) -> Frame:
         """Show one state, without a step of physics."""
         tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
         self._base.set_state_dict(tensors)
         pictures = self._base._get_obs_sensor_data()
-        agent, wanted = self._base.agent, self._pictures
+        wanted = self._pictures
         return Frame(
             rgb={name: pictures[name]["rgb"][0].cpu().numpy() for name in wanted.cameras},
             depth={name: to_millimetres(pictures[name]["depth"][0, ..., 0]) for name in wanted.cameras if wanted.depth},
-            tcp_in_world=_matrix(agent.tcp.pose),
-            arm_base_in_world=_matrix(agent.arm_base_link.pose),
+            tcp_in_world=tcp,
+            arm_base_in_world=base,
         )
 
     def cameras(self) -> dict[str, CameraModel]:

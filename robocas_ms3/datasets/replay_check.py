@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.reader import Dataset, Episode
@@ -115,14 +114,12 @@ class _Player:
             if reason:
                 return EpisodeReplay(number, task, None, skipped=reason)
             arrays = episode.arrays
-            actions = episode_actions(arrays)[:-1].astype(np.float64)
-            turns = Rotation.from_euler("xyz", actions[:, 3:6])
             open_loop = self._environment(scene["env_info"])
             open_loop.reset(int(scene["seed"]), scene.get("reset_options") or {})
             other = _other_scene(scene, open_loop)
             if other:
                 return EpisodeReplay(number, task, None, skipped=f"its seed builds another scene now: {other}")
-            played = open_loop.play(actions[:, :3], turns, actions[:, 6] > 0.5)
+            played = open_loop.play(episode_actions(arrays)[:-1])
             error = np.linalg.norm(played.tcp_in_base - arrays["ee_pos"], axis=1)
         except (RobocasError, ValueError, TypeError, KeyError, IndexError, AttributeError, OSError) as error:
             return EpisodeReplay(number, task, None, skipped=first_line(error))

@@ -11,12 +11,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.episode import Joints, SubGoal, to_matrices, wxyz_to_xyzw
+from robocas_ms3.datasets.episode import Joints, SubGoal
+from robocas_ms3.demos.sampling import split_states
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.robots.constants import JOINTS, ROBOT_UID
 
-_REST = len(JOINTS)
-_POSE_DIM = 13  # position 3, quaternion wxyz 4, linear and angular velocity 6
+_STATE_DIM = 13 + 2 * len(JOINTS)
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,8 @@ class Recording:
 
     def joints(self, samples: NDArray[np.int64]) -> Joints:
         """Joint states at some of the states."""
-        robot = self.states["articulations"][ROBOT_UID][samples].astype(np.float64)
-        return Joints(
-            qpos=robot[:, _POSE_DIM : _POSE_DIM + _REST],
-            qvel=robot[:, _POSE_DIM + _REST :],
-            root_in_world=to_matrices(robot[:, :3], wxyz_to_xyzw(robot[:, 3:7])),
-        )
+        root_in_world, qpos, qvel = split_states(self.states["articulations"][ROBOT_UID][samples])
+        return Joints(qpos, qvel, root_in_world)
 
     def state(self, index: int) -> dict[str, dict[str, NDArray[np.float32]]]:
         """One state as ``set_state_dict`` takes it, each array (1, D)."""
@@ -173,7 +169,7 @@ class TrajectoryFile:
                 found=f"{len(actions)} actions, {sorted(lengths)} states",
             )
         robot = states.get("articulations", {}).get(ROBOT_UID)
-        width = _POSE_DIM + 2 * _REST
+        width = _STATE_DIM
         if robot is None or robot.shape[1] != width:
             raise DatasetError(
                 "states of another robot",

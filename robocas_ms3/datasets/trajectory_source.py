@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.episode import SubGoal, episode_arrays, sample_subgoals
+from robocas_ms3.datasets.episode import SubGoal, episode_arrays, robot_frames, sample_subgoals
 from robocas_ms3.datasets.info import action_space, split_by_seed
 from robocas_ms3.datasets.provenance import succeeded
 from robocas_ms3.datasets.reader import Episode
@@ -79,8 +79,6 @@ class TrajectorySource:
         Raises:
             DatasetError: it is damaged, or the states are those of another robot.
         """
-        from robocas_ms3.datasets.forward import robot_frames
-
         entry = self._entries[number]
         recording = self._read(entry)
         samples = sample_states(entry.control_steps, self._stride)

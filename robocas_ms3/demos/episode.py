@@ -18,7 +18,6 @@ from robocas_ms3.config import TaskConfig, load_task_config
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.demos.record import EpisodeRecorder
-from robocas_ms3.demos.sampling import to_matrices
 from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.planning.executor import Executor, Seconds
 from robocas_ms3.planning.mplib_backend import MplibPlanner
@@ -189,12 +188,12 @@ class EpisodeGenerator:
             raise PlanningFailed("episode", "no_success")
         if self.open_loop is not None:
             gripper = np.array([action[7] for action in executor.actions])
-            poses = to_matrices(np.array(executor.tcp_in_base, dtype=np.float64))
+            states = np.array(executor.robot_states)
             for trial in range(TRIALS):
                 noise = np.random.default_rng([executor.seed, trial]) if trial else None
                 with executor.seconds.spent_on("simulation"):
                     played = self.open_loop.play_recording(
-                        executor.seed, poses, gripper, self.settings.control_freq, noise
+                        executor.seed, states, gripper, self.settings.control_freq, noise
                     )
                 if played.clipped:
                     raise EpisodeLost("replay", "clipped")

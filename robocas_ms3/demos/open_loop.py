@@ -9,13 +9,22 @@ import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-from robocas_ms3.demos.sampling import Array, gripper_open, relative_motion, sample_states, sample_stride
+from robocas_ms3.demos.sampling import (
+    Array,
+    gripper_open,
+    invert,
+    sample_states,
+    sample_stride,
+    split_states,
+    stored_actions,
+    stored_motion,
+)
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.robots.constants import FINGER_TARGETS, OPEN_FINGER
+from robocas_ms3.robots.constants import FINGER_SLICE, FINGER_TARGETS
 from robocas_ms3.robots.controllers import to_ee_delta_action
+from robocas_ms3.robots.forward import link_poses
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -92,19 +101,14 @@ class OpenLoop:
         assert layout is not None
         return layout
 
-    def play(self, translations: Array, rotations: Rotation, gripper: NDArray[np.bool_]) -> Played:
-        """Play actions from the reset on.
-
-        Args:
-            translations: (S, 3) m, of the TCP in its own frame.
-            rotations: (S,) likewise.
-            gripper: (S,) True = open.
-        """
+    def play(self, dataset_actions: NDArray[np.floating]) -> Played:
+        """Play actions (S, 7) from the reset on; see `sampling.stored_actions`, whose last row is left out."""
         env = self.env.unwrapped
         assert isinstance(env, RoboCASEnv)
-        motion = to_ee_delta_action(translations, rotations) if len(translations) else np.zeros((0, 6), np.float32)
+        wanted = np.asarray(dataset_actions, dtype=np.float64).reshape(-1, 7)
+        motion = to_ee_delta_action(wanted[:, :3], wanted[:, 3:6], euler="xyz")
         beyond = (np.abs(motion[:, :3]) > 1).any(axis=1) | (np.linalg.norm(motion[:, 3:], axis=1) > 1)
-        actions = np.column_stack([np.clip(motion, -1, 1), np.where(gripper, 1, -1)]).astype(np.float32)
+        actions = np.column_stack([np.clip(motion, -1, 1), np.where(wanted[:, 6] > 0.5, 1, -1)]).astype(np.float32)
         places, success = [env.agent.tcp_in_arm_base.p[0].numpy().copy()], False
         for action in actions:
             *_, info = self.env.step(action)
@@ -121,28 +125,30 @@ class OpenLoop:
     def play_recording(
         self,
         seed: int,
-        tcp_in_base: Array,
+        robot_states: NDArray[np.floating],
         gripper: NDArray[np.floating],
         control_freq: float,
         noise: np.random.Generator | None = None,
     ) -> Played:
-        """Play what a dataset of this rate would hold of a recording.
+        """Play what a dataset of this rate will hold of a recording, to the last bit.
 
         Args:
             seed: of the episode.
-            tcp_in_base: (S + 1, 4, 4) after the reset and after each control step.
+            robot_states: (S + 1, 37) after the reset and after each control step.
             gripper: (S,) commands in [-1, 1].
             control_freq: of the recording, Hz.
             noise: source of noise of ``NOISE`` that is added to each action's translation; default: none.
         """
         samples = sample_states(len(gripper), sample_stride(control_freq, self._rate))
-        motion = relative_motion(tcp_in_base[samples])[:-1]
-        status = gripper_open(gripper, samples, finger_range=FINGER_TARGETS, initial_width=2 * OPEN_FINGER)
-        translations = motion[:, :3, 3].copy()
+        root_in_world, qpos, _ = split_states(robot_states[samples])
+        tcp, base = link_poses(root_in_world, qpos)
+        width = float(qpos[0, FINGER_SLICE].sum())
+        status = gripper_open(gripper, samples, finger_range=FINGER_TARGETS, initial_width=width)
+        actions = stored_actions(*stored_motion(invert(base) @ tcp), status)[:-1].astype(np.float64)
         if noise is not None:
-            translations += noise.normal(0, NOISE, translations.shape)
+            actions[:, :3] += noise.normal(0, NOISE, (len(actions), 3))
         self.reset(seed)
-        return self.play(translations, Rotation.from_matrix(motion[:, :3, :3]), status[1:])
+        return self.play(actions)
 
     def close(self) -> None:
         """Close the environment."""

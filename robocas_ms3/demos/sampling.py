@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.robots.constants import JOINTS
 
 Array = NDArray[np.float64]
 
+_POSE = 13  # of a state: position 3, quaternion wxyz 4, linear and angular velocity 6
 OPEN_WIDTH = 0.04
 """A gripper commanded wider than this counts as open, m."""
 
@@ -82,6 +84,39 @@ def invert(poses: Array) -> Array:
 def relative_motion(poses: Array) -> Array:
     """(T, 4, 4) ``inv(pose[t]) pose[t + 1]``; the last one is the identity."""
     return np.concatenate([invert(poses[:-1]) @ poses[1:], np.eye(4)[None]])
+
+
+def stored_motion(poses: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """``relative_motion`` as datasets hold it: positions (T, 3) m and quaternions (T, 4) xyzw, w >= 0."""
+    motion = relative_motion(poses)
+    turns = Rotation.from_matrix(motion[:, :3, :3]).as_quat(canonical=True)
+    return motion[:, :3, 3].astype(np.float32), turns.astype(np.float32)
+
+
+def stored_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """RoboCAS' actions (T, 7) of stored motion; row t leads from step t to t + 1, so the last one holds.
+
+    Motion in m and, about the fixed axes x, y, z (scipy's "xyz"), Euler angles in rad; the gripper's command is
+    ``gripper_status[t + 1]``, 1 = open.
+
+    Args:
+        positions, turns: of ``stored_motion`` of the TCP in the arm's base.
+        gripper_status: (T,) of ``gripper_open``.
+    """
+    status = np.asarray(gripper_status, dtype=np.float64)
+    actions = np.zeros((len(status), 7))
+    actions[:-1, :3] = positions[:-1]
+    if len(status) > 1:
+        actions[:-1, 3:6] = Rotation.from_quat(np.asarray(turns[:-1], np.float64)).as_euler("xyz")
+    actions[:-1, 6] = status[1:]
+    actions[-1, 6] = status[-1]
+    return actions.astype(np.float32)
+
+
+def split_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:
+    """The robot's root in the world (T, 4, 4), qpos (T, 12) and qvel (T, 12) of its states (T, 37), ManiSkill's."""
+    states = np.asarray(states, dtype=np.float64)
+    return to_matrices(states[:, :7]), states[:, _POSE : _POSE + len(JOINTS)], states[:, _POSE + len(JOINTS) :]
 
 
 def to_matrices(poses: Array) -> Array:

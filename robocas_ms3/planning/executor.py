@@ -74,7 +74,7 @@ class Executor:
         env: the environment, possibly wrapped by a recorder.
         seed: the episode's seed.
         actions: every action since the reset, (8,) each, or (11,) where the base is driven.
-        tcp_in_base: pose of the TCP in the arm's base frame after the reset and after each action, (7,) m and wxyz.
+        robot_states: ManiSkill's state of the robot after the reset and after each action, (37,) each.
         segments: the sub-goals so far.
         info: of the last step or reset.
         gripper: the gripper's command as it stands.
@@ -87,7 +87,7 @@ class Executor:
     env: gym.Env
     seed: int
     actions: list[np.ndarray] = field(default_factory=list)
-    tcp_in_base: list[np.ndarray] = field(default_factory=list)
+    robot_states: list[np.ndarray] = field(default_factory=list)
     segments: list[Segment] = field(default_factory=list)
     info: dict[str, Any] = field(default_factory=dict)
     gripper: float = OPEN
@@ -114,7 +114,7 @@ class Executor:
             _, self.info = self.env.reset(seed=self.seed)
         self.actions, self.segments, self.gripper, self.base = [], [], OPEN, np.zeros(3)
         self.facts, self.checkpoints = {}, []
-        self.tcp_in_base = [self._tcp()]
+        self.robot_states = [self._robot_state()]
 
     def mark(self) -> None:
         """Make this moment a checkpoint."""
@@ -217,7 +217,7 @@ class Executor:
         with self.seconds.spent_on("simulation"):
             *_, self.info = self.env.step(action)
         self.actions.append(action)
-        self.tcp_in_base.append(self._tcp())
+        self.robot_states.append(self._robot_state())
 
-    def _tcp(self) -> np.ndarray:
-        return self.base_env.agent.tcp_in_arm_base.raw_pose[0].cpu().numpy().copy()
+    def _robot_state(self) -> np.ndarray:
+        return self.base_env.agent.robot.get_state()[0].cpu().numpy().copy()

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import planar_base
-from robocas_ms3.datasets.forward import robot_frames
+from robocas_ms3.datasets.episode import planar_base, robot_frames
 from robocas_ms3.datasets.provenance import succeeded
 from robocas_ms3.datasets.scene_values import one_seed, sound
 from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile

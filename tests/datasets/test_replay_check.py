@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets import replay_check
@@ -34,12 +35,12 @@ class Player:
     def reset(self, seed, options):
         self.seed, self.options = seed, options
 
-    def play(self, translations, rotations, gripper):
-        self.plays.append((self.seed, translations, rotations, gripper))
+    def play(self, actions):
+        self.plays.append((self.seed, actions))
         pose, places = np.eye(4), [np.zeros(3)]
-        for shift, turn in zip(translations, rotations, strict=True):
-            pose[:3, 3] += pose[:3, :3] @ shift
-            pose[:3, :3] = pose[:3, :3] @ turn.as_matrix()
+        for action in actions.astype(float):
+            pose[:3, 3] += pose[:3, :3] @ action[:3]
+            pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("xyz", action[3:6]).as_matrix()
             places.append(pose[:3, 3].copy())
         return Played(self.seed != 5, np.array(places), 0)
 
@@ -80,11 +81,11 @@ def test_actions_are_the_datasets_own(dataset, player):
     assert (made.rate_hz, made.closed) == (5.0, True)
     assert [seed for seed, *_ in made.plays] == [3, 5]
     with np.load(dataset / "episode_0000000" / "episode_info.npz") as arrays:
-        _, translations, rotations, gripper = made.plays[0]
-        np.testing.assert_allclose(translations, arrays["rel_pos"][:-1], atol=1e-7)
-        quaternions = rotations.as_quat(canonical=True)
+        _, actions = made.plays[0]
+        np.testing.assert_array_equal(actions[:, :3], arrays["rel_pos"][:-1])
+        quaternions = Rotation.from_euler("xyz", actions[:, 3:6]).as_quat(canonical=True)
         np.testing.assert_allclose(quaternions, arrays["rel_orn"][:-1], atol=1e-6)
-        assert gripper.tolist() == arrays["gripper_status"][1:].tolist()
+        assert actions[:, 6].tolist() == arrays["gripper_status"][1:].tolist()
     assert [episode.success for episode in report.episodes] == [True, False]
     of_task = report.by_task()["pick"]
     assert (of_task["tried"], of_task["succeeded"], of_task["share"], of_task["skipped"]) == (2, 1, 0.5, 0)

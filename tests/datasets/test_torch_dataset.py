@@ -21,8 +21,7 @@ from torch.utils.data import DataLoader, WeightedRandomSampler
 
 from robocas_ms3.datasets import RoboCASDataset
 from robocas_ms3.datasets.actions import ActionScale, episode_actions
-from robocas_ms3.datasets.episode import Joints
-from robocas_ms3.datasets.forward import robot_frames
+from robocas_ms3.datasets.episode import Joints, robot_frames
 from robocas_ms3.datasets.sampling import SampleIndex, balancing_weights
 from robocas_ms3.datasets.windows import Window
 from robocas_ms3.errors import DatasetError

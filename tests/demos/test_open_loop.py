@@ -2,11 +2,16 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
+from robocas_ms3.datasets.actions import episode_actions
+from robocas_ms3.datasets.episode import episode_arrays, robot_frames, sample_subgoals
+from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
 from robocas_ms3.demos.open_loop import OpenLoop
+from robocas_ms3.demos.sampling import gripper_open, invert, sample_states, split_states
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.robots.constants import FINGER_TARGETS
+from robocas_ms3.robots.forward import link_poses
 
 pytestmark = pytest.mark.slow
 SEED = 2
@@ -24,27 +29,45 @@ def recorded(tmp_path_factory):
         return calls[-1][1]
 
     generator.open_loop.play_recording = listening
-    result = generator.generate(SEED, tmp_path_factory.mktemp("recorded"), "one")
+    folder = tmp_path_factory.mktemp("recorded")
+    result = generator.generate(SEED, folder, "one")
     assert result.success
     assert [args[4] is None for args, _ in calls] == [True, False]
     (args, played), *_ = calls
-    yield generator.open_loop, args[:4], played
+    yield generator.open_loop, args[:4], played, folder / "one.h5"
     generator.close()
 
 
 def test_a_demonstrations_own_actions_succeed_again(recorded):
-    _, (seed, tcp_in_base, gripper, control_freq), played = recorded
-    assert (seed, control_freq, len(tcp_in_base)) == (SEED, 20, len(gripper) + 1)
+    _, (seed, states, gripper, control_freq), played, _ = recorded
+    assert (seed, control_freq, len(states)) == (SEED, 20, len(gripper) + 1)
     assert played.success
     assert played.clipped == 0
     samples = [*range(0, len(gripper), 4), len(gripper)]
-    error = np.linalg.norm(played.tcp_in_base - tcp_in_base[samples, :3, 3], axis=1)
+    tcp, base = link_poses(*split_states(states[samples])[:2])
+    error = np.linalg.norm(played.tcp_in_base - (invert(base) @ tcp)[:, :3, 3], axis=1)
     assert error.mean() < 0.002
     assert error.max() < 0.02
 
 
+def test_a_trial_plays_what_a_dataset_will_hold_to_the_last_bit(recorded, monkeypatch):
+    open_loop, args, _, path = recorded
+    played = []
+    monkeypatch.setattr(open_loop, "play", played.append)
+    open_loop.play_recording(*args)
+    with TrajectoryFile(path) as file:
+        recording = file.recording(0)
+    samples = sample_states(recording.control_steps, 4)
+    joints = recording.joints(samples)
+    commands = recording.actions[:, 7]
+    status = gripper_open(commands, samples, finger_range=FINGER_TARGETS, initial_width=joints.qpos[0, 10:].sum())
+    goals = sample_subgoals(recording.subgoals, samples)
+    arrays = episode_arrays(robot_frames(joints), joints, status, recording.instruction, goals)
+    np.testing.assert_array_equal(played[0], episode_actions(arrays)[:-1])
+
+
 def test_noise_moves_the_tcp_a_little(recorded):
-    open_loop, args, played = recorded
+    open_loop, args, played, _ = recorded
     noisy = open_loop.play_recording(*args, np.random.default_rng(0))
     difference = np.abs(noisy.tcp_in_base - played.tcp_in_base)[:20]  # before anything is touched
     assert 1e-6 < difference.max() < 3e-4
@@ -53,23 +76,23 @@ def test_noise_moves_the_tcp_a_little(recorded):
 
 
 def test_with_an_open_gripper_they_do_not(recorded):
-    open_loop, (seed, tcp_in_base, gripper, control_freq), _ = recorded
-    assert not open_loop.play_recording(seed, tcp_in_base, np.ones_like(gripper), control_freq).success
+    open_loop, (seed, states, gripper, control_freq), *_ = recorded
+    assert not open_loop.play_recording(seed, states, np.ones_like(gripper), control_freq).success
 
 
 def test_beside_the_object_they_do_not(recorded):
-    open_loop, (seed, tcp_in_base, gripper, control_freq), _ = recorded
-    shifted = tcp_in_base.copy()
-    shifted[8:, 0, 3] += 0.1
+    open_loop, (seed, states, gripper, control_freq), *_ = recorded
+    shifted = states.copy()
+    shifted[8:, 13 + 3] += 0.2  # rad of the first joint of the arm, about 0.1 m at the hand
     assert not open_loop.play_recording(seed, shifted, gripper, control_freq).success
 
 
 def test_motion_beyond_a_step_is_counted(recorded):
-    open_loop, (seed, *_), _ = recorded
+    open_loop, (seed, *_), *_ = recorded
     open_loop.reset(seed)
     assert len(open_loop.layout.object_ids) == 10
-    turns = Rotation.from_euler("xyz", [[0, 0, 0], [0, 0, 0], [0.4, 0, 0.4]])  # the last: 0.57 rad in one step
-    played = open_loop.play(np.array([[0, 0, -0.15], [0, 0, 0.01], [0, 0, 0]]), turns, np.ones(3, bool))
+    actions = np.array([[0, 0, -0.15, 0, 0, 0, 1], [0, 0, 0.01, 0, 0, 0, 1], [0, 0, 0, 0.4, 0, 0.4, 1]])
+    played = open_loop.play(actions)  # the last: 0.57 rad in one step
     assert played.clipped == 2
     assert not played.success
 

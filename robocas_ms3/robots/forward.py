@@ -10,18 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import Frames, Joints
 from robocas_ms3.robots.constants import ARM_BASE_LINK, ARM_SLICE, BASE_SLICE, TCP_LINK
 from robocas_ms3.robots.urdf import robot_files
 
 Array = NDArray[np.float64]
 
 
-def robot_frames(joints: Joints) -> Frames:
-    """Poses of the TCP and of the arm's base in the world."""
+def link_poses(root_in_world: Array, qpos: Array) -> tuple[Array, Array]:
+    """Poses of the TCP and of the arm's base in the world, (T, 4, 4) each.
+
+    Whatever makes dataset actions of recorded states goes this way: equal states give equal numbers to the last bit,
+    with and without a renderer, which the links' poses of a simulator do not.
+
+    Args:
+        root_in_world: (T, 4, 4) of the robot.
+        qpos: (T, 12) m, rad.
+    """
     urdf = robot_files().urdf
-    base = joints.root_in_world @ chain(urdf, "root", ARM_BASE_LINK, joints.qpos[:, BASE_SLICE])
-    return Frames(base @ chain(urdf, ARM_BASE_LINK, TCP_LINK, joints.qpos[:, ARM_SLICE]), base)
+    base = root_in_world @ chain(urdf, "root", ARM_BASE_LINK, qpos[:, BASE_SLICE])
+    return base @ chain(urdf, ARM_BASE_LINK, TCP_LINK, qpos[:, ARM_SLICE]), base
 
 
 def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:
