@@ -72,7 +72,7 @@ def _write(cfg: View, out: Path, source, console) -> int:
     ours = (out / "data" / "index.js").is_file()
     if cfg.overwrite and out.is_dir() and any(out.iterdir()) and not ours:
         raise RobocasError("this folder was not made by `robocas view`", where=out, fix="It stays; choose another.")
-    claim_output(out, overwrite=False, resume=cfg.overwrite)
+    claim_output(out, resume=cfg.overwrite or None)  # what is there stays until the new one is written
     with Progress(console=Console(stderr=True), transient=True) as progress:
         bar = progress.add_task("episodes", total=None)
         count, damaged = export(

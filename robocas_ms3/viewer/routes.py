@@ -8,13 +8,16 @@
     /pictures/12/base_camera/rgb/30.jpg      a picture; depth in colours
     /thumbnails/12.jpg
 
-Data travel as scripts, so that the same page also works from files, where a browser fetches nothing.
+Data travel as scripts, so that the same page also works from files, where a browser fetches nothing. The page asks for
+pictures with a query that tells this server from others: a browser keeps them, and what is served at this port later may
+be another dataset.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import secrets
 import threading
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -58,6 +61,7 @@ class Routes:
 
     def __init__(self, source: Source) -> None:
         self.source = source
+        self.version = secrets.token_hex(4)
         self._index: dict[str, Any] | None = None
         self._script = b""
         self._making = threading.Lock()
@@ -69,7 +73,7 @@ class Routes:
         with self._making:
             if self._index is None:
                 self._index = self.source.index()
-                self._script = script("index", self._index)
+                self._script = script("index", {**self._index, "version": self.version})
             return self._index
 
     def respond(self, path: str) -> Response:

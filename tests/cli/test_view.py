@@ -51,7 +51,9 @@ def test_it_writes_a_folder(trajectory, tmp_path, capsys):
     assert capsys.readouterr().out.strip() == f"2 episodes: {out / 'index.html'}"
     assert {path.name for path in out.iterdir()} == {"index.html", "page", "data"}
     assert run(["view", str(trajectory), "--static", str(out)]) == 1
-    assert "--overwrite" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "--overwrite" in said
+    assert "--resume" not in said  # which it lacks
     assert run(["view", str(trajectory), "--static", str(out), "--overwrite", "--episodes", "1"]) == 0
     assert sorted(path.name for path in (out / "data").iterdir()) == ["episode_1.js", "index.js"]
 

@@ -5,6 +5,8 @@ import shutil
 import threading
 import time
 
+import cv2
+import numpy as np
 import pytest
 from browser import Browser, require_chromium
 
@@ -64,7 +66,7 @@ def pictures(browser, number, kind, at):
     want = f"pictures/{number}/static_camera/{kind}/{at}.jpg"
     browser.wait(
         "[...document.querySelectorAll('#cameras img')].every(img => img.complete && img.naturalWidth > 0 &&"
-        f" img.src.endsWith('{want}'.replace('static_camera', img.alt.replace(' ', '_')))) &&"
+        f" new URL(img.src).pathname.endsWith('{want}'.replace('static_camera', img.alt.replace(' ', '_')))) &&"
         " document.querySelectorAll('#cameras img').length === 3"
     )
 
@@ -197,8 +199,10 @@ def test_deep_links(page):
     page.send("Page.reload")
     page.wait(f"!window.old && {LOADED} && document.querySelector('#instruction').textContent.includes('cube 5')")
     assert step(page) == 5
-    page.run("location.hash = '#episode=2&step=999'")
-    page.wait("document.querySelector('#clock').textContent.startsWith('step 6')")
+    for words, at in (("999", 6), ("1.5", 2), ("-3", 0), ("6.4", 6), ("x", 0), ("Infinity", 6), ("NaN", 0)):
+        page.run(f"location.hash = '#episode=2&step={words}'")
+        page.wait(f"document.querySelector('#clock').textContent.startsWith('step {at} / 6')")
+        pictures(page, 2, "rgb", at)
 
 
 def test_a_link_to_nothing_says_so(page):
@@ -311,6 +315,25 @@ def test_a_thousand_episodes_are_quick_and_only_seen_rows_are_made(browser, fold
         browser.goto("about:blank")
         server.shutdown()
     assert browser.errors == []
+
+
+def test_another_dataset_at_the_same_port_shows_its_own_pictures(browser, folder, tmp_path):
+    other = shutil.copytree(folder, tmp_path / "other")
+    for path in other.glob("episode_0000000/*/rgb/0000.png"):
+        cv2.imwrite(str(path), np.full((12, 16, 3), 200, np.uint8))
+    port, widths = 0, {}
+    for path in (folder, other):
+        with Viewer(open_source(path), port) as server:
+            threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+            port = server.server_port
+            browser.goto(server.url)
+            browser.wait(LOADED)
+            pictures(browser, 0, "rgb", 0)
+            browser.wait("document.querySelector('.row img').naturalWidth === 96")
+            widths[path] = browser.run("document.querySelector('#cameras img').naturalWidth")
+            browser.goto("about:blank")
+            server.shutdown()
+    assert list(widths.values()) == [64, 16]
 
 
 def test_dark_and_narrow(page):

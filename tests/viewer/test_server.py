@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.viewer.routes import PAGE_FILES
+from robocas_ms3.viewer.routes import PAGE_FILES, Routes
 from robocas_ms3.viewer.server import HOST, Viewer
 from robocas_ms3.viewer.source import open_source
 
@@ -62,7 +62,10 @@ def test_the_page_and_its_files(server):
 def test_data(server, folder):
     response, data = get(server, "/data/index.js")
     assert response.headers["Content-Type"].startswith("text/javascript")
-    assert [row["n"] for row in content(data, "index")["episodes"]] == [0, 1, 2, None]
+    index = content(data, "index")
+    assert [row["n"] for row in index["episodes"]] == [0, 1, 2, None]
+    assert index["version"] != Routes(server.routes.source).version  # of pictures that a browser keeps
+    assert content(get(server, "/data/index.js")[1], "index") == index
     _, data = get(server, "/data/episode_1.js")
     assert content(data, "episode_1")["steps"] == 7
 
@@ -74,6 +77,7 @@ def test_pictures(server, folder):
     response, data = get(server, "/pictures/1/base_camera/depth/2.jpg")
     assert response.headers["Content-Type"] == "image/jpeg"
     assert pixels(data).shape == (48, 64, 3)
+    assert get(server, "/pictures/1/base_camera/depth/2.jpg?1a2b")[1] == data
     _, data = get(server, "/thumbnails/1.jpg")
     assert pixels(data).shape == (72, 96, 3)
 

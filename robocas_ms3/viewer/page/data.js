@@ -5,9 +5,11 @@ const robocas = (() => {
   const store = new Map();
   const waiting = new Map();
   const KEEP = 12; // episodes in memory
+  let query = ""; // of pictures, which a browser keeps: it must not take them for those of another server
 
   function put(name, content) {
     store.set(name, content);
+    if (name === "index" && content.version) query = `?${content.version}`;
     const episodes = [...store.keys()].filter((key) => key !== "index");
     for (const key of episodes.slice(0, Math.max(0, episodes.length - KEEP))) store.delete(key);
   }
@@ -27,7 +29,8 @@ const robocas = (() => {
     return promise;
   }
 
-  const pictureUrl = (episode, camera, kind, step) => `pictures/${episode}/${camera}/${kind}/${step}.jpg`;
+  const pictureUrl = (episode, camera, kind, step) => `pictures/${episode}/${camera}/${kind}/${step}.jpg${query}`;
+  const thumbnailUrl = (episode) => `thumbnails/${episode}.jpg${query}`;
   const byId = (id) => document.getElementById(id);
 
   function element(tag, attributes = {}, ...children) {
@@ -62,5 +65,5 @@ const robocas = (() => {
     return { ctx, width, height };
   }
 
-  return { put, load, pictureUrl, byId, element, colour, seriesColour, context };
+  return { put, load, pictureUrl, thumbnailUrl, byId, element, colour, seriesColour, context };
 })();

@@ -67,7 +67,7 @@ robocas.player = (() => {
   function go(to) {
     if (!episode) return;
     const last = episode.steps - 1;
-    step = Math.max(0, Math.min(last, Number.isNaN(to) ? 0 : to));
+    step = Math.max(0, Math.min(last, Math.round(to) || 0)); // NaN, of an address: the first
     byId("scrub").value = step;
     byId("clock").textContent = `step ${step} / ${last}   ${episode.times[step].toFixed(2)} s`;
     const now = episode.subgoals.findIndex((goal) => goal.first <= step && step <= goal.last);

@@ -2,7 +2,7 @@
 // The episode table: filters, sorting, and rows made only where they are seen.
 
 robocas.table = (() => {
-  const { byId, element } = robocas;
+  const { byId, element, thumbnailUrl } = robocas;
   const HEIGHT = 52; // of a row, as in style.css
   const SPARE = 6; // rows beyond the visible ones
   let index = null;
@@ -138,7 +138,7 @@ robocas.table = (() => {
       };
     }
     if (index.cameras.length) {
-      row.append(gone ? element("span") : element("img", { src: `thumbnails/${e.n}.jpg`, alt: "", loading: "lazy" }));
+      row.append(gone ? element("span") : element("img", { src: thumbnailUrl(e.n), alt: "", loading: "lazy" }));
     }
     const title = gone ? `seed ${e.seed}, given up` : e.object || e.instruction || `seed ${e.seed ?? "unknown"}`;
     const attempts = e.attempts > 1 ? `${e.attempts} attempts` : "";
