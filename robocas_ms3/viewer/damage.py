@@ -73,6 +73,12 @@ def entry_of(entries: Any, number: int) -> Any:
     return entries.get(str(number)) if isinstance(entries, dict) else None
 
 
+def split_of(info: Mapping[str, Any]) -> dict[int, str]:
+    """Side of each episode that a dataset lists, "train" or "val"; the others are on neither."""
+    sides = {side: info.get(f"{side}_eps") for side in ("train", "val")}
+    return {n: side for side, listed in sides.items() if isinstance(listed, list) for n in listed if type(n) is int}
+
+
 def integer(value: Any) -> int | None:
     """A whole number that is one; None for others."""
     return value if type(value) is int else None

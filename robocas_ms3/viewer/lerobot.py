@@ -17,13 +17,14 @@ from robocas_ms3.datasets.scene_values import one_seed
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer import damage
 from robocas_ms3.viewer.arrays import show_arrays
-from robocas_ms3.viewer.damage import ledger_entry, readable, table
+from robocas_ms3.viewer.damage import ledger_entry, readable, split_of, table
 from robocas_ms3.viewer.failures import Failures, stages
+from robocas_ms3.viewer.kept import KeptPictures
 from robocas_ms3.viewer.pictures import encode_jpeg
 from robocas_ms3.viewer.source import Picture, inside_path, make_episode, make_index, plot, row
 
 _AT_ONCE = 8  # pictures decoded together: a video opens and seeks slowly, and who looks at one looks at the next
-_KEPT = 64  # such groups in memory
+_KEPT = 128 * 2**20  # bytes of such groups in memory: 17 of 640 x 480
 
 
 class LeRobotSource:
@@ -46,20 +47,20 @@ class LeRobotSource:
         self._settings, wrong = table(lambda: self.dataset.settings, schema.CONVERSION_FILE)
         self._note = " ".join(filter(None, (wrong, self.failures.note)))
         self._open = lru_cache(maxsize=16)(self._open_now)
-        self._frames = lru_cache(maxsize=_KEPT)(self._decode)
+        self._kept = KeptPictures(_KEPT)
         self._decoding = threading.Lock()
 
     def index(self) -> dict[str, Any]:
         """From ``meta/episodes`` and, where it is one of ours, ledger and scenes of its conversion."""
         texts, wrong = table(self._scenes, schema.SCENES_FILE)
-        val = self._settings.get("val_eps")
-        rows = [self._row(entry, texts, val if isinstance(val, list) else None) for entry in self.dataset.rows]
+        split = split_of(self._settings)
+        rows = [self._row(entry, texts, split) for entry in self.dataset.rows]
         rows += self.failures.given_up(rows)
         note = " ".join(filter(None, (wrong, self._note)))
         rate_hz, cameras, has_depth = self._pictures
         return make_index(self.root, "LeRobot dataset", rate_hz, cameras, has_depth, rows, note)
 
-    def _row(self, entry: dict[str, Any], texts: dict[int, str], val: list | None) -> dict[str, Any]:
+    def _row(self, entry: dict[str, Any], texts: dict[int, str], split: dict[int, str]) -> dict[str, Any]:
         number = int(entry["episode_index"])
         scene, wrong = damage.scene(lambda: json.loads(texts.get(number, "null")))
         made, wrong_made = ledger_entry(self._settings.get("episodes"), number, schema.CONVERSION_FILE)
@@ -73,7 +74,7 @@ class LeRobotSource:
             target=(made.get("target") or {}).get("name", ""),
             seed=seed,
             success=made.get("success"),
-            split="" if val is None else "val" if number in val else "train",
+            split=split.get(number, ""),
             stages=stages(self.failures.of_seed(seed), recorded),
             attempts=recorded.get("attempts"),
             damage="; ".join(filter(None, (wrong, wrong_made))),
@@ -126,7 +127,8 @@ class LeRobotSource:
         if not 0 <= step < self._open(number).steps:
             raise DatasetError("no such step", where=f"{self.root}, episode {number}", found=step)
         with self._decoding:
-            return self._frames(number, camera, kind, step // _AT_ONCE)[step % _AT_ONCE]
+            key = number, camera, kind, step // _AT_ONCE
+            return self._kept.get(key, lambda: self._decode(*key))[step % _AT_ONCE]
 
     def _decode(self, number: int, camera: str, kind: str, group: int) -> list[NDArray]:
         episode, first = self._open(number), group * _AT_ONCE

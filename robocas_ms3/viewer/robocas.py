@@ -16,7 +16,7 @@ from robocas_ms3.datasets.tolerant import DAMAGED
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer import damage
 from robocas_ms3.viewer.arrays import NEEDED, show_arrays
-from robocas_ms3.viewer.damage import entry_of, integer, ledger_entry, rate_of, readable, table, text
+from robocas_ms3.viewer.damage import entry_of, integer, ledger_entry, rate_of, readable, split_of, table, text
 from robocas_ms3.viewer.failures import Failures, stages
 from robocas_ms3.viewer.source import Picture, inside_path, make_index, row
 
@@ -48,14 +48,13 @@ class RoboCASSource:
 
         Seeds without an episode, from ``failures.jsonl``, come last.
         """
-        val = self._info.get("val_eps")
-        val = {number for number in val if type(number) is int} if isinstance(val, list) else set()
-        rows = [self._row(number, val) for number in self.dataset.numbers]
+        split = split_of(self._info)
+        rows = [self._row(number, split.get(number, "")) for number in self.dataset.numbers]
         first = self.dataset.episode(self.dataset.numbers[0])
         rows += self.failures.given_up(rows)
         return make_index(self.root, "RoboCAS folder", self.rate_hz, first.cameras, first.has_depth, rows, self._note)
 
-    def _row(self, number: int, val: set[int]) -> dict[str, Any]:
+    def _row(self, number: int, split: str) -> dict[str, Any]:
         episode = Episode(self.root / schema.episode_folder(number))
         scene, wrong = damage.scene(lambda: episode.scene)
         entry, wrong_entry = ledger_entry(self._settings.get("episodes"), number, schema.CONVERSION_FILE)
@@ -71,7 +70,7 @@ class RoboCASSource:
             target=(scene.get("target") or entry.get("target") or {}).get("name", ""),
             seed=seed,
             success=scene.get("success", entry.get("success")),
-            split="" if not self._info else "val" if number in val else "train",
+            split=split,
             stages=stages(self.failures.of_seed(seed), recorded),
             attempts=recorded.get("attempts"),
             damage="; ".join(filter(None, (wrong, wrong_entry, wrong_steps))),

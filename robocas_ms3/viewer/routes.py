@@ -9,8 +9,8 @@
     /thumbnails/12.jpg
 
 Data travel as scripts, so that the same page also works from files, where a browser fetches nothing. The page asks for
-pictures with a query that tells this server from others: a browser keeps them, and what is served at this port later may
-be another dataset.
+pictures with a query that tells this server from others: a browser keeps them, and what is served at this port later
+may be another dataset.
 """
 
 from __future__ import annotations

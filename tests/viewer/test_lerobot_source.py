@@ -42,6 +42,24 @@ def test_pictures_are_those_of_that_step(lerobot, folder):
         source.rgb(3, "static_camera", 0)
 
 
+def test_decoded_pictures_take_little_memory(lerobot, monkeypatch):
+    """A group of 7 pictures is 64 x 48 x 3 x 7 bytes."""
+    monkeypatch.setattr("robocas_ms3.viewer.lerobot._KEPT", 2 * 64 * 48 * 3 * 7)
+    source, decoded = open_source(lerobot), []
+    decode = source._decode
+    source._decode = lambda *key: decoded.append(key[0]) or decode(*key)
+    for number in (0, 1, 0, 2, 0, 1):
+        source.rgb(number, "base_camera", 3)
+    assert decoded == [0, 1, 2, 1]
+
+
+def test_an_episode_that_is_not_listed_is_on_no_side(lerobot, tmp_path):
+    other = shutil.copytree(lerobot, tmp_path / "other")
+    path = other / "meta/robocas/conversion.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "train_eps": [0], "val_eps": [2]}))
+    assert [row["split"] for row in open_source(other).index()["episodes"]] == ["train", "", "val", ""]
+
+
 def test_another_makers_dataset_shows_its_columns(lerobot, tmp_path):
     other = shutil.copytree(lerobot, tmp_path / "other")
     shutil.rmtree(other / "meta/robocas")

@@ -122,6 +122,15 @@ def test_a_folder_lists_episodes(folder):
     assert sorted(row["split"] for row in index["episodes"]) == ["", "train", "train", "val"]
 
 
+def test_an_episode_that_is_not_listed_is_on_no_side(folder, tmp_path):
+    """As after a conversion that was interrupted."""
+    other = shutil.copytree(folder, tmp_path / "other")
+    info = json.loads((other / "data_info.json").read_text())
+    for train, val, shown in (([0], [2], ["train", "", "val"]), ([], [], [""] * 3), (["x"], 3, [""] * 3)):
+        (other / "data_info.json").write_text(json.dumps({**info, "train_eps": train, "val_eps": val}))
+        assert [row["split"] for row in open_source(other).index()["episodes"]] == [*shown, ""]
+
+
 def test_an_episode_of_a_folder(folder):
     episode, arrays = open_source(folder).episode(1), Dataset(folder).episode(1).arrays
     assert set(episode) == EPISODE
