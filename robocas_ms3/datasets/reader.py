@@ -22,6 +22,7 @@ from robocas_ms3.datasets.tolerant import complete, load_arrays
 from robocas_ms3.errors import DatasetError
 
 _RATE_HZ = 5.0  # upstream's
+_SPLIT = "robocas split --in-place --val-share 0.1 makes a new one."
 _SEE_VALIDATE = "robocas validate lists all that is wrong."
 
 
@@ -153,6 +154,10 @@ class Dataset:
         return sorted(number for number in found if number is not None)
 
     @cached_property
+    def _known(self) -> frozenset[int]:
+        return frozenset(self.numbers)
+
+    @cached_property
     def settings(self) -> dict[str, Any]:
         """``conversion.json``; empty where there is none."""
         return _read_json(self.root / schema.CONVERSION_FILE)
@@ -161,6 +166,23 @@ class Dataset:
     def info(self) -> dict[str, Any]:
         """``data_info.json``; empty where there is none."""
         return _read_json(self.root / schema.DATA_INFO_FILE)
+
+    @cached_property
+    def sides(self) -> tuple[list[int], list[int]]:
+        """Training and validation episodes, as ``data_info.json`` lists them; numbers written as texts count too.
+
+        Raises:
+            DatasetError: a list holds something else.
+        """
+        return self._side("train_eps"), self._side("val_eps")
+
+    def _side(self, key: str) -> list[int]:
+        listed = self.info.get(key, [])
+        if isinstance(listed, list) and all(type(n) is int or (isinstance(n, str) and n.isdecimal()) for n in listed):
+            return [int(n) for n in listed]
+        where = f"{self.root / schema.DATA_INFO_FILE}, {key}"
+        found = str(listed)[:60]
+        raise DatasetError("this split is damaged", where=where, expected="episode numbers", found=found, fix=_SPLIT)
 
     @property
     def rate_hz(self) -> float:
@@ -173,7 +195,7 @@ class Dataset:
         Raises:
             DatasetError: there is none of this number.
         """
-        if number not in self.numbers:
+        if number not in self._known:
             known = f"{self.numbers[0]} to {self.numbers[-1]}"
             raise DatasetError("no such episode", where=self.root, expected=known, found=number)
         return Episode(self.root / schema.episode_folder(number), self)

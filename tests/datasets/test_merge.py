@@ -9,6 +9,7 @@ from robocas_ms3.datasets.convert import convert
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.output import Placed
 from robocas_ms3.datasets.manage.parts import names_of
+from robocas_ms3.datasets.manage.splitting import Share, resplit
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.validate import validate
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
@@ -143,6 +144,25 @@ def test_unfinished_datasets(parts, tmp_path):
     edit(other / "conversion.json", lambda c: c["episodes"].pop("1"))
     fails("these episodes are not listed .found 1", [other], tmp_path / "out")
     fails("no dataset here", [tmp_path / "nothing"], tmp_path / "out")
+
+
+def test_a_split_of_texts_is_read_as_numbers(parts, tmp_path):
+    part = spoiled(parts[0], tmp_path)
+    sides = Dataset(part).sides
+    edit(part / "data_info.json", lambda c: c.update({k: list(map(str, c[k])) for k in ("train_eps", "val_eps")}))
+    merge([part], tmp_path / "out")
+    assert sides[1]
+    assert Dataset(tmp_path / "out").sides == sides
+    assert resplit(part) == sides
+
+
+@pytest.mark.parametrize("listed", [["x"], [0.5], [True], [[0]], "0", {"0": 1}, None])
+def test_a_split_of_something_else(parts, tmp_path, listed):
+    part = spoiled(parts[0], tmp_path)
+    edit(part / "data_info.json", lambda c: c.update(val_eps=listed))
+    fails("data_info.json, val_eps: this split is damaged .expected episode numbers", [part], tmp_path / "out")
+    resplit(part, Share(0.5))  # as the message says
+    merge([part], tmp_path / "out")
 
 
 def test_a_damaged_episode_stops_it_before_the_end(parts, tmp_path):

@@ -85,25 +85,23 @@ def open_part(root: Path) -> Part:
                 found=found,
                 fix="Run robocas upgrade first.",
             )
-    return Part(dataset, ledger, (list(dataset.info["train_eps"]), list(dataset.info["val_eps"])))
+    return Part(dataset, ledger, dataset.sides)
 
 
 def check_whole(dataset: Dataset) -> None:
     """Check that ``data_info.json`` lists the episodes on disk: an unfinished conversion's does not.
 
     Raises:
-        DatasetError: it lists others.
+        DatasetError: it lists others, or something else.
     """
     path = dataset.root / schema.DATA_INFO_FILE
-    info = dataset.info
-    if not info:
+    if not dataset.info:
         raise DatasetError(
             "this dataset is not finished", where=path, found="no file", fix="Run robocas convert --resume first."
         )
-    sides = [info.get(key) for key in ("train_eps", "val_eps")]
-    listed = [number for side in sides if isinstance(side, list) for number in side]
-    if sorted(map(str, listed)) != sorted(map(str, dataset.numbers)):
-        different = sorted(set(map(str, listed)) ^ set(map(str, dataset.numbers)), key=lambda n: (len(n), n))
+    listed = [number for side in dataset.sides for number in side]
+    if sorted(listed) != dataset.numbers:
+        different = sorted(set(listed) ^ set(dataset.numbers))
         raise DatasetError(
             "not the episodes on disk",
             where=path,

@@ -111,11 +111,7 @@ def resplit(root: Path, share: Share | None = None) -> Sides:
     """
     with locked_folder(root):
         dataset = Dataset(root)
-        before = dataset.info
-        sides: Sides = (list(before.get("train_eps", [])), list(before.get("val_eps", [])))
-        if share is not None:
-            train, val = cut(groups_of(dataset, share.by), [1 - share.val, share.val])
-            sides = (train, val)
+        sides = dataset.sides if share is None else _sides(dataset, share)
         settings = dataset.settings
         if settings:
             there = {str(number) for number in dataset.numbers}
