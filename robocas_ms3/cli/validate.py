@@ -32,7 +32,8 @@ class Validate:
     replay: bool = False
     """Play the actions too (RoboCAS folders; simulated, not rendered)."""
     min_share: float = 0.0
-    """With --replay: exit code 1 where a smaller share of a task's episodes succeeds again (0 to 1)."""
+    """With --replay: exit code 1 where a smaller share of a task's episodes succeeds again (0 to 1), or where
+    none of them could be tried."""
     json: bool = False
     """Print a machine-readable report."""
 
@@ -59,7 +60,7 @@ def main(cfg: Validate) -> int:
     if cfg.replay:
         replays = _replay(cfg.dataset)
         content["replay"] = replays.as_json()
-        wrong |= any(of_task["tried"] and of_task["share"] < cfg.min_share for of_task in replays.by_task().values())
+        wrong |= any((of_task["share"] or 0.0) < cfg.min_share for of_task in replays.by_task().values())
         if not cfg.json:
             for line in _lines(replays):
                 console.print(line)
@@ -99,9 +100,12 @@ def _lines(report: ReplayReport) -> Iterator[str]:
             strayed = f"strayed {episode.max_error * 1000:.0f} mm at most"
             yield f"episode {episode.number}: its own actions do not succeed again; {strayed}"
     for task, of_task in report.by_task().items():
-        if of_task["tried"]:
+        name = task or "unknown task"
+        if not of_task["tried"]:
+            yield f"{name}: none of {of_task['skipped']} episodes could be replayed: no share is known"
+        else:
             yield (
-                f"{task or 'unknown task'}: {of_task['succeeded']} of {of_task['tried']} replayed episodes succeed"
+                f"{name}: {of_task['succeeded']} of {of_task['tried']} replayed episodes succeed"
                 f" again ({of_task['share']:.0%}); tracking error {of_task['mean_error'] * 1000:.1f} mm on average,"
                 f" {of_task['max_error'] * 1000:.0f} mm at most"
             )

@@ -12,6 +12,7 @@ import numpy as np
 
 from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.datasets.scene_values import one_seed
 from robocas_ms3.datasets.tolerant import first_line
 from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.errors import RobocasError
@@ -110,12 +111,12 @@ class _Player:
         try:
             scene = episode.scene
             task = str(scene.get("task") or "")
-            reason = _not_playable(episode)
-            if reason:
+            seed, reason = one_seed(scene.get("seed")), _not_playable(episode)
+            if seed is None or reason:
                 return EpisodeReplay(number, task, None, skipped=reason)
             arrays = episode.arrays
             open_loop = self._environment(scene["env_info"])
-            open_loop.reset(int(scene["seed"]), scene.get("reset_options") or {})
+            open_loop.reset(seed, scene.get("reset_options") or {})
             other = _other_scene(scene, open_loop)
             if other:
                 return EpisodeReplay(number, task, None, skipped=f"its seed builds another scene now: {other}")
@@ -160,7 +161,7 @@ def _other_scene(scene: dict[str, Any], open_loop: OpenLoop) -> str:
 
 def _not_playable(episode: Episode) -> str:
     scene = episode.scene
-    if not scene.get("env_info") or scene.get("seed") is None:
+    if not scene.get("env_info") or one_seed(scene.get("seed")) is None:
         return "its scene.json does not say how to build the scene"
     if scene.get("success") is False:
         return "it was recorded without success"

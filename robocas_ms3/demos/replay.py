@@ -171,11 +171,11 @@ def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env
 
 
 def state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:
-    """Greatest absolute difference of any number of two states."""
-    worst = 0.0
+    """Greatest absolute difference of any number of two states; NaN where one has a NaN."""
+    worst = np.float64(0.0)
     for kind in ("actors", "articulations"):
         for name, value in recorded[kind].items():
             now = state[kind][name]
             now = now.cpu().numpy() if isinstance(now, torch.Tensor) else np.asarray(now)
-            worst = max(worst, float(np.abs(now.reshape(-1) - np.asarray(value).reshape(-1)).max()))
-    return worst
+            worst = np.maximum(worst, np.abs(now.reshape(-1) - np.asarray(value).reshape(-1)).max())  # max() hides NaN
+    return float(worst)

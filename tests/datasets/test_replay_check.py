@@ -138,6 +138,15 @@ def test_arrays_that_can_not_be_played_cost_no_other_episode(dataset, changes, r
     assert second.success is False
 
 
+def test_a_seed_as_maniskill_writes_it(dataset, player):
+    edit_scene(dataset, 0, seed=[5])
+    edit_scene(dataset, 1, seed=[3, 4])
+    first, second = replay_dataset(dataset).episodes
+    assert (first.success, first.skipped) == (False, "")
+    assert [seed for seed, *_ in player.made[0].plays] == [5]
+    assert "does not say how to build the scene" in second.skipped
+
+
 def test_unknown_success_is_tried(dataset):
     edit_scene(dataset, 0, success=None)
     assert replay_dataset(dataset).episodes[0].success is True
@@ -165,3 +174,17 @@ def test_the_command_tells_it_and_may_ask_for_a_share(dataset, capsys):
     assert run(["validate", str(dataset), "--replay", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["replay"]["by_task"]["pick"]["share"] == 0.5
+
+
+@pytest.mark.parametrize("json_too", [(), ("--json",)])
+def test_a_share_that_nobody_could_see_is_not_enough(dataset, capsys, json_too):
+    """As where the pack is not installed, or for one of two tasks."""
+    for number in (0, 1):
+        edit_scene(dataset, number, env_info={"env_id": "x", "env_kwargs": {"pack": "gone"}})
+    command = ["validate", str(dataset), "--replay", *json_too]
+    assert run(command) == 0
+    said = "pick: none of 2 episodes could be replayed: no share is known"
+    assert json_too or said in capsys.readouterr().out
+    assert run([*command, "--min-share", "0.9"]) == 1
+    edit_scene(dataset, 0, env_info={"env_id": "y", "env_kwargs": {}}, task="select")
+    assert run([*command, "--min-share", "0.9"]) == 1
