@@ -133,13 +133,17 @@ def convert(
             if on_start:
                 on_start(len(missing))
             job = Job(file.path, out, stride, rate_hz, pictures, vectors, open_source, missing)
-            written = _write(job, plan, jobs, on_episode)
+            written = _write(job, file.env_info, plan, jobs, on_episode)
     written.sort(key=lambda episode: episode.number)
     return Conversion(written, len(plan.tasks) - len(missing), time.perf_counter() - begun)
 
 
 def _write(
-    job: Job, plan: Plan, jobs: int, on_episode: Callable[[WrittenEpisode], None] | None
+    job: Job,
+    env_info: dict[str, Any],
+    plan: Plan,
+    jobs: int,
+    on_episode: Callable[[WrittenEpisode], None] | None,
 ) -> list[WrittenEpisode]:
     written: list[WrittenEpisode] = []
     before = _split_before(job.out)
@@ -150,7 +154,7 @@ def _write(
                 written.append(episode)
                 if on_episode:
                     on_episode(episode)
-        add_failures(job.trajectory.parent, job.out)
+        add_failures(job.trajectory.parent, job.out, env_info)
         write_info(job.out, before)
     return written
 

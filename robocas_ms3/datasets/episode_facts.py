@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.config import load_task_config
-from robocas_ms3.datasets.provenance import succeeded
+from robocas_ms3.datasets.provenance import succeeded, task_of
 from robocas_ms3.datasets.sources import Source
 from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
 from robocas_ms3.datasets.trajectory_source import TrajectorySource
@@ -161,12 +160,6 @@ def _standing(recording: Recording, count: int) -> tuple[list[int], Array]:
 
 def _place(slots: list[int], slot: int | None) -> int | None:
     return slots.index(slot) if slot in slots else None
-
-
-def task_of(env_id: str | None) -> str | None:
-    """Name of the task of an environment, by its id; the registry itself would bring the simulator."""
-    match = re.fullmatch(r"(?:\w+:)?RoboCAS(\w+)-v\d+", env_id or "")
-    return "_".join(re.findall("[A-Z][a-z]*", match[1])).lower() if match else None
 
 
 def _config_name(env_info: Mapping[str, Any], task: str | None) -> str:

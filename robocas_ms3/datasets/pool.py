@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import threading
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from robocas_ms3.demos.parent import leave_with_parent
 from robocas_ms3.errors import DatasetError
 
 Task = TypeVar("Task")
@@ -76,16 +76,8 @@ def _start_worker(open_worker: Callable[[], Worker[Any, Any]]) -> None:
     global _worker  # noqa: PLW0603  (state of a worker process)
     # One thread a process: several that render in software on all cores get in each other's way.
     os.environ.setdefault("LP_NUM_THREADS", "1")
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    leave_with_parent()
     _worker = open_worker()
-
-
-def _leave_with_parent() -> None:
-    """A worker whose parent was killed would wait for work for ever."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def _do(task: Any) -> Any:

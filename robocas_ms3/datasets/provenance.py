@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -58,3 +61,17 @@ def scene_record(
 def succeeded(episode: dict[str, Any]) -> bool:
     """Whether a trajectory's entry ended in success."""
     return bool(np.all(episode.get("success", False)))
+
+
+def task_of(env_id: str | None) -> str | None:
+    """Name of the task of an environment, by its id; the registry itself would bring the simulator."""
+    match = re.fullmatch(r"(?:\w+:)?RoboCAS(\w+)-v\d+", env_id or "")
+    return "_".join(re.findall("[A-Z][a-z]*", match[1])).lower() if match else None
+
+
+def environment_of(env_info: Mapping[str, Any] | None) -> str:
+    """What tells an environment from others of another task, configuration or pack; empty where it is not known."""
+    if not env_info or not env_info.get("env_id"):
+        return ""
+    known = [env_info["env_id"], env_info.get("env_kwargs") or {}]
+    return hashlib.sha256(json.dumps(known, sort_keys=True, default=str).encode()).hexdigest()[:12]

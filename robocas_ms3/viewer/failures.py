@@ -10,11 +10,32 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from robocas_ms3.datasets.provenance import environment_of
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.viewer.source import row
 
 FAILURES_FILE = "failures.jsonl"
-_LINE = TypeAdapter(Failure)
+
+
+@dataclass(frozen=True)
+class Told(Failure):
+    """A line of the file.
+
+    Attributes:
+        task, environment: which run it is of, where a dataset may be of several; None where it does not say.
+    """
+
+    task: str | None = None
+    environment: str | None = None
+
+    def is_of(self, env_info: Any) -> bool:
+        """Whether it is of a run in this environment, as far as either is known."""
+        if not self.environment or not isinstance(env_info, Mapping):
+            return True
+        return environment_of(env_info) in ("", self.environment)
+
+
+_LINE = TypeAdapter(Told)
 
 
 @dataclass(frozen=True)
@@ -26,7 +47,7 @@ class Failures:
         note: which lines are damaged, for people.
     """
 
-    by_seed: Mapping[int, list[Failure]] = field(default_factory=dict)
+    by_seed: Mapping[int, list[Told]] = field(default_factory=dict)
     note: str = ""
 
     @classmethod
@@ -38,7 +59,7 @@ class Failures:
             return cls()
         except OSError as error:
             return cls(note=f"`{FAILURES_FILE}` can't be read: {error.strerror}.")
-        found: dict[int, list[Failure]] = defaultdict(list)
+        found: dict[int, list[Told]] = defaultdict(list)
         damaged = []
         for number, line in enumerate(lines, 1):
             try:
@@ -49,21 +70,39 @@ class Failures:
                 damaged.append(str(number))
         return cls(dict(found), _damaged(damaged))
 
-    def of_seed(self, seed: int | None) -> list[Failure]:
-        """Of one seed; none where it is not known."""
-        return [] if seed is None else self.by_seed.get(seed, [])
+    def of_seed(self, seed: int | None, env_info: Any = None) -> list[Told]:
+        """Of one seed in an environment; none where the seed is not known."""
+        return [] if seed is None else [told for told in self.by_seed.get(seed, []) if told.is_of(env_info)]
 
-    def given_up(self, rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-        """Rows of the seeds that were given up, but those that have an episode after all."""
-        there, tasks = {entry["seed"] for entry in rows}, {entry["task"] for entry in rows}
-        task = tasks.pop() if len(tasks) == 1 else ""  # the file does not say
+    def given_up(self, rows: Iterable[Mapping[str, Any]], env_infos: Iterable[Any]) -> list[dict[str, Any]]:
+        """Rows of the seeds that were given up, but those that have an episode after all.
+
+        Args:
+            rows: of the episodes.
+            env_infos: the environment of each, as far as it is known.
+        """
+        there: dict[int, list[Any]] = defaultdict(list)
+        tasks = set()
+        for entry, env_info in zip(rows, env_infos, strict=True):
+            there[entry["seed"]].append(env_info)
+            tasks.add(entry["task"])
+        task = tasks.pop() if len(tasks) == 1 else ""  # where the file does not say
         lost = []
-        for seed, failures in sorted(self.by_seed.items()):
-            if seed not in there and any(failure.gave_up for failure in failures):
-                tried = [failure for failure in failures if not failure.gave_up]
-                named = stages(tried, {}) or ["given up"]
-                lost.append(row(None, task=task, seed=seed, success=False, stages=named, attempts=len(tried)))
+        for seed, of_seed in sorted(self.by_seed.items()):
+            runs: dict[str | None, list[Told]] = defaultdict(list)
+            for told in of_seed:
+                runs[told.environment].append(told)
+            for of_run in runs.values():
+                made = any(of_run[0].is_of(env_info) for env_info in there[seed])
+                if not made and any(told.gave_up for told in of_run):
+                    tried = [told for told in of_run if not told.gave_up]
+                    lost.append(_lost(seed, of_run[0].task or task, tried))
         return lost
+
+
+def _lost(seed: int, task: str, tried: list[Told]) -> dict[str, Any]:
+    named = stages(tried, {}) or ["given up"]
+    return row(None, task=task, seed=seed, success=False, stages=named, attempts=len(tried))
 
 
 def _damaged(lines: list[str]) -> str:

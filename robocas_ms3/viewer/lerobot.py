@@ -54,19 +54,21 @@ class LeRobotSource:
         """From ``meta/episodes`` and, where it is one of ours, ledger and scenes of its conversion."""
         texts, wrong = table(self._scenes, schema.SCENES_FILE)
         split = split_of(self._settings)
-        rows = [self._row(entry, texts, split) for entry in self.dataset.rows]
-        rows += self.failures.given_up(rows)
+        found = [self._row(entry, texts, split) for entry in self.dataset.rows]
+        rows, env_infos = [row for row, _ in found], [env_info for _, env_info in found]
+        rows += self.failures.given_up(rows, env_infos)
         note = " ".join(filter(None, (wrong, self._note)))
         rate_hz, cameras, has_depth = self._pictures
         return make_index(self.root, "LeRobot dataset", rate_hz, cameras, has_depth, rows, note)
 
-    def _row(self, entry: dict[str, Any], texts: dict[int, str], split: dict[int, str]) -> dict[str, Any]:
+    def _row(self, entry: dict[str, Any], texts: dict[int, str], split: dict[int, str]) -> tuple[dict, Any]:
         number = int(entry["episode_index"])
         scene, wrong = damage.scene(lambda: json.loads(texts.get(number, "null")))
         made, wrong_made = ledger_entry(self._settings.get("episodes"), number, schema.CONVERSION_FILE)
         recorded, tasks = scene.get("recorded") or {}, entry.get("tasks") or [""]
         seed = one_seed(made.get("seed"))
-        return row(
+        env_info = scene.get("env_info")
+        shown = row(
             number,
             steps=int(entry["length"]),
             instruction=str(tasks[0]),
@@ -75,17 +77,18 @@ class LeRobotSource:
             seed=seed,
             success=made.get("success"),
             split=split.get(number, ""),
-            stages=stages(self.failures.of_seed(seed), recorded),
+            stages=stages(self.failures.of_seed(seed, env_info), recorded),
             attempts=recorded.get("attempts"),
             damage="; ".join(filter(None, (wrong, wrong_made))),
         )
+        return shown, env_info
 
     def episode(self, number: int) -> dict[str, Any]:
         """As a RoboCAS folder shows it, or each numeric column as a plot."""
         episode, rate = self._open(number), self.dataset.rate_hz
         if self.ours:
             scene, _ = damage.scene(lambda: episode.scene)  # the table says what is wrong
-            failures = self.failures.of_seed(one_seed(scene.get("seed")))
+            failures = self.failures.of_seed(one_seed(scene.get("seed")), scene.get("env_info"))
             return show_arrays(number, episode.arrays, scene, rate, failures)
         features, skipped = self.dataset.info["features"], {*schema.INDICES, schema.SUBTASK_INDEX.key}
         plots = []

@@ -49,12 +49,13 @@ class RoboCASSource:
         Seeds without an episode, from ``failures.jsonl``, come last.
         """
         split = split_of(self._info)
-        rows = [self._row(number, split.get(number, "")) for number in self.dataset.numbers]
+        found = [self._row(number, split.get(number, "")) for number in self.dataset.numbers]
+        rows, env_infos = [row for row, _ in found], [env_info for _, env_info in found]
         first = self.dataset.episode(self.dataset.numbers[0])
-        rows += self.failures.given_up(rows)
+        rows += self.failures.given_up(rows, env_infos)
         return make_index(self.root, "RoboCAS folder", self.rate_hz, first.cameras, first.has_depth, rows, self._note)
 
-    def _row(self, number: int, split: str) -> dict[str, Any]:
+    def _row(self, number: int, split: str) -> tuple[dict[str, Any], Any]:
         episode = Episode(self.root / schema.episode_folder(number))
         scene, wrong = damage.scene(lambda: episode.scene)
         entry, wrong_entry = ledger_entry(self._settings.get("episodes"), number, schema.CONVERSION_FILE)
@@ -62,7 +63,8 @@ class RoboCASSource:
         seed = one_seed(scene.get("seed", entry.get("seed")))
         said = integer(entry_of(self._info.get("ep_length"), number)) or 0
         steps, wrong_steps = (said, "") if said > 0 else _steps(episode)
-        return row(
+        env_info = scene.get("env_info")
+        shown = row(
             number,
             steps=steps,
             instruction=text(entry_of(self._info.get("language_goal"), number)),
@@ -71,16 +73,17 @@ class RoboCASSource:
             seed=seed,
             success=scene.get("success", entry.get("success")),
             split=split,
-            stages=stages(self.failures.of_seed(seed), recorded),
+            stages=stages(self.failures.of_seed(seed, env_info), recorded),
             attempts=recorded.get("attempts"),
             damage="; ".join(filter(None, (wrong, wrong_entry, wrong_steps))),
         )
+        return shown, env_info
 
     def episode(self, number: int) -> dict[str, Any]:
         """Arrays as plots, sub-goals, and the TCP's path among the objects where they stood at the start."""
         episode = self._open(number)
         scene, _ = damage.scene(lambda: episode.scene)  # the table says what is wrong
-        failures = self.failures.of_seed(one_seed(scene.get("seed")))
+        failures = self.failures.of_seed(one_seed(scene.get("seed")), scene.get("env_info"))
         return show_arrays(number, _arrays(episode), scene, self.rate_hz, failures)
 
     def rgb(self, number: int, camera: str, step: int) -> Picture:

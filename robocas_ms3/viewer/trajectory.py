@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.episode import planar_base, robot_frames
-from robocas_ms3.datasets.provenance import succeeded
+from robocas_ms3.datasets.provenance import succeeded, task_of
 from robocas_ms3.datasets.scene_values import one_seed, sound
 from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
 from robocas_ms3.errors import DatasetError
@@ -44,7 +44,7 @@ class TrajectorySource:
 
     def index(self) -> dict[str, Any]:
         """From the JSON alone; seeds without an episode, from ``failures.jsonl``, come last."""
-        task, rows = _task(self.file.env_info), []
+        task, rows = task_of(str(self.file.env_info.get("env_id"))) or "", []
         for episode in self.file.episodes:
             recorded, wrong = _entry(episode)
             seed = one_seed(episode.get("episode_seed"))
@@ -62,7 +62,7 @@ class TrajectorySource:
                     damage=wrong,
                 )
             )
-        rows += self.failures.given_up(rows)
+        rows += self.failures.given_up(rows, [self.file.env_info] * len(rows))
         note = f"{NOTE.format(name=self.root.name)} {self.failures.note}".strip()
         return make_index(self.root, "trajectory file", self.file.control_freq, (), False, rows, note)
 
@@ -154,12 +154,6 @@ def _objects(recording: Recording, entry: dict[str, Any], world_to_base: NDArray
         name = named.get(actor, actor.replace("_", " "))
         found.append({"name": name, "target": actor == f"object_{target}", "path": path[:1] if still else path})
     return found
-
-
-def _task(env_info: dict[str, Any]) -> str:
-    """``pick`` of ``robocas_ms3:RoboCASOpenPick-v1`` and the like."""
-    name = str(env_info.get("env_id", "")).rpartition(":")[2].removeprefix("RoboCAS").partition("-")[0]
-    return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name).lstrip("_")
 
 
 def _entry(episode: dict[str, Any]) -> tuple[dict[str, Any], str]:

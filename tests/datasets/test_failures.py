@@ -1,10 +1,13 @@
 import json
 
+from managing import edit
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.datasets.convert import convert
 from robocas_ms3.datasets.failures import add_failures
 from robocas_ms3.datasets.manage.merging import merge
+from robocas_ms3.datasets.provenance import environment_of
+from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.validate import validate
 from robocas_ms3.demos.ledger import Failure, Ledger
 
@@ -13,28 +16,63 @@ LOST = Failure(4, -1, "episode", "gave_up", 0.0)
 OTHER = Failure(9, 1, "reach", "unreachable", 1.0)
 
 
-def run_of(folder, failures, seeds=(3, 5)):
+def run_of(folder, failures, seeds=(3, 5), **kwargs):
     """A trajectory and what went wrong with it."""
     folder.mkdir()
     Ledger(folder / "failures.jsonl").append(failures)
-    return write_trajectory(folder / "trajectory.h5", seeds=seeds)
+    return write_trajectory(folder / "trajectory.h5", seeds=seeds, **kwargs)
+
+
+def told(out, task=None):
+    """Failures of a dataset, of one task or all."""
+    lines = [json.loads(line) for line in (out / "failures.jsonl").read_text().splitlines()]
+    assert all(set(line) == {*vars(SLIPPED), "task", "environment"} for line in lines)
+    return [Failure(*(line[key] for key in vars(SLIPPED))) for line in lines if task in (None, line["task"])]
 
 
 def test_lost_seeds_go_along(tmp_path):
     trajectory, out = run_of(tmp_path / "run", [SLIPPED, LOST]), tmp_path / "out"
     convert(trajectory, out, embeddings=False, open_source=RayCaster)
-    assert (out / "failures.jsonl").read_bytes() == (tmp_path / "run" / "failures.jsonl").read_bytes()
+    assert told(out) == [SLIPPED, LOST]
     assert validate(out).violations == []
     # appended: what is not there yet, once
     more = run_of(tmp_path / "more", [LOST, OTHER], seeds=(7,))
     for _ in range(2):
         convert(more, out, embeddings=False, open_source=RayCaster, append=True)
-        assert Ledger(out / "failures.jsonl").read() == [SLIPPED, LOST, OTHER]
+        assert told(out) == [SLIPPED, LOST, OTHER]
     assert validate(out).violations == []
     merge([out], tmp_path / "merged")
     assert validate(tmp_path / "merged").violations == []
     convert(more, out, embeddings=False, open_source=RayCaster, overwrite=True)
-    assert Ledger(out / "failures.jsonl").read() == [LOST, OTHER]
+    assert told(out) == [LOST, OTHER]
+
+
+def test_another_task_has_seeds_of_its_own(tmp_path):
+    """The same line of two runs is two failures."""
+    first, out = run_of(tmp_path / "run", [SLIPPED, LOST]), tmp_path / "out"
+    second = run_of(tmp_path / "more", [LOST], seeds=(3, 7), steps=24)
+    edit(second.with_suffix(".json"), lambda c: c["env_info"].update(env_id="robocas_ms3:RoboCASOpenPick-v1"))
+    third = run_of(tmp_path / "third", [LOST], seeds=(9,))
+    edit(third.with_suffix(".json"), lambda c: c["env_info"]["env_kwargs"].update(config="pick_table_orderly"))
+    convert(first, out, embeddings=False, open_source=RayCaster)
+    for more in (second, second, third):
+        convert(more, out, embeddings=False, open_source=RayCaster, append=True)
+    assert told(out, "pick") == [SLIPPED, LOST, LOST]
+    assert told(out, "open_pick") == [LOST]
+    made_in = [json.loads(line)["environment"] for line in (out / "failures.jsonl").read_text().splitlines()]
+    assert made_in[0] == made_in[1]
+    assert len(set(made_in)) == 3
+    scenes = [Dataset(out).episode(n).scene for n in Dataset(out).numbers]
+    assert [environment_of(scene["env_info"]) for scene in scenes] == [made_in[i] for i in (0, 0, 2, 2, 3)]
+
+
+def test_lines_of_an_earlier_version_are_not_added_again(tmp_path):
+    trajectory, out = run_of(tmp_path / "run", [SLIPPED, LOST]), tmp_path / "out"
+    convert(trajectory, out, embeddings=False, open_source=RayCaster)
+    before = (tmp_path / "run" / "failures.jsonl").read_bytes()
+    (out / "failures.jsonl").write_bytes(before)
+    convert(trajectory, out, embeddings=False, open_source=RayCaster, append=True)
+    assert (out / "failures.jsonl").read_bytes() == before
 
 
 def test_nothing_went_wrong(tmp_path):
@@ -50,6 +88,5 @@ def test_a_run_that_was_cut_off(tmp_path):
         (tmp_path / name / "failures.jsonl").write_text(text)
     (tmp_path / "out").mkdir()
     for name in ("more", "run"):
-        add_failures(tmp_path / name, tmp_path / "out")
-    expected = "".join(json.dumps(vars(failure)) + "\n" for failure in (LOST, SLIPPED))
-    assert (tmp_path / "out" / "failures.jsonl").read_text() == expected
+        add_failures(tmp_path / name, tmp_path / "out", {"env_id": "robocas_ms3:RoboCASPick-v1"})
+    assert told(tmp_path / "out", "pick") == [LOST, SLIPPED]

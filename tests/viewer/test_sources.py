@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
+from robocas_ms3.datasets.convert import convert
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.plots import base_plot, motion_plots
@@ -156,6 +157,29 @@ def test_there_is_no_such_episode(folder, run_folder, number):
     for path in (folder, run_folder):
         with pytest.raises(DatasetError, match="no such episode"):
             open_source(path).episode(number)
+
+
+def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, made_up, tmp_path):
+    """Seeds 4 and 9 failed at one task; another task's episodes of the same seeds have nothing to do with it."""
+    other = made_up.write_trajectory(tmp_path / "trajectory.h5", seeds=(4, 9), steps=24)
+    metadata = json.loads(other.with_suffix(".json").read_text())
+    metadata["env_info"]["env_id"] = "robocas_ms3:RoboCASOpenPick-v1"
+    other.with_suffix(".json").write_text(json.dumps(metadata))
+    slipped = {"seed": 4, "attempt": 1, "stage": "pull", "reason": "slipped", "seconds": 1.0}
+    (tmp_path / "failures.jsonl").write_text(json.dumps(slipped))
+    both = shutil.copytree(folder, tmp_path / "both")
+    (both / "failures.jsonl").unlink()
+    for path in (run_folder / "trajectory.h5", other):
+        convert(path, both, open_source=made_up.RayCaster, embeddings=False, include_failed=True, append=True)
+    for scene in both.glob("*/scene.json"):  # the frames' source has one task
+        change = {"task": "open_pick"} if "OpenPick" in scene.read_text() else {}
+        scene.write_text(json.dumps({**json.loads(scene.read_text()), **change}))
+    source = open_source(both)
+    rows = source.index()["episodes"]
+    assert [(row["n"], row["seed"]) for row in rows] == [(0, 3), (1, 4), (2, 5), (3, 4), (4, 9), (None, 9)]
+    assert [row["stages"] for row in rows] == [[], ["grasp"], [], ["pull"], [], ["reach"]]
+    assert [row["task"] for row in rows] == ["pick"] * 3 + ["open_pick"] * 2 + ["pick"]
+    assert [len(source.episode(n)["failures"]) for n in range(5)] == [0, 1, 0, 1, 0]
 
 
 def test_a_folder_without_our_additions_is_shown_too(folder, tmp_path):

@@ -14,11 +14,10 @@ import numpy as np
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.convert import open_env
-from robocas_ms3.datasets.episode_facts import task_of
 from robocas_ms3.datasets.manage.parts import check_whole, schema_version, shown
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.plan import dataset_settings
-from robocas_ms3.datasets.provenance import fingerprint, scene_record
+from robocas_ms3.datasets.provenance import fingerprint, scene_record, task_of
 from robocas_ms3.datasets.reader import Dataset, Episode
 from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
 from robocas_ms3.datasets.workers import OpenSource
