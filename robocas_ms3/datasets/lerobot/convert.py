@@ -108,7 +108,10 @@ def convert_lerobot(
 
 
 def _plan(source: EpisodeSource, entries: list[dict[str, Any]], codec: str) -> dict[str, Any]:
-    train, val = split_by_seed({i: i if e["seed"] is None else _seed(e["seed"]) for i, e in enumerate(entries)})
+    place = {entry["source"]: i for i, entry in enumerate(entries)}
+    before_train, before_val = ([place[n] for n in side if n in place] for side in source.sides())
+    seeds = {i: i if e["seed"] is None else _seed(e["seed"]) for i, e in enumerate(entries)}
+    train, val = split_by_seed(seeds, (before_train, before_val))
     plan = {
         "format": "lerobot",
         "made_with": {"robocas_ms3": robocas_ms3.__version__},

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
@@ -82,6 +83,14 @@ class FolderSource:
             )
         return found
 
+    def sides(self) -> tuple[list[int], list[int]]:
+        """Of its split.
+
+        Raises:
+            DatasetError: it is damaged.
+        """
+        return self._dataset.sides
+
     def play(self, number: int, on_frame: OnFrame, timing: Timing) -> Shown:
         """Read the episode of this number.
 
@@ -133,6 +142,13 @@ def _arrays(episode: Episode) -> dict[str, NDArray]:
         raise DatasetError(
             "these arrays can't be read", where=where, found=str(error).splitlines()[0], fix=fix
         ) from error
+    spoilt = [key for key in sorted(needed_arrays() & set(arrays)) if _holds_nan(arrays[key])]
+    if spoilt:
+        raise DatasetError(
+            "this array holds NaN or infinity",
+            where=f"{episode.folder / schema.EPISODE_FILE}, {spoilt[0]}",
+            fix="robocas validate lists all that is wrong.",
+        )
     if missing or lengths != {episode.steps}:
         raise DatasetError(
             "this episode is not complete",
@@ -141,3 +157,7 @@ def _arrays(episode: Episode) -> dict[str, NDArray]:
             fix="robocas validate says what is wrong.",
         )
     return arrays
+
+
+def _holds_nan(array: NDArray) -> bool:
+    return array.dtype.kind == "f" and not np.isfinite(array).all()

@@ -67,7 +67,7 @@ class LeRobotDataset:
     @property
     def has_depth(self) -> bool:
         """Whether depth is there."""
-        return bool(self.rows) and f"depth/{self.cameras[0]}/file_index" in self.rows[0]
+        return bool(self.rows) and any(f"depth/{camera}/file_index" in self.rows[0] for camera in self.cameras[:1])
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:

@@ -49,6 +49,10 @@ class EpisodeSource(Protocol):
         """Of each episode, in order, what tells it from others; ``source`` is its number for `play`."""
         ...
 
+    def sides(self) -> tuple[list[int], list[int]]:
+        """``source`` of the training and validation episodes, as far as that was settled before."""
+        ...
+
     def play(self, number: int, on_frame: OnFrame, timing: Timing) -> Shown:
         """Hand over an episode's pictures, then the rest."""
         ...

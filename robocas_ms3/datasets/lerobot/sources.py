@@ -69,6 +69,10 @@ class TrajectorySource:
             found.append(entry)
         return found
 
+    def sides(self) -> tuple[list[int], list[int]]:
+        """None: a trajectory has no sides."""
+        return [], []
+
     def play(self, number: int, on_frame: OnFrame, timing: Timing) -> Shown:
         """Render the recording of this index."""
         with timing.measure("load"):
