@@ -81,8 +81,8 @@ def main(cfg: Convert) -> int:
             )
     if cfg.video and cfg.to == "robocas":
         with bar("videos") as shown:
-            shown.start(len(done.episodes) + done.kept)
-            write_previews(cfg.out, on_video=shown.advance)
+            new = {episode.number for episode in done.episodes}
+            write_previews(cfg.out, new=new, on_start=shown.start, on_video=shown.advance)
     steps = sum(episode.steps for episode in done.episodes)
     megabytes = sum(episode.size for episode in done.episodes) / 1e6
     each = done.seconds / max(1, len(done.episodes))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -126,17 +126,34 @@ def contact_sheet(
 
 
 def write_previews(
-    root: Path | str, *, on_video: Callable[[Path], None] | None = None, episodes: Sequence[int] | None = None
+    root: Path | str,
+    *,
+    new: Collection[int] = (),
+    episodes: Sequence[int] | None = None,
+    on_start: Callable[[int], None] | None = None,
+    on_video: Callable[[Path], None] | None = None,
 ) -> tuple[list[Path], Path]:
-    """Write a video of each episode and a contact sheet into the dataset's ``preview`` folder; gives their paths."""
+    """Write videos of episodes and a contact sheet into the dataset's ``preview`` folder; gives their paths.
+
+    Args:
+        root: the dataset.
+        new: episodes that were not there before.
+        episodes: of which; None: videos of the new ones and of those that have none, the sheet of the first ten.
+        on_start: called with the number of videos to write.
+        on_video: called after each.
+    """
     dataset = Dataset(Path(root))
     folder = make_folder(dataset.root / schema.PREVIEW_FOLDER)
-    videos = []
-    for number in dataset.numbers if episodes is None else episodes:
-        videos.append(write_video(dataset, number, folder / f"{schema.episode_folder(number)}.mp4"))
+    paths = {number: folder / f"{schema.episode_folder(number)}.mp4" for number in episodes or dataset.numbers}
+    if episodes is None:
+        paths = {number: path for number, path in paths.items() if number in new or not path.is_file()}
+    if on_start:
+        on_start(len(paths))
+    for number, path in paths.items():
+        write_video(dataset, number, path)
         if on_video:
-            on_video(videos[-1])
-    return videos, contact_sheet(root, folder / "contact_sheet.png", episodes=episodes)
+            on_video(path)
+    return list(paths.values()), contact_sheet(root, folder / "contact_sheet.png", episodes=episodes)
 
 
 def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:

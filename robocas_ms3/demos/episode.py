@@ -18,6 +18,7 @@ from robocas_ms3.config import TaskConfig, load_task_config
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.demos.record import EpisodeRecorder
+from robocas_ms3.demos.trials import try_actions
 from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.planning.executor import Executor, Seconds
 from robocas_ms3.planning.mplib_backend import MplibPlanner
@@ -31,8 +32,7 @@ from robocas_ms3.tasks.spec import TASKS
 
 STANDARD_FREQ = 20  # Hz, at which the tasks' horizons are given
 
-TRIALS = 2  # of an attempt's own actions: as they are, and with noise that any robot has
-FAR = ("horizon", "replay")  # stages whose failure has its cause farther back than the last checkpoint
+FAR = ("horizon",)  # stages whose failure has its cause farther back than the last checkpoint
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class EpisodeSettings:
         max_attempts: attempts a seed has.
         keep_recoveries: leave failed attempts in the record instead of undoing them.
         replay_rate: Hz; an attempt counts only if its own actions, as a dataset of this rate holds them, succeed again
-            open loop, ``TRIALS`` times, and none goes beyond [-1, 1]. 0: not tried; nor is it where the base drives,
-            which those actions leave out.
+            open loop (`trials`), and none goes beyond [-1, 1]. 0: not tried; nor is it where the base drives, which
+            those actions leave out.
     """
 
     task: str
@@ -129,7 +129,7 @@ class EpisodeGenerator:
         result = EpisodeResult(seed, success=False, seconds=executor.seconds)
         finished = False
         try:
-            recoveries = self._attempts(executor, result)
+            recoveries = self._attempts(executor, recorder, result)
             if result.success:
                 recorder.finish({**self._describe(executor), "attempts": result.attempts, "recoveries": recoveries})
                 finished = True
@@ -138,7 +138,7 @@ class EpisodeGenerator:
                 recorder.discard()
         return result
 
-    def _attempts(self, executor: Executor, result: EpisodeResult) -> list[dict[str, Any]]:
+    def _attempts(self, executor: Executor, recorder: EpisodeRecorder, result: EpisodeResult) -> list[dict[str, Any]]:
         recoveries = []
         try:
             executor.reset()
@@ -154,7 +154,7 @@ class EpisodeGenerator:
             arm = Arm(self.planner, self.reachability, executor, np.random.default_rng(entropy), attempt)
             try:
                 self.policy(arm)
-                self._check(executor)
+                self._check(executor, recorder)
                 result.success, result.steps = True, len(executor.actions)
                 return recoveries
             except PlanningFailed as error:
@@ -174,7 +174,7 @@ class EpisodeGenerator:
             recoveries = [kept for kept in recoveries if kept["range"][1] < len(executor.actions)]
         return recoveries
 
-    def _check(self, executor: Executor) -> None:
+    def _check(self, executor: Executor, recorder: EpisodeRecorder) -> None:
         """See that what a policy says it has done is a demonstration.
 
         Raises:
@@ -187,18 +187,7 @@ class EpisodeGenerator:
         if not executor.flag("success"):
             raise PlanningFailed("episode", "no_success")
         if self.open_loop is not None:
-            gripper = np.array([action[7] for action in executor.actions])
-            states = np.array(executor.robot_states)
-            for trial in range(TRIALS):
-                noise = np.random.default_rng([executor.seed, trial]) if trial else None
-                with executor.seconds.spent_on("simulation"):
-                    played = self.open_loop.play_recording(
-                        executor.seed, states, gripper, self.settings.control_freq, noise
-                    )
-                if played.clipped:
-                    raise EpisodeLost("replay", "clipped")
-                if not played.success:
-                    raise EpisodeLost("replay", "no_success")
+            try_actions(self.open_loop, executor, recorder, self.settings.control_freq)
 
     @staticmethod
     def _log(result: EpisodeResult, attempt: int, error: PlanningFailed, seconds: float) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
@@ -31,6 +31,7 @@ from robocas_ms3.tasks.base import RoboCASEnv
 CONTROL_MODE = "pd_ee_delta_pose"
 SETTLE_SECONDS = 1.0  # after the last action, held still: what was let go comes to rest
 NOISE = 1e-5  # m; a dataset's rounding alone makes some heaps fall otherwise
+DIVERGED = 0.01  # m that an object may be off the recording
 _OTHERWISE = ("control_mode", "obs_mode", "reward_mode", "render_backend", "render_mode", "sim_backend", "num_envs")
 
 
@@ -43,11 +44,21 @@ class Played:
         tcp_in_base: (T, 3) m, where the TCP was, in the arm's base frame.
         clipped: actions beyond what one step may do: a component of the translation, or the norm of the rotation,
             outside [-1, 1].
+        objects: name -> (T, 3) m, where each actor was in the world.
     """
 
     success: bool
     tcp_in_base: Array
     clipped: int
+    objects: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+
+    def parted_at(self, recorded: dict[str, NDArray[np.float32]]) -> int:
+        """First step at which an object was more than ``DIVERGED`` off a recording, (T, 13) each; T where none was."""
+        steps = len(self.tcp_in_base)
+        apart = np.zeros(steps)
+        for name, places in self.objects.items():
+            apart = np.maximum(apart, np.linalg.norm(places - recorded[name][:steps, :3], axis=1))
+        return int(np.argmax(apart > DIVERGED)) if (apart > DIVERGED).any() else steps
 
 
 class OpenLoop:
@@ -81,7 +92,7 @@ class OpenLoop:
             )
         except gym.error.Error as error:
             raise DatasetError("no such environment", where=env_info["env_id"], found=str(error)) from error
-        self._rate = int(rate_hz)
+        self.rate_hz = int(rate_hz)
 
     def reset(self, seed: int, options: dict[str, Any] | None = None) -> None:
         """Build an episode's scene.
@@ -109,18 +120,20 @@ class OpenLoop:
         motion = to_ee_delta_action(wanted[:, :3], wanted[:, 3:6], euler="xyz")
         beyond = (np.abs(motion[:, :3]) > 1).any(axis=1) | (np.linalg.norm(motion[:, 3:], axis=1) > 1)
         actions = np.column_stack([np.clip(motion, -1, 1), np.where(wanted[:, 6] > 0.5, 1, -1)]).astype(np.float32)
-        places, success = [env.agent.tcp_in_arm_base.p[0].numpy().copy()], False
+        places, objects, success = [env.agent.tcp_in_arm_base.p[0].numpy().copy()], [_objects(env)], False
         for action in actions:
             *_, info = self.env.step(action)
             places.append(env.agent.tcp_in_arm_base.p[0].numpy().copy())
+            objects.append(_objects(env))
             success |= bool(info["success"][0])
         still = np.append(np.zeros(6), actions[-1, 6] if len(actions) else 1).astype(np.float32)
-        for _ in range(round(SETTLE_SECONDS * self._rate)):
+        for _ in range(round(SETTLE_SECONDS * self.rate_hz)):
             if success:
                 break
             *_, info = self.env.step(still)
             success |= bool(info["success"][0])
-        return Played(success, np.stack(places).astype(np.float64), int(beyond.sum()))
+        moved = {name: np.stack([at[name] for at in objects]) for name in objects[0]}
+        return Played(success, np.stack(places).astype(np.float64), int(beyond.sum()), moved)
 
     def play_recording(
         self,
@@ -139,7 +152,7 @@ class OpenLoop:
             control_freq: of the recording, Hz.
             noise: source of noise of ``NOISE`` that is added to each action's translation; default: none.
         """
-        samples = sample_states(len(gripper), sample_stride(control_freq, self._rate))
+        samples = sample_states(len(gripper), sample_stride(control_freq, self.rate_hz))
         root_in_world, qpos, _ = split_states(robot_states[samples])
         tcp, base = link_poses(root_in_world, qpos)
         width = float(qpos[0, FINGER_SLICE].sum())
@@ -153,3 +166,8 @@ class OpenLoop:
     def close(self) -> None:
         """Close the environment."""
         self.env.close()
+
+
+def _objects(env: RoboCASEnv) -> dict[str, NDArray[np.float32]]:
+    states: Any = env.get_state_dict()
+    return {name: state[0, :3].numpy().copy() for name, state in states["actors"].items()}

@@ -9,7 +9,9 @@ from typing import Any, cast
 
 import gymnasium as gym
 import h5py
+import numpy as np
 from mani_skill.utils.wrappers.record import RecordEpisode
+from numpy.typing import NDArray
 
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing, write_json
@@ -40,6 +42,12 @@ class EpisodeRecorder(RecordEpisode):
             source_desc="scripted policy of robocas_ms3",
         )
         self._paths = [folder / f"{name}.h5", folder / f"{name}.json"]
+
+    @property
+    def states(self) -> dict[str, dict[str, NDArray[np.float32]]]:
+        """ManiSkill's states since the reset: ``{"actors": {name: (S + 1, 13)}, "articulations": {...}}``."""
+        buffer: Any = self._trajectory_buffer
+        return {kind: {name: array[:, 0] for name, array in found.items()} for kind, found in buffer.state.items()}
 
     def finish(self, episode: dict[str, Any]) -> None:
         """Write the episode and close the file; the environment stays open.

@@ -74,7 +74,6 @@ class Executor:
         env: the environment, possibly wrapped by a recorder.
         seed: the episode's seed.
         actions: every action since the reset, (8,) each, or (11,) where the base is driven.
-        robot_states: ManiSkill's state of the robot after the reset and after each action, (37,) each.
         segments: the sub-goals so far.
         info: of the last step or reset.
         gripper: the gripper's command as it stands.
@@ -87,7 +86,6 @@ class Executor:
     env: gym.Env
     seed: int
     actions: list[np.ndarray] = field(default_factory=list)
-    robot_states: list[np.ndarray] = field(default_factory=list)
     segments: list[Segment] = field(default_factory=list)
     info: dict[str, Any] = field(default_factory=dict)
     gripper: float = OPEN
@@ -114,7 +112,6 @@ class Executor:
             _, self.info = self.env.reset(seed=self.seed)
         self.actions, self.segments, self.gripper, self.base = [], [], OPEN, np.zeros(3)
         self.facts, self.checkpoints = {}, []
-        self.robot_states = [self._robot_state()]
 
     def mark(self) -> None:
         """Make this moment a checkpoint."""
@@ -124,6 +121,10 @@ class Executor:
     def at_checkpoint(self) -> bool:
         """Whether nothing was done since the last checkpoint."""
         return bool(self.checkpoints) and self.checkpoints[-1].length == len(self.actions)
+
+    def forget_checkpoints(self, after: int) -> None:
+        """Give up checkpoints with more than so many actions."""
+        self.checkpoints = [checkpoint for checkpoint in self.checkpoints if checkpoint.length <= after]
 
     def go_back(self, *, far: bool = False) -> None:
         """Undo what failed: return to the last checkpoint, where there is none to the reset.
@@ -217,7 +218,3 @@ class Executor:
         with self.seconds.spent_on("simulation"):
             *_, self.info = self.env.step(action)
         self.actions.append(action)
-        self.robot_states.append(self._robot_state())
-
-    def _robot_state(self) -> np.ndarray:
-        return self.base_env.agent.robot.get_state()[0].cpu().numpy().copy()

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +23,9 @@ CORNER_RADII = (0.3, 0.1, 0.03)  # rad; smaller ones are tried when a rounded co
 DETOUR = 1.5  # a straight motion to another goal is taken when not longer than this times the nearest (+ 0.5 rad)
 SHORTCUTS = 40
 STILL = 1e-6  # rad; a shorter motion is none
+TCP_SPEED_LIMIT = 0.45  # m/s: at 5 Hz pd_ee_delta_pose moves 0.1 m a step at most, with some lag to catch up
+
+T = TypeVar("T", Trajectory, Trajectory | None)
 
 
 class MplibPlanner:
@@ -56,7 +62,7 @@ class MplibPlanner:
         self._world = ArmWorld(urdf, srdf, voxel=voxel)
         self._kinematics = ArmKinematics(self._world)
         self._dt = dt
-        self._limits = {"velocity": velocity_limit, "acceleration": acceleration_limit, "dt": dt}
+        self._limits = {"velocity": velocity_limit, "acceleration": acceleration_limit}
         self._budget = int(planning_time * CHECKS_PER_SECOND)
         self._search = PathSearch(
             self._world.free, self._kinematics.lower, self._kinematics.upper, step=rrt_range, spacing=SPACING
@@ -138,7 +144,7 @@ class MplibPlanner:
         enough = DETOUR * float(np.linalg.norm(free[0] - start)) + 0.5
         for goal in free:
             if np.linalg.norm(goal - start) <= enough and self._straight_free(start, goal):
-                return stopping(np.array([start, goal]), **self._limits)
+                return self._timed(partial(stopping, np.array([start, goal])))
         reason = "rrt_timeout"
         # The nearest goal alone gets a quick try, then all of them the full budget; a path that slips through something
         # between two checks is searched again with the spacing of the final check.
@@ -176,8 +182,7 @@ class MplibPlanner:
         path = through(waypoints)
         if not self._path_free(path, cloud=check_collisions):
             raise PlanningFailed(stage, "straight_line_blocked")
-        limits = {name: value * speed for name, value in self._limits.items()} | {"dt": self._dt}
-        trajectory = timed(path, **limits)
+        trajectory = self._timed(partial(timed, path), speed)
         if trajectory is None:
             raise PlanningFailed(stage, "timing_failed")
         return trajectory
@@ -208,15 +213,27 @@ class MplibPlanner:
         points[-1] = waypoints[-1]
         corners = np.array(points)
         if len(points) == 2 and self._straight_free(*points):
-            return stopping(corners, **self._limits)
+            return self._timed(partial(stopping, corners))
         for radius in CORNER_RADII:
             path = rounded(corners, radius)
             if self._path_free(path):
-                trajectory = timed(path, **self._limits)
+                trajectory = self._timed(partial(timed, path))
                 if trajectory is not None:
                     return trajectory
         polyline = [a + (b - a) * s for a, b in zip(corners[:-1], corners[1:], strict=True) for s in _fractions(a, b)]
-        return stopping(corners, **self._limits) if all(map(self._world.free, polyline)) else None
+        return self._timed(partial(stopping, corners)) if all(map(self._world.free, polyline)) else None
+
+    def _timed(self, time: Callable[..., T], speed: float = 1.0) -> T:
+        """Time a motion within a fraction of the limits, and slower where the TCP would be faster than its limit."""
+        limits = {name: value * speed for name, value in self._limits.items()}
+        trajectory = time(**limits, dt=self._dt)
+        if trajectory is not None and len(trajectory.qpos) > 1:
+            places = np.array([self.tcp(qpos)[:3, 3] for qpos in trajectory.qpos])
+            fastest = float(np.linalg.norm(np.diff(places, axis=0), axis=1).max()) / self._dt
+            if fastest > TCP_SPEED_LIMIT:
+                limits["velocity"] *= TCP_SPEED_LIMIT / fastest
+                trajectory = time(**limits, dt=self._dt)
+        return trajectory
 
 
 def _fractions(a: Array, b: Array) -> Array:

@@ -8,11 +8,12 @@ import pytest
 import torch
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 
-from robocas_ms3.demos.episode import TRIALS, EpisodeGenerator, EpisodeSettings, horizon
+from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings, horizon
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.open_loop import OpenLoop, Played
 from robocas_ms3.demos.record import merge, open_trajectory, read_json
 from robocas_ms3.demos.replay import replay
+from robocas_ms3.demos.trials import TRIALS
 from robocas_ms3.errors import DatasetError, EpisodeLost, OutputExistsError, PlanningFailed, RobocasError
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Trajectory

@@ -7,7 +7,7 @@ from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.episode import episode_arrays, robot_frames, sample_subgoals
 from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
-from robocas_ms3.demos.open_loop import OpenLoop
+from robocas_ms3.demos.open_loop import OpenLoop, Played
 from robocas_ms3.demos.sampling import gripper_open, invert, sample_states, split_states
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.robots.constants import FINGER_TARGETS
@@ -95,6 +95,19 @@ def test_motion_beyond_a_step_is_counted(recorded):
     played = open_loop.play(actions)  # the last: 0.57 rad in one step
     assert played.clipped == 2
     assert not played.success
+
+
+def test_where_objects_part_from_the_recording():
+    still = np.zeros((4, 13), np.float32)
+    moved = still[:, :3].copy()
+    moved[1:, 0] = 0.009
+    assert Played(False, np.zeros((4, 3)), 0, {"cup": moved, "can": still[:, :3]}).parted_at(
+        {"cup": still, "can": still}
+    ) == 4  # fmt: skip
+    moved[2:, 1] = 0.005
+    assert Played(False, np.zeros((4, 3)), 0, {"can": still[:, :3], "cup": moved}).parted_at(
+        {"cup": still, "can": still}
+    ) == 2  # fmt: skip
 
 
 @pytest.mark.parametrize("rate", [0, 2.5, 7])

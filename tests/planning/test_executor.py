@@ -28,9 +28,6 @@ class Counter:
 class Simulated(Executor):
     base_env = property(lambda self: SimpleNamespace(control_mode="pd_joint_pos", control_timestep=0.05))
 
-    def _tcp(self) -> np.ndarray:
-        return np.full(7, sum(self.env.done))
-
 
 def executor() -> Simulated:
     made = Simulated(Counter(), seed=0)
@@ -52,13 +49,14 @@ def test_without_a_checkpoint_all_is_undone():
     assert made.env.resets == 2
 
 
-def test_a_pose_of_the_tcp_for_each_state():
+@pytest.mark.parametrize(("after", "kept"), [(0, []), (1, []), (2, [2]), (3, [2]), (9, [2, 4])])
+def test_checkpoints_after_a_moment_are_forgotten(after, kept):
     made = executor()
-    act(made, 1, 2)
-    made.mark()
-    act(made, 3)
-    made.go_back()
-    assert [pose[0] for pose in made.tcp_in_base] == [0, 1, 3]  # after the reset and after each action that is left
+    for _ in range(2):
+        act(made, 1, 2)
+        made.mark()
+    made.forget_checkpoints(after)
+    assert [checkpoint.length for checkpoint in made.checkpoints] == kept
 
 
 def test_what_came_after_the_last_checkpoint_is_undone_and_the_rest_done_again():

@@ -8,7 +8,7 @@ from planning_scenes import REST, Box, cloud, corners, table_scene, top_down
 
 from robocas_ms3.errors import PlanningFailed, RobocasError
 from robocas_ms3.planning.kinematics import pose_error
-from robocas_ms3.planning.mplib_backend import MplibPlanner
+from robocas_ms3.planning.mplib_backend import TCP_SPEED_LIMIT, MplibPlanner
 from robocas_ms3.planning.protocol import AttachedBody, Planner
 
 WALL = Box((0.55, 0.0, 0.15), (0.4, 0.03, 0.4))
@@ -261,3 +261,14 @@ def test_wrong_files_and_steps_are_refused(panda_files, tmp_path):
     lonely.write_bytes(panda_files.arm_urdf.read_bytes())  # its meshes are not beside it
     with pytest.raises(RobocasError, match="can't load this description"):
         MplibPlanner(lonely, panda_files.arm_srdf, dt=0.05)
+
+
+def test_the_tcp_of_a_stretched_arm_keeps_its_speed_limit(planner):
+    """Three joints that turn at 0.5 rad/s each carry a hand 0.8 m away faster than pd_ee_delta_pose can follow."""
+    start = np.array([-1.2, 0.9, -0.6, -0.7, 0.0, 1.7, 0.8])
+    goal = start * [-1, 1, -1, 1, 1, 1, 1]
+    trajectory = planner.plan_to_qpos(start, [goal], stage="sweep")
+    check_limits(start, trajectory)
+    places = np.array([planner.tcp(qpos)[:3, 3] for qpos in trajectory.qpos])
+    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / trajectory.dt
+    assert 0.9 * TCP_SPEED_LIMIT < speeds.max() < 1.02 * TCP_SPEED_LIMIT

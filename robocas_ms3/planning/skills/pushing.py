@@ -19,6 +19,7 @@ from robocas_ms3.scenes.placement import transform
 ABOVE = 0.08  # m above the start of the push, from where the tool comes straight down
 LIFT = 0.05  # m after the push (upstream's)
 SPEED = 0.6  # of the arm's limits while pushing: what is pushed neither rolls far nor jumps
+SWING_DEG = 20.0  # by which attempts after the first turn the paper's direction, so that they push otherwise
 PUSHES_TRIED, PUSHES_PLANNED = 24, 6
 MAX_FORCE = 30.0  # N; pushed harder, objects wedged against others are shot out of the heap
 RESISTED_SECONDS = 0.1  # of more than that after which a push is cut short
@@ -158,7 +159,8 @@ def reachable_pushes(arm: Arm, slot: int, target: int, others: Array) -> Iterato
         transform(arm.scene.object_in_base(s), arm.env.object_assets[0][s].surface_points(SPACING))
         for s in (slot, target)
     )
-    pushes = list(candidates(arm.rng, points, own.mean(axis=0), others, surface_in_base(arm), _fixed(arm)))
+    swing = SWING_DEG if arm.attempt else 0.0
+    pushes = list(candidates(arm.rng, points, own.mean(axis=0), others, surface_in_base(arm), _fixed(arm), swing))
     if not pushes:
         return
     starts, ends = np.stack([push.start for push in pushes]), np.stack([push.end for push in pushes])
