@@ -144,7 +144,8 @@ def write_previews(
     """
     dataset = Dataset(Path(root))
     folder = make_folder(dataset.root / schema.PREVIEW_FOLDER)
-    paths = {number: folder / f"{schema.episode_folder(number)}.mp4" for number in episodes or dataset.numbers}
+    chosen = dataset.numbers if episodes is None else episodes
+    paths = {number: folder / f"{schema.episode_folder(number)}.mp4" for number in chosen}
     if episodes is None:
         paths = {number: path for number, path in paths.items() if number in new or not path.is_file()}
     if on_start:
