@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
 
