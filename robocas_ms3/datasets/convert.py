@@ -163,8 +163,7 @@ def _split_before(out: Path) -> tuple[list[int], list[int]]:
     """Training and validation episodes of the dataset that is there, if one is."""
     if not (out / schema.DATA_INFO_FILE).is_file():
         return [], []
-    info = Dataset(out).info
-    return info.get("train_eps", []), info.get("val_eps", [])
+    return Dataset(out).sides
 
 
 def choose(file: TrajectoryFile, include_failed: bool) -> list[int]:

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.episode import SubGoal
 from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.datasets.scene_values import one_seed
 from robocas_ms3.datasets.tolerant import DAMAGED
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import write_json
@@ -101,9 +102,9 @@ def summarize(episode: Episode, number: int) -> Summary:
             found=str(error).splitlines()[0],
             fix="robocas validate says what is wrong.",
         ) from error
-    seed = episode.scene.get("seed")
+    seed = one_seed(episode.scene.get("seed"))
     return Summary(
-        number if seed is None else int(seed),
+        number if seed is None else seed,
         int(arrays["episode_length"]),
         str(arrays["language_goal"]),
         runs(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist()),

@@ -156,6 +156,18 @@ def test_a_split_of_texts_is_read_as_numbers(parts, tmp_path):
     assert resplit(part) == sides
 
 
+def test_what_is_appended_leaves_a_split_of_texts_as_it_is(parts, tmp_path):
+    part = spoiled(parts[0], tmp_path)
+    sides = Dataset(part).sides[::-1]  # not the rule's
+    edit(part / "data_info.json", lambda c: c.update(train_eps=[str(*sides[0])], val_eps=[str(*sides[1])]))
+    for number, seed in ((0, [10]), (1, [11])):  # as ManiSkill writes seeds
+        edit(part / f"episode_000000{number}" / "scene.json", lambda c, seed=seed: c.update(seed=seed))
+    trajectory = write_trajectory(tmp_path / "more.h5", seeds=(30,))
+    convert(trajectory, part, embeddings=False, open_source=RayCaster, append=True)
+    train, val = Dataset(part).sides
+    assert ([n for n in train if n < 2], [n for n in val if n < 2]) == sides
+
+
 @pytest.mark.parametrize("listed", [["x"], [0.5], [True], [[0]], "0", {"0": 1}, None])
 def test_a_split_of_something_else(parts, tmp_path, listed):
     part = spoiled(parts[0], tmp_path)
