@@ -1,6 +1,6 @@
 """Does depth agree with the cameras' intrinsics and poses? Pure maths, robust against occlusion and thin edges.
 
-Three laws hold in any scene. Nothing lies below the floor, and what is near the floor lies on it. A surface point one
+Three laws hold in any scene. Nothing lies below the floor, and what is level and near the floor lies on it. A surface point one
 camera sees is, seen from another camera, at the depth stored there or hidden by something nearer: no camera looks
 through a surface that another one saw. And all cameras look at the workspace, so at some step the depth of each agrees
 with another one's. Wrong poses, intrinsics, axes or units break one of them.
@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 POINT_ROWS = 80  # of the points looked at
 MIN_POINTS = 100  # fewer say nothing
 FLOOR_TOLERANCE = 0.03  # m
-FLOOR_BAND = 0.15  # m; what lies within it is taken for the floor
+FLOOR_BAND = 0.15  # m; what is level and within it is taken for the floor
+LEVEL = np.cos(np.deg2rad(20))  # of the angle between a surface's normal and the vertical: not a wall's foot
 SEEN_THROUGH = 0.05  # share of points
 AGREEING = 0.1  # share of points, at the step and with the camera where it is highest; the rest may be hidden
 NEAR = 0.15  # m; nearer than this a pixel covers less than the depth's millimetre
@@ -45,13 +46,26 @@ class View:
 
     def points(self, step: int = 0) -> Array:
         """(N, 3) seen points in the world, one of ``step`` x ``step`` pixels (0: as the size asks for), m."""
+        grid, known = self.grid(step)
+        return grid[known]
+
+    def level_points(self) -> Array:
+        """(N, 3) those on level surfaces."""
+        grid, known = self.grid()
+        normals = np.cross(np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1])
+        lengths = np.linalg.norm(normals, axis=-1)
+        level = np.abs(normals[..., 2]) > LEVEL * lengths
+        return grid[:-1, :-1][level & (lengths > 0) & known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:]]
+
+    def grid(self, step: int = 0) -> tuple[Array, NDArray[np.bool_]]:
+        """Every ``step``-th row and column: points (R, C, 3) in the world, m, and whether something was seen (R, C)."""
         step = step or max(1, self.depth.shape[0] // POINT_ROWS)
         rows, columns = np.mgrid[step // 2 : self.depth.shape[0] : step, step // 2 : self.depth.shape[1] : step]
         z = self.depth[rows, columns].astype(np.float64) / 1000
         fx, fy, cx, cy = self.intrinsic
         # SAPIEN's rays go through pixel centres, which lie at + 0.5.
-        local = np.stack([(columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z], axis=-1)[z > 0]
-        return local @ self.camera_in_world[:3, :3].T + self.camera_in_world[:3, 3]
+        local = np.stack([(columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z], axis=-1)
+        return local @ self.camera_in_world[:3, :3].T + self.camera_in_world[:3, 3], z > 0
 
 
 def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]]:
@@ -67,7 +81,7 @@ def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]
     agreement: dict[str, float] = {}  # of cameras that others may agree with
     for index, views in enumerate(steps):
         clouds = {view.camera: view.points() for view in views}
-        broken = [law for view in views for law in _floor(view.camera, clouds[view.camera])]
+        broken = [law for view in views for law in _floor(view, clouds[view.camera])]
         seen = {camera for camera, points in clouds.items() if len(points) >= MIN_POINTS}
         for camera in clouds:
             if seen - {camera}:
@@ -93,16 +107,17 @@ def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]
             yield 0, camera, "depth that agrees with another camera's", f"at most {share:.0%} of the points agree"
 
 
-def _floor(camera: str, points: Array) -> Iterator[tuple[str, str, str]]:
+def _floor(view: View, points: Array) -> Iterator[tuple[str, str, str]]:
     if len(points) < MIN_POINTS:
         return
     heights = points[:, 2]
     below = np.mean(heights < -FLOOR_TOLERANCE)
     if below > 0.01:
-        yield camera, "nothing below the floor", f"{below:.0%} of the depth, down to {heights.min():.2f} m"
-    near = np.abs(heights[np.abs(heights) < FLOOR_BAND])
+        yield view.camera, "nothing below the floor", f"{below:.0%} of the depth, down to {heights.min():.2f} m"
+    level = np.abs(view.level_points()[:, 2])
+    near = level[level < FLOOR_BAND]
     if len(near) > MIN_POINTS and np.median(near) > FLOOR_TOLERANCE:
-        yield camera, "floor at height 0", f"a floor {np.median(near) * 100:.0f} cm off"
+        yield view.camera, "floor at height 0", f"a floor {np.median(near) * 100:.0f} cm off"
 
 
 def compare(points: Array, view: View) -> tuple[int, float, float]:

@@ -41,6 +41,15 @@ def test_floor():
     assert [law[2] for law in check([[overhead(1.0, depth=0.9)]])][0] == "floor at height 0"
 
 
+def test_the_foot_of_a_wall_is_no_floor():
+    """From 0.55 m, a wall 1 m ahead is seen from 5 cm above the floor on."""
+    pose = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0.55], [0, 0, 0, 1.0]])
+    wall = View("ahead", np.full((80, 80), 1000, np.uint16), np.array([80.0, 80, 40, 40]), pose)
+    heights = wall.points()[:, 2]
+    assert heights.min() > 0.05 and np.sum(heights < 0.15) > 600
+    assert list(check([[wall]])) == []
+
+
 def test_where_nobody_can_agree_nobody_has_to():
     alone = overhead(1.0)
     assert list(check([[alone]])) == []
