@@ -1,9 +1,9 @@
 """Does depth agree with the cameras' intrinsics and poses? Pure maths, robust against occlusion and thin edges.
 
-Three laws hold in any scene. Nothing lies below the floor, and what is level and near the floor lies on it. A surface point one
-camera sees is, seen from another camera, at the depth stored there or hidden by something nearer: no camera looks
-through a surface that another one saw. And all cameras look at the workspace, so at some step the depth of each agrees
-with another one's. Wrong poses, intrinsics, axes or units break one of them.
+Three laws hold in any scene. Nothing lies below the floor, and what is level and near the floor lies on it. A surface
+point one camera sees is, seen from another camera, at the depth stored there or hidden by something nearer: no camera
+looks through a surface that another one saw. And all cameras look at the workspace, so at some step the depth of each
+agrees with another one's. Wrong poses, intrinsics, axes or units break one of them.
 """
 
 from __future__ import annotations
