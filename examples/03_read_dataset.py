@@ -14,6 +14,8 @@ from robocas_ms3.datasets.convert import convert
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.reader import Dataset
 
+if len(sys.argv) != 3:
+    sys.exit("python examples/03_read_dataset.py TRAJECTORY.h5 OUT")
 trajectory, out = map(Path, sys.argv[1:])
 convert(trajectory, out, rate_hz=5, embeddings=False, pictures=Pictures(size=(320, 240)), overwrite=True)
 

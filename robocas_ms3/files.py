@@ -153,7 +153,7 @@ def locked_folder(path: Path | str) -> Iterator[None]:
     If the folder is not there in the end, the parents made for the lock go too.
 
     Raises:
-        RobocasError: another process holds it.
+        RobocasError: another process holds it, or nothing can be written there.
     """
     path = Path(path)
     new = [folder for folder in path.parents if not folder.exists()]
@@ -175,7 +175,11 @@ def _locked(lock: Path, path: Path) -> TextIOWrapper:
     """Open and lock a file that whoever held it before may just have removed."""
     while True:
         make_folder(lock.parent)
-        file = lock.open("w")
+        try:
+            file = lock.open("w")
+        except OSError as error:  # it says that it is writable, as those of /proc do
+            what = "can't write into this folder"
+            raise RobocasError(what, where=lock.parent, found=error.strerror, fix="Choose another.") from error
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             with suppress(FileNotFoundError):

@@ -110,3 +110,10 @@ def test_a_lock_that_was_removed_meanwhile_is_none(tmp_path, monkeypatch):
         assert len(calls) == 2
         with pytest.raises(RobocasError, match="another process"), locked_folder(tmp_path / "out"):
             pass
+
+
+@pytest.mark.skipif(not os.access("/proc", os.W_OK), reason="here it says that it is not writable")
+def test_a_lock_in_a_folder_that_only_says_it_is_writable():
+    with pytest.raises(RobocasError, match="/proc: can't write into this folder") as error, locked_folder("/proc/out"):
+        pass
+    assert "\n" not in str(error.value)

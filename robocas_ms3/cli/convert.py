@@ -57,8 +57,34 @@ class Convert:
 
 def main(cfg: Convert) -> int:
     """Convert, with a progress bar; gives the exit code."""
+    _check(cfg)
+    try:
+        return _convert(cfg)
+    except KeyboardInterrupt:
+        if not cfg.out.is_dir():
+            raise
+        how = "the same command" if cfg.append else "--resume" + (" in place of --overwrite" if cfg.overwrite else "")
+        raise KeyboardInterrupt(f"{how} goes on") from None
+
+
+def _check(cfg: Convert) -> None:
+    from robocas_ms3.errors import DatasetError
+
+    ways = [flag for flag in ("overwrite", "resume", "append") if getattr(cfg, flag)]
+    if cfg.overwrite and len(ways) > 1:
+        found = " ".join(f"--{flag}" for flag in ways)
+        raise DatasetError("these exclude each other", where="convert", expected="one of them", found=found)
+    if cfg.jobs < 1:
+        raise DatasetError("not a number of processes", where="--jobs", expected="1 or more", found=cfg.jobs)
+    if len(set(cfg.cameras)) < len(cfg.cameras):
+        found = " ".join(cfg.cameras)
+        raise DatasetError("a camera is named twice", where="--cameras", expected="each once", found=found)
+
+
+def _convert(cfg: Convert) -> int:
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.datasets.convert import convert
+    from robocas_ms3.datasets.described import count_of
     from robocas_ms3.datasets.pictures import Pictures
     from robocas_ms3.datasets.video import write_previews
 
@@ -83,12 +109,14 @@ def main(cfg: Convert) -> int:
         with bar("videos") as shown:
             new = {episode.number for episode in done.episodes}
             write_previews(cfg.out, new=new, on_start=shown.start, on_video=shown.advance)
-    steps = sum(episode.steps for episode in done.episodes)
-    megabytes = sum(episode.size for episode in done.episodes) / 1e6
-    each = done.seconds / max(1, len(done.episodes))
-    kept = f", {done.kept} kept" if done.kept else ""
-    say(f"{cfg.out}: {len(done.episodes)} episodes{kept}, {steps} steps, {megabytes:.0f} MB, {each:.1f} s an episode")
-    if done.episodes:
+    count = len(done.episodes)
+    said = [f"{cfg.out}: {count_of(count, 'episode')}"] + ([f"{done.kept} kept"] if done.kept else [])
+    if count:
+        megabytes = sum(episode.size for episode in done.episodes) / 1e6
+        steps = count_of(sum(episode.steps for episode in done.episodes), "step")
+        said += [steps, f"{megabytes:.0f} MB", f"{done.seconds / count:.1f} s an episode"]
+    say(", ".join(said))
+    if count:
         say(parts(done, cfg))
     return 0
 

@@ -71,8 +71,8 @@ def run(argv: Sequence[str]) -> int:
         logging.getLogger("mani_skill ").addFilter(lambda record: record.levelno >= logging.ERROR)
     try:
         return _dispatch(arguments)
-    except KeyboardInterrupt:
-        return _say("interrupted", sys.stderr, INTERRUPTED)
+    except KeyboardInterrupt as interrupt:  # a command may say how to go on
+        return _say("; ".join(["interrupted", *map(str, interrupt.args)]), sys.stderr, INTERRUPTED)
     except BrokenPipeError:
         # The reader went away (`robocas list | head`); whatever Python flushes on exit has nowhere to go.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -31,7 +31,7 @@ class Validate:
     """Folder of the dataset."""
     replay: bool = False
     """Play the actions too (RoboCAS folders; simulated, not rendered)."""
-    min_share: float = 0.0
+    min_share: float | None = None
     """With --replay: exit code 1 where a smaller share of a task's episodes succeeds again (0 to 1), or where
     none of them could be tried."""
     json: bool = False
@@ -42,8 +42,13 @@ def main(cfg: Validate) -> int:
     """Validate; gives the exit code."""
     from rich.console import Console
 
+    from robocas_ms3.datasets.described import count_of
     from robocas_ms3.datasets.validate import validate
 
+    if cfg.min_share is not None and not cfg.replay:
+        raise DatasetError("a share of replayed episodes needs --replay", where="--min-share")
+    if cfg.min_share is not None and not 0 <= cfg.min_share <= 1:
+        raise DatasetError("no such share", where="--min-share", expected="0 to 1", found=cfg.min_share)
     is_lerobot = (cfg.dataset / "meta" / "info.json").is_file()
     if is_lerobot and cfg.replay:
         raise DatasetError("only RoboCAS folders can be replayed", where=cfg.dataset)
@@ -54,13 +59,15 @@ def main(cfg: Validate) -> int:
     if not cfg.json:
         for violation in report.violations:
             console.print(str(violation))
-        verdict = f"{len(report.violations)} violations" if report.violations else "valid"
-        console.print(f"{cfg.dataset}: {report.episodes} episodes, {report.steps} steps, {verdict}")
+        verdict = count_of(len(report.violations), "violation") if report.violations else "valid"
+        counts = f"{count_of(report.episodes, 'episode')}, {count_of(report.steps, 'step')}"
+        console.print(f"{cfg.dataset}: {counts}, {verdict}")
     content, wrong = report.as_json(), bool(report.violations)
     if cfg.replay:
         replays = _replay(cfg.dataset)
         content["replay"] = replays.as_json()
-        wrong |= any((of_task["share"] or 0.0) < cfg.min_share for of_task in replays.by_task().values())
+        least = cfg.min_share or 0.0
+        wrong |= any((of_task["share"] or 0.0) < least for of_task in replays.by_task().values())
         if not cfg.json:
             for line in _lines(replays):
                 console.print(line)

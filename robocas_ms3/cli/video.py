@@ -36,6 +36,8 @@ def main(cfg: Video) -> int:
     dataset = Dataset(cfg.dataset)
     out = cfg.out or cfg.dataset / PREVIEW_FOLDER
     numbers = list(cfg.episodes) or dataset.numbers
+    for number in numbers:  # before anything is written
+        dataset.episode(number)
     suffix = "" if cfg.kind == "rgb" else f"_{cfg.kind}"
     console = Console(soft_wrap=True, highlight=False)
     for number in numbers:

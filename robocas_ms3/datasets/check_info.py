@@ -30,7 +30,10 @@ def check_info(root: Path, episodes: Mapping[int, Mapping[str, NDArray]]) -> Ite
     try:
         info = json.loads((root / FILE).read_text(encoding="utf-8"))
     except FileNotFoundError:
-        yield Violation(FILE, "", "this file", "no file")
+        unfinished = (root / schema.CONVERSION_FILE).is_file()
+        yield Violation(
+            FILE, "", "this file", "no file" + (": not finished, convert with --resume" if unfinished else "")
+        )
         return
     except (OSError, ValueError) as error:
         yield Violation(FILE, "", "JSON", first_line(error))

@@ -88,9 +88,10 @@ def check_ledger(root: Path, episodes: Mapping[int, Mapping[str, NDArray]]) -> I
     """
     settings = _settings(root)
     ledger, rate_hz = settings.get("episodes"), None if check_rate(settings) else settings["rate_hz"]
-    for number in ledger if isinstance(ledger, dict) else ():
+    for number, entry in ledger.items() if isinstance(ledger, dict) else ():
         if not number.isdecimal() or int(number) not in episodes:
-            yield Violation(FILE, f"episodes.{number}", "the episodes on disk", "no folder (convert with --resume?)")
+            found = f"no folder{_way_back(entry)}"
+            yield Violation(FILE, f"episodes.{number}", "the episodes on disk", found)
     marks: dict[str, int] = {}
     for number, arrays in episodes.items():
         name = schema.episode_folder(number)
@@ -103,6 +104,12 @@ def check_ledger(root: Path, episodes: Mapping[int, Mapping[str, NDArray]]) -> I
         first = marks.setdefault(arrays_fingerprint(arrays), number)
         if first != number:
             yield Violation(name, "", "each episode once", f"the arrays of {schema.episode_folder(first)}")
+
+
+def _way_back(entry: Any) -> str:
+    """How to get a missing episode, where its entry says which recording it is of."""
+    file = entry.get("trajectory") if isinstance(entry, dict) else None
+    return f" (convert {file} again with --append or --resume)" if file else ""
 
 
 def _settings(root: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from robocas_ms3.datasets.failures import add_failures
 from robocas_ms3.datasets.info import write_info
 from robocas_ms3.datasets.output import check_overwrite, kept_if_begun, sweep
 from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.plan import Plan, appended_plan, dataset_settings, new_plan, resumed_plan
+from robocas_ms3.datasets.plan import Plan, appended_plan, dataset_settings, new_plan, resumed_plan, still_missing
 from robocas_ms3.datasets.provenance import succeeded
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.timing import Timing
@@ -134,6 +134,8 @@ def convert(
                 on_start(len(missing))
             job = Job(file.path, out, stride, rate_hz, pictures, vectors, open_source, missing)
             written = _write(job, file.env_info, plan, jobs, on_episode)
+            if left := still_missing(out, plan.content):
+                _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))
     written.sort(key=lambda episode: episode.number)
     return Conversion(written, len(plan.tasks) - len(missing), time.perf_counter() - begun)
 

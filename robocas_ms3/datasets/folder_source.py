@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.episode import SubGoal
-from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.datasets.reader import Dataset, Episode, no_dataset
 from robocas_ms3.datasets.tolerant import DAMAGED, first_line, is_declared
 from robocas_ms3.errors import DatasetError
 
@@ -31,12 +31,9 @@ class FolderSource:
         self.path = path
         info_file = path / schema.DATA_INFO_FILE
         if not info_file.is_file():
-            raise DatasetError(
-                "no dataset here",
-                where=path,
-                expected=f"a folder with {schema.DATA_INFO_FILE}, or a trajectory.h5",
-                fix="Make one with robocas convert.",
-            )
+            if (path / schema.CONVERSION_FILE).is_file():
+                raise DatasetError("this dataset is not finished", where=path, fix="Convert with --resume.")
+            raise no_dataset(path, f"a folder with {schema.DATA_INFO_FILE}, or a trajectory.h5")
         overview = _Overview(path)
         self.info, settings = overview.info, overview.settings
         try:

@@ -98,6 +98,26 @@ def appended_plan(out: Path, file: TrajectoryFile, chosen: list[int], settings: 
     return Plan(plan.content, [*known, *plan.tasks])
 
 
+def still_missing(out: Path, content: Mapping[str, Any]) -> list[str]:
+    """Which planned episodes are not there: ``episodes 4-6 of select.h5``, one text a trajectory."""
+    missing: dict[str, list[int]] = {}
+    for number, entry in content["episodes"].items():
+        if not (out / schema.episode_folder(int(number))).is_dir():
+            missing.setdefault(str(entry.get("trajectory") or "?"), []).append(int(number))
+    return [f"episodes {_spans(numbers)} of {name}" for name, numbers in missing.items()]
+
+
+def _spans(numbers: list[int]) -> str:
+    """``0, 4-6``."""
+    spans: list[list[int]] = []
+    for number in sorted(numbers):
+        if spans and number == spans[-1][1] + 1:
+            spans[-1][1] = number
+        else:
+            spans.append([number, number])
+    return ", ".join(f"{first}-{last}" if first < last else str(first) for first, last in spans)
+
+
 def check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any], what: str, fix: str) -> None:
     """Compare the settings of two conversions.
 

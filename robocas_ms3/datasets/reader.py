@@ -143,7 +143,7 @@ class Dataset:
             DatasetError: no episodes there.
         """
         if not self.numbers:
-            raise DatasetError("no dataset here", where=self.root, expected="folders episode_0000000, ...")
+            raise no_dataset(self.root, "folders episode_0000000, ...")
 
     @cached_property
     def numbers(self) -> list[int]:
@@ -199,6 +199,22 @@ class Dataset:
             known = f"{self.numbers[0]} to {self.numbers[-1]}"
             raise DatasetError("no such episode", where=self.root, expected=known, found=number)
         return Episode(self.root / schema.episode_folder(number), self)
+
+
+def no_dataset(root: Path, expected: str) -> DatasetError:
+    """What to say of a folder that is no dataset, with what may have been meant."""
+    if (root / "meta" / "info.json").is_file():
+        return DatasetError("a LeRobot dataset; this takes RoboCAS folders", where=root)
+    meant = near(root)
+    return DatasetError("no dataset here", where=root, expected=expected, fix=f"Did you mean {meant}?" if meant else "")
+
+
+def near(root: Path) -> Path | None:
+    """The first dataset or recording in a folder."""
+    if not root.is_dir():
+        return None
+    datasets = sorted(root.glob(f"*/{schema.CONVERSION_FILE}")) or sorted(root.glob(f"*/{schema.DATA_INFO_FILE}"))
+    return next(iter([path.parent for path in datasets] or sorted(root.glob("*.h5"))), None)
 
 
 def said_of(info: Mapping[str, Any], number: int | None) -> dict[str, Any]:

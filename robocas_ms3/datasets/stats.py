@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES
-from robocas_ms3.datasets.described import counted, described, histogram, rounded
+from robocas_ms3.datasets.described import count_of, counted, described, histogram, rounded
 from robocas_ms3.datasets.episode_facts import Facts, facts_reader
 from robocas_ms3.datasets.layout_map import LayoutMap, layout_map
 from robocas_ms3.datasets.sample_arrays import checked_actions
@@ -75,10 +75,10 @@ class Stats:
         tasks = ", ".join(f"{task} {len(lengths)}" for task, lengths in sorted(self.lengths.items()))
         covered = [share for share in (one.coverage for one in self.layouts.values()) if share is not None]
         parts = [
-            f"{self.episodes} episodes ({tasks})",
-            f"{self.steps} steps ({self.steps / self.rate_hz / 60:.1f} min at {self.rate_hz:g} Hz)",
-            f"{len(self.targets)} targets of {len(self.objects)} objects",
-            f"{len(self.instructions)} instructions",
+            f"{count_of(self.episodes, 'episode')} ({tasks})",
+            f"{count_of(self.steps, 'step')} ({self.steps / self.rate_hz / 60:.1f} min at {self.rate_hz:g} Hz)",
+            f"{count_of(len(self.targets), 'target')} of {count_of(len(self.objects), 'object')}",
+            count_of(len(self.instructions), "instruction"),
         ]
         if covered:
             low, high = f"{min(covered):.0%}", f"{max(covered):.0%}"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.datasets.actions import ACTION_NAMES
-from robocas_ms3.datasets.described import counted, histogram
+from robocas_ms3.datasets.described import count_of, counted, histogram
 from robocas_ms3.datasets.layout_map import LayoutMap
 from robocas_ms3.datasets.stats import Stats
 from robocas_ms3.errors import MissingExtraError
@@ -84,10 +84,6 @@ def _short(text: str) -> str:
     return text if len(text) <= _TEXT else text[: _TEXT - 1].rstrip() + "…"
 
 
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}" + ("" if count == 1 else "s")
-
-
 def _whole_numbers(axis: Any) -> None:
     axis.get_major_locator().set_params(integer=True)
 
@@ -104,7 +100,7 @@ def draw_lengths(stats: Stats, figure_of: FigureOf) -> Any:
         median = float(np.median(lengths))
         axes.axvline(median, color=ORANGE, linestyle="--", linewidth=1)
         about = f"median {median:.0f} steps = {median / stats.rate_hz:.0f} s"
-        axes.set_title(f"{task}: {_counted(len(lengths), 'episode')}, {about}")
+        axes.set_title(f"{task}: {count_of(len(lengths), 'episode')}, {about}")
         axes.set(xlabel=f"steps of {stats.rate_hz:g} Hz", ylabel="episodes")
         _whole_numbers(axes.xaxis)
         _whole_numbers(axes.yaxis)
@@ -175,9 +171,10 @@ def _draw_layout(figure: Any, axes: Any, name: str, layout: LayoutMap) -> None:
     axes.set_ylim(layout.x_edges[0], layout.x_edges[-1])
     axes.locator_params(nbins=5)
     covered = "" if layout.coverage is None else f", {layout.coverage:.0%} covered"
-    axes.set_title(f"{_short(name)}\n{_counted(layout.episodes, 'episode')}{covered}")
+    axes.set_title(f"{_short(name)}\n{count_of(layout.episodes, 'episode')}{covered}")
     axes.set(xlabel=f"y of {layout.frame} (m)", ylabel="x (m)")
     bar = figure.colorbar(mesh, cax=axes.inset_axes((1.04, 0.0, 0.04, 1.0)))  # as high as the map
+    bar.ax.set_ylim(0, max(1, layout.counts.max()))
     _whole_numbers(bar.ax.yaxis)
 
 
@@ -221,7 +218,7 @@ def draw_actions(stats: Stats, figure_of: FigureOf) -> Any:
         axes.stairs(counts, edges, fill=True, color=BLUE)
         axes.set_yscale("log")
         axes.set_ylim(bottom=0.7)
-        axes.locator_params(axis="x", nbins=5)
+        axes.locator_params(axis="x", nbins=4)
         for percentile in np.percentile(column, [1, 99]):
             axes.axvline(percentile, color=ORANGE, linestyle="--", linewidth=1)
         axes.set(title=f"{name} ({unit})", ylabel="steps (log)")
@@ -248,7 +245,7 @@ def draw_subgoals(stats: Stats, figure_of: FigureOf) -> Any:
     for box in boxes["boxes"]:
         box.set(facecolor="#b9d3ea", edgecolor=BLUE)
     labels = [
-        f"{kind}\n{_counted(len(s), 'time')}, median {np.median(s):.1f} s"
+        f"{kind}\n{count_of(len(s), 'time')}, median {np.median(s):.1f} s"
         for kind, s in zip(kinds, seconds, strict=True)
     ]
     axes.set_yticks(np.arange(1, len(kinds) + 1), labels)

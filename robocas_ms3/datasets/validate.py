@@ -15,7 +15,9 @@ from robocas_ms3.datasets.check_arrays import check_poses, check_shapes, check_v
 from robocas_ms3.datasets.check_info import check_info
 from robocas_ms3.datasets.check_pictures import check_cameras, check_depth, check_pictures
 from robocas_ms3.datasets.check_scene import check_ledger, check_scene, check_settings
+from robocas_ms3.datasets.output import MARKS
 from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.reader import no_dataset
 from robocas_ms3.datasets.tolerant import DAMAGED, first_line, is_declared
 from robocas_ms3.datasets.violation import Violation
 from robocas_ms3.errors import DatasetError
@@ -53,12 +55,15 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
         on_episode: called with (done, all) after each episode.
 
     Raises:
-        DatasetError: there is no such folder.
+        DatasetError: there is no such folder, or it is something else.
     """
     root = Path(root)
     if not root.is_dir():
         raise DatasetError("no such dataset folder", where=root)
+    marked = any((root / mark).exists() for mark in MARKS)
     numbers = {n: folder for folder in sorted(root.iterdir()) if (n := schema.episode_number(folder.name)) is not None}
+    if not (numbers or marked) and any(root.iterdir()):
+        raise no_dataset(root, "folders episode_0000000, ...")
     violations: list[Violation] = []
     pictures, wrong = check_settings(root)
     violations += wrong

@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.reader import Dataset, Episode
+from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, replacing
 
 PANEL = (426, 320)
@@ -35,7 +36,12 @@ def write_video(
         speed: 1 is real time.
         kind: ``rgb``, or ``depth`` in colours.
         panel: width and height of one camera's picture.
+
+    Raises:
+        DatasetError: no such episode, or no such speed.
     """
+    if not 0 < speed < np.inf:
+        raise DatasetError("no such speed", where="speed", expected="> 0", found=speed)
     path = Path(path)
     episode = dataset.episode(number)
     with (

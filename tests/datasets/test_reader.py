@@ -3,6 +3,8 @@
 import pytest
 
 from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.stats import collect
+from robocas_ms3.datasets.validate import validate
 from robocas_ms3.errors import DatasetError
 
 
@@ -27,3 +29,34 @@ def test_an_episode_is_found_without_a_search(tmp_path):
 def test_a_dataset_without_a_split(tmp_path):
     (tmp_path / "episode_0000000").mkdir()
     assert Dataset(tmp_path).sides == ([], [])
+
+
+def lerobot(root):
+    (root / "meta").mkdir(parents=True)
+    (root / "meta" / "info.json").write_text("{}")
+
+
+def datasets(root):
+    for name in ("part_1", "part_0"):
+        (root / name).mkdir(parents=True)
+        (root / name / "conversion.json").write_text("{}")
+
+
+def recording(root):
+    root.mkdir()
+    (root / "trajectory.h5").touch()
+
+
+@pytest.mark.parametrize("ask", [Dataset, collect, validate])
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lerobot, "here: a LeRobot dataset; this takes RoboCAS folders$"),
+        (datasets, "here: no dataset here .*Did you mean .*here/part_0[?]$"),
+        (recording, "here: no dataset here .*Did you mean .*here/trajectory.h5[?]$"),
+    ],
+)
+def test_what_may_have_been_meant(tmp_path, ask, make, said):
+    make(tmp_path / "here")
+    with pytest.raises(DatasetError, match=said):
+        ask(tmp_path / "here")

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.video import PANEL, colour_depth, contact_sheet, video_frame, write_previews, write_video
 from robocas_ms3.errors import DatasetError
@@ -79,4 +80,9 @@ def test_errors(made, tmp_path):
         Dataset(tmp_path)
     with pytest.raises(DatasetError, match="no such episode .expected 0 to 1, found 9"):
         write_video(Dataset(made), 9, tmp_path / "e.mp4")
+    for speed in (0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(DatasetError, match="speed: no such speed .expected > 0, found"):
+            write_video(Dataset(made), 0, tmp_path / "e.mp4", speed=speed)
+    words = ["video", str(made), "--out", str(tmp_path / "out"), "--episodes", "0", "9"]
+    assert run(words) == 1
     assert list(tmp_path.iterdir()) == []

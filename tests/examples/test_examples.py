@@ -50,3 +50,9 @@ def test_read_dataset(recorded, needs_renderer, tmp_path):
     assert about.startswith("1 episodes, ")
     first, last = trained.split("loss ")[1].split(" -> ")
     assert float(last) < float(first)
+
+
+def test_missing_arguments_are_a_line(tmp_path):
+    command = [sys.executable, str(EXAMPLES / "03_read_dataset.py"), "F.h5"]
+    done = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "python examples/03_read_dataset.py TRAJECTORY.h5 OUT\n")

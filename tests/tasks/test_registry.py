@@ -1,5 +1,7 @@
 """Contract of every registered task: it makes, resets, steps, and repeats for the same seed."""
 
+import logging
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -114,3 +116,14 @@ def test_visual_modes_hold_nothing_only_a_simulator_knows():
     env = RoboCASPickEnv.__new__(RoboCASPickEnv)
     env.obs_mode_struct, env._obs_mode = Mode(), "rgb+depth"
     assert env._get_obs_extra({}) == {}
+
+
+def test_a_renderer_on_the_cpu_is_not_warned_of(caplog):
+    logger = logging.getLogger("mani_skill ")
+    logger.addHandler(caplog.handler)  # it hands nothing on; errors pass the command line's own filter
+    try:
+        logger.error('Requested to use render device "sapien_cuda", but CUDA device was not found.')
+        logger.error("anything else")
+    finally:
+        logger.removeHandler(caplog.handler)
+    assert {record.getMessage() for record in caplog.records} == {"anything else"}
