@@ -206,7 +206,8 @@ def no_dataset(root: Path, expected: str) -> DatasetError:
     if (root / "meta" / "info.json").is_file():
         return DatasetError("a LeRobot dataset; this takes RoboCAS folders", where=root)
     meant = near(root)
-    return DatasetError("no dataset here", where=root, expected=expected, fix=f"Did you mean {meant}?" if meant else "")
+    fix = f"Did you mean {meant}?" if meant else "Make one with robocas convert."
+    return DatasetError("no dataset here", where=root, expected=expected, fix=fix)
 
 
 def near(root: Path) -> Path | None:
