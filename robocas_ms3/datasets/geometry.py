@@ -1,9 +1,10 @@
 """Does depth agree with the cameras' intrinsics and poses? Pure maths, robust against occlusion and thin edges.
 
-Three laws hold in any scene. Nothing lies below the floor, and what is level and near the floor lies on it. A surface
-point one camera sees is, seen from another camera, at the depth stored there or hidden by something nearer: no camera
-looks through a surface that another one saw. And all cameras look at the workspace, so at some step the depth of each
-agrees with another one's. Wrong poses, intrinsics, axes or units break one of them.
+Three laws hold in any scene. Nothing lies below the floor, and what is level and near the floor lies on it, but for
+furniture's own bottoms, which the gripper's camera sees from near. A surface point one camera sees is, seen from another
+camera, at the depth stored there or hidden by something nearer: no camera looks through a surface that another one saw.
+And all cameras look at the workspace, so at some step the depth of each agrees with another one's. Wrong poses,
+intrinsics, axes or units break one of them.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from robocas_ms3.demos.sampling import invert
 Array = NDArray[np.float64]
 
 POINT_ROWS = 80  # of the points looked at
+JUMP = 0.2  # m between neighbours that are not of one surface
 MIN_POINTS = 100  # fewer say nothing
 FLOOR_TOLERANCE = 0.03  # m
 FLOOR_BAND = 0.15  # m; what is level and within it is taken for the floor
+INTO_FURNITURE = "gripper_camera"
 LEVEL = np.cos(np.deg2rad(20))  # of the angle between a surface's normal and the vertical: not a wall's foot
 SEEN_THROUGH = 0.05  # share of points
 AGREEING = 0.1  # share of points, at the step and with the camera where it is highest; the rest may be hidden
@@ -52,10 +55,11 @@ class View:
     def level_points(self) -> Array:
         """(N, 3) those on level surfaces."""
         grid, known = self.grid()
-        normals = np.cross(np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1])
-        lengths = np.linalg.norm(normals, axis=-1)
-        level = np.abs(normals[..., 2]) > LEVEL * lengths
-        return grid[:-1, :-1][level & (lengths > 0) & known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:]]
+        across, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
+        normals = np.cross(across, down)
+        level = np.abs(normals[..., 2]) > LEVEL * np.linalg.norm(normals, axis=-1)
+        joined = np.maximum(np.linalg.norm(across, axis=-1), np.linalg.norm(down, axis=-1)) < JUMP
+        return grid[:-1, :-1][level & joined & known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:]]
 
     def grid(self, step: int = 0) -> tuple[Array, NDArray[np.bool_]]:
         """Every ``step``-th row and column: points (R, C, 3) in the world, m, and whether something was seen (R, C)."""
@@ -114,6 +118,8 @@ def _floor(view: View, points: Array) -> Iterator[tuple[str, str, str]]:
     below = np.mean(heights < -FLOOR_TOLERANCE)
     if below > 0.01:
         yield view.camera, "nothing below the floor", f"{below:.0%} of the depth, down to {heights.min():.2f} m"
+    if view.camera == INTO_FURNITURE:
+        return
     level = np.abs(view.level_points()[:, 2])
     near = level[level < FLOOR_BAND]
     if len(near) > MIN_POINTS and np.median(near) > FLOOR_TOLERANCE:

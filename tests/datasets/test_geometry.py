@@ -41,12 +41,24 @@ def test_floor():
     assert [law[2] for law in check([[overhead(1.0, depth=0.9)]])][0] == "floor at height 0"
 
 
+def test_the_gripper_may_look_at_a_drawers_bottom():
+    seen = overhead(1.0, depth=0.945)  # 5.5 cm above the floor, level
+    assert list(check([[View("gripper_camera", seen.depth, seen.intrinsic, seen.camera_in_world)]])) == []
+    assert [law[2] for law in check([[seen]])] == ["floor at height 0"]
+
+
 def test_the_foot_of_a_wall_is_no_floor():
     """From 0.55 m, a wall 1 m ahead is seen from 5 cm above the floor on."""
     pose = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0.55], [0, 0, 0, 1.0]])
     wall = View("ahead", np.full((80, 80), 1000, np.uint16), np.array([80.0, 80, 40, 40]), pose)
     heights = wall.points()[:, 2]
     assert heights.min() > 0.05 and np.sum(heights < 0.15) > 600
+    assert list(check([[wall]])) == []
+    # Stripes of another wall 30 cm behind it, from 0.35 m up and nearer: from one to the other is no level surface.
+    pose[2, 3], striped = 0.35, np.full((80, 80), 1000, np.uint16)
+    striped[::2] = 1300
+    wall = View("ahead", striped, np.array([160.0, 160, 40, 40]), pose)
+    assert np.sum(wall.points()[:, 2] < 0.15) > 600
     assert list(check([[wall]])) == []
 
 
