@@ -1,7 +1,7 @@
 """Does depth agree with the cameras' intrinsics and poses? Pure maths, robust against occlusion and thin edges.
 
 Three laws hold in any scene. Nothing lies below the floor, and what is level and near the floor lies on it, but for
-furniture's own bottoms, which the gripper's camera sees from near. A surface point one camera sees is, seen from another
+furniture's own bottoms, which the gripper's camera sees from near. A surface point one camera sees is, seen by another
 camera, at the depth stored there or hidden by something nearer: no camera looks through a surface that another one saw.
 And all cameras look at the workspace, so at some step the depth of each agrees with another one's. Wrong poses,
 intrinsics, axes or units break one of them.
