@@ -48,11 +48,14 @@ def main(cfg: ImportRobocas) -> int:
     import json
 
     from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.datasets.described import count_of
     from robocas_ms3.datasets.manage.importing import import_robocas
+    from robocas_ms3.datasets.manage.output import check_apart
     from robocas_ms3.datasets.manage.survey import survey
     from robocas_ms3.files import claim_output
 
     if cfg.out is not None:
+        check_apart(cfg.out, [cfg.dataset])
         claim_output(cfg.out, resume=cfg.resume or cfg.overwrite)  # before minutes of reading
     embed = None
     if cfg.embeddings:
@@ -79,7 +82,7 @@ def main(cfg: ImportRobocas) -> int:
             on_episode=shown.advance,
         )
     if not cfg.json:
-        say(f"{cfg.out}: {len(found.taken)} episodes{f', {kept} kept' if kept else ''}")
+        say(f"{cfg.out}: {count_of(len(found.taken), 'episode')}{f', {kept} kept' if kept else ''}")
     return 0
 
 
@@ -89,6 +92,7 @@ def _table(found: Survey) -> None:
     from rich.table import Table
 
     from robocas_ms3.cli.bars import say
+    from robocas_ms3.datasets.described import count_of
 
     rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
     for finding in found.findings:
@@ -107,7 +111,7 @@ def _table(found: Survey) -> None:
             console.width = _FILE_WIDTH
         console.print(table)
     left_out = len(found.as_json()["left_out"])
-    say(f"{found.root}: {found.episodes} episodes, {len(found.taken)} can be taken, {left_out} are left out")
+    say(f"{found.root}: {count_of(found.episodes, 'episode')}, can be taken: {len(found.taken)}, left out: {left_out}")
 
 
 def ranges(numbers: list[int], most: int = 6) -> str:

@@ -13,7 +13,11 @@ import tyro
 class Merge:
     """Write a dataset of all episodes of others, in the order given, numbered anew; the split stays as it was."""
 
-    datasets: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    datasets: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="PATH [PATH ...]", help_behavior_hint="(required)"),  # tyro takes none, too: see `merge`
+    ]
     """Folders of datasets of the same settings."""
     out: Path
     """Folder of the new dataset."""
@@ -30,6 +34,7 @@ class Merge:
 def main(cfg: Merge) -> int:
     """Merge, with a progress bar; gives the exit code."""
     from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.datasets.described import count_of
     from robocas_ms3.datasets.manage.merging import merge
 
     with bar("episodes") as shown:
@@ -43,6 +48,6 @@ def main(cfg: Merge) -> int:
             on_start=shown.start,
             on_episode=shown.advance,
         )
-    skipped = f", {done.skipped} duplicates left out" if done.skipped else ""
+    skipped = f", {count_of(done.skipped, 'duplicate')} left out" if done.skipped else ""
     say(f"{done.written}{skipped}")
     return 0

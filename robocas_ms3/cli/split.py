@@ -46,6 +46,7 @@ class Split:
 def main(cfg: Split) -> int:
     """Split, with a progress bar; gives the exit code."""
     from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.datasets.described import count_of
     from robocas_ms3.datasets.manage.splitting import Share, resplit, write_parts
 
     check(cfg)
@@ -53,7 +54,7 @@ def main(cfg: Split) -> int:
     share = None if cfg.val_share is None else Share(cfg.val_share, "seed" if whole else cfg.by or "seed")
     if cfg.in_place:
         train, val = resplit(cfg.dataset, share)
-        say(f"{cfg.dataset}: {len(train)} episodes train, {len(val)} validate")
+        say(f"{cfg.dataset}: {count_of(len(train), 'episode')} for training, {len(val)} for validation")
         return 0
     part, pieces = _pieces(cfg, share)
     with bar("episodes") as shown:

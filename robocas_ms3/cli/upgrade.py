@@ -26,10 +26,17 @@ class Upgrade:
 def main(cfg: Upgrade) -> int:
     """Upgrade, with a progress bar; gives the exit code."""
     from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.datasets.described import count_of
     from robocas_ms3.datasets.manage.upgrading import upgrade
+    from robocas_ms3.datasets.schema import SCHEMA_VERSION
 
     with bar("episodes") as shown:
         done = upgrade(cfg.dataset, trajectories=cfg.trajectory, on_start=shown.start, on_episode=shown.advance)
-    lacking = f"; of {len(done.incomplete)} the layout is not known (--trajectory)" if done.incomplete else ""
-    say(f"{cfg.dataset}: was version {done.before}, {len(done.described)} episodes described{lacking}")
+    if done.before == SCHEMA_VERSION and not done.described:
+        text = f"is of version {SCHEMA_VERSION} already; nothing to do"
+    else:
+        text = f"was of version {done.before}; {count_of(len(done.described), 'episode')} described"
+    if done.incomplete:
+        text += f"; of {count_of(len(done.incomplete), 'episode')} the layout is not known (--trajectory)"
+    say(f"{cfg.dataset}: {text}")
     return 0

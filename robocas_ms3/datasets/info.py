@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -17,7 +18,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.episode import SubGoal
 from robocas_ms3.datasets.reader import Dataset, Episode
 from robocas_ms3.datasets.scene_values import one_seed
-from robocas_ms3.datasets.tolerant import DAMAGED
+from robocas_ms3.datasets.tolerant import DAMAGED, first_line
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import write_json
 
@@ -90,18 +91,23 @@ def summarize(episode: Episode, number: int) -> Summary:
     """Read what the overview needs of an episode; one of unknown seed counts as one of a seed of its own.
 
     Raises:
-        DatasetError: its arrays can't be read.
+        DatasetError: its arrays can't be read, or its motion is no numbers.
     """
     try:
         with np.load(episode.folder / schema.EPISODE_FILE, allow_pickle=False) as content:
             arrays = {key: content[key] for key in _NEEDED}
-    except (*DAMAGED, KeyError) as error:
+    except (*DAMAGED, KeyError, TypeError) as error:  # TypeError: a single array, not an archive
         raise DatasetError(
             "this episode can't be read",
             where=episode.folder / schema.EPISODE_FILE,
-            found=str(error).splitlines()[0],
+            found=first_line(error),
             fix="robocas validate says what is wrong.",
         ) from error
+    for key in ("rel_pos", "rel_orn"):
+        if not np.isfinite(arrays[key]).all():
+            where = f"{episode.folder / schema.EPISODE_FILE}, {key}"
+            fix = "robocas validate says what is wrong."
+            raise DatasetError("this episode's motion is no numbers", where=where, expected="finite numbers", fix=fix)
     seed = one_seed(episode.scene.get("seed"))
     return Summary(
         number if seed is None else seed,
@@ -126,18 +132,30 @@ def runs(types: Sequence[str], texts: Sequence[str]) -> list[SubGoal]:
 
 
 def write_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
-    """Write ``data_info.json`` from the episodes on disk, and give its content.
+    """Write ``data_info.json`` from the episodes on disk, and give its content; parameters and errors of `info_of`."""
+    info = info_of(root, before)
+    write_json(root / schema.DATA_INFO_FILE, info)
+    return info
+
+
+def info_of(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
+    """Content of ``data_info.json`` by the episodes on disk.
 
     Args:
         root: the dataset.
         before: of `split_by_seed`.
 
     Raises:
-        DatasetError: an episode can't be read.
+        DatasetError: an episode can't be read, or there is no motion to give a range of.
     """
     dataset = Dataset(root)
-    info = data_info({number: summarize(dataset.episode(number), number) for number in dataset.numbers}, before)
-    write_json(root / schema.DATA_INFO_FILE, info)
+    episodes = {number: summarize(dataset.episode(number), number) for number in dataset.numbers}
+    try:
+        info = data_info(episodes, before)
+        json.dumps(info, allow_nan=False)  # JSON knows no NaN: many readers refuse a file with one
+    except (ValueError, IndexError) as error:  # quaternions of length 0; no episode of two steps
+        where, fix = f"{root / schema.DATA_INFO_FILE}, action_space", "robocas validate says what is wrong."
+        raise DatasetError("the motion has no range", where=where, found=first_line(error), fix=fix) from error
     return info
 
 

@@ -50,6 +50,40 @@ def problems(root, **kwargs):
     return [(f.episode, f.file.split("/", 1)[-1], f.problem, f.outcome) for f in survey(root, **kwargs).findings]
 
 
+NO_SCENE = "no file: seed, target, layout and configuration are not known"
+
+
+def test_files_that_are_missing_everywhere_are_told_once(four, tmp_path):
+    root = shutil.copytree(four, tmp_path / "four")
+    found = [(f.episode, f.file, f.problem, f.outcome) for f in survey(root).findings if f.episode is None]
+    assert found == [
+        (None, "conversion.json", "no file: made of the episodes, 5 steps a second", "mended"),
+        (None, "scene.json", NO_SCENE, "noted"),
+        *(
+            (None, f"{camera}/cam_pose_wrt_{parent}.npy", f"no file: a copy of cam_pos_wrt_{parent}.npy", "mended")
+            for camera, parent in (("base_camera", "arm_base"), ("gripper_camera", "ee"), ("static_camera", "world"))
+        ),
+    ]
+    poses = root / "episode_0000002" / "static_camera"
+    shutil.copy(poses / "cam_pos_wrt_world.npy", poses / "cam_pose_wrt_world.npy")
+    found = [f for f in survey(root).findings if "static_camera" in f.file]
+    assert [(f.episode, f.file) for f in found] == [
+        (n, f"episode_000000{n}/static_camera/cam_pose_wrt_world.npy") for n in (0, 1, 3)
+    ]
+
+
+def test_a_whole_dataset_of_ours_has_no_findings(made):
+    assert survey(made).findings == []
+
+
+def test_the_output_is_the_input(four, capsys):
+    for out in (four, four / "inside", four.parent):
+        assert run(["import-robocas", str(four), "--out", str(out)]) == 1
+        text = capsys.readouterr().err
+        assert "the output is an input" in text
+        assert "--overwrite" not in text
+
+
 def imported(root, out, **kwargs):
     import_robocas(survey(root, **kwargs), out)
     return Dataset(out)
@@ -300,7 +334,7 @@ def test_pictures_that_are_missing_or_damaged(four, tmp_path):
     assert (1, "base_camera/rgb/0003.png", "PNG cut off", "left out") in found
     assert (2, "static_camera/depth/0000.png", "missing", "left out") in found
     assert (2, "static_camera/depth", "4 more are missing or damaged", "left out") in found
-    assert (3, "gripper_camera/depth", "1 files beyond the 7 steps: not taken", "noted") in found
+    assert (3, "gripper_camera/depth", "1 file beyond the 7 steps: not taken", "noted") in found
     new = imported(root, tmp_path / "out")
     assert new.numbers == [0, 3]
     assert validate(new.root).violations == []
@@ -356,7 +390,7 @@ def test_the_overview(four, tmp_path):
         info["language_goal"]["2"] = "dance"
 
     edit(root / "data_info.json", spoil)
-    found = [problem for problem in problems(root) if "made of" not in problem[2]]
+    found = [problem for problem in problems(root) if problem[0] is not None and "made of" not in problem[2]]
     assert [(episode, problem) for episode, _, problem, _ in found] == [
         (0, "listed twice: it trains"),
         (0, "data_info.json says 9, this 7"),
@@ -395,12 +429,8 @@ def test_embeddings_of_all_or_none(dataset, tmp_path):
     change(dataset / "episode_0000000", language_embedding=np.ones(512, np.float32))
     found = problems(dataset)
     assert (0, "episode_info.npz, language_embedding", "not taken: shape (512,), not (384,)", "noted") in found
-    assert found[0] == (
-        None,
-        "episode_info.npz",
-        "1 episodes lack embeddings: those of the others are not taken",
-        "mended",
-    )
+    text = "missing in 1 episode: those of the others are not taken"
+    assert (None, "episode_info.npz, embeddings", text, "mended") in found
     assert imported(dataset, tmp_path / "none").settings["embeddings"] is False
     assert validate(tmp_path / "none").violations == []
 
@@ -448,7 +478,7 @@ def test_nothing_to_take(four, tmp_path, capsys):
     with pytest.raises(DatasetError, match="no episode can be taken"):
         imported(root, tmp_path / "out")
     assert run(["import-robocas", str(root), "--out", str(tmp_path / "out")]) == 1
-    assert "0 can be taken, 4 are left out" in capsys.readouterr().out
+    assert "4 episodes, can be taken: 0, left out: 4" in capsys.readouterr().out
     assert not (tmp_path / "out").exists()
 
 
@@ -466,7 +496,7 @@ def test_command(four, tmp_path, capsys):
     change(root / "episode_0000002", rel_pos=np.zeros((7, 3)))
     assert run(["import-robocas", str(root)]) == 0
     text = capsys.readouterr().out
-    assert "4 episodes, 3 can be taken, 1 are left out" in text
+    assert "4 episodes, can be taken: 3, left out: 1" in text
     assert "missing; made of base_pos, base_orn" in text
     assert run(["import-robocas", str(root), "--out", str(out), "--json", "--link"]) == 0
     report = json.loads(capsys.readouterr().out)

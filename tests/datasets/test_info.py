@@ -1,9 +1,12 @@
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from managing import change
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.info import action_space, split_by_seed
+from robocas_ms3.datasets.info import action_space, split_by_seed, write_info
+from robocas_ms3.errors import DatasetError
 
 
 @settings(max_examples=50, deadline=None)
@@ -36,3 +39,26 @@ def test_action_space_by_hand():
     ranges = action_space([positions], [Rotation.from_euler("xyz", turns).as_quat()])
     np.testing.assert_allclose(ranges["relative_position"], [[1, 0, 0], [99, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(ranges["relative_rotation"], [[0, 0, -0.98], [0, 0, 0.98]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("new", "message"),
+    [
+        ({"rel_pos": np.full((7, 3), np.nan)}, "episode_0000001/episode_info.npz, rel_pos: .*expected finite numbers"),
+        ({"rel_orn": np.full((7, 4), np.inf)}, "episode_0000001/episode_info.npz, rel_orn: .*expected finite numbers"),
+        ({"rel_orn": np.zeros((7, 4))}, "data_info.json, action_space: the motion has no range"),
+    ],
+)
+def test_the_overview_never_holds_nan(dataset, new, message):
+    change(dataset / "episode_0000001", **new)
+    before = (dataset / "data_info.json").read_bytes()
+    with pytest.raises(DatasetError, match=message):
+        write_info(dataset)
+    assert (dataset / "data_info.json").read_bytes() == before
+
+
+def test_episodes_of_one_step_have_no_range(dataset):
+    for number in (0, 1):
+        change(dataset / f"episode_000000{number}", rel_pos=np.zeros((1, 3)), rel_orn=np.array([[0, 0, 0, 1.0]]))
+    with pytest.raises(DatasetError, match="the motion has no range"):
+        write_info(dataset)

@@ -1,7 +1,8 @@
+import re
 import shutil
 
 import pytest
-from managing import die, edit, files_of, make, read
+from managing import DAMAGES, change, die, edit, files_of, make, read
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
@@ -10,6 +11,7 @@ from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.output import Placed
 from robocas_ms3.datasets.manage.parts import names_of
 from robocas_ms3.datasets.manage.splitting import Share, resplit
+from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.validate import validate
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
@@ -81,6 +83,7 @@ def test_names_tell_datasets_apart(tmp_path):
     roots = [tmp_path / "x" / "ds", tmp_path / "y" / "ds"]
     assert names_of(roots) == ["x/ds", "y/ds"]
     assert names_of(roots[:1]) == ["ds"]
+    assert names_of([roots[0], roots[0]]) == [str(roots[0])] * 2
 
 
 def test_duplicates(parts, tmp_path):
@@ -177,12 +180,48 @@ def test_a_split_of_something_else(parts, tmp_path, listed):
     merge([part], tmp_path / "out")
 
 
-def test_a_damaged_episode_stops_it_before_the_end(parts, tmp_path):
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_episode_stops_it_before_anything_is_written(parts, tmp_path, damage):
     part = spoiled(parts[0], tmp_path)
-    (part / "episode_0000001" / "episode_info.npz").write_bytes(b"PK")
-    with pytest.raises(DatasetError, match="this episode can't be read"):
-        merge([parts[1], part], tmp_path / "out")
-    assert not (tmp_path / "out" / "data_info.json").exists()
+    spoil, file, found = DAMAGES[damage]
+    spoil(part / "episode_0000001")
+    where, fix = re.escape(f"{part}/episode_0000001/{file}"), re.escape(f"robocas validate {part} lists all.")
+    fails(f"^{where}: this episode is damaged .*{found}.*{fix}$", [parts[1], part], tmp_path / "out")
+
+
+def test_what_is_overwritten_stays_where_an_input_is_damaged(parts, tmp_path):
+    part = spoiled(parts[0], tmp_path)
+    merge([parts[1]], tmp_path / "out")
+    before = files_of(tmp_path / "out")
+    (part / "episode_0000000" / "static_camera" / "rgb" / "0000.png").unlink()
+    for flag in ("overwrite", "resume"):
+        with pytest.raises(DatasetError, match="this episode is damaged"):
+            merge([part], tmp_path / "out", **{flag: True})
+    assert files_of(tmp_path / "out") == before
+
+
+def test_arrays_that_an_import_could_not_make_may_be_missing(parts, tmp_path):
+    part = spoiled(parts[0], tmp_path)
+    change(part / "episode_0000001", base_pos=None)
+    fails("episode_0000001/episode_info.npz, base_pos: this episode is damaged", [part], tmp_path / "out")
+    edit(part / "episode_0000001" / "scene.json", lambda s: s["source"].update(missing=["base_pos"]))
+    assert merge([part], tmp_path / "out").written.episodes == 2
+
+
+def test_pictures_with_something_behind_them_are_sound(parts, tmp_path):
+    part = spoiled(parts[0], tmp_path)
+    with (part / "episode_0000001" / "base_camera" / "rgb" / "0003.png").open("ab") as file:
+        file.write(b"more")
+    assert merge([part], tmp_path / "out").written.episodes == 2
+
+
+@pytest.mark.parametrize("image_format", ["jpg", "webp"])
+def test_other_formats(tmp_path, image_format):
+    part = make(tmp_path, "a", (10,), pictures=Pictures(image_format=image_format))
+    picture = part / "episode_0000000" / "base_camera" / "rgb" / f"0003.{image_format}"
+    assert merge([part], tmp_path / "out").written.episodes == 1
+    picture.write_bytes(picture.read_bytes()[:-9])
+    fails(f"base_camera/rgb/0003.{image_format}: this episode is damaged", [part], tmp_path / "again")
 
 
 def test_the_output(parts, tmp_path):
@@ -226,6 +265,17 @@ def test_command(parts, tmp_path, capsys):
     assert capsys.readouterr().err.startswith("error: ")
     assert run([*words, "--skip-duplicates", "--copy"]) == 0
     assert "4 episodes, 0 files linked, 212 copied, 2 duplicates left out" in capsys.readouterr().out
+
+
+def test_the_command_wants_datasets(tmp_path, capsys):
+    assert run(["merge", "--out", str(tmp_path / "out")]) == 1
+    assert "nothing to merge" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        run(["merge", "--help"])
+    text = capsys.readouterr().out
+    assert "PATH [PATH ...]" in text
+    assert "[[PATH" not in text
+    assert "(default: )" not in text
 
 
 def test_a_merged_dataset_can_be_appended_to(parts, tmp_path):

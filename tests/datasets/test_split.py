@@ -3,7 +3,7 @@ import shutil
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from managing import edit, files_of, make, read
+from managing import DAMAGES, edit, files_of, make, read
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.info import split_by_seed
@@ -177,12 +177,38 @@ def test_wrong_words(six, tmp_path, capsys):
         (["--out", out], "what is a part?"),
         (["--out-train", out, "--out-val", f"{out}/val"], "two datasets in one folder"),
         (["--in-place", "--by", "seed"], "how much validates?"),
-        (["--in-place", "--val-share", "1.5"], "not shares of a whole"),
+        (["--in-place", "--val-share", "1.5"], "val_share: not a share (expected > 0 and < 1, found 1.5)"),
+        (["--in-place", "--val-share", "0"], "val_share: not a share (expected > 0 and < 1, found 0.0)"),
+        (["--in-place", "--val-share", "nan"], "val_share: not a share (expected > 0 and < 1, found nan)"),
         (["--parts", "0.9", "0.2", "--out", out], "not shares of a whole"),
     ]:
         assert run(["split", str(six), *words]) == 1
         assert text in capsys.readouterr().err
         assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_episode_stops_it_before_anything_is_written(six, tmp_path, capsys, damage):
+    root = shutil.copytree(six, tmp_path / "ds")
+    spoil, file, _ = DAMAGES[damage]
+    spoil(root / "episode_0000004")
+    out = tmp_path / "out"
+    assert run(["split", str(root), "--parts", "0.5", "0.5", "--out", str(out)]) == 1
+    text = capsys.readouterr().err
+    assert text.startswith(f"error: {root}/episode_0000004/{file}: this episode is damaged")
+    assert text.count("\n") == 1
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("damage", ["NaN in rel_pos", "infinite ee_pos", "pickles", "no archive", "no arrays"])
+def test_in_place_leaves_all_as_it_is_where_arrays_are_damaged(six, tmp_path, damage):
+    root = shutil.copytree(six, tmp_path / "ds")
+    spoil, file, _ = DAMAGES[damage]
+    spoil(root / "episode_0000004")
+    before = files_of(root)
+    with pytest.raises(DatasetError, match=f"episode_0000004/{file}: this episode is damaged"):
+        resplit(root, Share(0.5))
+    assert files_of(root) == before
 
 
 def test_unknown_targets(six, tmp_path):

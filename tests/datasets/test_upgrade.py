@@ -43,7 +43,7 @@ def test_with_the_trajectory_it_is_what_convert_writes_today(old):
 def test_without_it_is_as_far_as_known_and_can_be_completed(old, capsys):
     root, new, trajectory = old
     assert run(["upgrade", str(root)]) == 0
-    assert "was version 1, 3 episodes described; of 3 the layout is not known" in capsys.readouterr().out
+    assert "was of version 1; 3 episodes described; of 3 episodes the layout is not known" in capsys.readouterr().out
     scene, whole = (read(folder / "episode_0000002" / "scene.json") for folder in (root, new))
     unknown = {key for key, value in scene.items() if value is None}
     assert unknown == {"config", "layout", "objects", "reset_options", "recorded"}
@@ -105,11 +105,13 @@ def test_what_can_not_be_upgraded(old, tmp_path):
         upgrade(root)
 
 
-def test_a_dataset_of_today_stays_as_it_is(old):
+def test_a_dataset_of_today_stays_as_it_is(old, capsys):
     _, new, _ = old
     edit(new / "conversion.json", lambda c: c.update(source={"format": "robocas v0"}, more=1))
     before = files_of(new)
     assert upgrade(new).described == []
+    assert run(["upgrade", str(new)]) == 0
+    assert capsys.readouterr().out == f"{new}: is of version 2 already; nothing to do\n"
     assert files_of(new) == before
 
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import robocas_ms3
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.described import count_of
 from robocas_ms3.datasets.info import write_info
-from robocas_ms3.datasets.manage.output import Placed, begun_output
+from robocas_ms3.datasets.manage.input_check import check_episodes
+from robocas_ms3.datasets.manage.output import Placed, begun_output, check_apart
 from robocas_ms3.datasets.manage.parts import Part
 from robocas_ms3.datasets.plan import SETTINGS
-from robocas_ms3.files import replacing_folder
+from robocas_ms3.files import claim_output, replacing_folder
 
 Side = Literal["train", "val"]
 OnStart = Callable[[int], None]
@@ -50,7 +52,30 @@ class Assembled:
     def __str__(self) -> str:
         """One line."""
         kept = f", {self.kept} of them were there" if self.kept else ""
-        return f"{self.out}: {self.episodes} episodes{kept}, {self.linked} files linked, {self.copied} copied"
+        linked = f"{count_of(self.linked, 'file')} linked, {self.copied} copied"
+        return f"{self.out}: {count_of(self.episodes, 'episode')}{kept}, {linked}"
+
+
+def check_before(outs: Iterable[Path], members: Sequence[Member], *, go_on: bool) -> None:
+    """Refuse outputs that are there and episodes that are damaged, before anything is written.
+
+    Args:
+        outs: folders that will be written.
+        members: all of their episodes.
+        go_on: whether outputs may be there.
+
+    Raises:
+        DatasetError: an output is an input, or an episode is damaged.
+        OutputExistsError: an output is there.
+    """
+    numbers: dict[Path, tuple[Part, list[int]]] = {}
+    for member in members:
+        numbers.setdefault(member.part.root, (member.part, []))[1].append(member.number)
+    for out in outs:
+        check_apart(out, list(numbers))
+        claim_output(out, resume=go_on)
+    for part, chosen in numbers.values():
+        check_episodes(part, chosen)
 
 
 def assemble(
@@ -64,7 +89,7 @@ def assemble(
     on_start: OnStart | None = None,
     on_episode: OnEpisode | None = None,
 ) -> Assembled:
-    """Write a dataset of these episodes, in this order, numbered from 0.
+    """Write a dataset of these episodes, in this order, numbered from 0; `check_before` has seen them.
 
     Killed at any moment, it goes on with ``resume``, and ends as if it had not been. Hard links share the files with
     the datasets they are from: nothing in this package changes a file in place, an editor may.

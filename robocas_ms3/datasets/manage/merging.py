@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.manage.assemble import Assembled, Member, OnEpisode, OnStart, Side, assemble
+from robocas_ms3.datasets.manage.assemble import Assembled, Member, OnEpisode, OnStart, Side, assemble, check_before
 from robocas_ms3.datasets.manage.parts import Part, names_of, open_part, shown
 from robocas_ms3.datasets.plan import SETTINGS
 from robocas_ms3.errors import DatasetError
@@ -47,11 +47,11 @@ def merge(
         on_episode: see `assemble`.
 
     Raises:
-        DatasetError: they do not fit together, or are not finished.
+        DatasetError: they do not fit together, are not finished, or an episode is damaged.
         OutputExistsError: ``out`` is not empty and neither flag is set.
     """
     if not roots:
-        raise DatasetError("nothing to merge", expected="datasets")
+        raise DatasetError("nothing to merge", expected="folders of datasets", fix="robocas merge A B --out C")
     parts = [open_part(root) for root in roots]
     _check_settings(parts)
     members: list[Member] = []
@@ -75,6 +75,7 @@ def merge(
             found=f"{len(duplicates)}: {shown(pairs, 4)}",
             fix="Pass --skip-duplicates to take each once.",
         )
+    check_before([out], members, go_on=overwrite or resume)
     written = assemble(
         out,
         members,

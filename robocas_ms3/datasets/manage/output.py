@@ -80,7 +80,7 @@ def begun_output(
         DatasetError: it is an input, or what is there is no dataset or another one.
     """
     plan = json.loads(json.dumps(plan))
-    _check_apart(out, inputs)
+    check_apart(out, inputs)
     with locked_folder(out):
         claim_output(out, resume=resume or overwrite)
         if resume:
@@ -95,7 +95,12 @@ def begun_output(
             yield out
 
 
-def _check_apart(out: Path, inputs: Sequence[Path]) -> None:
+def check_apart(out: Path, inputs: Sequence[Path]) -> None:
+    """Refuse an output that is an input, or in one, or holds one.
+
+    Raises:
+        DatasetError: it is.
+    """
     target = out.resolve()
     for path in (path.resolve() for path in inputs):
         if path == target or path in target.parents or target in path.parents:

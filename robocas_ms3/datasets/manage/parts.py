@@ -120,7 +120,7 @@ def names_of(roots: Iterable[Path]) -> list[str]:
     """Names that tell datasets apart, as short as they can be: the last parts of their paths."""
     parts = [root.resolve().parts for root in roots]
     for length in range(1, max(map(len, parts), default=1) + 1):
-        names = ["/".join(path[-length:]) for path in parts]
+        names = [str(Path(*path[-length:])) for path in parts]
         if len(set(names)) == len(names):
             return names
-    return ["/".join(path) for path in parts]
+    return [str(Path(*path)) for path in parts]

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from robocas_ms3.datasets.described import count_of
 from robocas_ms3.datasets.manage.findings import FULL_SIZE, Layout, Report
 from robocas_ms3.datasets.picture_files import PictureHeader, read_header
 from robocas_ms3.datasets.reader import Episode
@@ -53,7 +54,9 @@ def _pictures_of(
     folder = episode.folder / camera / kind
     extra = {path.name for path in folder.iterdir()} - {path.name for path in paths} if folder.is_dir() else set()
     if extra:
-        report.noted(f"{camera}/{kind}", f"{len(extra)} files beyond the {steps} steps: not taken")
+        report.noted(
+            f"{camera}/{kind}", f"{count_of(len(extra), 'file')} beyond the {count_of(steps, 'step')}: not taken"
+        )
 
 
 def _header(path: Path) -> PictureHeader | str:

@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.info import write_info
-from robocas_ms3.datasets.manage.assemble import Assembled, Member, OnEpisode, OnStart, Side, assemble
+from robocas_ms3.datasets.info import info_of
+from robocas_ms3.datasets.manage.assemble import Assembled, Member, OnEpisode, OnStart, Side, assemble, check_before
+from robocas_ms3.datasets.manage.input_check import check_numbers
 from robocas_ms3.datasets.manage.parts import Part, Sides, names_of
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.errors import DatasetError
@@ -35,6 +36,15 @@ class Share:
 
     val: float
     by: By = "seed"
+
+    def __post_init__(self) -> None:
+        """Check the share.
+
+        Raises:
+            DatasetError: it is none.
+        """
+        if not 0 < self.val < 1:
+            raise DatasetError("not a share", where="val_share", expected="> 0 and < 1", found=self.val)
 
     @property
     def rule(self) -> str:
@@ -107,11 +117,13 @@ def resplit(root: Path, share: Share | None = None) -> Sides:
         share: how to split; None: every episode keeps its side, new ones are split by the writer's rule.
 
     Raises:
-        DatasetError: there is no dataset, or it can't be split so.
+        DatasetError: there is no dataset, it can't be split so, or arrays of an episode are damaged.
     """
     with locked_folder(root):
         dataset = Dataset(root)
         sides = dataset.sides if share is None else _sides(dataset, share)
+        check_numbers(dataset)
+        info = info_of(root, sides)
         settings = dataset.settings
         if settings:
             there = {str(number) for number in dataset.numbers}
@@ -120,7 +132,7 @@ def resplit(root: Path, share: Share | None = None) -> Sides:
             new = {**settings, **rule, **({"episodes": kept} if "episodes" in settings else {})}
             if new != settings:
                 write_json(root / schema.CONVERSION_FILE, new)
-        info = write_info(root, sides)
+        write_json(root / schema.DATA_INFO_FILE, info)
     return info["train_eps"], info["val_eps"]
 
 
@@ -185,23 +197,28 @@ def write_parts(
         on_episode: called after each.
 
     Raises:
-        DatasetError: an output would be empty, is the input, or something else was begun there.
+        DatasetError: an output would be empty, is the input, or something else was begun there; an episode is damaged.
         OutputExistsError: one is not empty and neither flag is set.
     """
     for out, sides in pieces.items():
         if not any(sides):
             raise DatasetError("no episodes for this part", where=out, fix="Choose other shares.")
-    counts: list[int] = []
-    if on_start:
-        on_start(sum(len(side) for sides in pieces.values() for side in sides))
     name = names_of([part.root])[0]
-    done = []
+    members: dict[Path, list[Member]] = {}
     for out, (train, val) in pieces.items():
         side_of: dict[int, Side] = {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}
+        members[out] = [Member(part, name, number, side_of[number]) for number in sorted(side_of)]
+    everything = [member for chosen in members.values() for member in chosen]
+    check_before(members, everything, go_on=overwrite or resume)
+    if on_start:
+        on_start(len(everything))
+    counts: list[int] = []
+    done = []
+    for out, chosen in members.items():
         done.append(
             assemble(
                 out,
-                [Member(part, name, number, side_of[number]) for number in sorted(side_of)],
+                chosen,
                 split_rule=share.rule if share else KEEP_RULE,
                 link=link,
                 overwrite=overwrite,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.manage.findings import Finding, Layout
+from robocas_ms3.datasets.described import count_of
+from robocas_ms3.datasets.manage.findings import Finding, Layout, Outcome
 from robocas_ms3.datasets.manage.reading import read_episode
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.tolerant import arrays_fingerprint
@@ -107,10 +108,34 @@ def survey(
             del lengths[number]
     embeddings = bool(lengths) and embedded >= set(lengths)
     if not embeddings and embedded & set(lengths):
-        lacking = f"{len(set(lengths) - embedded)} episodes lack embeddings: those of the others are not taken"
-        findings.append(Finding(None, schema.EPISODE_FILE, lacking, "mended"))
+        lacking = f"missing in {count_of(len(set(lengths) - embedded), 'episode')}: those of the others are not taken"
+        findings.append(Finding(None, f"{schema.EPISODE_FILE}, embeddings", lacking, "mended"))
+    findings += _files(dataset, list(lengths), rate_hz)
     findings.sort(key=lambda finding: -1 if finding.episode is None else finding.episode)
     return Survey(root, rate_hz, turn_eef, len(dataset.numbers), lengths, layout, embeddings, findings)
+
+
+def _files(dataset: Dataset, taken: Sequence[int], rate_hz: float) -> Iterator[Finding]:
+    """Files of today's schema that are missing; told once where they are in all episodes that can be taken."""
+    if not dataset.settings:
+        made = f"no file: made of the episodes, {rate_hz:g} steps a second"
+        yield Finding(None, schema.CONVERSION_FILE, made, "mended")
+    lacking: dict[tuple[str, str, Outcome], list[int]] = {}
+    for number in taken:
+        episode = dataset.episode(number)
+        if not (episode.folder / schema.SCENE_FILE).is_file():
+            text = "no file: seed, target, layout and configuration are not known"
+            lacking.setdefault((schema.SCENE_FILE, text, "noted"), []).append(number)
+        for camera in [camera for camera in schema.CAMERAS if camera.name in episode.cameras]:
+            for name, other in zip(camera.pose_files, camera.pose_files[::-1], strict=True):
+                if not (episode.folder / camera.name / name).is_file():
+                    key: tuple[str, str, Outcome] = (f"{camera.name}/{name}", f"no file: a copy of {other}", "mended")
+                    lacking.setdefault(key, []).append(number)
+    for (file, problem, outcome), numbers in lacking.items():
+        if len(numbers) == len(taken):
+            yield Finding(None, file, problem, outcome)
+        else:
+            yield from (Finding(n, f"{schema.episode_folder(n)}/{file}", problem, outcome) for n in numbers)
 
 
 def read_info(dataset: Dataset, findings: list[Finding]) -> dict[str, Any]:
