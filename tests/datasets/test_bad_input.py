@@ -44,8 +44,10 @@ def test_pickles_go_off_nowhere(bomb, tmp_path):
         _ = Dataset(bomb).episode(1).arrays
     assert Dataset(bomb).episode(0).steps == 7  # others are not concerned
     change(bomb / "episode_0000000", rel_pos=np.array([Bomb()] * 7, object))
-    with pytest.raises(DatasetError, match="this episode can't be read.*robocas validate"):
+    damaged = "dataset/episode_0000000/episode_info.npz, rel_pos: this episode is damaged .*pickled.*robocas validate"
+    with pytest.raises(DatasetError, match=damaged):
         merge([bomb], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
     with pytest.raises(DatasetError, match="this episode can't be read"):
         write_info(bomb)
 
