@@ -57,8 +57,6 @@ def load_arrays(path: Path) -> Loaded:
     loaded = Loaded()
     try:
         with np.load(path, allow_pickle=False) as content:
-            if isinstance(content, np.ndarray):
-                raise ValueError("a single array")
             for key in content.files:
                 if key not in SPECS:
                     loaded.ignored.append(key)
@@ -70,7 +68,7 @@ def load_arrays(path: Path) -> Loaded:
                     loaded.unreadable[key] = PICKLED if "allow_pickle" in text else text
     except FileNotFoundError as error:
         raise DatasetError("no such file", where=path) from error
-    except DAMAGED as error:
+    except (*DAMAGED, TypeError) as error:  # TypeError: a single array is no context
         text = first_line(error)
         found = PICKLED if "pickle" in text else text
         raise DatasetError("not a numpy archive, or a damaged one", where=path, found=found) from error

@@ -173,7 +173,7 @@ def test_a_scene_that_is_another_leaves_nothing_behind(recorded, tmp_path):
 def test_a_real_dataset_is_valid(recorded, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(Convert(recorded[0], out, embeddings=False, size=SIZE)) == 0
-    assert "1 episodes, 4 steps" in capsys.readouterr().out  # states 0, 4, 8, 9
+    assert "1 episode, 4 steps" in capsys.readouterr().out  # states 0, 4, 8, 9
     assert {path.name for path in (out / "preview").iterdir()} == {"episode_0000000.mp4", "contact_sheet.png"}
     assert validate(out).violations == []
     with np.load(out / "episode_0000000" / "episode_info.npz") as arrays:

@@ -146,6 +146,13 @@ def test_a_damaged_member_of_an_archive(dataset):
     assert len(load_arrays(dataset / NPZ).unreadable) == 1
 
 
+def test_a_single_array_is_no_archive(tmp_path):
+    with (tmp_path / "episode_info.npz").open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(DatasetError, match="not a numpy archive"):
+        load_arrays(tmp_path / "episode_info.npz")
+
+
 def chunk(kind, data=b""):
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
