@@ -156,12 +156,12 @@ def wrap_angle(angle: Array) -> Array:
 
 
 def planar_base(joints: Joints) -> Array:
-    """Mobile base in the world: (T, 3) x, y in m, yaw in rad."""
+    """Mobile base in the world: (T, 3) x, y in m, yaw in rad, at first in [-pi, pi), without jumps after that."""
     x, y, yaw = joints.qpos[:, :3].T
     root = joints.root_in_world
     position = root[:, :3, 3] + np.einsum("tij,tj->ti", root[:, :3, :3], np.stack([x, y, 0 * x], axis=1))
     root_yaw = np.arctan2(root[:, 1, 0], root[:, 0, 0])
-    return np.column_stack([position[:, :2], wrap_angle(root_yaw + yaw)])
+    return np.column_stack([position[:, :2], np.unwrap(wrap_angle(root_yaw + yaw))])
 
 
 def episode_arrays(

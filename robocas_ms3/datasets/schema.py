@@ -126,7 +126,7 @@ EPISODE_INFO: tuple[ArraySpec, ...] = (
     ArraySpec(
         "gripper_status", "bool", ("T",), "", "command in force at this step: True = open (commanded width > 0.04 m)"
     ),
-    ArraySpec("agv_pose", "float32", ("T", 3), "m, m, rad", "mobile base in the world: x, y, yaw"),
+    ArraySpec("agv_pose", "float32", ("T", 3), "m, m, rad", "mobile base in the world: x, y, yaw, which never jumps"),
     ArraySpec(
         "rel_agv_pose", "float32", ("T", 3), "m, m, rad", "agv_pose[t+1] - agv_pose[t] (world frame); last row 0"
     ),

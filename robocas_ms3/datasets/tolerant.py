@@ -137,7 +137,7 @@ def complete(loaded: Loaded, said: Mapping[str, Any], rate_hz: float) -> None:
     base = _poses(arrays, "base_pos", "base_orn")
     if base is not None:
         yaw = np.arctan2(base[:, 1, 0], base[:, 0, 0])
-        put("agv_pose", np.column_stack([base[:, :2, 3], yaw]), "base_pos, base_orn")
+        put("agv_pose", np.column_stack([base[:, :2, 3], np.unwrap(yaw)]), "base_pos, base_orn")
     if "agv_pose" in arrays:
         put("rel_agv_pose", planar_motion(arrays["agv_pose"]), "agv_pose")
     joints = arrays.get("robot_joints", np.zeros((0, 7)))

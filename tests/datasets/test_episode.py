@@ -117,7 +117,7 @@ def test_base_pose_in_the_world():
     root = to_matrices(np.array([[0.7, 0.15, 0]] * 2), Rotation.from_euler("z", [[90], [90]], degrees=True).as_quat())
     qpos = np.zeros((2, 12))
     qpos[1, :3] = 0.2, 0.0, np.deg2rad(100)
-    expected = [[0.7, 0.15, np.pi / 2], [0.7, 0.35, np.deg2rad(190 - 360)]]
+    expected = [[0.7, 0.15, np.pi / 2], [0.7, 0.35, np.deg2rad(190)]]  # on from 90, not to -170
     np.testing.assert_allclose(planar_base(Joints(qpos, qpos, root)), expected, atol=1e-12)
 
 
@@ -191,3 +191,12 @@ def test_gripper_status_is_the_command_that_led_there():
     status = gripper_open(commands, samples, initial_width=0.08, **kwargs)
     assert status.tolist() == [True, True, False, False, True, True]
     assert not gripper_open(commands, samples, initial_width=0.0, **kwargs)[0]
+
+
+def test_the_bases_yaw_does_not_jump():
+    """A base that stands at -180 deg, give or take a hair."""
+    qpos = np.zeros((4, 12))
+    qpos[:, 2] = -np.pi + np.array([0, 1e-6, -1e-6, -0.1])
+    root = np.tile(np.eye(4), (4, 1, 1))
+    yaw = planar_base(Joints(qpos, qpos, root))[:, 2]
+    np.testing.assert_allclose(yaw, qpos[:, 2], atol=1e-9)
