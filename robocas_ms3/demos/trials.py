@@ -43,5 +43,5 @@ def try_actions(open_loop: OpenLoop, executor: Executor, recorder: EpisodeRecord
             raise EpisodeLost("replay", "clipped")
         if not played.success:
             parted = played.parted_at({name: found[samples] for name, found in states["actors"].items()})
-            executor.forget_checkpoints(after=int(samples[min(parted, len(samples) - 1)]))
+            executor.forget_checkpoints(after=int(samples[max(parted - 1, 0)]))  # the last moment that was as recorded
             raise EpisodeLost("replay", "no_success")

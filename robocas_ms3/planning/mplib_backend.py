@@ -25,7 +25,7 @@ SHORTCUTS = 40
 STILL = 1e-6  # rad; a shorter motion is none
 TCP_SPEED_LIMIT = 0.45  # m/s: at 5 Hz pd_ee_delta_pose moves 0.1 m a step at most, with some lag to catch up
 
-T = TypeVar("T", Trajectory, Trajectory | None)
+Timed = TypeVar("Timed", Trajectory, Trajectory | None)
 
 
 class MplibPlanner:
@@ -223,7 +223,7 @@ class MplibPlanner:
         polyline = [a + (b - a) * s for a, b in zip(corners[:-1], corners[1:], strict=True) for s in _fractions(a, b)]
         return self._timed(partial(stopping, corners)) if all(map(self._world.free, polyline)) else None
 
-    def _timed(self, time: Callable[..., T], speed: float = 1.0) -> T:
+    def _timed(self, time: Callable[..., Timed], speed: float = 1.0) -> Timed:
         """Time a motion within a fraction of the limits, and slower where the TCP would be faster than its limit."""
         limits = {name: value * speed for name, value in self._limits.items()}
         trajectory = time(**limits, dt=self._dt)
@@ -231,7 +231,9 @@ class MplibPlanner:
             places = np.array([self.tcp(qpos)[:3, 3] for qpos in trajectory.qpos])
             fastest = float(np.linalg.norm(np.diff(places, axis=0), axis=1).max()) / self._dt
             if fastest > TCP_SPEED_LIMIT:
-                limits["velocity"] *= TCP_SPEED_LIMIT / fastest
+                # Slower by s: velocities by s, accelerations by its square. Then all of the motion is, ramps too.
+                slower = TCP_SPEED_LIMIT / fastest
+                limits = {"velocity": limits["velocity"] * slower, "acceleration": limits["acceleration"] * slower**2}
                 trajectory = time(**limits, dt=self._dt)
         return trajectory
 
