@@ -1,0 +1,293 @@
+"""Branches of an episode, each in a forked process: what is tried there leaves no trace here.
+
+A decision (`planning.decisions`) forks a child for each candidate. The child plays it, says how well it went, and
+waits. The best one is told to go on: it *is* the episode from then on, while this process waits for its end. Where it
+fails, this process, still at the decision, tells the next best. So processes stand in a row, one for each decision
+made, and the last one writes the episode. Nothing is simulated twice, and the actions since the reset remain all there
+is.
+
+Children die with their parents, leave no zombies, and have a time limit; one that crashes has failed.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import logging
+import math
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from typing import Any, NoReturn, Protocol, TypeVar
+
+import torch
+
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.decisions import TRIES, Decisions
+
+T = TypeVar("T")
+
+PLAY_LIMIT, GO_ON_LIMIT = 300.0, 3600.0  # s of wall-clock time for one candidate; for the rest of the episode
+_PR_SET_PDEATHSIG = 1
+_log = logging.getLogger(__name__)
+
+
+class Tally(Protocol):
+    """What survives a branch: where time went and what failed. Whoever is running has the only valid one."""
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no further attempt may be made."""
+        ...
+
+    def failed(self, error: PlanningFailed) -> None:
+        """Note a failed attempt."""
+        ...
+
+    def adopt(self, other: Any) -> None:
+        """Become what another process sent."""
+        ...
+
+
+class Undone(Exception):  # noqa: N818  (no error: the attempts from here have failed, and are noted already)
+    """Every way from here was gone, in vain: the decision before has to be made otherwise."""
+
+
+class BranchingDecisions(Decisions, Protocol):
+    """Decisions that can be undone, around one attempt after the other."""
+
+    def run(self, attempt: Callable[[], None]) -> bool:
+        """Run an attempt, which makes decisions; it begins with a reset.
+
+        Returns:
+            Whether it, or one that decided otherwise, ended well. What failed is in the tally.
+        """
+        ...
+
+
+class _Done(Exception):  # noqa: N818
+    """The episode has ended well, in a child."""
+
+
+class _Crashed(Exception):  # noqa: N818
+    """A child is gone, or took too long."""
+
+
+@dataclass
+class _Child:
+    pid: int
+    pipe: Connection
+    score: float = -math.inf
+
+
+@dataclass(frozen=True)
+class _Failed:
+    """Message of a child: its candidate can't be done, or what came after it failed."""
+
+    error: PlanningFailed | None = None
+
+
+class ForkedBranches:
+    """Makes decisions by forking; see the module.
+
+    Args:
+        tally: of the episode; children send theirs back.
+    """
+
+    def __init__(self, tally: Tally) -> None:
+        self._tally = tally
+        self._pipe: Connection | None = None  # to the parent, in a child
+        self._children: list[_Child] = []
+
+    def run(self, attempt: Callable[[], None]) -> bool:
+        """Run an attempt; see `BranchingDecisions`. A child's ends here."""
+        ended_well = False
+        try:
+            attempt()
+            ended_well = True
+        except _Done:
+            ended_well = True
+        except Undone:
+            pass
+        except PlanningFailed as error:
+            self._tally.failed(error)
+        except BaseException as error:
+            if self._pipe is not None:
+                self._say_and_leave(error)
+            raise
+        if self._pipe is not None:
+            self._say_and_leave("done" if ended_well else _Failed())
+        return ended_well
+
+    def choose(
+        self,
+        candidates: Iterable[T],
+        play: Callable[[T], float],
+        *,
+        ahead: int = 1,
+        tries: int = TRIES,
+        enough: float = math.inf,
+    ) -> T:
+        """Choose; see `Decisions`. Returns in the child that goes on."""
+        failure, gone_on, left = PlanningFailed("decision", "no_candidate"), 0, iter(candidates)
+        try:
+            while gone_on < tries and not self._tally.exhausted:
+                for candidate in left:
+                    child = self._fork()
+                    if child is None:
+                        self._play(play, candidate)
+                        return candidate
+                    try:
+                        answer = self._hear(child, PLAY_LIMIT)
+                    except _Crashed as error:
+                        answer = _Failed(PlanningFailed("branch", str(error)))
+                    if isinstance(answer, _Failed):
+                        failure = answer.error or failure
+                        self._end(child)
+                        continue
+                    child.score = answer
+                    if len(self._children) == ahead or child.score >= enough:
+                        break
+                if not self._children:
+                    break
+                for child in sorted(self._children, key=lambda child: -child.score):
+                    self._go_on_as(child)
+                    gone_on += 1
+                    if gone_on == tries or self._tally.exhausted:
+                        break
+                self._end_all()
+        finally:
+            self._end_all()
+        if gone_on:
+            raise Undone
+        raise failure
+
+    # ------------------------------------------------------------------ this process
+
+    def _fork(self) -> _Child | None:
+        """A new child; None in the child itself."""
+        here, there = Pipe()
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        parent = os.getpid()
+        pid = os.fork()
+        if pid:
+            there.close()
+            child = _Child(pid, here)
+            self._children.append(child)
+            return child
+        _die_with(parent)
+        gc.freeze()  # a collection that walks all objects would copy all of the parent's memory
+        # locks of the parent's streams may be held by threads that are not here
+        sys.stdout, sys.stderr = (os.fdopen(os.dup(fd), "w") for fd in (1, 2))
+        for other in self._children:
+            other.pipe.close()
+        if self._pipe is not None:
+            self._pipe.close()
+        here.close()
+        self._pipe, self._children = there, []
+        return None
+
+    def _go_on_as(self, child: _Child) -> None:
+        """Let a child be the episode; comes back where that fails.
+
+        Raises:
+            _Done: it ended well.
+        """
+        child.pipe.send(self._tally)
+        try:
+            answer = self._hear(child, GO_ON_LIMIT)
+        except _Crashed as error:
+            self._tally.failed(PlanningFailed("branch", str(error)))
+            self._end(child)
+            return
+        self._end(child)
+        if answer == "done":
+            raise _Done
+
+    def _hear(self, child: _Child, limit: float) -> Any:
+        """What a child says next; its tally is ours then.
+
+        Raises:
+            _Crashed: it is gone, or says nothing.
+        """
+        try:
+            if not child.pipe.poll(limit):
+                raise _Crashed("timed_out")
+            answer, tally = child.pipe.recv()
+        except (EOFError, ConnectionError) as error:
+            raise _Crashed("crashed") from error
+        if isinstance(answer, BaseException):
+            raise answer
+        self._tally.adopt(tally)
+        return answer
+
+    def _end(self, child: _Child) -> None:
+        self._children.remove(child)
+        child.pipe.close()
+        os.kill(child.pid, signal.SIGKILL)  # it is still ours, if only as a zombie
+        os.waitpid(child.pid, 0)
+
+    def _end_all(self) -> None:
+        for child in list(self._children):
+            self._end(child)
+
+    # ------------------------------------------------------------------ a child
+
+    def _play(self, play: Callable[[T], float], candidate: T) -> None:
+        """Play a candidate, say how it went, and wait to be told to go on."""
+        try:
+            answer: Any = float(play(candidate))
+        except PlanningFailed as error:
+            self._say_and_leave(_Failed(error))
+        except BaseException as error:
+            self._say_and_leave(error)
+        assert self._pipe is not None
+        try:
+            self._pipe.send((answer, self._tally))
+            self._tally.adopt(self._pipe.recv())
+        except (EOFError, ConnectionError):
+            os._exit(0)
+
+    def _say_and_leave(self, answer: Any) -> NoReturn:
+        assert self._pipe is not None
+        self._end_all()
+        try:
+            self._pipe.send((answer, self._tally))
+        except Exception:  # noqa: BLE001  (an error that can't be pickled, or nobody listens)
+            if isinstance(answer, BaseException):
+                _log.exception("a branch failed", exc_info=answer)
+        os._exit(0)
+
+
+def _die_with(parent: int) -> None:
+    """Let the system kill this process when its parent ends."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before that
+        os._exit(0)
+
+
+def why_not_fork(*, renders: bool) -> str:
+    """Why this process can't be forked safely; empty where it can.
+
+    Args:
+        renders: whether a renderer is open.
+    """
+    if sys.platform != "linux":
+        return "this is not Linux"
+    if renders:
+        return "a renderer is open"
+    if torch.cuda.is_initialized():
+        return "CUDA is in use"
+    return ""
+
+
+@cache
+def say_once(reason: str) -> None:
+    """Tell the user that undoing takes longer here."""
+    _log.warning("can't fork (%s): what fails is undone by simulating everything again", reason)

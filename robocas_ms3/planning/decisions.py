@@ -1,0 +1,83 @@
+"""Decisions of a scripted policy: several ways to go on from one moment, of which the best is gone on from.
+
+A decision is a list of candidates, a function that plays one of them and scores what came of it, and whoever runs them:
+`demos.branches` undoes what was tried, `Straight` can't.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+from robocas_ms3.errors import PlanningFailed
+
+T = TypeVar("T")
+TRIES = 3  # candidates of one decision that are gone on from before the decision before it is made otherwise
+
+
+class Decisions(Protocol):
+    """Plays candidates and goes on from one of them."""
+
+    def choose(
+        self,
+        candidates: Iterable[T],
+        play: Callable[[T], float],
+        *,
+        ahead: int = 1,
+        tries: int = TRIES,
+        enough: float = math.inf,
+    ) -> T:
+        """Play candidates from this moment on and go on from the one with the greatest score.
+
+        When what comes after it fails, the policy is back here, and goes on from the next best one, as if the first
+        had never been tried.
+
+        Args:
+            candidates: ways to go on, those tried first that promise most.
+            play: makes a candidate's motions and gives its score; raises ``PlanningFailed`` where it can't be done.
+            ahead: how many that can be done are compared before the best is gone on from.
+            tries: how many are gone on from.
+            enough: a score at which no other candidate is looked at.
+
+        Returns:
+            The candidate that was played, its motions done.
+
+        Raises:
+            PlanningFailed: of the candidate that came last, where none can be done; nothing has moved then.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Straight:
+    """Takes the first candidate that can be played and never undoes anything.
+
+    Attributes:
+        done: number of actions so far; a candidate that fails after some leaves no way to the next.
+    """
+
+    done: Callable[[], int]
+
+    def choose(
+        self,
+        candidates: Iterable[T],
+        play: Callable[[T], float],
+        *,
+        ahead: int = 1,
+        tries: int = TRIES,
+        enough: float = math.inf,
+    ) -> T:
+        """Choose; see `Decisions`."""
+        failure = PlanningFailed("decision", "no_candidate")
+        for candidate in candidates:
+            before = self.done()
+            try:
+                play(candidate)
+                return candidate
+            except PlanningFailed as error:
+                failure = error
+                if self.done() > before:
+                    raise
+        raise failure

@@ -1,0 +1,297 @@
+"""Decisions that are undone: by forking, and by running again. A list of letters stands for the simulator."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from robocas_ms3.demos import branches
+from robocas_ms3.demos.branches import ForkedBranches, why_not_fork
+from robocas_ms3.demos.resimulation import Resimulation
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.decisions import Straight
+
+RUNNERS = [ForkedBranches, Resimulation]
+
+
+@dataclass
+class Notes:
+    """Failures so far, and what the episode came to."""
+
+    most: int = 100
+    failures: list[str] = field(default_factory=list)
+    outcome: str = ""
+
+    @property
+    def exhausted(self) -> bool:
+        return len(self.failures) >= self.most
+
+    def failed(self, error: PlanningFailed) -> None:
+        self.failures.append(f"{error.stage}: {error.reason}")
+
+    def adopt(self, other) -> None:
+        vars(self).update(vars(other))
+
+
+class World:
+    """Its state is all that was done since the reset."""
+
+    def __init__(self) -> None:
+        self.done = ""
+
+    def act(self, letter: str) -> None:
+        self.done += letter
+
+
+def search(decide, good, *, most=100, **how):
+    """Run an attempt that `decide`s; the outcome and the failures."""
+    found = []
+    for make in RUNNERS:
+        notes, world = Notes(most), World()
+        runner = make(notes)
+
+        def attempt(world=world, runner=runner, notes=notes):
+            world.done = ""
+            decide(world, runner, **how)
+            if world.done not in good:
+                raise PlanningFailed("end", world.done)
+            notes.outcome = world.done
+
+        ended = runner.run(attempt)
+        found.append((ended, notes.outcome, notes.failures))
+    assert found[0] == found[1], "both ways come to the same"
+    return found[0]
+
+
+def two_letters(world, runner, score=lambda letters: 0.0, **how):
+    for _ in range(2):
+        runner.choose("abc", lambda letter: (world.act(letter), score(world.done))[1], **how)
+
+
+def test_the_first_way_that_ends_well_is_taken_and_what_failed_leaves_no_trace():
+    ended, outcome, failures = search(two_letters, {"bc"})
+    assert (ended, outcome) == (True, "bc")
+    assert failures == ["end: aa", "end: ab", "end: ac", "end: ba", "end: bb"]
+
+
+def test_no_way_ends_well():
+    ended, outcome, failures = search(two_letters, set())
+    assert (ended, outcome) == (False, "")
+    assert len(failures) == 9
+
+
+def test_attempts_are_counted():
+    assert search(two_letters, {"cc"}, most=4) == (False, "", ["end: aa", "end: ab", "end: ac", "end: ba"])
+
+
+def test_a_decision_gives_up_after_some_tries():
+    ended, outcome, failures = search(two_letters, {"ba"}, tries=2)
+    assert (ended, outcome, failures) == (True, "ba", ["end: aa", "end: ab"])
+
+
+def test_the_best_of_those_compared_is_gone_on_from_first():
+    score = {"a": 1.0, "b": 3.0, "c": 2.0}
+    ended, outcome, failures = search(two_letters, {"cb", "bc"}, score=lambda letters: score[letters[-1]], ahead=3)
+    assert (ended, outcome, failures) == (True, "bc", ["end: bb"])
+
+
+def test_equal_scores_keep_the_order_of_the_candidates():
+    assert search(two_letters, {"aa"}, ahead=3) == (True, "aa", [])
+
+
+def test_others_are_compared_when_the_first_few_lead_nowhere():
+    score = {"a": 1.0, "b": 2.0, "c": 3.0}
+    ended, outcome, failures = search(two_letters, {"cc"}, score=lambda letters: score[letters[-1]], ahead=2, tries=9)
+    assert (ended, outcome) == (True, "cc")
+    assert failures == ["end: bb", "end: ba", "end: bc", "end: ab", "end: aa", "end: ac", "end: cb", "end: ca"]
+
+
+def test_enough_ends_the_comparison():
+    scores = {"a": 1.0, "b": 5.0, "c": 9.0}
+
+    def decide(world, runner):
+        runner.choose("abc", lambda letter: (world.act(letter), scores[letter])[1], ahead=3, enough=4)
+
+    assert search(decide, {"b"}) == (True, "b", [])
+
+
+def test_a_candidate_that_can_not_be_played_is_passed_over():
+    def decide(world, runner):
+        def play(letter):
+            world.act(letter)
+            if letter != "c":
+                raise PlanningFailed("play", letter)
+            return 0.0
+
+        runner.choose("abcd", play, ahead=2)
+        world.act("!")
+
+    assert search(decide, {"c!"}) == (True, "c!", [])
+
+
+def test_where_no_candidate_can_be_played_the_policy_may_do_something_else():
+    def decide(world, runner):
+        def no(letter):
+            world.act(letter)
+            raise PlanningFailed("play", letter)
+
+        with pytest.raises(PlanningFailed, match="play: b"):
+            runner.choose("ab", no)
+        assert world.done == "", "what could not be done is undone"
+        runner.choose("xy", lambda letter: (world.act(letter), 0.0)[1])
+
+    assert search(decide, {"y"}) == (True, "y", ["end: x"])
+
+
+def test_without_undoing_the_first_that_can_be_played_stays():
+    world = World()
+
+    def play(letter):
+        if letter == "a":
+            raise PlanningFailed("play", letter)
+        world.act(letter)
+        if letter == "c":
+            raise PlanningFailed("late", letter)
+        return 0.0
+
+    straight = Straight(lambda: len(world.done))
+    assert straight.choose("ab", play) == "b"
+    with pytest.raises(PlanningFailed, match="late: c"):
+        straight.choose("cb", play)
+    assert world.done == "bc"
+
+
+# ---------------------------------------------------------------------- processes
+
+
+def children() -> set[int]:
+    return {int(pid) for pid in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()}
+
+
+def forked(decide, notes=None):
+    notes = notes or Notes()
+    runner = ForkedBranches(notes)
+    before = children()
+    ended = runner.run(lambda: decide(runner))
+    assert children() == before, "no child is left, and no zombie"
+    return ended, notes
+
+
+@pytest.mark.parametrize("signal_", [signal.SIGSEGV, signal.SIGKILL])
+def test_a_child_that_crashes_has_failed(signal_):
+    def play(letter):
+        if letter == "a":
+            os.kill(os.getpid(), signal_)
+        return 0.0
+
+    def decide(runner):
+        assert runner.choose("ab", play) == "b"
+
+    ended, notes = forked(decide)
+    assert ended
+    assert notes.failures == []  # it was never gone on from
+
+
+def test_a_crash_further_on_is_a_failed_attempt():
+    def decide(runner):
+        if runner.choose("ab", lambda letter: 0.0) == "a":
+            os.kill(os.getpid(), signal.SIGSEGV)
+
+    ended, notes = forked(decide)
+    assert ended
+    assert notes.failures == ["branch: crashed"]
+
+
+def test_a_child_that_takes_too_long_is_ended(monkeypatch):
+    monkeypatch.setattr(branches, "PLAY_LIMIT", 0.2)
+
+    def play(letter):
+        if letter == "a":
+            time.sleep(60)
+        return 0.0
+
+    def decide(runner):
+        assert runner.choose("ab", play) == "b"
+
+    start = time.monotonic()
+    assert forked(decide)[0]
+    assert time.monotonic() - start < 20
+
+
+def test_an_error_of_ours_is_raised_here():
+    def decide(runner):
+        runner.choose("a", lambda letter: 1 / 0)
+
+    with pytest.raises(ZeroDivisionError):
+        forked(decide)
+
+    def later(runner):
+        runner.choose("a", lambda letter: 0.0)
+        raise KeyError("later")
+
+    with pytest.raises(KeyError, match="later"):
+        forked(later)
+
+
+def test_what_children_print_comes_once(capfd):
+    def decide(runner):
+        print("before", end="")
+        runner.choose("ab", lambda letter: 0.0)
+
+    assert forked(decide)[0]
+    assert capfd.readouterr().out == "before"
+
+
+SLEEPER = """
+import os, sys, time
+from robocas_ms3.demos.branches import ForkedBranches
+class Notes:
+    exhausted = False
+    def failed(self, error): pass
+    def adopt(self, other): pass
+def attempt():
+    for _ in range(2):
+        runner.choose("ab", lambda letter: 0.0, ahead=2)
+    print(os.getpid(), flush=True)
+    time.sleep(120)
+runner = ForkedBranches(Notes())
+runner.run(attempt)
+"""
+
+
+def test_children_die_with_their_parent():
+    with subprocess.Popen([sys.executable, "-c", SLEEPER], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        last = int(parent.stdout.readline())
+        assert last != parent.pid
+        parent.kill()
+    deadline = time.monotonic() + 20
+    while alive(last):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_where_a_process_must_not_be_forked(monkeypatch):
+    assert why_not_fork(renders=True) == "a renderer is open"
+    assert why_not_fork(renders=False) == ("" if sys.platform == "linux" else "this is not Linux")
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert why_not_fork(renders=False) == "this is not Linux"
+
+
+def test_scores_are_numbers():
+    assert search(two_letters, {"aa"}, score=lambda letters: -math.inf) == (True, "aa", [])
