@@ -15,11 +15,15 @@ import torch
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.config import TaskConfig, load_task_config
+from robocas_ms3.demos.branches import ForkedBranches, say_once, why_not_fork
 from robocas_ms3.demos.ledger import Failure
-from robocas_ms3.demos.open_loop import OpenLoop
+from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.demos.record import EpisodeRecorder
-from robocas_ms3.demos.trials import try_actions
+from robocas_ms3.demos.resimulation import Resimulation
+from robocas_ms3.demos.sampling import sample_stride
+from robocas_ms3.demos.trials import Trials
 from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
+from robocas_ms3.planning.decisions import Straight
 from robocas_ms3.planning.executor import Executor, Seconds
 from robocas_ms3.planning.mplib_backend import MplibPlanner
 from robocas_ms3.planning.protocol import Planner
@@ -31,8 +35,6 @@ from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.spec import TASKS
 
 STANDARD_FREQ = 20  # Hz, at which the tasks' horizons are given
-
-FAR = ("horizon",)  # stages whose failure has its cause farther back than the last checkpoint
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,9 @@ class EpisodeSettings:
         replay_rate: Hz; an attempt counts only if its own actions, as a dataset of this rate holds them, succeed again
             open loop (`trials`), and none goes beyond [-1, 1]. 0: not tried; nor is it where the base drives, which
             those actions leave out.
+        noisy_trials: how often they are tried with noise, besides once without.
+        noise_mm: its standard deviation, of each component of each action's translation, mm.
+        noise_deg: the same of its Euler angles.
     """
 
     task: str
@@ -58,11 +63,14 @@ class EpisodeSettings:
     max_attempts: int = 20
     keep_recoveries: bool = False
     replay_rate: int = 5
+    noisy_trials: int = 1
+    noise_mm: float = 0.5
+    noise_deg: float = 0.2
 
 
 @dataclass
 class EpisodeResult:
-    """What became of a seed.
+    """What became of a seed; processes that branch off hand it on (`branches.Tally`).
 
     Attributes:
         seed: of the episode.
@@ -71,6 +79,8 @@ class EpisodeResult:
         attempts: attempts used.
         seconds: where the time went.
         failures: every attempt that failed.
+        max_attempts: after so many the seed is given up.
+        begun: when the attempt did, s of the clock.
     """
 
     seed: int
@@ -79,6 +89,26 @@ class EpisodeResult:
     attempts: int = 0
     seconds: Seconds = field(default_factory=Seconds)
     failures: list[Failure] = field(default_factory=list)
+    max_attempts: int = 1
+    begun: float = field(default_factory=time.perf_counter)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the seed is given up."""
+        return len(self.failures) >= self.max_attempts
+
+    def failed(self, error: PlanningFailed) -> None:
+        """Note a failed attempt."""
+        now = time.perf_counter()
+        self.failures.append(
+            Failure(self.seed, len(self.failures), error.stage, error.reason, round(now - self.begun, 3))
+        )
+        self.begun = now
+
+    def adopt(self, other: EpisodeResult) -> None:
+        """Become what another process sent."""
+        vars(self.seconds).update(vars(other.seconds))  # the executor counts on in these
+        vars(self).update({key: value for key, value in vars(other).items() if key != "seconds"})
 
 
 class EpisodeGenerator:
@@ -86,9 +116,10 @@ class EpisodeGenerator:
 
     Args:
         settings: the same for all episodes.
+        fork: undo what fails by forking where that is safe; the episodes are the same without.
     """
 
-    def __init__(self, settings: EpisodeSettings) -> None:
+    def __init__(self, settings: EpisodeSettings, *, fork: bool = True) -> None:
         self.settings = settings
         # On a busy machine the threads of torch's small operations wait for each other, 25 times longer than they work.
         torch.set_num_threads(1)
@@ -112,12 +143,22 @@ class EpisodeGenerator:
         self.reachability = Reachability(str(files.arm_urdf))
         # a scripted policy tries once, from wherever the episode stands, and raises PlanningFailed
         self.policy: Callable[[Arm], None] = import_module(TASKS[settings.task].solver).attempt
-        self.open_loop: OpenLoop | None = None
+        self.worlds: list[OpenLoop] = []
+        self.trials: Trials | None = None
         if settings.replay_rate and not config.base_motion:
-            kwargs = {"config": settings.config, "pack": settings.pack}
-            self.open_loop = OpenLoop(
-                {"env_id": TASKS[settings.task].env_id, "env_kwargs": kwargs}, settings.replay_rate
-            )
+            info = {
+                "env_id": TASKS[settings.task].env_id,
+                "env_kwargs": {"config": settings.config, "pack": settings.pack},
+            }
+            self.worlds = [OpenLoop(info, settings.replay_rate) for _ in range(1 + settings.noisy_trials)]
+            noise = Noise(settings.noise_mm / 1000, float(np.deg2rad(settings.noise_deg)))
+            stride = sample_stride(settings.control_freq, settings.replay_rate)
+            self.trials = Trials(self.worlds, noise, stride)
+        self._fork = fork and not settings.keep_recoveries
+        reason = why_not_fork(renders=base_env.scene.can_render())
+        if self._fork and reason:
+            say_once(reason)
+            self._fork = False
 
     def generate(self, seed: int, folder: Path, name: str) -> EpisodeResult:
         """Make the episode of a seed, as ``folder/name.h5`` and ``.json``; no files where every attempt failed.
@@ -126,56 +167,74 @@ class EpisodeGenerator:
         """
         recorder = EpisodeRecorder(self.env, folder, name)
         executor = Executor(recorder, seed)
-        result = EpisodeResult(seed, success=False, seconds=executor.seconds)
-        finished = False
+        result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=self.settings.max_attempts)
+        executor.rehearse = lambda: self._rehearse(executor, recorder)
         try:
-            recoveries = self._attempts(executor, recorder, result)
-            if result.success:
-                recorder.finish({**self._describe(executor), "attempts": result.attempts, "recoveries": recoveries})
-                finished = True
-        finally:
-            if not finished:
-                recorder.discard()
+            if self.settings.keep_recoveries:
+                self._keep_trying(executor, recorder, result)
+            else:
+                self._try_again(executor, recorder, result)
+        except LayoutError as error:
+            result.failed(PlanningFailed("layout", error.what))
+        result.attempts = len(result.failures) + result.success
         return result
 
-    def _attempts(self, executor: Executor, recorder: EpisodeRecorder, result: EpisodeResult) -> list[dict[str, Any]]:
-        recoveries = []
-        try:
-            executor.reset()
-        except LayoutError as error:
-            self._log(result, 0, PlanningFailed("layout", error.what), 0.0)
-            return recoveries
-        for attempt in range(self.settings.max_attempts):
-            result.attempts = attempt + 1
-            begun, first = time.perf_counter(), len(executor.actions)
-            # seeded by seed and attempt alone: what was planned before must not matter
-            entropy = np.random.SeedSequence([executor.seed, attempt])
-            self.planner.seed(int(entropy.generate_state(1)[0]))
-            arm = Arm(self.planner, self.reachability, executor, np.random.default_rng(entropy), attempt)
+    def _try_again(self, executor: Executor, recorder: EpisodeRecorder, result: EpisodeResult) -> None:
+        """Attempt after attempt, each from the reset; within them decisions are made otherwise."""
+        decisions = ForkedBranches(result) if self._fork else Resimulation(result)
+        while not result.exhausted:
+            number = len(result.failures)
+
+            def attempt(number: int = number) -> None:
+                self._reset(executor)
+                self.policy(Arm(self.planner, self.reachability, executor, decisions, (number,)))
+                self._finish(executor, recorder, result, [])
+
+            if decisions.run(attempt):
+                return
+
+    def _keep_trying(self, executor: Executor, recorder: EpisodeRecorder, result: EpisodeResult) -> None:
+        """Attempts one after the other in one motion, as far as what failed can be mended."""
+        decisions = Straight(lambda: len(executor.actions))
+        recoveries: list[dict[str, Any]] = []
+        self._reset(executor)
+        while not result.exhausted:
+            first = len(executor.actions)
+            arm = Arm(self.planner, self.reachability, executor, decisions, (len(result.failures),))
             try:
                 self.policy(arm)
-                self._check(executor, recorder)
-                result.success, result.steps = True, len(executor.actions)
-                return recoveries
+                self._finish(executor, recorder, result, recoveries)
+                return
             except PlanningFailed as error:
-                self._log(result, attempt, error, time.perf_counter() - begun)
+                result.failed(error)
                 last = error
-            mendable = first < len(executor.actions) < self.horizon and not isinstance(last, EpisodeLost)
-            if self.settings.keep_recoveries and mendable:
-                try:
-                    back_out(arm)
-                    recoveries.append(
-                        {"range": [first, len(executor.actions) - 1], "stage": last.stage, "reason": last.reason}
-                    )
-                    continue
-                except PlanningFailed:
-                    pass
-            executor.go_back(far=last.stage in FAR)
-            recoveries = [kept for kept in recoveries if kept["range"][1] < len(executor.actions)]
-        return recoveries
+            try:
+                if not first < len(executor.actions) < self.horizon or isinstance(last, EpisodeLost):
+                    raise last
+                back_out(arm)
+                span = [first, len(executor.actions) - 1]
+                recoveries.append({"range": span, "stage": last.stage, "reason": last.reason})
+            except PlanningFailed:
+                recoveries = []
+                self._reset(executor)
 
-    def _check(self, executor: Executor, recorder: EpisodeRecorder) -> None:
-        """See that what a policy says it has done is a demonstration.
+    def _reset(self, executor: Executor) -> None:
+        executor.reset()
+        if self.trials is not None:
+            with executor.seconds.spent_on("reset"):
+                self.trials.reset(executor.seed)
+
+    def _rehearse(self, executor: Executor, recorder: EpisodeRecorder, *, finished: bool = False) -> None:
+        """Try what was done so far; see `trials`."""
+        if self.trials is not None:
+            gripper = np.array([action[7] for action in executor.actions])
+            with executor.seconds.spent_on("trial"):
+                self.trials.follow(recorder.states, gripper, finished=finished)
+
+    def _finish(
+        self, executor: Executor, recorder: EpisodeRecorder, result: EpisodeResult, recoveries: list[dict[str, Any]]
+    ) -> None:
+        """See that what a policy says it has done is a demonstration, and write it.
 
         Raises:
             PlanningFailed: the task has not succeeded.
@@ -186,12 +245,10 @@ class EpisodeGenerator:
             raise EpisodeLost("horizon", "too_long")
         if not executor.flag("success"):
             raise PlanningFailed("episode", "no_success")
-        if self.open_loop is not None:
-            try_actions(self.open_loop, executor, recorder, self.settings.control_freq)
-
-    @staticmethod
-    def _log(result: EpisodeResult, attempt: int, error: PlanningFailed, seconds: float) -> None:
-        result.failures.append(Failure(result.seed, attempt, error.stage, error.reason, round(seconds, 3)))
+        self._rehearse(executor, recorder, finished=True)
+        result.success, result.steps = True, len(executor.actions)
+        attempts = len(result.failures) + 1
+        recorder.finish({**self._describe(executor), "attempts": attempts, "recoveries": recoveries})
 
     def _describe(self, executor: Executor) -> dict[str, Any]:
         env = executor.base_env
@@ -214,7 +271,7 @@ class EpisodeGenerator:
                 }
                 for segment, after in zip(executor.segments, bounds[1:], strict=True)
             ],
-            "replay_rate": self.settings.replay_rate if self.open_loop is not None else None,
+            "replay_rate": self.settings.replay_rate if self.trials is not None else None,
             "facts": {"disturbed": int(executor.info["disturbed"][0]), **executor.facts},
             "seconds": {part: round(value, 3) for part, value in asdict(executor.seconds).items()},
         }
@@ -222,8 +279,8 @@ class EpisodeGenerator:
     def close(self) -> None:
         """Close the environments."""
         self.env.close()
-        if self.open_loop is not None:
-            self.open_loop.close()
+        for world in self.worlds:
+            world.close()
 
 
 def horizon(task: str, control_freq: int) -> int:

@@ -42,6 +42,7 @@ class EpisodeRecorder(RecordEpisode):
             source_desc="scripted policy of robocas_ms3",
         )
         self._paths = [folder / f"{name}.h5", folder / f"{name}.json"]
+        self.discard()  # nothing is open while the episode is made: a forked child may be the one that writes it
 
     @property
     def states(self) -> dict[str, dict[str, NDArray[np.float32]]]:
@@ -55,6 +56,7 @@ class EpisodeRecorder(RecordEpisode):
         Args:
             episode: what ManiSkill's format has no place for: instruction, target, sub-goals.
         """
+        self._h5_file = h5py.File(self._paths[0], "w")
         self.flush_trajectory()
         self._h5_file.close()
         data = json.loads(self._paths[1].read_text(encoding="utf-8"))

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.robots.constants import JOINTS
+from robocas_ms3.robots.constants import FINGER_SLICE, FINGER_TARGETS, JOINTS
+from robocas_ms3.robots.forward import link_poses
 
 Array = NDArray[np.float64]
 
@@ -111,6 +112,26 @@ def stored_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[n
     actions[:-1, 6] = status[1:]
     actions[-1, 6] = status[-1]
     return actions.astype(np.float32)
+
+
+def dataset_actions(
+    robot_states: NDArray[np.floating], gripper: NDArray[np.floating], samples: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """What a dataset will hold of a recording, to the last bit: the actions between its sampled states.
+
+    Args:
+        robot_states: (S + 1, 37) after the reset and after each control step.
+        gripper: (S,) commands in [-1, 1].
+        samples: (T,) indices of states, from ``sample_states``, the first of them 0, or some of them in a row.
+
+    Returns:
+        (T - 1, 7) actions.
+    """
+    root_in_world, qpos, _ = split_states(robot_states[samples])
+    tcp, base = link_poses(root_in_world, qpos)
+    width = float(robot_states[0, _POSE : _POSE + len(JOINTS)][FINGER_SLICE].astype(np.float64).sum())
+    status = gripper_open(gripper, samples, finger_range=FINGER_TARGETS, initial_width=width)
+    return stored_actions(*stored_motion(invert(base) @ tcp), status)[:-1]
 
 
 def split_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:

@@ -1,47 +1,84 @@
-"""Tries a demonstration's own actions before it counts: open loop, as a dataset holds them."""
+"""Tries a demonstration's own actions while it is made: open loop, as a dataset will hold them, clean and with noise.
+
+Each trial is a world of its own, in which the actions of the recording are played as far as it has come, part by part.
+So what a robot would do otherwise shows where it begins, and only that part has to be done again.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
-from robocas_ms3.demos.open_loop import OpenLoop
-from robocas_ms3.demos.record import EpisodeRecorder
-from robocas_ms3.demos.sampling import sample_states, sample_stride
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.demos.open_loop import Noise, OpenLoop
+from robocas_ms3.demos.sampling import dataset_actions, sample_states
 from robocas_ms3.errors import EpisodeLost
-from robocas_ms3.planning.executor import Executor
 from robocas_ms3.robots.constants import ROBOT_UID
 
-TRIALS = 2  # as they are, and with noise that any robot has
+PARTED = 0.03  # m by which an object may be off the recording at the end of a part
+
+States = dict[str, dict[str, NDArray[np.float32]]]
 
 
-def try_actions(open_loop: OpenLoop, executor: Executor, recorder: EpisodeRecorder, control_freq: float) -> None:
-    """Play what was done since the reset, several times.
-
-    Where that goes wrong, checkpoints after the moment at which objects went other ways than recorded are forgotten:
-    the cause lies before them.
+class Trials:
+    """Worlds that follow a recording.
 
     Args:
-        open_loop: of the same configuration.
-        executor: what was done.
-        recorder: what came of it.
-        control_freq: of the recording, Hz.
-
-    Raises:
-        EpisodeLost: the actions do not succeed again, or go beyond the range of ``pd_ee_delta_pose``.
+        worlds: of the same configuration; the first one plays the actions as they are, the others with noise.
+        noise: of the others.
+        stride: control steps of the recording an action.
     """
-    gripper = np.array([action[7] for action in executor.actions])
-    states = recorder.states
-    samples = sample_states(len(gripper), sample_stride(control_freq, open_loop.rate_hz))
-    for trial in range(TRIALS):
-        noise = np.random.default_rng([executor.seed, trial]) if trial else None
-        with executor.seconds.spent_on("simulation"):
-            played = open_loop.play_recording(
-                executor.seed, states["articulations"][ROBOT_UID], gripper, control_freq, noise
-            )
-        if played.clipped:
-            executor.forget_checkpoints(after=0)
-            raise EpisodeLost("replay", "clipped")
-        if not played.success:
-            parted = played.parted_at({name: found[samples] for name, found in states["actors"].items()})
-            executor.forget_checkpoints(after=int(samples[max(parted - 1, 0)]))  # the last moment that was as recorded
-            raise EpisodeLost("replay", "no_success")
+
+    def __init__(self, worlds: Sequence[OpenLoop], noise: Noise, stride: int) -> None:
+        self._worlds, self._noise, self._stride = worlds, noise, stride
+        self._seed, self._played = 0, 0
+
+    def reset(self, seed: int) -> None:
+        """Build the episode's scene in each world."""
+        for world in self._worlds:
+            world.reset(seed)
+        self._seed, self._played = seed, 0
+
+    def follow(self, states: States, gripper: NDArray[np.floating], *, finished: bool = False) -> None:
+        """Play what was recorded since the last call, and compare.
+
+        Args:
+            states: ManiSkill's, after the reset and after each control step; see ``EpisodeRecorder.states``.
+            gripper: (S,) its commands.
+            finished: the recording has ended: the last action may be a shorter one, and the task must succeed.
+
+        Raises:
+            EpisodeLost: ``clipped``, an action goes beyond the range of ``pd_ee_delta_pose``; ``parted``, an object is
+                elsewhere than recorded; ``no_success``.
+        """
+        samples = sample_states(len(gripper), self._stride)
+        if not finished:
+            samples = samples[samples % self._stride == 0]
+        new = samples[self._played :]
+        actions = dataset_actions(states["articulations"][ROBOT_UID], gripper, new).astype(np.float64)
+        for number, world in enumerate(self._worlds):
+            self._play(world, number, actions)
+            if world.clipped:
+                raise EpisodeLost("replay", "clipped")
+            if finished and not world.settle():
+                raise EpisodeLost("replay", "no_success")
+            if not finished and _distance(world, states, int(new[-1])) > PARTED:
+                raise EpisodeLost("replay", "parted")
+        self._played += len(actions)
+
+    def _play(self, world: OpenLoop, number: int, actions: NDArray[np.float64]) -> None:
+        if number:
+            # drawn from the first action on, so that an action's noise is the same however often it is played
+            rng = np.random.default_rng([self._seed, number])
+            actions = actions + self._noise.draw(rng, self._played + len(actions))[self._played :]
+        for action in actions:
+            world.step(action)
+
+
+def _distance(world: OpenLoop, states: States, sample: int) -> float:
+    """How far the object that is farthest off the recording is, m."""
+    env = world.env
+    recorded = np.stack([states["actors"][actor.name][sample, :3] for actor in env.objects])
+    apart = np.linalg.norm(env.object_poses[0, :, :3].numpy() - recorded, axis=1)
+    return float(apart[env.present[0].numpy()].max())

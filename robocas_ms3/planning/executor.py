@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +15,6 @@ from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.tasks.transfer import TransferEnv
 
 OPEN, CLOSED = 1.0, -1.0
-TRIES = 2  # attempts from a checkpoint
 
 
 @dataclass
@@ -34,36 +33,22 @@ class Segment:
 
 
 @dataclass
-class Checkpoint:
-    """A moment of the demonstration that later attempts may begin at, with nothing in the gripper.
-
-    Attributes:
-        length: actions made until then.
-        facts: what the policy had counted by then.
-        failures: attempts that began there, or went on from there, and failed.
-    """
-
-    length: int
-    facts: dict[str, Any]
-    failures: int = 0
-
-
-@dataclass
 class Seconds:
-    """Where an episode's time went."""
+    """Where an episode's time went: CPU seconds of this process, or of those that went on with its episode."""
 
     reset: float = 0.0
     planning: float = 0.0
     simulation: float = 0.0
+    trial: float = 0.0
 
     @contextmanager
     def spent_on(self, part: str) -> Iterator[None]:
         """Add the time spent inside to a part."""
-        start = time.perf_counter()
+        start = time.process_time()
         try:
             yield
         finally:
-            setattr(self, part, getattr(self, part) + time.perf_counter() - start)
+            setattr(self, part, getattr(self, part) + time.process_time() - start)
 
 
 @dataclass
@@ -80,7 +65,8 @@ class Executor:
         base: (3,) where the base's joints are told to be: x m, y m, yaw rad.
         seconds: where the time went.
         facts: what a policy counts since the reset, for the record, e.g. ``pushes``.
-        checkpoints: what the policy reached since the reset, so that the next attempt need not begin at the reset.
+        rehearse: tries what was done so far as a dataset will hold it; raises ``EpisodeLost`` where it comes out
+            otherwise.
     """
 
     env: gym.Env
@@ -92,7 +78,7 @@ class Executor:
     base: Array = field(default_factory=lambda: np.zeros(3))
     seconds: Seconds = field(default_factory=Seconds)
     facts: dict[str, Any] = field(default_factory=dict)
-    checkpoints: list[Checkpoint] = field(default_factory=list)
+    rehearse: Callable[[], None] = lambda: None
 
     @property
     def base_env(self) -> TransferEnv:
@@ -111,46 +97,7 @@ class Executor:
         with self.seconds.spent_on("reset"):
             _, self.info = self.env.reset(seed=self.seed)
         self.actions, self.segments, self.gripper, self.base = [], [], OPEN, np.zeros(3)
-        self.facts, self.checkpoints = {}, []
-
-    def mark(self) -> None:
-        """Make this moment a checkpoint."""
-        self.checkpoints.append(Checkpoint(len(self.actions), dict(self.facts)))
-
-    @property
-    def at_checkpoint(self) -> bool:
-        """Whether nothing was done since the last checkpoint."""
-        return bool(self.checkpoints) and self.checkpoints[-1].length == len(self.actions)
-
-    def forget_checkpoints(self, after: int) -> None:
-        """Give up checkpoints with more than so many actions."""
-        self.checkpoints = [checkpoint for checkpoint in self.checkpoints if checkpoint.length <= after]
-
-    def go_back(self, *, far: bool = False) -> None:
-        """Undo what failed: return to the last checkpoint, where there is none to the reset.
-
-        Where an attempt could do nothing from the checkpoint, or the second one failed, half of all checkpoints are
-        given up. There is no other way back than to simulate all kept actions again, from the reset on.
-
-        Args:
-            far: give up half of all checkpoints in any case.
-        """
-        if self.checkpoints:
-            self.checkpoints[-1].failures += 1
-            if far or self.at_checkpoint or self.checkpoints[-1].failures == TRIES:
-                del self.checkpoints[len(self.checkpoints) // 2 :]
-        kept = self.checkpoints
-        length = kept[-1].length if kept else 0
-        if length == len(self.actions):
-            return
-        actions, segments = self.actions[:length], [s for s in self.segments if s.first < length]
-        self.reset()
-        for action in actions:
-            self._step(action)
-        self.segments, self.checkpoints = segments, kept
-        if kept:
-            self.facts, self.gripper = dict(kept[-1].facts), float(actions[-1][7])
-            self.base = actions[-1][8:].astype(float) if self.drives else self.base
+        self.facts = {}
 
     def follow(self, trajectory: Trajectory, *, until: str | None = None) -> bool:
         """Send a trajectory's rows to the arm, the gripper's command held.

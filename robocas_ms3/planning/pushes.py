@@ -54,7 +54,7 @@ def candidates(
     others: Array,
     surface: tuple[Array, Array],
     fixed: Array,
-    swing_deg: float = 0.0,
+    turn_deg: float = 0.0,
 ) -> Iterator[Push]:
     """Pushes of an object that begin clear of everything else and end on the surface; the paper's direction first.
 
@@ -69,15 +69,14 @@ def candidates(
         others: (Q, 3) surfaces of everything else.
         surface: of `surface_in_base`.
         fixed: (R, 3) surfaces of furniture and basket.
-        swing_deg: by up to this the paper's direction is turned, at random.
+        turn_deg: by which the paper's direction is turned.
     """
     frame, half = surface
     walls = fixed[(fixed[:, 2] > frame[2, 3] + 0.01) & (fixed[:, 2] < points[:, 2].max())][:, :2]
     tree = KDTree(walls) if len(walls) else None
     center = points.mean(axis=0)
     ahead = push_direction(rng, center, target)
-    if swing_deg:
-        ahead = Rotation.from_euler("z", rng.uniform(-swing_deg, swing_deg), degrees=True).apply(ahead)
+    ahead = Rotation.from_euler("z", turn_deg, degrees=True).apply(ahead)
     lowest = frame[2, 3] + TIP_CLEARANCE + TIP_BELOW_TCP
     top = points[:, 2].max()
     heights = [h for h in np.arange(max(target[2], points[:, 2].min(), lowest), top - BELOW_TOP, 0.015)]

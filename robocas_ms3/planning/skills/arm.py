@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 
 from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.decisions import TRIES, Decisions
 from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.reachability import Reachability
@@ -16,6 +18,7 @@ from robocas_ms3.robots.constants import ARM_REST
 from robocas_ms3.scenes.grasping import MAX_WIDTH
 from robocas_ms3.tasks.transfer import TransferEnv
 
+T = TypeVar("T")
 OPEN_SECONDS, CLOSE_SECONDS = 0.30, 0.45
 RISE, RISES = 0.04, 4  # m a step, steps
 
@@ -28,22 +31,46 @@ class Arm:
         planner: motion planner.
         reachability: batched inverse kinematics of the same arm.
         executor: runs motions in the environment and remembers them.
-        rng: source of all randomness of the attempt.
-        attempt: which attempt at the episode this is, from 0.
+        decisions: plays what `choose` is given.
+        path: the attempt's number, and which candidate was taken at each decision since.
+        rng: source of all randomness, made anew for each candidate: what was tried before must not matter.
         at: (7,) rad where the arm was last told to be; at first, where it is.
     """
 
     planner: Planner
     reachability: Reachability
     executor: Executor
-    rng: np.random.Generator
-    attempt: int = 0
+    decisions: Decisions
+    path: tuple[int, ...] = (0,)
+    rng: np.random.Generator = field(init=False)
     at: Array = field(init=False)
 
     def __post_init__(self) -> None:
         self.scene = PlanningScene(self.env)
         self.at = self.scene.arm_qpos
         self.hold_nothing()
+        self._seed()
+
+    def _seed(self) -> None:
+        entropy = np.random.SeedSequence([self.executor.seed, *self.path])
+        self.planner.seed(int(entropy.generate_state(1)[0]))
+        self.rng = np.random.default_rng(entropy)
+
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], **how: Any) -> T:
+        """Decide between candidates; see ``Decisions.choose``, which takes the other arguments."""
+        path = self.path
+
+        def play_one(numbered: tuple[int, T]) -> float:
+            index, candidate = numbered
+            self.path = (*path, index)
+            self._seed()
+            return play(candidate)
+
+        return self.decisions.choose(enumerate(candidates), play_one, **how)[1]
+
+    def come_back_here(self, *, tries: int = TRIES) -> None:
+        """Let what comes next begin again from here when it fails, with other random numbers."""
+        self.choose(range(tries), lambda _: 0.0, tries=tries)
 
     @property
     def env(self) -> TransferEnv:

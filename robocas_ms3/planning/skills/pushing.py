@@ -19,7 +19,6 @@ from robocas_ms3.scenes.placement import transform
 ABOVE = 0.08  # m above the start of the push, from where the tool comes straight down
 LIFT = 0.05  # m after the push (upstream's)
 SPEED = 0.6  # of the arm's limits while pushing: what is pushed neither rolls far nor jumps
-SWING_DEG = 20.0  # by which attempts after the first turn the paper's direction, so that they push otherwise
 PUSHES_TRIED, PUSHES_PLANNED = 24, 6
 MAX_FORCE = 30.0  # N; pushed harder, objects wedged against others are shot out of the heap
 RESISTED_SECONDS = 0.1  # of more than that after which a push is cut short
@@ -37,15 +36,21 @@ class PushPlan:
     direction: Array
 
 
-def push_away(arm: Arm, slot: int, target: int) -> None:
+def push_away(arm: Arm, slot: int, target: int, *, turn_deg: float = 0.0) -> None:
     """Push an object away from the target until it has gone far enough or resists, then rise.
+
+    Args:
+        arm: the attempt's tools.
+        slot: of the object.
+        target: slot of the target.
+        turn_deg: by which the paper's direction is turned.
 
     Raises:
         PlanningFailed: no push can be planned.
     """
     arm.rise_clear()
     with arm.planning():
-        plan = plan_push(arm, slot, target)
+        plan = plan_push(arm, slot, target, turn_deg)
     arm.executor.gripper = CLOSED  # it closes on the way
     arm.follow(plan.reach, plan.down)
     lift = plan.lift if _push_on(arm, plan.push, plan.direction) else _plan_lift(arm, plan.direction)
@@ -93,7 +98,7 @@ def _fixed(arm: Arm) -> Array:
     return arm.scene.obstacles_in_base(without=range(len(arm.env.object_assets[0])))
 
 
-def plan_push(arm: Arm, slot: int, target: int) -> PushPlan:
+def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPlan:
     """Plan the first push that has a way in; one that would move other objects too only where there is no other.
 
     The way to the object is clear of everything, the way along of furniture, basket and target in either case, and the
@@ -104,12 +109,12 @@ def plan_push(arm: Arm, slot: int, target: int) -> PushPlan:
     """
     slots = set(range(len(arm.env.object_assets[0])))
     try:
-        return _plan_push(arm, slot, target, movable={slot})
+        return _plan_push(arm, slot, target, turn_deg, movable={slot})
     except PlanningFailed:
-        return _plan_push(arm, slot, target, movable=slots - {target})
+        return _plan_push(arm, slot, target, turn_deg, movable=slots - {target})
 
 
-def _plan_push(arm: Arm, slot: int, target: int, movable: set[int]) -> PushPlan:
+def _plan_push(arm: Arm, slot: int, target: int, turn_deg: float, movable: set[int]) -> PushPlan:
     planner, everything = arm.planner, arm.scene.obstacles_in_base()
     others = arm.scene.obstacles_in_base(without=slot)
     failure = PlanningFailed("push", "no_room")
@@ -117,7 +122,7 @@ def _plan_push(arm: Arm, slot: int, target: int, movable: set[int]) -> PushPlan:
     try:
         planner.set_scene(everything)
         begun: list[tuple[Push, Array, Trajectory]] = []
-        for push, qpos in reachable_pushes(arm, slot, target, others):
+        for push, qpos in reachable_pushes(arm, slot, target, others, turn_deg):
             try:
                 begun.append((push, qpos, planner.plan_straight(qpos, push.start, stage="push")))
             except PlanningFailed as error:
@@ -150,7 +155,9 @@ def _plan_push(arm: Arm, slot: int, target: int, movable: set[int]) -> PushPlan:
     raise failure
 
 
-def reachable_pushes(arm: Arm, slot: int, target: int, others: Array) -> Iterator[tuple[Push, Array]]:
+def reachable_pushes(
+    arm: Arm, slot: int, target: int, others: Array, turn_deg: float = 0.0
+) -> Iterator[tuple[Push, Array]]:
     """Pushes that the arm can reach, the paper's direction first, then those near where the arm is.
 
     Each comes with a configuration (7,) above its start.
@@ -159,8 +166,7 @@ def reachable_pushes(arm: Arm, slot: int, target: int, others: Array) -> Iterato
         transform(arm.scene.object_in_base(s), arm.env.object_assets[0][s].surface_points(SPACING))
         for s in (slot, target)
     )
-    swing = SWING_DEG if arm.attempt else 0.0
-    pushes = list(candidates(arm.rng, points, own.mean(axis=0), others, surface_in_base(arm), _fixed(arm), swing))
+    pushes = list(candidates(arm.rng, points, own.mean(axis=0), others, surface_in_base(arm), _fixed(arm), turn_deg))
     if not pushes:
         return
     starts, ends = np.stack([push.start for push in pushes]), np.stack([push.end for push in pushes])

@@ -69,6 +69,13 @@ def lift_height(arm: Arm, slot: int) -> float:
     return float(np.clip(near[:, 2].max(initial=0.0) + 0.02 - points[:, 2].min(), *LIFTS))
 
 
+def clear_grasps(arm: Arm, slot: int) -> int:
+    """How many of an object's grasps from above, of some of them, nothing is in the way of."""
+    grasps = _grasps_from_above(arm, slot)
+    near = arm.scene.obstacles_in_base(without=slot)
+    return int(gripper_is_clear(grasps, near).sum())
+
+
 def blockers(arm: Arm, slot: int) -> list[int]:
     """Objects in the way of an object's grasps from above, those first that alone block most of them.
 
@@ -76,12 +83,7 @@ def blockers(arm: Arm, slot: int) -> list[int]:
         arm: the attempt's tools.
         slot: of the object to be grasped.
     """
-    notes, frame = arm.env.object_assets[0][slot].annotations, arm.scene.object_in_base(slot)
-    grasps = frame @ notes.grasps_tcp_in_object
-    passed = np.logical_and.reduce(list(directions_ok(grasps, frame[:3, 3]).values()))
-    grasps = grasps[passed & (notes.grasp_widths <= MAX_WIDTH)]
-    grasps = grasps[arm.rng.permutation(len(grasps))[:GRASPS_LOOKED_AT]]
-    in_the_way = {}
+    grasps, in_the_way = _grasps_from_above(arm, slot), {}
     for other, used in enumerate(arm.env.present[0].tolist()):
         if used and other != slot:
             points = transform(arm.scene.object_in_base(other), arm.env.object_assets[0][other].surface_points(SPACING))
@@ -89,6 +91,15 @@ def blockers(arm: Arm, slot: int) -> list[int]:
     count = np.sum(list(in_the_way.values()), axis=0)
     score = {other: float(np.sum(blocked / np.maximum(count, 1) ** 2)) for other, blocked in in_the_way.items()}
     return sorted((other for other in score if score[other] > 0), key=lambda other: -score[other])
+
+
+def _grasps_from_above(arm: Arm, slot: int) -> Array:
+    """Some of an object's grasps (G, 4, 4) that come from above, in the arm's base frame."""
+    notes, frame = arm.env.object_assets[0][slot].annotations, arm.scene.object_in_base(slot)
+    grasps = frame @ notes.grasps_tcp_in_object
+    passed = np.logical_and.reduce(list(directions_ok(grasps, frame[:3, 3]).values()))
+    grasps = grasps[passed & (notes.grasp_widths <= MAX_WIDTH)]
+    return grasps[arm.rng.permutation(len(grasps))[:GRASPS_LOOKED_AT]]
 
 
 def plan_place(arm: Arm, slot: int) -> tuple[Trajectory, Trajectory]:

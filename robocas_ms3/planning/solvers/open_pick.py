@@ -19,9 +19,11 @@ def attempt(arm: Arm) -> None:
     if not arm.env.task_stages()["furniture_opened"][0]:
         arm.executor.label(**subgoal("operate the target", *words))
         open_from_reach(arm)
-        arm.executor.mark()
+        arm.executor.rehearse()
+        arm.come_back_here()
     arm.executor.label(**subgoal("move and grasp", *words))
     grasp_from_reach(arm, slot)
+    arm.executor.rehearse()
     arm.executor.label(**subgoal("transfer object", *words))
     drive_to_basket(arm, slot)
     carry_to_basket(arm, slot)

@@ -18,6 +18,7 @@ def attempt(arm: Arm) -> None:
     words = arm.env.target_asset().asset.name, arm.env.task_config.support
     arm.executor.label(**subgoal("move and grasp", *words))
     grasp_from_reach(arm, slot)
+    arm.executor.rehearse()
     arm.executor.label(**subgoal("transfer object", *words))
     drive_to_basket(arm, slot)
     carry_to_basket(arm, slot)

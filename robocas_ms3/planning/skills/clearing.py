@@ -1,0 +1,151 @@
+"""Make room around a target: which moves of obstacles there are, and how well one has done."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from robocas_ms3.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.planning.executor import OPEN
+from robocas_ms3.planning.protocol import Array
+from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.looking import hidden_share
+from robocas_ms3.planning.skills.pushing import push_away, surface_in_base
+from robocas_ms3.planning.skills.removing import blockers, clear_grasps, remove
+from robocas_ms3.scenes.placement import transform
+from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE, Clutter
+from robocas_ms3.tasks.search import FALLEN, RoboCASSearchEnv
+
+MOVES = 8  # pushes and removals a demonstration may hold
+MOVED = 0.02  # m by which a push moves its object at least; less is one in vain
+LOOKED_AT = 4  # obstacles, of those that are highest
+TURNS_DEG = (30.0, -30.0)  # off the paper's direction of a push, where that one does not do
+AT_EDGE = 0.01  # m from the surface's edge, nearer than which no object may come
+
+# What a move is worth, in seconds of the demonstration that it makes needless or costs
+PER_OBSTACLE, PER_HIDDEN_SHARE, NO_GRASP, PER_METRE_OF_TARGET = 10.0, 30.0, 8.0, 40.0
+
+
+@dataclass(frozen=True)
+class Move:
+    """A way to get an object out of the way.
+
+    Attributes:
+        skill: what is done with it.
+        slot: of the object.
+        turn_deg: of a push, off the paper's direction.
+    """
+
+    skill: Literal["push", "lift"]
+    slot: int
+    turn_deg: float = 0.0
+
+
+@dataclass(frozen=True)
+class Heap:
+    """The objects around a target, as they lie now.
+
+    Attributes:
+        arm: the attempt's tools.
+        target: slot of the target.
+    """
+
+    arm: Arm
+    target: int
+
+    @property
+    def env(self) -> RoboCASSearchEnv:
+        """The environment under its wrappers."""
+        env = self.arm.env
+        assert isinstance(env, RoboCASSearchEnv)
+        return env
+
+    def clutter(self) -> Clutter:
+        """What hides and surrounds the target."""
+        return self.env.clutter()
+
+    @property
+    def visible(self) -> bool:
+        """Whether the gripper's camera sees most of the target."""
+        return hidden_share(self.arm, self.target) <= MAX_HIDDEN_SHARE
+
+    @property
+    def cleared(self) -> bool:
+        """Whether the target is free, by the paper's rule."""
+        return bool(self.clutter().cleared[0]) and self.visible
+
+    def moves(self) -> Iterator[Move]:
+        """Ways to make room, those first that promise most: of the highest obstacles, then of what blocks grasps.
+
+        A push takes less time than a lift.
+        """
+        obstacles = np.flatnonzero(self.clutter().obstacles[0].cpu().numpy()).tolist()
+        obstacles.sort(key=lambda slot: -self._points(slot)[:, 2].max())
+        order = dict.fromkeys(obstacles[:LOOKED_AT])
+        order |= dict.fromkeys(slot for slot in blockers(self.arm, self.target)[:LOOKED_AT] if slot not in order)
+        slots = [slot for slot in order if slot != self.target][:LOOKED_AT]
+        yield from (Move("push", slot) for slot in slots[:2])
+        yield from (Move("lift", slot) for slot in slots[:2])
+        yield from (Move("push", slot) for slot in slots[2:])
+        yield from (Move("push", slot, turn) for slot in slots[:2] for turn in TURNS_DEG)
+        yield from (Move("lift", slot) for slot in slots[2:])
+
+    def make(self, move: Move) -> float:
+        """Make a move; gives what it was worth, in seconds.
+
+        Raises:
+            PlanningFailed: it can't be planned, was in vain, or brought an object to the edge.
+            EpisodeLost: something fell off the surface, or enough has been moved.
+        """
+        arm, facts = self.arm, self.arm.executor.facts
+        if sum(facts.values()) >= MOVES:
+            raise EpisodeLost("horizon", "too_many_obstacles")
+        before, target, begun = self.middle(move.slot), self.middle(self.target), len(arm.executor.actions)
+        arm.rise_clear()
+        if move.skill == "push":
+            push_away(arm, move.slot, self.target, turn_deg=move.turn_deg)
+            if np.linalg.norm(self.middle(move.slot) - before) <= MOVED:
+                raise PlanningFailed("push", "in_vain")
+            facts["pushes"] += 1
+        else:
+            arm.executor.gripper = OPEN  # it opens on the way
+            remove(arm, move.slot)
+            facts["removals"] += 1
+        self.check_surface()
+        seconds = (len(arm.executor.actions) - begun) * arm.executor.dt
+        return (
+            -seconds - self.work_left() - PER_METRE_OF_TARGET * float(np.linalg.norm(self.middle(self.target) - target))
+        )
+
+    def work_left(self) -> float:
+        """What is still in the way, in seconds it may take."""
+        clutter = self.clutter()
+        hidden, obstacles = float(clutter.hidden_share[0]), int(clutter.obstacles[0].sum())
+        work = PER_OBSTACLE * max(0, obstacles - 1) + PER_HIDDEN_SHARE * max(0.0, hidden - MAX_HIDDEN_SHARE)
+        return work + NO_GRASP * (not clear_grasps(self.arm, self.target))
+
+    def check_surface(self) -> None:
+        """See that nothing has been moved to the edge, or over it.
+
+        Raises:
+            EpisodeLost: something lies on the floor.
+            PlanningFailed: something is at the edge.
+        """
+        frame, half = surface_in_base(self.arm)
+        present = np.flatnonzero(self.env.present[0].cpu().numpy()).tolist()
+        places = np.stack([self.arm.scene.object_in_base(slot)[:3, 3] for slot in present])
+        if (places[:, 2] < frame[2, 3] - FALLEN).any():
+            raise EpisodeLost("clear", "fell_off_table")
+        local = (places - frame[:3, 3]) @ frame[:3, :3]
+        if (np.abs(local[:, :2]) > half - AT_EDGE).any():
+            raise PlanningFailed("clear", "at_the_edge")
+
+    def middle(self, slot: int) -> Array:
+        """(3,) middle of an object's surface, in the arm's base frame, m."""
+        return self._points(slot).mean(axis=0)
+
+    def _points(self, slot: int) -> Array:
+        return transform(self.arm.scene.object_in_base(slot), self.env.object_assets[0][slot].surface_points())
