@@ -1,58 +1,184 @@
-"""Where an episode's time goes, without rendering: reset, control step, planning. Prints JSON.
+"""What demonstrations cost and how good they are, without rendering; prints JSON.
 
-Run: python benchmarks/episode.py [--episodes 5] [--pack builtin]
+For each configuration, over seeds: CPU seconds an episode by part, beside those of bare PhysX under its actions;
+success, length, attempts, memory; and whether the episodes' own 7-D actions succeed again open loop, as a dataset would
+hold them, clean and with fresh noise.
+
+python benchmarks/episode.py pick_table_scattered search_table_stacked --seeds 60000:60020
 """
 
+from __future__ import annotations
+
 import json
+import multiprocessing
+import resource
+import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from collections import Counter
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
+from robocas_ms3.config import load_task_config
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.demos.open_loop import Noise
+from robocas_ms3.demos.record import open_trajectory
+from robocas_ms3.demos.sampling import dataset_actions, sample_states, sample_stride
+from robocas_ms3.robots.constants import ROBOT_UID
+
+FRESH = 1000  # first number of the noise drawn here; trials while generating have smaller ones
 
 
 @dataclass
 class Args:
-    episodes: int = 5
-    """Episodes to generate."""
+    configs: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pick_table_scattered",)
+    """Task configurations."""
+    seeds: str = "60000:60020"
+    """FIRST:END."""
     pack: str = "builtin"
     """Object pack."""
+    draws: int = 5
+    """Noisy trials of each episode."""
+    noise: tuple[float, float] = (0.5, 0.2)
+    """Its standard deviations, mm and degrees, of each component of each action."""
+    jobs: int = 1
+    """Processes. One, on a machine that does nothing else, where times are to be compared."""
+    fork: bool = True
+    """Undo what fails by forking."""
+
+
+@dataclass
+class Seed:
+    """What came of a seed."""
+
+    seed: int
+    success: bool
+    steps: int
+    attempts: int
+    cpu: float
+    parts: dict[str, float]
+    failures: list[str]
+    rss_mb: int
+    physx: float = 0.0
+    facts: dict[str, int] = field(default_factory=dict)
+    clean: bool = False
+    noisy: int = 0
 
 
 def main(args: Args) -> None:
-    generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", args.pack))
-    env = generator.env
-    resets, steps = [], []
-    for seed in range(5):
-        start = time.perf_counter()
-        env.reset(seed=seed)
-        resets.append(time.perf_counter() - start)
-        action = np.append(env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy(), 1.0).astype(np.float32)
-        for _ in range(20):
-            start = time.perf_counter()
-            env.step(action)
-            steps.append(time.perf_counter() - start)
+    report = {}
+    for config in args.configs:
+        first, end = map(int, args.seeds.split(":"))
+        shares = [list(range(first, end))[job :: args.jobs] for job in range(args.jobs)]
+        if args.jobs == 1:
+            found = run(args, config, shares[0])
+        else:
+            with multiprocessing.get_context("spawn").Pool(args.jobs) as pool:
+                parts = pool.starmap(run, [(args, config, share) for share in shares])
+            found = sorted((seed for part in parts for seed in part), key=lambda seed: seed.seed)
+        report[config] = summary(found, args)
+    print(json.dumps(report, indent=2))
+
+
+def run(args: Args, config: str, seeds: list[int]) -> list[Seed]:
+    settings = EpisodeSettings(load_task_config(config).task, config, args.pack)
+    generator = EpisodeGenerator(settings, fork=args.fork)
+    found = []
     with tempfile.TemporaryDirectory() as folder:
-        results = [generator.generate(seed, Path(folder), str(seed)) for seed in range(args.episodes)]
-    parts = [asdict(result.seconds) for result in results]
-    print(
-        json.dumps(
-            {
-                "reset_ms": round(1000 * float(np.median(resets)), 1),
-                "step_ms": round(1000 * float(np.median(steps)), 2),
-                "success": sum(result.success for result in results),
-                "episodes": len(results),
-                "attempts": [result.attempts for result in results],
-                "mean_steps": float(np.mean([result.steps for result in results])),
-                "mean_seconds": {key: round(float(np.mean([p[key] for p in parts])), 2) for key in parts[0]},
-            },
-            indent=2,
-        )
-    )
+        generator.generate(seeds[0] - 1, Path(folder), "warm")  # loads packs, starts planners
+        for seed in seeds:
+            before = cpu()
+            result = generator.generate(seed, Path(folder), str(seed))
+            spent = cpu() - before
+            parts = {name: round(value, 3) for name, value in asdict(result.seconds).items()}
+            failures = [f"{failure.stage}: {failure.reason}" for failure in result.failures]
+            found.append(
+                Seed(seed, result.success, result.steps, result.attempts, round(spent, 3), parts, failures, rss_mb())
+            )
+            if result.success:
+                judge(found[-1], generator, Path(folder) / f"{seed}.h5", args)
+            print(json.dumps(asdict(found[-1])), file=sys.stderr, flush=True)
+    generator.close()
+    return found
+
+
+def cpu() -> float:
+    """CPU seconds of this process and of the children it has waited for."""
+    spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in spent)
+
+
+def rss_mb() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() // 2**20
+
+
+def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> None:
+    """Play the recorded actions in bare PhysX, and the episode's own 7-D actions open loop."""
+    with open_trajectory(path) as file:
+        group: Any = file["traj_0"]
+        actions = np.array(group["actions"])
+        states = np.array(group["env_states"]["articulations"][ROBOT_UID])
+    found.facts = json.loads(path.with_suffix(".json").read_text())["episodes"][0]["robocas"]["facts"]
+    found.physx = round(bare_physx(generator, found.seed, actions), 3)
+    if not generator.worlds:
+        return
+    world = generator.worlds[0]
+    stride = sample_stride(generator.settings.control_freq, world.rate_hz)
+    own = dataset_actions(states, actions[:, 7], sample_states(len(actions), stride)).astype(np.float64)
+    noise = Noise(args.noise[0] / 1000, float(np.deg2rad(args.noise[1])))
+    for draw in range(-1, args.draws):
+        world.reset(found.seed)
+        rng = np.random.default_rng([found.seed, FRESH + draw + 1])
+        success = world.play(own if draw < 0 else own + noise.draw(rng, len(own))).success
+        if draw < 0:
+            found.clean = success
+        else:
+            found.noisy += success
+
+
+def bare_physx(generator: EpisodeGenerator, seed: int, actions: np.ndarray) -> float:
+    """CPU seconds that PhysX takes for an episode's actions."""
+    import torch
+
+    generator.env.reset(seed=seed)
+    env: Any = generator.env.unwrapped
+    substeps, spent = env._sim_steps_per_control, 0.0
+    for action in torch.as_tensor(actions):
+        env.agent.set_action(action[None])
+        for _ in range(substeps):
+            env.agent.before_simulation_step()
+            start = time.process_time()
+            env.scene.px.step()
+            spent += time.process_time() - start
+    return spent
+
+
+def summary(found: list[Seed], args: Args) -> dict[str, Any]:
+    good = [seed for seed in found if seed.success]
+    mean = lambda values: round(float(np.mean(list(values) or [np.nan])), 3)  # noqa: E731
+    return {
+        "seeds": len(found),
+        "success": len(good) / len(found),
+        "lost": [seed.seed for seed in found if not seed.success],
+        "cpu_seconds": mean(seed.cpu for seed in found),
+        "cpu_seconds_median": round(float(np.median([seed.cpu for seed in found])), 3),
+        "cpu_seconds_by_part": {part: mean(seed.parts[part] for seed in found) for part in found[0].parts},
+        "physx_cpu_seconds": mean(seed.physx for seed in good),
+        "over_physx": round(sum(seed.cpu for seed in good) / max(1e-9, sum(seed.physx for seed in good)), 2),
+        "mean_length_s": mean(seed.steps / 20 for seed in good),
+        "mean_attempts": mean(seed.attempts for seed in found),
+        "failures": dict(Counter(failure for seed in found for failure in seed.failures).most_common()),
+        "facts": {key: mean(seed.facts.get(key, 0) for seed in good) for key in (good[0].facts if good else ())},
+        "clean_success": mean(seed.clean for seed in good),
+        "noisy_success": mean(seed.noisy / max(1, args.draws) for seed in good),
+        "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        "rss_mb": {seed.seed: seed.rss_mb for seed in found[:: max(1, len(found) // 10)]},
+    }
 
 
 if __name__ == "__main__":

@@ -1,13 +1,12 @@
-"""Where an attempt begins after one that failed. A counter stands for the simulator: it only sums up actions."""
+"""What an executor keeps of what it has done. A counter stands for the simulator."""
 
 from __future__ import annotations
 
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
-from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
+from robocas_ms3.planning.executor import CLOSED, OPEN, Executor, Seconds
 
 
 class Counter:
@@ -15,15 +14,14 @@ class Counter:
 
     def __init__(self) -> None:
         self.done: list[float] = []
-        self.resets = 0
 
     def reset(self, seed: int):
-        self.done, self.resets = [], self.resets + 1
-        return None, {}
+        self.done = []
+        return None, {"seed": seed}
 
     def step(self, action: np.ndarray):
         self.done.append(float(action[0]))
-        return None, 0, False, False, {}
+        return None, 0, False, False, {"success": [len(self.done) == 3]}
 
 
 class Simulated(Executor):
@@ -31,7 +29,7 @@ class Simulated(Executor):
 
 
 def executor() -> Simulated:
-    made = Simulated(Counter(), seed=0)
+    made = Simulated(Counter(), seed=7)
     made.reset()
     return made
 
@@ -41,78 +39,45 @@ def act(made: Simulated, *values: float) -> None:
         made._step(made._action(np.full(7, value)))
 
 
-def test_without_a_checkpoint_all_is_undone():
-    made = executor()
-    act(made, 1, 2)
-    made.go_back()
-    assert made.env.done == []
-    assert made.actions == []
-    assert made.env.resets == 2
-
-
-@pytest.mark.parametrize(("after", "kept"), [(0, []), (1, []), (2, [2]), (3, [2]), (9, [2, 4])])
-def test_checkpoints_after_a_moment_are_forgotten(after, kept):
-    made = executor()
-    for _ in range(2):
-        act(made, 1, 2)
-        made.mark()
-    made.forget_checkpoints(after)
-    assert [checkpoint.length for checkpoint in made.checkpoints] == kept
-
-
-def test_what_came_after_the_last_checkpoint_is_undone_and_the_rest_done_again():
+def test_a_reset_forgets_all_that_was_done():
     made = executor()
     made.label("find the object", "find it")
     made.gripper, made.facts["pushes"] = CLOSED, 1
     act(made, 1, 2)
-    made.mark()
-    made.label("move and grasp", "grasp it")
-    made.gripper, made.facts["pushes"] = OPEN, 2
-    act(made, 3, 4, 5)
-    made.go_back()
-    assert made.env.done == [1, 2]
-    assert [float(action[0]) for action in made.actions] == [1, 2]
-    assert [segment.goal_type for segment in made.segments] == ["find the object"]
-    assert made.gripper == CLOSED
-    assert made.facts == {"pushes": 1}
-    assert made.at_checkpoint
-
-
-def test_the_second_failure_gives_up_half_of_the_checkpoints():
-    made = executor()
-    for value in (1, 2, 3, 4):
-        act(made, value)
-        made.mark()
-    for expected in ([1, 2, 3, 4], [1, 2], [1, 2], [1], [1], []):
-        act(made, 9)
-        made.go_back()
-        assert made.env.done == expected
-
-
-def test_a_checkpoint_from_which_nothing_can_be_done_is_given_up_at_once():
-    made = executor()
-    act(made, 1)
-    made.mark()
-    act(made, 2)
-    made.mark()
-    made.go_back()  # planning failed: no action since
-    assert made.env.done == [1]
-
-
-def test_what_took_too_long_gives_up_half_of_the_checkpoints_at_once():
-    made = executor()
-    for value in (1, 2, 3, 4):
-        act(made, value)
-        made.mark()
-    act(made, 9)
-    made.go_back(far=True)
-    assert made.env.done == [1, 2]
-
-
-def test_a_reset_forgets_the_checkpoints():
-    made = executor()
-    act(made, 1)
-    made.mark()
+    assert made.env.done == [1, 2] == [float(action[0]) for action in made.actions]
+    assert [float(action[7]) for action in made.actions] == [CLOSED, CLOSED]
     made.reset()
-    assert not made.checkpoints
-    assert not made.at_checkpoint
+    assert (made.env.done, made.actions, made.segments, made.gripper, made.facts) == ([], [], [], OPEN, {})
+    assert made.info == {"seed": 7}
+
+
+def test_a_label_begins_with_the_next_action_and_replaces_one_without_any():
+    made = executor()
+    made.label("find the object", "find it")
+    act(made, 1)
+    made.label("move and grasp", "grasp it")
+    made.label("find the object", "find it")  # nothing was done in between
+    act(made, 2)
+    made.label("transfer object", "carry it")
+    assert [(segment.goal_type, segment.first) for segment in made.segments] == [
+        ("find the object", 0),
+        ("transfer object", 2),
+    ]
+
+
+def test_a_flag_ends_a_motion():
+    made = executor()
+    motion = SimpleNamespace(qpos=np.zeros((9, 7)))
+    assert not made.info.get("success")
+    made.info = {"success": [False]}
+    assert made.follow(motion, until="success")
+    assert len(made.actions) == 3
+
+
+def test_time_is_added_up_by_part():
+    seconds = Seconds()
+    for _ in range(2):
+        with seconds.spent_on("planning"):
+            sum(range(200_000))
+    assert seconds.planning > 0
+    assert seconds.simulation == 0
