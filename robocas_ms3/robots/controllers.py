@@ -20,6 +20,8 @@ from mani_skill.agents.controllers import (
     PDEEPoseControllerConfig,
     PDJointPosController,
     PDJointPosControllerConfig,
+    PDJointPosMimicController,
+    PDJointPosMimicControllerConfig,
 )
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.utils import gym_utils
@@ -30,6 +32,7 @@ from mani_skill.utils.geometry.rotation_conversions import (
     quaternion_multiply,
 )
 from mani_skill.utils.structs import Pose
+from sapien.physx import PhysxArticulationJoint
 from scipy.spatial.transform import Rotation
 
 POSITION_SCALE, ROTATION_SCALE = 0.1, 0.5  # m and rad at |action| = 1, end effector
@@ -109,7 +112,42 @@ def batched_ik(
     return qpos[:, joints]
 
 
-class SmoothJointPosController(PDJointPosController):
+class DirectDrives(PDJointPosController):
+    """Sets drive targets, on a CPU without ManiSkill's wrapper of each joint, which takes longer than the physics."""
+
+    def _initialize_joints(self) -> None:
+        super()._initialize_joints()
+        self._drives: list[PhysxArticulationJoint] = [joint._objs[0] for joint in self.joints]
+
+    def set_drive_targets(self, targets: torch.Tensor) -> None:
+        """Set the targets (N, joints), rad or m, of all joints."""
+        if self.scene.gpu_sim_enabled:
+            super().set_drive_targets(targets)
+            return
+        for drive, target in zip(self._drives, targets[0].tolist(), strict=True):
+            drive.set_drive_target(target)
+
+    def set_drive_velocities(self, velocities: torch.Tensor) -> None:
+        """Set the velocities (N, joints), rad/s or m/s, that the drives of all joints aim at."""
+        if self.scene.gpu_sim_enabled:
+            self.articulation.set_joint_drive_velocity_targets(velocities, self.joints, self.active_joint_indices)
+            return
+        for drive, velocity in zip(self._drives, velocities[0].tolist(), strict=True):
+            drive.set_drive_velocity_target(velocity)
+
+
+class MimicController(DirectDrives, PDJointPosMimicController):
+    """ManiSkill's: the other joints do as the first."""
+
+
+@dataclass
+class MimicControllerConfig(PDJointPosMimicControllerConfig):
+    """Configuration of a ``MimicController``."""
+
+    controller_cls = MimicController
+
+
+class SmoothJointPosController(DirectDrives):
     """Joint positions, absolute or relative to the last target, whose drive target moves evenly within a control step.
 
     A target that jumps at 5 Hz makes the arm start and stop with every step, at twice the planned velocity. ManiSkill's
@@ -161,7 +199,7 @@ class SmoothJointPosControllerConfig(PDJointPosControllerConfig):
     controller_cls = SmoothJointPosController
 
 
-class HeldJointsController(PDJointPosController):
+class HeldJointsController(DirectDrives):
     """Holds joints where they are at reset; takes no action (0 dimensions)."""
 
     def _initialize_action_space(self) -> None:
@@ -192,7 +230,7 @@ class HeldJointsControllerConfig(PDJointPosControllerConfig):
     controller_cls = HeldJointsController
 
 
-class RoboCASEEPoseController(PDEEPoseController):
+class RoboCASEEPoseController(DirectDrives, PDEEPoseController):
     """End-effector pose control: deltas in the end effector's frame, or absolute poses in the arm's base frame.
 
     Differs from ManiSkill's: rotations have their natural sign; body-frame deltas work on a GPU too, since the target
@@ -270,7 +308,7 @@ class RoboCASEEPoseController(PDEEPoseController):
     def _drive_with(self, targets: torch.Tensor, velocities: torch.Tensor) -> None:
         """Set drive targets and their velocities: an arm that is told its velocity does not lag."""
         self.set_drive_targets(targets)
-        self.articulation.set_joint_drive_velocity_targets(velocities, self.joints, self.active_joint_indices)
+        self.set_drive_velocities(velocities)
 
     def reset(self) -> None:
         """Start from the present configuration, at rest."""

@@ -10,7 +10,6 @@ import torch
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
 from mani_skill.agents.controllers import (
     PDJointPosControllerConfig,
-    PDJointPosMimicControllerConfig,
     deepcopy_dict,
 )
 from mani_skill.agents.registration import register_agent
@@ -26,6 +25,7 @@ from robocas_ms3.robots.controllers import (
     POSITION_SCALE,
     ROTATION_SCALE,
     HeldJointsControllerConfig,
+    MimicControllerConfig,
     RoboCASEEPoseController,
     RoboCASEEPoseControllerConfig,
     SmoothJointPosControllerConfig,
@@ -127,7 +127,7 @@ class RoboCASMobilePanda(BaseAgent):
             ),
         )
         mimic: dict[str, Any] = {self.gripper_joint_names[1]: {"joint": self.gripper_joint_names[0]}}
-        gripper = PDJointPosMimicControllerConfig(
+        gripper = MimicControllerConfig(
             self.gripper_joint_names,
             lower=c.FINGER_TARGETS[0],
             upper=c.FINGER_TARGETS[1],
