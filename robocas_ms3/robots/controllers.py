@@ -31,7 +31,7 @@ from mani_skill.utils.geometry.rotation_conversions import (
     quaternion_apply,
     quaternion_multiply,
 )
-from mani_skill.utils.structs import Pose
+from mani_skill.utils.structs import Link, Pose
 from sapien.physx import PhysxArticulationJoint
 from scipy.spatial.transform import Rotation
 
@@ -85,6 +85,17 @@ def ee_delta_target(
     return position + quaternion_apply(quaternion, delta[:, :3]), quaternion_multiply(quaternion, rotation)
 
 
+def relative_pose(frame: Link, link: Link) -> Pose:
+    """(N,) poses of a link in the frame of another; on a CPU by SAPIEN, ten times faster than by tensors."""
+    if frame.scene.gpu_sim_enabled:
+        return frame.pose.inv() * link.pose
+    pose = frame._bodies[0].entity_pose.inv() * link._bodies[0].entity_pose
+    position, quaternion = pose.p, pose.q
+    if quaternion[0] < 0:  # as ManiSkill's products
+        quaternion = -quaternion
+    return Pose(raw_pose=torch.from_numpy(np.concatenate([position, quaternion]))[None])
+
+
 def batched_ik(
     kinematics: Kinematics, target: Pose, qpos: torch.Tensor, joints: torch.Tensor, now: Pose
 ) -> torch.Tensor:
@@ -136,15 +147,20 @@ class DirectDrives(PDJointPosController):
             drive.set_drive_velocity_target(velocity)
 
 
-class MimicController(DirectDrives, PDJointPosMimicController):
-    """ManiSkill's: the other joints do as the first."""
+class FingersController(DirectDrives, PDJointPosMimicController):
+    """Absolute positions of fingers that all do the same; ManiSkill's, without its detours."""
+
+    def set_action(self, action: Any) -> None:
+        """Take the position (N, 1) of every finger."""
+        self._target_qpos = self._preprocess_action(action).repeat(1, len(self.joints))
+        self.set_drive_targets(self._target_qpos)
 
 
 @dataclass
-class MimicControllerConfig(PDJointPosMimicControllerConfig):
-    """Configuration of a ``MimicController``."""
+class FingersControllerConfig(PDJointPosMimicControllerConfig):
+    """Configuration of a ``FingersController``: what mimics does so one to one."""
 
-    controller_cls = MimicController
+    controller_cls = FingersController
 
 
 class SmoothJointPosController(DirectDrives):
@@ -164,8 +180,8 @@ class SmoothJointPosController(DirectDrives):
         """Take the positions (N, joints), rad or m, to command at the end of the control step."""
         action = self._preprocess_action(action)
         assert self._target_qpos is not None, "the controller has not been reset"
-        moved = (self._target_qpos - self.qpos).abs() > ARM_SET_FROM_OUTSIDE
-        start = torch.where(moved, self.qpos, self._target_qpos)
+        now = self.qpos
+        start = torch.where((self._target_qpos - now).abs() > ARM_SET_FROM_OUTSIDE, now, self._target_qpos)
         travel = action if self.config.use_delta else action - start
         if self.config.max_speed is not None:
             furthest = self.config.max_speed / self._control_freq
@@ -213,8 +229,9 @@ class HeldJointsController(DirectDrives):
     def set_action(self, action: Any) -> None:
         """Keep the drive targets, unless the state was set from outside: then hold the joints where they are now."""
         assert self._target_qpos is not None, "the controller has not been reset"
-        moved = (self._target_qpos - self.qpos).abs() > HELD_SET_FROM_OUTSIDE
-        self._target_qpos = torch.where(moved, self.qpos, self._target_qpos)
+        now = self.qpos
+        moved = (self._target_qpos - now).abs() > HELD_SET_FROM_OUTSIDE
+        self._target_qpos = torch.where(moved, now, self._target_qpos)
         self.set_drive_targets(self._target_qpos)
 
 

@@ -219,6 +219,7 @@ class RoboCASEnv(SeededEnv):
                 actor.set_pose(Pose.create(poses[:, slot]))
             self.start_poses[env_idx] = poses
             self.target_slot[env_idx] = torch.tensor([layout.target for layout in layouts])
+            self._is_target = torch.nn.functional.one_hot(self.target_slot, len(self.objects)).bool()
             self.present[env_idx] = torch.as_tensor(np.stack([layout.present for layout in layouts])).to(self.device)
         for i, layout in zip(env_idx.tolist(), layouts, strict=True):
             self.layouts[i] = layout
@@ -270,6 +271,9 @@ class RoboCASEnv(SeededEnv):
             forces: of ``gripper_forces``, if they are known already.
         """
         forces = self.gripper_forces() if forces is None else forces
+        pressed = terms.pressed(forces[:, 0], forces[:, 1])
+        if not pressed.any():  # as most of the time: no need to ask in which direction
+            return pressed
         finger = link_poses(self.scene, [self.agent.finger1_link])[:, 0]
         # the left finger opens along its own +y
         return terms.finger_grasps(forces[:, 0], forces[:, 1], terms.rotate(finger[:, 3:], self._sideways))
@@ -280,7 +284,7 @@ class RoboCASEnv(SeededEnv):
             return {}
         return {
             "object_poses": torch.where(self.present[..., None], self.object_states[..., :7], 0.0).flatten(1),
-            "target": torch.nn.functional.one_hot(self.target_slot, len(self.objects)).float(),
+            "target": self._is_target.float(),
             "basket_pose": self.basket_pose,
         }
 

@@ -47,24 +47,27 @@ def inside_box(points: Tensor, box_position: Tensor, box_quaternion: Tensor, low
     return ((local >= low) & (local <= high)).all(dim=-1)
 
 
+MIN_GRASP_FORCE = 0.5  # N, on each finger
+
+
+def pressed(left_force: Tensor, right_force: Tensor) -> Tensor:
+    """(N, K) bool: which objects press on both fingers, in whatever direction, from forces (N, K, 3) in N."""
+    sizes = torch.linalg.vector_norm(torch.stack([left_force, right_force]), dim=-1)
+    return (sizes >= MIN_GRASP_FORCE).all(dim=0)
+
+
 def finger_grasps(
-    left_force: Tensor,
-    right_force: Tensor,
-    closing_axis: Tensor,
-    *,
-    min_force: float = 0.5,
-    max_angle_deg: float = 85.0,
+    left_force: Tensor, right_force: Tensor, closing_axis: Tensor, *, max_angle_deg: float = 85.0
 ) -> Tensor:
     """Which objects both fingers press on, each along its own opening direction.
 
-    The rule of ManiSkill's ``Panda.is_grasping``: the force on each finger is at least ``min_force`` and within
+    The rule of ManiSkill's ``Panda.is_grasping``: the force on each finger is at least ``MIN_GRASP_FORCE`` and within
     ``max_angle_deg`` of the direction in which that finger opens.
 
     Args:
         left_force: (N, K, 3) force of each object on the left finger, world.
         right_force: (N, K, 3) the same on the right finger.
         closing_axis: (N, 3) unit, the direction in which the left finger opens, world.
-        min_force: N.
         max_angle_deg: degrees.
 
     Returns:
@@ -73,7 +76,8 @@ def finger_grasps(
     forces = torch.stack([left_force, -right_force])
     size = torch.linalg.vector_norm(forces, dim=-1)
     along = (forces * closing_axis[:, None]).sum(-1)
-    return ((size >= min_force) & (along >= math.cos(math.radians(max_angle_deg)) * size)).all(dim=0)
+    aligned = along >= math.cos(math.radians(max_angle_deg)) * size
+    return ((size >= MIN_GRASP_FORCE) & aligned).all(dim=0)
 
 
 def touched(forces: Tensor, *, min_force: float = 1e-3) -> Tensor:

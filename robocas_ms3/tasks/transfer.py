@@ -40,6 +40,8 @@ class TransferEnv(RoboCASEnv):
             self._reached = torch.zeros(len(self.STAGES), self.num_envs, dtype=torch.bool, device=self.device)
             self._stages = dict(zip(self.STAGES, self._reached, strict=True))  # views
         self._reached[:, env_idx] = False
+        # most of the time nothing moves; what is remembered holds for an episode, as where it began counts too
+        self._basket_stands, self._target_in_basket = Remembered(self._stands_of), Remembered(self._target_in)
         self._count_disturbed, self._undo = Remembered(self._disturbed_of), Remembered(self._undo_of)
         said = {env: self._instruct(env) for env in env_idx.tolist()}
         kept = getattr(self, "instructions", [])
@@ -105,20 +107,22 @@ class TransferEnv(RoboCASEnv):
         if touched is None:
             touched = terms.touched(self.gripper_forces())
         objects = self.object_states if objects is None else objects
-        basket, start, slot = self.basket_pose, self.basket_at_start, self.target_slot
-        target = terms.of_target(objects, slot)
+        target, basket = terms.of_target(objects, self.target_slot), self.basket_pose
         return {
-            "in_basket": terms.of_target(self.in_basket(objects), slot),
-            "untouched": ~terms.of_target(touched, slot),
+            "in_basket": self._target_in_basket(target[:, :7], basket),
+            "untouched": ~terms.of_target(touched, self.target_slot),
             "at_rest": terms.at_rest(target[:, 7:10], target[:, 10:]),
-            "basket_stands": terms.stands(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:]),
+            "basket_stands": self._basket_stands(basket),
         }
 
-    def in_basket(self, objects: torch.Tensor) -> torch.Tensor:
-        """(N, K) bool: whose centre of mass is in the basket's inner volume, from states or poses (N, K, >= 7)."""
-        basket = self.basket_pose
-        centers = objects[..., :3] + terms.rotate(objects[..., 3:7], self._centers_of_mass)
-        return terms.inside_box(centers, basket[:, :3], basket[:, 3:], self._basket_low, self._basket_high)
+    def _target_in(self, target: torch.Tensor, basket: torch.Tensor) -> torch.Tensor:
+        """(N,) bool of `in_basket`, of the targets alone, from poses (N, 7)."""
+        center = target[:, :3] + terms.rotate(target[:, 3:], terms.of_target(self._centers_of_mass, self.target_slot))
+        return terms.inside_box(center, basket[:, :3], basket[:, 3:], self._basket_low, self._basket_high)
+
+    def _stands_of(self, basket: torch.Tensor) -> torch.Tensor:
+        start = self.basket_at_start
+        return terms.stands(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:])
 
     def _disturbed(self, poses: torch.Tensor) -> torch.Tensor:
         """(N,) how many objects other than the target no longer stand as they stood, from poses (N, K, 7)."""
