@@ -266,17 +266,27 @@ class RoboCASEEPoseController(DirectDrives, PDEEPoseController):
         rotation = rotation / torch.linalg.norm(rotation, dim=1, keepdim=True).clamp(min=1.0)
         return torch.hstack([position, rotation * self.action_space_high[3:]])
 
-    def compute_target_pose(self, prev_ee_pose_at_base: Pose, action: torch.Tensor) -> Pose:
+    def compute_target_pose(self, prev_ee_pose_at_base: Pose | None, action: torch.Tensor) -> Pose:
         """Compute the target in the arm's base frame.
 
         Args:
-            prev_ee_pose_at_base: (N,) the pose deltas refer to.
+            prev_ee_pose_at_base: (N,) the pose that deltas refer to; None where actions are poses.
             action: (N, 6) scaled: m and rad.
         """
-        if self.config.use_delta:
+        if prev_ee_pose_at_base is not None:
             return Pose.create_from_pq(*ee_delta_target(prev_ee_pose_at_base.p, prev_ee_pose_at_base.q, action))
         rotation = matrix_to_quaternion(euler_angles_to_matrix(action[:, 3:6], "XYZ"))
         return Pose.create_from_pq(action[:, :3], rotation)
+
+    def _initialize_joints(self) -> None:
+        super()._initialize_joints()
+        if not self.kinematics.use_gpu_ik:
+            of_model: list[torch.Tensor] = [
+                self.kinematics.pmodel_active_joint_indices,
+                self.kinematics.qmask,
+                self.kinematics.pmodel_controlled_joint_indices,
+            ]
+            self._chain, self._free, self._arm = (tensor.numpy() for tensor in of_model)
 
     sets_target_qvel = True
     _forgotten: torch.Tensor | None = None  # (N,) whose targets count no longer
@@ -285,16 +295,19 @@ class RoboCASEEPoseController(DirectDrives, PDEEPoseController):
         """Drive the arm towards the pose; where no inverse kinematics is found it stays where it is."""
         action = self._preprocess_action(action)
         self._step = 0
-        now, reference = self.ee_pose_at_base, self.reference_pose()
-        last = self.qpos if self._target_qpos is None else self._target_qpos
-        moved = (last - self.qpos).abs() > ARM_SET_FROM_OUTSIDE
+        reference = self.reference_pose() if self.config.use_delta else None
+        last = now = self.qpos
+        if self._target_qpos is not None:
+            last = self._target_qpos
+        moved = (last - now).abs() > ARM_SET_FROM_OUTSIDE
         if self._forgotten is not None:
             moved |= self._forgotten[:, None]
-        self._start_qpos = torch.where(moved, self.qpos, last)
-        self._target_pose = self.compute_target_pose(reference, action)
-        target = self._solve(self._target_pose, now)
+        self._start_qpos = torch.where(moved, now, last)
+        wanted = self.compute_target_pose(reference, action)
+        target = self._solve(wanted)
         if target is None:
-            target, self._target_pose = self.qpos, reference
+            target, wanted = now, self.reference_pose() if reference is None else reference
+        self._target_pose = wanted
         self._target_qpos, self._forgotten = target, None
         if self.config.use_delta:
             self._drive_with(self._start_qpos, (target - self._start_qpos) * self._control_freq)
@@ -334,22 +347,33 @@ class RoboCASEEPoseController(DirectDrives, PDEEPoseController):
 
     def reference_pose(self) -> Pose:
         """(N,) poses in the arm's base frame that the next deltas start from."""
-        now = self.ee_pose_at_base
         if not self.config.use_target or self._target_pose is None:
-            return now
+            return self.ee_pose_at_base
         far, turned = EE_HELD_BACK
-        distance = torch.linalg.norm(self._target_pose.p - now.p, dim=1)
+        now = relative_pose(self.root_link, self.ee_link)
+        distance = torch.linalg.vector_norm(self._target_pose.p - now.p, dim=1)
         cosine = (self._target_pose.q * now.q).sum(dim=1).abs()  # of half the angle between them
         lost = (distance > far) | (cosine < np.cos(turned / 2))
         if self._forgotten is not None:
             lost |= self._forgotten
-        return Pose.create(torch.where(lost[:, None], now.raw_pose, self._target_pose.raw_pose))
+        if not lost.any():
+            return self._target_pose
+        return Pose.create(torch.where(lost[:, None], self.ee_pose_at_base.raw_pose, self._target_pose.raw_pose))
 
-    def _solve(self, target: Pose, now: Pose) -> torch.Tensor | None:
-        qpos = self.articulation.get_qpos()
-        if not self.scene.gpu_sim_enabled:
-            return cast("torch.Tensor | None", self.kinematics.compute_ik(pose=target, q0=qpos))
-        return batched_ik(self.kinematics, target, qpos, self.active_joint_indices, now)
+    def _solve(self, target: Pose) -> torch.Tensor | None:
+        """(N, joints) that reach poses in the arm's base frame; None: not found, on a CPU."""
+        kinematics, qpos = self.kinematics, self.articulation.get_qpos()
+        if self.scene.gpu_sim_enabled:
+            return batched_ik(kinematics, target, qpos, self.active_joint_indices, self.ee_pose_at_base)
+        # what ManiSkill's `compute_ik` does, without its conversions
+        found, success, _ = kinematics.pmodel.compute_inverse_kinematics(
+            kinematics.end_link_idx,
+            target.sp,
+            initial_qpos=qpos[0].numpy()[self._chain],
+            active_qmask=self._free,
+            max_iterations=100,
+        )
+        return torch.from_numpy(found[self._arm].astype(np.float32))[None] if success else None
 
 
 @dataclass
