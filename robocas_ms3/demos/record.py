@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import json
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
@@ -10,18 +12,24 @@ from typing import Any, cast
 import gymnasium as gym
 import h5py
 import numpy as np
-from mani_skill.utils.wrappers.record import RecordEpisode
+from mani_skill.utils import common
+from mani_skill.utils.gym_utils import find_max_episode_steps_value
+from mani_skill.utils.wrappers.record import parse_env_info
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing, write_json
+from robocas_ms3.tasks.base import RoboCASEnv
 
 # Settings of one machine or one run; a trajectory has to replay without them.
 _LOCAL_KWARGS = ("render_backend", "render_mode", "sim_backend", "reward_mode")
+_PICTURES = ("rgb", "depth", "seg")
 
 
-class EpisodeRecorder(RecordEpisode):
-    """ManiSkill's recorder for a single episode in a file of its own, so that a crash costs one episode at most.
+class EpisodeRecorder(gym.Wrapper):
+    """Keeps a single episode of one env, and writes it in ManiSkill's format when it is finished.
+
+    Until then there is no file: it costs next to nothing a step, and survives a fork of the process.
 
     Args:
         env: the environment to record.
@@ -30,51 +38,130 @@ class EpisodeRecorder(RecordEpisode):
     """
 
     def __init__(self, env: gym.Env, folder: Path, name: str) -> None:
-        super().__init__(
-            cast(Any, env),
-            output_dir=str(folder),
-            trajectory_name=name,
-            save_video=False,
-            save_on_reset=False,
-            record_reward=False,
-            clean_on_close=False,
-            source_type="motionplanning",
-            source_desc="scripted policy of robocas_ms3",
-        )
-        self._paths = [folder / f"{name}.h5", folder / f"{name}.json"]
-        self.discard()  # nothing is open while the episode is made: a forked child may be the one that writes it
+        super().__init__(env)
+        base_env = env.unwrapped
+        assert isinstance(base_env, RoboCASEnv)
+        self._base_env, self._trajectory = base_env, folder / f"{name}.h5"
+        self._steps = _Steps()
+        self._reset_kwargs: dict[str, Any] = {}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment and begin anew."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._reset_kwargs = copy.deepcopy({"options": options} if seed is None else {"options": options, "seed": seed})
+        self._steps = _Steps()
+        self._keep(observation)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step the environment and keep what came of it."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._steps.actions.append(np.array(action, np.float32).reshape(-1))
+        self._steps.flags.append((bool(terminated), bool(truncated), bool(info["success"])))
+        self._keep(observation)
+        return observation, reward, terminated, truncated, info
+
+    def _keep(self, observation: Any) -> None:
+        steps = self._steps
+        steps.states.append(self._base_env.bodies.read()[0].cpu().numpy())
+        steps.controllers.append(_of_one_env(self._base_env.agent.get_controller_state()))
+        steps.observations.append(_of_one_env(observation))
 
     @property
     def states(self) -> dict[str, dict[str, NDArray[np.float32]]]:
         """ManiSkill's states since the reset: ``{"actors": {name: (S + 1, 13)}, "articulations": {...}}``."""
-        buffer: Any = self._trajectory_buffer
-        return {kind: {name: array[:, 0] for name, array in found.items()} for kind, found in buffer.state.items()}
+        return self._base_env.bodies.split(np.stack(self._steps.states))
 
     def finish(self, episode: dict[str, Any]) -> None:
-        """Write the episode and close the file; the environment stays open.
+        """Write the episode; the environment stays open.
 
         Args:
             episode: what ManiSkill's format has no place for: instruction, target, sub-goals.
         """
-        self._h5_file = h5py.File(self._paths[0], "w")
-        self.flush_trajectory()
-        self._h5_file.close()
-        data = json.loads(self._paths[1].read_text(encoding="utf-8"))
-        info = data["env_info"]
-        # With the module's name in front, gymnasium imports this package by itself: ManiSkill's own tools then work.
-        info["env_id"] = f"robocas_ms3:{info['env_id']}"
-        info["env_kwargs"] = {k: v for k, v in info["env_kwargs"].items() if k not in _LOCAL_KWARGS}
-        data.pop("commit_info", None)  # of ManiSkill's checkout, or of whatever repository the user stands in
-        base_env: Any = self.base_env
-        data["robocas"] = {"control_freq": base_env.control_freq, "sim_freq": base_env.sim_freq, "versions": versions()}
-        data["episodes"][0]["robocas"] = episode
-        write_json(self._paths[1], data)
+        steps, env = self._steps, self._base_env
+        terminated, truncated, success = np.array(steps.flags, bool).reshape(-1, 3).T
+        with replacing(self._trajectory) as tmp:
+            with h5py.File(tmp, "w") as file:
+                group = file.create_group("traj_0", track_order=True)
+                _write(group, "obs", _stacked(steps.observations))
+                group.create_dataset("actions", data=np.stack(steps.actions), dtype=np.float32)
+                flags = {"terminated": terminated, "truncated": truncated, "success": success}
+                for name, values in flags.items():
+                    group.create_dataset(name, data=values, dtype=bool)
+                controllers = _stacked(steps.controllers)
+                _write(group, "env_states", {**self.states, **({"controller": controllers} if controllers else {})})
+            # the JSON first: an HDF5 file that is there always has its JSON
+            write_json(
+                self._trajectory.with_suffix(".json"),
+                {
+                    "env_info": self._env_info(),
+                    "episodes": [
+                        {
+                            "episode_id": 0,
+                            "episode_seed": int(cast(Any, env._episode_seed)[0]),
+                            "control_mode": env.control_mode,
+                            "elapsed_steps": len(steps.actions),
+                            "reset_kwargs": self._reset_kwargs,
+                            "success": bool(success[-1]),
+                            "robocas": episode,
+                        }
+                    ],
+                    "source_type": "motionplanning",
+                    "source_desc": "scripted policy of robocas_ms3",
+                    "robocas": {"control_freq": env.control_freq, "sim_freq": env.sim_freq, "versions": versions()},
+                },
+            )
+
+    def _env_info(self) -> dict[str, Any]:
+        info = parse_env_info(self.env)
+        assert info is not None, "the environment was made by gym.make"
+        kwargs = {key: value for key, value in info["env_kwargs"].items() if key not in _LOCAL_KWARGS}
+        return {
+            # With the module's name in front, gymnasium imports this package by itself: ManiSkill's own tools then work.
+            "env_id": f"robocas_ms3:{info['env_id']}",
+            "env_kwargs": kwargs,
+            "max_episode_steps": find_max_episode_steps_value(self.env),
+        }
 
     def discard(self) -> None:
-        """Close and remove the file; the environment stays open."""
-        self._h5_file.close()
-        for path in self._paths:
-            path.unlink(missing_ok=True)
+        """Forget the episode; the environment stays open."""
+        self._steps = _Steps()
+
+
+@dataclass
+class _Steps:
+    """What was recorded since the reset: S actions and what came of them; of the rest S + 1."""
+
+    actions: list[NDArray[np.float32]] = field(default_factory=list)
+    flags: list[tuple[bool, bool, bool]] = field(default_factory=list)
+    """terminated, truncated, success"""
+    states: list[NDArray[np.float32]] = field(default_factory=list)
+    controllers: list[Any] = field(default_factory=list)
+    observations: list[Any] = field(default_factory=list)
+
+
+def _of_one_env(data: Any) -> Any:
+    """Nested tensors (1, ...) as arrays (...) of their own."""
+    if isinstance(data, dict):
+        return {key: _of_one_env(value) for key, value in data.items()}
+    return common.to_numpy(data)[0].copy()
+
+
+def _stacked(steps: list[Any]) -> Any:
+    """Equal nested dicts of arrays as one, with the steps as the first axis."""
+    if isinstance(steps[0], dict):
+        return {key: _stacked([step[key] for step in steps]) for key in steps[0]}
+    return np.stack(steps)
+
+
+def _write(group: h5py.Group, key: str, data: Any) -> None:
+    if isinstance(data, dict):
+        inner = group.create_group(key, track_order=True)
+        for name, value in data.items():
+            _write(inner, name, value)
+        return
+    packing = {"compression": "gzip", "compression_opts": 5} if key in _PICTURES else {}
+    group.create_dataset(key, data=data, dtype=data.dtype, **packing)
 
 
 def versions() -> dict[str, str]:

@@ -20,6 +20,8 @@ from mani_skill.agents.controllers import (
     PDEEPoseControllerConfig,
     PDJointPosController,
     PDJointPosControllerConfig,
+    PDJointPosMimicController,
+    PDJointPosMimicControllerConfig,
 )
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.utils import gym_utils
@@ -29,7 +31,8 @@ from mani_skill.utils.geometry.rotation_conversions import (
     quaternion_apply,
     quaternion_multiply,
 )
-from mani_skill.utils.structs import Pose
+from mani_skill.utils.structs import Link, Pose
+from sapien.physx import PhysxArticulationJoint
 from scipy.spatial.transform import Rotation
 
 POSITION_SCALE, ROTATION_SCALE = 0.1, 0.5  # m and rad at |action| = 1, end effector
@@ -82,6 +85,17 @@ def ee_delta_target(
     return position + quaternion_apply(quaternion, delta[:, :3]), quaternion_multiply(quaternion, rotation)
 
 
+def relative_pose(frame: Link, link: Link) -> Pose:
+    """(N,) poses of a link in the frame of another; on a CPU by SAPIEN, ten times faster than by tensors."""
+    if frame.scene.gpu_sim_enabled:
+        return frame.pose.inv() * link.pose
+    pose = frame._bodies[0].entity_pose.inv() * link._bodies[0].entity_pose
+    position, quaternion = pose.p, pose.q
+    if quaternion[0] < 0:  # as ManiSkill's products
+        quaternion = -quaternion
+    return Pose(raw_pose=torch.from_numpy(np.concatenate([position, quaternion]))[None])
+
+
 def batched_ik(
     kinematics: Kinematics, target: Pose, qpos: torch.Tensor, joints: torch.Tensor, now: Pose
 ) -> torch.Tensor:
@@ -109,7 +123,47 @@ def batched_ik(
     return qpos[:, joints]
 
 
-class SmoothJointPosController(PDJointPosController):
+class DirectDrives(PDJointPosController):
+    """Sets drive targets, on a CPU without ManiSkill's wrapper of each joint, which takes longer than the physics."""
+
+    def _initialize_joints(self) -> None:
+        super()._initialize_joints()
+        self._drives: list[PhysxArticulationJoint] = [joint._objs[0] for joint in self.joints]
+
+    def set_drive_targets(self, targets: torch.Tensor) -> None:
+        """Set the targets (N, joints), rad or m, of all joints."""
+        if self.scene.gpu_sim_enabled:
+            super().set_drive_targets(targets)
+            return
+        for drive, target in zip(self._drives, targets[0].tolist(), strict=True):
+            drive.set_drive_target(target)
+
+    def set_drive_velocities(self, velocities: torch.Tensor) -> None:
+        """Set the velocities (N, joints), rad/s or m/s, that the drives of all joints aim at."""
+        if self.scene.gpu_sim_enabled:
+            self.articulation.set_joint_drive_velocity_targets(velocities, self.joints, self.active_joint_indices)
+            return
+        for drive, velocity in zip(self._drives, velocities[0].tolist(), strict=True):
+            drive.set_drive_velocity_target(velocity)
+
+
+class FingersController(DirectDrives, PDJointPosMimicController):
+    """Absolute positions of fingers that all do the same; ManiSkill's, without its detours."""
+
+    def set_action(self, action: Any) -> None:
+        """Take the position (N, 1) of every finger."""
+        self._target_qpos = self._preprocess_action(action).repeat(1, len(self.joints))
+        self.set_drive_targets(self._target_qpos)
+
+
+@dataclass
+class FingersControllerConfig(PDJointPosMimicControllerConfig):
+    """Configuration of a ``FingersController``: what mimics does so one to one."""
+
+    controller_cls = FingersController
+
+
+class SmoothJointPosController(DirectDrives):
     """Joint positions, absolute or relative to the last target, whose drive target moves evenly within a control step.
 
     A target that jumps at 5 Hz makes the arm start and stop with every step, at twice the planned velocity. ManiSkill's
@@ -126,8 +180,8 @@ class SmoothJointPosController(PDJointPosController):
         """Take the positions (N, joints), rad or m, to command at the end of the control step."""
         action = self._preprocess_action(action)
         assert self._target_qpos is not None, "the controller has not been reset"
-        moved = (self._target_qpos - self.qpos).abs() > ARM_SET_FROM_OUTSIDE
-        start = torch.where(moved, self.qpos, self._target_qpos)
+        now = self.qpos
+        start = torch.where((self._target_qpos - now).abs() > ARM_SET_FROM_OUTSIDE, now, self._target_qpos)
         travel = action if self.config.use_delta else action - start
         if self.config.max_speed is not None:
             furthest = self.config.max_speed / self._control_freq
@@ -161,7 +215,7 @@ class SmoothJointPosControllerConfig(PDJointPosControllerConfig):
     controller_cls = SmoothJointPosController
 
 
-class HeldJointsController(PDJointPosController):
+class HeldJointsController(DirectDrives):
     """Holds joints where they are at reset; takes no action (0 dimensions)."""
 
     def _initialize_action_space(self) -> None:
@@ -175,8 +229,9 @@ class HeldJointsController(PDJointPosController):
     def set_action(self, action: Any) -> None:
         """Keep the drive targets, unless the state was set from outside: then hold the joints where they are now."""
         assert self._target_qpos is not None, "the controller has not been reset"
-        moved = (self._target_qpos - self.qpos).abs() > HELD_SET_FROM_OUTSIDE
-        self._target_qpos = torch.where(moved, self.qpos, self._target_qpos)
+        now = self.qpos
+        moved = (self._target_qpos - now).abs() > HELD_SET_FROM_OUTSIDE
+        self._target_qpos = torch.where(moved, now, self._target_qpos)
         self.set_drive_targets(self._target_qpos)
 
 
@@ -192,7 +247,7 @@ class HeldJointsControllerConfig(PDJointPosControllerConfig):
     controller_cls = HeldJointsController
 
 
-class RoboCASEEPoseController(PDEEPoseController):
+class RoboCASEEPoseController(DirectDrives, PDEEPoseController):
     """End-effector pose control: deltas in the end effector's frame, or absolute poses in the arm's base frame.
 
     Differs from ManiSkill's: rotations have their natural sign; body-frame deltas work on a GPU too, since the target
@@ -211,17 +266,27 @@ class RoboCASEEPoseController(PDEEPoseController):
         rotation = rotation / torch.linalg.norm(rotation, dim=1, keepdim=True).clamp(min=1.0)
         return torch.hstack([position, rotation * self.action_space_high[3:]])
 
-    def compute_target_pose(self, prev_ee_pose_at_base: Pose, action: torch.Tensor) -> Pose:
+    def compute_target_pose(self, prev_ee_pose_at_base: Pose | None, action: torch.Tensor) -> Pose:
         """Compute the target in the arm's base frame.
 
         Args:
-            prev_ee_pose_at_base: (N,) the pose deltas refer to.
+            prev_ee_pose_at_base: (N,) the pose that deltas refer to; None where actions are poses.
             action: (N, 6) scaled: m and rad.
         """
-        if self.config.use_delta:
+        if prev_ee_pose_at_base is not None:
             return Pose.create_from_pq(*ee_delta_target(prev_ee_pose_at_base.p, prev_ee_pose_at_base.q, action))
         rotation = matrix_to_quaternion(euler_angles_to_matrix(action[:, 3:6], "XYZ"))
         return Pose.create_from_pq(action[:, :3], rotation)
+
+    def _initialize_joints(self) -> None:
+        super()._initialize_joints()
+        if not self.kinematics.use_gpu_ik:
+            of_model: list[torch.Tensor] = [
+                self.kinematics.pmodel_active_joint_indices,
+                self.kinematics.qmask,
+                self.kinematics.pmodel_controlled_joint_indices,
+            ]
+            self._chain, self._free, self._arm = (tensor.numpy() for tensor in of_model)
 
     sets_target_qvel = True
     _forgotten: torch.Tensor | None = None  # (N,) whose targets count no longer
@@ -230,16 +295,19 @@ class RoboCASEEPoseController(PDEEPoseController):
         """Drive the arm towards the pose; where no inverse kinematics is found it stays where it is."""
         action = self._preprocess_action(action)
         self._step = 0
-        now, reference = self.ee_pose_at_base, self.reference_pose()
-        last = self.qpos if self._target_qpos is None else self._target_qpos
-        moved = (last - self.qpos).abs() > ARM_SET_FROM_OUTSIDE
+        reference = self.reference_pose() if self.config.use_delta else None
+        last = now = self.qpos
+        if self._target_qpos is not None:
+            last = self._target_qpos
+        moved = (last - now).abs() > ARM_SET_FROM_OUTSIDE
         if self._forgotten is not None:
             moved |= self._forgotten[:, None]
-        self._start_qpos = torch.where(moved, self.qpos, last)
-        self._target_pose = self.compute_target_pose(reference, action)
-        target = self._solve(self._target_pose, now)
+        self._start_qpos = torch.where(moved, now, last)
+        wanted = self.compute_target_pose(reference, action)
+        target = self._solve(wanted)
         if target is None:
-            target, self._target_pose = self.qpos, reference
+            target, wanted = now, self.reference_pose() if reference is None else reference
+        self._target_pose = wanted
         self._target_qpos, self._forgotten = target, None
         if self.config.use_delta:
             self._drive_with(self._start_qpos, (target - self._start_qpos) * self._control_freq)
@@ -270,7 +338,7 @@ class RoboCASEEPoseController(PDEEPoseController):
     def _drive_with(self, targets: torch.Tensor, velocities: torch.Tensor) -> None:
         """Set drive targets and their velocities: an arm that is told its velocity does not lag."""
         self.set_drive_targets(targets)
-        self.articulation.set_joint_drive_velocity_targets(velocities, self.joints, self.active_joint_indices)
+        self.set_drive_velocities(velocities)
 
     def reset(self) -> None:
         """Start from the present configuration, at rest."""
@@ -279,22 +347,33 @@ class RoboCASEEPoseController(PDEEPoseController):
 
     def reference_pose(self) -> Pose:
         """(N,) poses in the arm's base frame that the next deltas start from."""
-        now = self.ee_pose_at_base
         if not self.config.use_target or self._target_pose is None:
-            return now
+            return self.ee_pose_at_base
         far, turned = EE_HELD_BACK
-        distance = torch.linalg.norm(self._target_pose.p - now.p, dim=1)
+        now = relative_pose(self.root_link, self.ee_link)
+        distance = torch.linalg.vector_norm(self._target_pose.p - now.p, dim=1)
         cosine = (self._target_pose.q * now.q).sum(dim=1).abs()  # of half the angle between them
         lost = (distance > far) | (cosine < np.cos(turned / 2))
         if self._forgotten is not None:
             lost |= self._forgotten
-        return Pose.create(torch.where(lost[:, None], now.raw_pose, self._target_pose.raw_pose))
+        if not lost.any():
+            return self._target_pose
+        return Pose.create(torch.where(lost[:, None], self.ee_pose_at_base.raw_pose, self._target_pose.raw_pose))
 
-    def _solve(self, target: Pose, now: Pose) -> torch.Tensor | None:
-        qpos = self.articulation.get_qpos()
-        if not self.scene.gpu_sim_enabled:
-            return cast("torch.Tensor | None", self.kinematics.compute_ik(pose=target, q0=qpos))
-        return batched_ik(self.kinematics, target, qpos, self.active_joint_indices, now)
+    def _solve(self, target: Pose) -> torch.Tensor | None:
+        """(N, joints) that reach poses in the arm's base frame; None: not found, on a CPU."""
+        kinematics, qpos = self.kinematics, self.articulation.get_qpos()
+        if self.scene.gpu_sim_enabled:
+            return batched_ik(kinematics, target, qpos, self.active_joint_indices, self.ee_pose_at_base)
+        # what ManiSkill's `compute_ik` does, without its conversions
+        found, success, _ = kinematics.pmodel.compute_inverse_kinematics(
+            kinematics.end_link_idx,
+            target.sp,
+            initial_qpos=qpos[0].numpy()[self._chain],
+            active_qmask=self._free,
+            max_iterations=100,
+        )
+        return torch.from_numpy(found[self._arm].astype(np.float32))[None] if success else None
 
 
 @dataclass

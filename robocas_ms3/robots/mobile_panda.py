@@ -10,7 +10,6 @@ import torch
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
 from mani_skill.agents.controllers import (
     PDJointPosControllerConfig,
-    PDJointPosMimicControllerConfig,
     deepcopy_dict,
 )
 from mani_skill.agents.registration import register_agent
@@ -25,10 +24,12 @@ from robocas_ms3.robots.controllers import (
     JOINT_SCALE,
     POSITION_SCALE,
     ROTATION_SCALE,
+    FingersControllerConfig,
     HeldJointsControllerConfig,
     RoboCASEEPoseController,
     RoboCASEEPoseControllerConfig,
     SmoothJointPosControllerConfig,
+    relative_pose,
 )
 from robocas_ms3.robots.urdf import robot_files
 
@@ -127,7 +128,7 @@ class RoboCASMobilePanda(BaseAgent):
             ),
         )
         mimic: dict[str, Any] = {self.gripper_joint_names[1]: {"joint": self.gripper_joint_names[0]}}
-        gripper = PDJointPosMimicControllerConfig(
+        gripper = FingersControllerConfig(
             self.gripper_joint_names,
             lower=c.FINGER_TARGETS[0],
             upper=c.FINGER_TARGETS[1],
@@ -186,6 +187,16 @@ class RoboCASMobilePanda(BaseAgent):
             targets = torch.as_tensor(init_qpos, dtype=torch.float32, device=self.device).reshape(-1, len(joints))
             self.robot.set_joint_drive_targets(targets, joints)
 
+    def set_action(self, action: Any) -> None:
+        """Hand an action (N, action size) to the controllers.
+
+        Raises:
+            ValueError: on a CPU, a number of it is NaN.
+        """
+        if not self.scene.gpu_sim_enabled and torch.isnan(action).any():
+            raise ValueError("Action cannot be NaN. Environment received:", action)
+        self.controller.set_action(action)
+
     def set_control_mode(self, control_mode: str | None = None) -> None:
         """Change the control mode; what the last one told the arm about its velocity is forgotten."""
         super().set_control_mode(cast("str", control_mode))
@@ -234,7 +245,7 @@ class RoboCASMobilePanda(BaseAgent):
     @property
     def tcp_in_arm_base(self) -> Pose:
         """TCP in the frame of ``panda_link0``."""
-        return self.arm_base_link.pose.inv() * self.tcp.pose
+        return relative_pose(self.arm_base_link, self.tcp)
 
     @property
     def gripper_width(self) -> torch.Tensor:

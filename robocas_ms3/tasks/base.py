@@ -26,7 +26,8 @@ from robocas_ms3.scenes.layout import Array, Layout
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import object_set
 from robocas_ms3.tasks import terms
-from robocas_ms3.tasks.contacts import contact_forces
+from robocas_ms3.tasks.bodies import Bodies, link_poses
+from robocas_ms3.tasks.contacts import Contacts
 from robocas_ms3.tasks.seeds import SeededEnv
 from robocas_ms3.tasks.spec import TaskSpec
 
@@ -170,10 +171,21 @@ class RoboCASEnv(SeededEnv):
         self.present = torch.ones(self.num_envs, slots, dtype=torch.bool, device=self.device)
         self.target_slot = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.basket_at_start = torch.zeros(self.num_envs, 7, device=self.device)
+        self._sideways = torch.tensor([[0.0, 1.0, 0.0]], device=self.device)
         inner = self.model.basket.asset.inner
         assert inner is not None  # the model saw to it
         self._basket_low = torch.tensor(inner.min, device=self.device)
         self._basket_high = torch.tensor(inner.max, device=self.device)
+
+    def _after_reconfigure(self, options: dict) -> None:
+        super()._after_reconfigure(options)
+        self.bodies = Bodies(self.scene)
+        rows = [self.bodies.actors.index(actor.name) for actor in self.objects]
+        assert rows == list(range(rows[0], rows[0] + len(rows))), "the objects are built one after the other"
+        self._object_rows = slice(rows[0], rows[-1] + 1)
+        self._basket_row = self.bodies.actors.index(self.fixtures.basket.name)
+        gripper = [self.agent.finger1_link, self.agent.finger2_link, self.agent.robot.links_map[HAND_LINK]]
+        self._gripper_contacts = Contacts(self.scene, gripper, self.objects)
 
     def _load_lighting(self, options: dict) -> None:
         shadow = self.task_config.lights.shadow or self.enable_shadow
@@ -207,9 +219,16 @@ class RoboCASEnv(SeededEnv):
                 actor.set_pose(Pose.create(poses[:, slot]))
             self.start_poses[env_idx] = poses
             self.target_slot[env_idx] = torch.tensor([layout.target for layout in layouts])
+            self._is_target = torch.nn.functional.one_hot(self.target_slot, len(self.objects)).bool()
             self.present[env_idx] = torch.as_tensor(np.stack([layout.present for layout in layouts])).to(self.device)
         for i, layout in zip(env_idx.tolist(), layouts, strict=True):
             self.layouts[i] = layout
+
+    def get_state_dict(self) -> dict:
+        """The state, in ManiSkill's form, from one read of all bodies."""
+        state: dict[str, Any] = dict(self.bodies.split(self.bodies.read().clone()))
+        controller = self.agent.get_controller_state()
+        return {**state, "controller": controller} if controller else state
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
         """Set the state; the next action starts from there, whatever the last one had asked for."""
@@ -223,9 +242,19 @@ class RoboCASEnv(SeededEnv):
     # ------------------------------------------------------------------ state
 
     @property
+    def object_states(self) -> torch.Tensor:
+        """(N, K, 13) poses of the objects, linear and angular velocities (`bodies.BODY`); don't write to it."""
+        return self.bodies.of_actors(self.bodies.read())[:, self._object_rows]
+
+    @property
     def object_poses(self) -> torch.Tensor:
         """(N, K, 7) poses of the objects in the world: position m, quaternion wxyz."""
-        return torch.stack([actor.pose.raw_pose for actor in self.objects], dim=1)
+        return self.object_states[..., :7].clone()
+
+    @property
+    def basket_pose(self) -> torch.Tensor:
+        """(N, 7) pose of the basket in the world; don't write to it."""
+        return self.bodies.of_actors(self.bodies.read())[:, self._basket_row, :7]
 
     def target_asset(self, env: int = 0) -> LoadedObject:
         """The target's asset in one env."""
@@ -233,8 +262,7 @@ class RoboCASEnv(SeededEnv):
 
     def gripper_forces(self) -> torch.Tensor:
         """(N, 3, K, 3) N: force of each object on left finger, right finger and hand, world frame."""
-        bodies = [self.agent.finger1_link, self.agent.finger2_link, self.agent.robot.links_map[HAND_LINK]]
-        return contact_forces(self.scene, bodies, self.objects)
+        return self._gripper_contacts.forces()
 
     def grasped(self, forces: torch.Tensor | None = None) -> torch.Tensor:
         """(N, K) bool: which objects both fingers hold right now.
@@ -243,18 +271,21 @@ class RoboCASEnv(SeededEnv):
             forces: of ``gripper_forces``, if they are known already.
         """
         forces = self.gripper_forces() if forces is None else forces
-        y = torch.tensor([[0.0, 1.0, 0.0]], device=self.device).expand(self.num_envs, 3)
+        pressed = terms.pressed(forces[:, 0], forces[:, 1])
+        if not pressed.any():  # as most of the time: no need to ask in which direction
+            return pressed
+        finger = link_poses(self.scene, [self.agent.finger1_link])[:, 0]
         # the left finger opens along its own +y
-        return terms.finger_grasps(forces[:, 0], forces[:, 1], terms.rotate(self.agent.finger1_link.pose.q, y))
+        return terms.finger_grasps(forces[:, 0], forces[:, 1], terms.rotate(finger[:, 3:], self._sideways))
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         """Nothing in visual modes; in state modes what only a simulator knows."""
         if not self.obs_mode_struct.state and self.obs_mode not in {"state", "state_dict"}:
             return {}
         return {
-            "object_poses": torch.where(self.present[..., None], self.object_poses, 0.0).flatten(1),
-            "target": torch.nn.functional.one_hot(self.target_slot, len(self.objects)).float(),
-            "basket_pose": self.fixtures.basket.pose.raw_pose,
+            "object_poses": torch.where(self.present[..., None], self.object_states[..., :7], 0.0).flatten(1),
+            "target": self._is_target.float(),
+            "basket_pose": self.basket_pose,
         }
 
 

@@ -3,38 +3,86 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
+import numpy as np
 import torch
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Link
-from sapien.physx import PhysxCpuSystem
+from numpy.typing import NDArray
+
+# m between two bodies that can't have touched in the last physics step, at whose beginning contacts are found: more than
+# they go in 10 ms, and than the distance at which PhysX begins to generate contacts
+_NEAR = 0.1
+
+
+class Contacts:
+    """Reads the forces between a few bodies and many objects, all pairs at once.
+
+    ManiSkill asks for one pair at a time and, on a CPU, walks over all contacts again for each.
+
+    Args:
+        scene: ready to be simulated.
+        bodies: B of them.
+        objects: K of them.
+    """
+
+    def __init__(self, scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor | Link]) -> None:
+        self._scene, self._px = scene, scene.px
+        self._shape = (len(bodies), len(objects))
+        if scene.gpu_sim_enabled:
+            pairs = [
+                pair for b in bodies for o in objects for pair in zip(b._bodies, o._bodies, strict=True)
+            ]  # one an env
+            self._query = self._px.gpu_create_contact_pair_impulse_query(pairs)
+        else:
+            self._bodies = [body._bodies[0] for body in bodies]
+            self._objects = [body._bodies[0] for body in objects]
+            self._none = torch.zeros(1, *self._shape, 3)
+            self._rows: dict[Any, int] = {body: i for i, body in enumerate(self._bodies)}
+            self._columns: dict[Any, int] = {body: i for i, body in enumerate(self._objects)}
+
+    def forces(self) -> torch.Tensor:
+        """Force that each object exerts on each body, summed over their contact points, in the last physics step.
+
+        Returns:
+            (N, B, K, 3) N, world frame; don't write to it.
+        """
+        if self._scene.gpu_sim_enabled:
+            self._px.gpu_query_contact_pair_impulses(self._query)
+            impulses = self._query.cuda_impulses.torch().view(*self._shape, -1, 3).permute(2, 0, 1, 3)
+            return impulses / self._px.timestep
+        if self._apart():
+            return self._none
+        impulses, rows, columns = np.zeros((1, *self._shape, 3), np.float32), self._rows, self._columns
+        for contact in self._px.get_contacts():
+            first, second = contact.bodies
+            if first in rows and second in columns:
+                total, sign = impulses[0, rows[first], columns[second]], 1
+            elif second in rows and first in columns:
+                total, sign = impulses[0, rows[second], columns[first]], -1  # an impulse acts on the first body
+            else:
+                continue
+            for point in contact.points:
+                total += sign * point.impulse
+        return torch.from_numpy(impulses) / self._px.timestep
+
+    def _apart(self) -> bool:
+        """Whether no object is near any body, on a CPU: then there is no need to look through a heap's contacts."""
+        low, high = _bounds(self._bodies)
+        others_low, others_high = _bounds(self._objects)
+        gaps = np.maximum(low[:, None] - others_high, others_low - high[:, None])  # (B, K, 3), along each axis
+        return bool((gaps.max(axis=-1) > _NEAR).all())
+
+
+def _bounds(bodies: list[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Least and greatest corners (B, 3) of boxes around bodies, world."""
+    boxes = np.array([body.get_global_aabb_fast() for body in bodies])
+    return boxes[:, 0], boxes[:, 1]
 
 
 def contact_forces(
     scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor | Link]
 ) -> torch.Tensor:
-    """Force that each object exerts on each body, summed over their contact points, in the last physics step.
-
-    ManiSkill asks for one pair at a time and, on a CPU, walks over all contacts again for each.
-
-    Returns:
-        (N, len(bodies), len(objects), 3) N, world frame.
-    """
-    if scene.gpu_sim_enabled:
-        rows = [torch.stack([scene.get_pairwise_contact_forces(b, o) for o in objects], dim=1) for b in bodies]
-        return torch.stack(rows, dim=1)
-    forces = torch.zeros(1, len(bodies), len(objects), 3)
-    body_index: dict[Any, int] = {b._bodies[0]: i for i, b in enumerate(bodies)}
-    object_index: dict[Any, int] = {o._bodies[0]: i for i, o in enumerate(objects)}
-    for contact in cast(PhysxCpuSystem, scene.px).get_contacts():
-        first, second = contact.bodies
-        if first in body_index and second in object_index:
-            key, sign = (body_index[first], object_index[second]), 1.0
-        elif second in body_index and first in object_index:
-            key, sign = (body_index[second], object_index[first]), -1.0  # an impulse acts on the first body
-        else:
-            continue
-        for point in contact.points:
-            forces[0, key[0], key[1]] += sign * torch.from_numpy(point.impulse)
-    return forces / scene.px.timestep
+    """`Contacts.forces` of bodies that are asked for once."""
+    return Contacts(scene, bodies, objects).forces()

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from mani_skill.utils.registration import register_env
 
-from robocas_ms3.tasks import occlusion
+from robocas_ms3.tasks import occlusion, terms
 from robocas_ms3.tasks.spec import SEARCH
 from robocas_ms3.tasks.transfer import STAGES, TransferEnv
 
@@ -31,28 +31,46 @@ class RoboCASSearchEnv(TransferEnv):
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
         points = [[_sample(asset.annotations.surface_points) for asset in row] for row in self.object_assets]
-        self._surface_points = torch.as_tensor(np.array(points), dtype=torch.float32, device=self.device)
-        self._cleared: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
+        columns = np.ascontiguousarray(np.array(points).swapaxes(-1, -2))
+        self._surface_points = torch.as_tensor(columns, dtype=torch.float32, device=self.device)
+        self._radii = torch.linalg.vector_norm(self._surface_points, dim=-2).amax(dim=-1)
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        super()._initialize_episode(env_idx, options)
+        self._measured: tuple[torch.Tensor, torch.Tensor] | None = None
+
+    def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
+        """Set the state; see `RoboCASEnv`."""
+        super().set_state_dict(state, env_idx)
+        self._measured = None  # else what follows would hang on what was before
 
     def clutter(self) -> occlusion.Clutter:
         """What hides and surrounds each env's target right now."""
-        points = occlusion.surface_points(self.object_poses, self._surface_points)
+        points = occlusion.surface_points(self.object_states[..., :7], self._surface_points)
         return occlusion.clutter(points, self.present, self.target_slot)
 
     def task_stages(self) -> dict[str, torch.Tensor]:
         """``obstacles_cleared``, (N,) bool, of this moment."""
-        if self._stages["obstacles_cleared"].all():  # it stays so: no need to measure again
+        taken = self.target_held | self._stages["target_grasped"]
+        if (taken | self._stages["obstacles_cleared"]).all():  # nothing can change it any more
             return {}
-        env, poses = torch.arange(self.num_envs, device=self.device), self.object_poses
-        # most of the time nothing in the heap moves, and what was measured stays so
-        if self._cleared is None or not (
-            torch.equal(self._cleared[0], poses) and torch.equal(self._cleared[1], self.target_slot)
-        ):
-            self._cleared = poses, self.target_slot.clone(), self.clutter().cleared
         surface = float(self.model.support_pose[2, 3]) + self.model.region.z
-        lies = poses[env, self.target_slot, 2] > surface - FALLEN
-        lies &= ~(self.target_held | self._stages["target_grasped"])
-        return {"obstacles_cleared": self._cleared[2] & lies}
+        lies = terms.of_target(self.object_states[..., 2], self.target_slot) > surface - FALLEN
+        return {"obstacles_cleared": self._cleared() & lies & ~taken}
+
+    def _cleared(self) -> torch.Tensor:
+        """(N,) bool of `clutter`, as it was measured when something in the heap last moved."""
+        poses = self.object_states[..., :7]
+        if self._measured is not None:
+            before, cleared = self._measured
+            if torch.equal(poses, before) or not self._moved(poses, before):
+                return cleared
+        cleared = self.clutter().cleared
+        self._measured = poses, cleared
+        return cleared
+
+    def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:
+        return bool(occlusion.moved_near(poses, before, self._radii, self.target_slot).any())
 
 
 def _sample(points: np.ndarray) -> np.ndarray:

@@ -26,9 +26,15 @@ class RoboCASSelectEnv(TransferEnv):
         self._kinds = torch.tensor([[row.index(name) for name in row] for row in names], device=self.device)
 
     def target_measures(
-        self, touched: torch.Tensor | None = None, poses: torch.Tensor | None = None
+        self, touched: torch.Tensor | None = None, objects: torch.Tensor | None = None
     ) -> dict[str, torch.Tensor]:
         """As of `TransferEnv`, and ``others_out``: no other object of the target's name is in the basket."""
-        poses = self.object_poses if poses is None else poses
-        others_in = terms.another_of_its_kind(self.in_basket(poses), self._kinds, self.target_slot)
-        return {**super().target_measures(touched, poses), "others_out": ~others_in}
+        objects = self.object_states if objects is None else objects
+        others_in = terms.another_of_its_kind(self.in_basket(objects), self._kinds, self.target_slot)
+        return {**super().target_measures(touched, objects), "others_out": ~others_in}
+
+    def in_basket(self, objects: torch.Tensor) -> torch.Tensor:
+        """(N, K) bool: whose centre of mass is in the basket's inner volume, from states or poses (N, K, >= 7)."""
+        basket = self.basket_pose
+        centers = objects[..., :3] + terms.rotate(objects[..., 3:7], self._centers_of_mass)
+        return terms.inside_box(centers, basket[:, :3], basket[:, 3:], self._basket_low, self._basket_high)

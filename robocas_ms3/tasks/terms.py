@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 
 def rotate_inverse(quaternion: Tensor, vector: Tensor) -> Tensor:
     """Rotate vectors (..., 3) by the inverse of unit quaternions (..., 4) wxyz."""
-    w, xyz = quaternion[..., :1], -quaternion[..., 1:]
-    t = 2 * torch.linalg.cross(xyz, vector)
-    return vector + w * t + torch.linalg.cross(xyz, t)
+    w, xyz = quaternion[..., :1], quaternion[..., 1:]
+    t = torch.linalg.cross(vector, xyz)
+    return vector + 2 * (w * t + torch.linalg.cross(t, xyz))
 
 
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
     """Rotate vectors (..., 3) by unit quaternions (..., 4) wxyz."""
-    conjugate = torch.cat([quaternion[..., :1], -quaternion[..., 1:]], dim=-1)
-    return rotate_inverse(conjugate, vector)
+    w, xyz = quaternion[..., :1], quaternion[..., 1:]
+    t = torch.linalg.cross(xyz, vector)
+    return vector + 2 * (w * t + torch.linalg.cross(xyz, t))
+
+
+def upward(quaternion: Tensor) -> Tensor:
+    """(..., 3) the vertical axes of bodies with unit quaternions (..., 4) wxyz."""
+    w, x, y, z = quaternion.unbind(-1)
+    return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
 
 
 def inside_box(points: Tensor, box_position: Tensor, box_quaternion: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -38,36 +47,37 @@ def inside_box(points: Tensor, box_position: Tensor, box_quaternion: Tensor, low
     return ((local >= low) & (local <= high)).all(dim=-1)
 
 
+MIN_GRASP_FORCE = 0.5  # N, on each finger
+
+
+def pressed(left_force: Tensor, right_force: Tensor) -> Tensor:
+    """(N, K) bool: which objects press on both fingers, in whatever direction, from forces (N, K, 3) in N."""
+    sizes = torch.linalg.vector_norm(torch.stack([left_force, right_force]), dim=-1)
+    return (sizes >= MIN_GRASP_FORCE).all(dim=0)
+
+
 def finger_grasps(
-    left_force: Tensor,
-    right_force: Tensor,
-    closing_axis: Tensor,
-    *,
-    min_force: float = 0.5,
-    max_angle_deg: float = 85.0,
+    left_force: Tensor, right_force: Tensor, closing_axis: Tensor, *, max_angle_deg: float = 85.0
 ) -> Tensor:
     """Which objects both fingers press on, each along its own opening direction.
 
-    The rule of ManiSkill's ``Panda.is_grasping``: the force on each finger is at least ``min_force`` and within
+    The rule of ManiSkill's ``Panda.is_grasping``: the force on each finger is at least ``MIN_GRASP_FORCE`` and within
     ``max_angle_deg`` of the direction in which that finger opens.
 
     Args:
         left_force: (N, K, 3) force of each object on the left finger, world.
         right_force: (N, K, 3) the same on the right finger.
         closing_axis: (N, 3) unit, the direction in which the left finger opens, world.
-        min_force: N.
         max_angle_deg: degrees.
 
     Returns:
         (N, K) bool.
     """
-    cosine = torch.cos(torch.deg2rad(torch.as_tensor(max_angle_deg)))
-    result = torch.ones(left_force.shape[:2], dtype=torch.bool, device=left_force.device)
-    for force, sign in ((left_force, 1.0), (right_force, -1.0)):
-        size = torch.linalg.norm(force, dim=-1)
-        along = sign * (force * closing_axis[:, None]).sum(-1)
-        result &= (size >= min_force) & (along >= cosine * size)
-    return result
+    forces = torch.stack([left_force, -right_force])
+    size = torch.linalg.vector_norm(forces, dim=-1)
+    along = (forces * closing_axis[:, None]).sum(-1)
+    aligned = along >= math.cos(math.radians(max_angle_deg)) * size
+    return ((size >= MIN_GRASP_FORCE) & aligned).all(dim=0)
 
 
 def touched(forces: Tensor, *, min_force: float = 1e-3) -> Tensor:
@@ -80,7 +90,7 @@ def touched(forces: Tensor, *, min_force: float = 1e-3) -> Tensor:
     Returns:
         (N, K) bool.
     """
-    return (torch.linalg.norm(forces, dim=-1) >= min_force).any(dim=1)
+    return (torch.linalg.vector_norm(forces, dim=-1) >= min_force).any(dim=1)
 
 
 def lifted(height: Tensor, rest_height: Tensor, grasped: Tensor, *, by: float = 0.03) -> Tensor:
@@ -99,18 +109,9 @@ def at_rest(
     linear_velocity: Tensor, angular_velocity: Tensor, *, max_linear: float = 0.03, max_angular: float = 0.5
 ) -> Tensor:
     """(N,) whether bodies with velocities (N, 3) in m/s and rad/s have come to rest."""
-    return (torch.linalg.norm(linear_velocity, dim=-1) <= max_linear) & (
-        torch.linalg.norm(angular_velocity, dim=-1) <= max_angular
+    return (torch.linalg.vector_norm(linear_velocity, dim=-1) <= max_linear) & (
+        torch.linalg.vector_norm(angular_velocity, dim=-1) <= max_angular
     )
-
-
-def tilt(quaternion: Tensor, quaternion_before: Tensor) -> Tensor:
-    """(N,) angle in rad between a body's vertical axis now and before, from quaternions (N, 4)."""
-    z = torch.zeros_like(quaternion[..., :3])
-    z[..., 2] = 1
-    now, before = rotate(quaternion, z), rotate(quaternion_before, z)
-    # atan2 keeps its precision near 0, where acos does not
-    return torch.atan2(torch.linalg.norm(torch.linalg.cross(now, before), dim=-1), (now * before).sum(-1))
 
 
 def stands(
@@ -123,8 +124,9 @@ def stands(
     max_tilt_deg: float = 20.0,
 ) -> Tensor:
     """(N,) whether a body still stands where it stood: moved and tilted no more than upstream allows a basket."""
-    shift = torch.linalg.norm(position - position_before, dim=-1)
-    return (shift <= max_shift) & (torch.rad2deg(tilt(quaternion, quaternion_before)) <= max_tilt_deg)
+    shift = torch.linalg.vector_norm(position - position_before, dim=-1)
+    upright = (upward(quaternion) * upward(quaternion_before)).sum(-1)  # cosine of the tilt
+    return (shift <= max_shift) & (upright >= math.cos(math.radians(max_tilt_deg)))
 
 
 def of_target(values: Tensor, target: Tensor) -> Tensor:
@@ -163,12 +165,10 @@ def disturbed(
     Returns:
         (N, K) bool.
     """
-    z = torch.zeros_like(poses[..., :3])
-    z[..., 2] = 1
-    position, up, up_at_start = poses[..., :3], rotate(poses[..., 3:], z), rotate(start[..., 3:], z)
+    position, up = poses[..., :3], upward(poses[..., 3:])
     if undo is not None:
-        turn = undo[:, None, 3:].expand_as(poses[..., 3:])
+        turn = undo[:, None, 3:]
         position, up = undo[:, None, :3] + rotate(turn, position), rotate(turn, up)
-    angle = torch.atan2(torch.linalg.norm(torch.linalg.cross(up, up_at_start), dim=-1), (up * up_at_start).sum(-1))
-    shift = torch.linalg.norm(position - start[..., :3], dim=-1)
-    return (shift > max_shift) | (torch.rad2deg(angle) > max_tilt_deg)
+    upright = (up * upward(start[..., 3:])).sum(-1)  # cosine of the tilt
+    shift = torch.linalg.vector_norm(position - start[..., :3], dim=-1)
+    return (shift > max_shift) | (upright < math.cos(math.radians(max_tilt_deg)))

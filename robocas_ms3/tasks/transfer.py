@@ -14,6 +14,8 @@ from robocas_ms3.config.relations import Relation
 from robocas_ms3.language.instructions import Instruction, choose_instruction, part_name
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
+from robocas_ms3.tasks.bodies import link_poses
+from robocas_ms3.tasks.remembered import Remembered
 
 _LANGUAGE = 100  # stream of an episode's seed; those of layouts are in scenes/sample.py
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
@@ -34,10 +36,13 @@ class TransferEnv(RoboCASEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
-        if not hasattr(self, "_stages") or len(self._stages["reached_any"]) != self.num_envs:
-            self._stages = {s: torch.zeros(self.num_envs, dtype=torch.bool, device=self.device) for s in self.STAGES}
-        for flags in self._stages.values():
-            flags[env_idx] = False
+        if not hasattr(self, "_reached"):
+            self._reached = torch.zeros(len(self.STAGES), self.num_envs, dtype=torch.bool, device=self.device)
+            self._stages = dict(zip(self.STAGES, self._reached, strict=True))  # views
+        self._reached[:, env_idx] = False
+        # most of the time nothing moves; what is remembered holds for an episode, as where it began counts too
+        self._basket_stands, self._target_in_basket = Remembered(self._stands_of), Remembered(self._target_in)
+        self._count_disturbed, self._undo = Remembered(self._disturbed_of), Remembered(self._undo_of)
         said = {env: self._instruct(env) for env in env_idx.tolist()}
         kept = getattr(self, "instructions", [])
         self.instructions = [said[env] if env in said else kept[env] for env in range(self.num_envs)]
@@ -63,11 +68,10 @@ class TransferEnv(RoboCASEnv):
         """Stages and success of each env, (N,) bool each; ``disturbed`` (N,) int."""
         # right after a reset the engine still tells the contacts of before
         forces = self.gripper_forces() * (self.elapsed_steps > 0)[:, None, None, None]
-        grasped = self.grasped(forces)
-        touched = terms.touched(forces)
-        poses = self.object_poses
-        lifted = terms.lifted(poses[..., 2], self.start_poses[..., 2], grasped)
-        measures = self.target_measures(touched, poses)
+        objects = self.object_states
+        touched, grasped = terms.touched(forces), self.grasped(forces)
+        lifted = terms.lifted(objects[..., 2], self.start_poses[..., 2], grasped)
+        measures = self.target_measures(touched, objects)
         self.target_held = terms.of_target(grasped, self.target_slot)
         now = {
             "reached_any": touched.any(dim=1),
@@ -78,14 +82,10 @@ class TransferEnv(RoboCASEnv):
             "target_in_basket": measures["in_basket"],
             **self.task_stages(),
         }
-        for stage, flags in now.items():
-            self._stages[stage] |= flags
+        self._reached |= torch.stack([now.get(stage, reached) for stage, reached in self._stages.items()])
         success = self._stages["target_lifted"] & torch.stack(list(measures.values())).all(dim=0)
-        return {
-            **{stage: flags.clone() for stage, flags in self._stages.items()},
-            "success": success,
-            "disturbed": self._disturbed(poses),
-        }
+        stages = dict(zip(self.STAGES, self._reached.clone(), strict=True))
+        return {**stages, "success": success, "disturbed": self._disturbed(objects[..., :7])}
 
     def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """(N,) float32: 1 where the task has succeeded at this moment, else 0."""
@@ -96,53 +96,51 @@ class TransferEnv(RoboCASEnv):
         return {}
 
     def target_measures(
-        self, touched: torch.Tensor | None = None, poses: torch.Tensor | None = None
+        self, touched: torch.Tensor | None = None, objects: torch.Tensor | None = None
     ) -> dict[str, torch.Tensor]:
         """What has to hold at the same moment for success, besides the target having been lifted: (N,) bool each.
 
         Args:
             touched: (N, K) bool, which objects the gripper touches, if that is known already.
-            poses: (N, K, 7) of the objects, likewise.
+            objects: (N, K, 13) their states, likewise.
         """
         if touched is None:
             touched = terms.touched(self.gripper_forces())
-        poses = self.object_poses if poses is None else poses
-        basket, start, slot = self.fixtures.basket.pose, self.basket_at_start, self.target_slot
-        linear, angular = self._target_velocity()
+        objects = self.object_states if objects is None else objects
+        target, basket = terms.of_target(objects, self.target_slot), self.basket_pose
         return {
-            "in_basket": terms.of_target(self.in_basket(poses), slot),
-            "untouched": ~terms.of_target(touched, slot),
-            "at_rest": terms.at_rest(linear, angular),
-            "basket_stands": terms.stands(basket.p, basket.q, start[:, :3], start[:, 3:]),
+            "in_basket": self._target_in_basket(target[:, :7], basket),
+            "untouched": ~terms.of_target(touched, self.target_slot),
+            "at_rest": terms.at_rest(target[:, 7:10], target[:, 10:]),
+            "basket_stands": self._basket_stands(basket),
         }
 
-    def in_basket(self, poses: torch.Tensor) -> torch.Tensor:
-        """(N, K) bool: whose centre of mass is in the basket's inner volume, from poses (N, K, 7)."""
-        basket = self.fixtures.basket.pose
-        centers = poses[..., :3] + terms.rotate(poses[..., 3:], self._centers_of_mass)
-        return terms.inside_box(centers, basket.p, basket.q, self._basket_low, self._basket_high)
+    def _target_in(self, target: torch.Tensor, basket: torch.Tensor) -> torch.Tensor:
+        """(N,) bool of `in_basket`, of the targets alone, from poses (N, 7)."""
+        center = target[:, :3] + terms.rotate(target[:, 3:], terms.of_target(self._centers_of_mass, self.target_slot))
+        return terms.inside_box(center, basket[:, :3], basket[:, 3:], self._basket_low, self._basket_high)
 
-    def _target_velocity(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """(N, 3) m/s and (N, 3) rad/s of the targets; for a single env without asking all objects."""
-        if self.num_envs == 1:
-            target = self.objects[int(self.target_slot[0])]
-            return target.linear_velocity, target.angular_velocity
-        linear = torch.stack([actor.linear_velocity for actor in self.objects], dim=1)
-        angular = torch.stack([actor.angular_velocity for actor in self.objects], dim=1)
-        return terms.of_target(linear, self.target_slot), terms.of_target(angular, self.target_slot)
+    def _stands_of(self, basket: torch.Tensor) -> torch.Tensor:
+        start = self.basket_at_start
+        return terms.stands(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:])
 
     def _disturbed(self, poses: torch.Tensor) -> torch.Tensor:
-        """(N,) how many objects other than the target no longer stand as they stood."""
+        """(N,) how many objects other than the target no longer stand as they stood, from poses (N, K, 7)."""
         support = self.fixtures.furniture[self.task_config.surface.furniture]
-        undo = None
         if isinstance(support, Articulation) and self.model.support_link:
-            links = support.links_map
-            before = Pose.create(sapien.Pose(self.model.support_motion(opened=False)), device=self.device)
-            undo = (links[BODY].pose * before * links[self.model.support_link].pose.inv()).raw_pose
-        moved = terms.disturbed(poses, self.start_poses, undo)
-        moved &= self.present
-        moved[torch.arange(self.num_envs, device=self.device), self.target_slot] = False
-        return moved.sum(dim=1)
+            links = [support.links_map[name] for name in (BODY, self.model.support_link)]
+            return self._count_disturbed(poses, self._undo(link_poses(self.scene, links))).clone()
+        return self._count_disturbed(poses).clone()
+
+    def _disturbed_of(self, poses: torch.Tensor, undo: torch.Tensor | None = None) -> torch.Tensor:
+        moved = terms.disturbed(poses, self.start_poses, undo) & self.present
+        slots = torch.arange(moved.shape[1], device=self.device)
+        return (moved & (slots != self.target_slot[:, None])).sum(dim=1)
+
+    def _undo_of(self, links: torch.Tensor) -> torch.Tensor:
+        """(N, 7) motion that brings the part that objects stand on back, from the poses of body and part (N, 2, 7)."""
+        before = Pose.create(sapien.Pose(self.model.support_motion(opened=False)), device=self.device)
+        return (Pose.create(links[:, 0]) * before * Pose.create(links[:, 1]).inv()).raw_pose
 
     def get_language_instruction(self) -> list[str]:
         """The instruction of each env."""

@@ -7,13 +7,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocas_ms3.tasks.occlusion import Clutter, clutter, surface_points
+from robocas_ms3.tasks.occlusion import Clutter, clutter, moved_near, surface_points
 
 
 def plate(x: tuple[float, float], y: tuple[float, float], z: float) -> torch.Tensor:
-    """(1681, 3) points of a level rectangle, at most 2.5 mm apart for one of 0.1 m."""
+    """(3, 1681) points of a level rectangle, at most 2.5 mm apart for one of 0.1 m."""
     u, v = (torch.linspace(low, high, 41) for low, high in (x, y))
-    return torch.stack([*(g.flatten() for g in torch.meshgrid(u, v, indexing="ij")), torch.full((41 * 41,), z)], dim=1)
+    return torch.stack([*(g.flatten() for g in torch.meshgrid(u, v, indexing="ij")), torch.full((41 * 41,), z)])
 
 
 TARGET = plate((-0.05, 0.05), (-0.05, 0.05), 0.65)
@@ -89,6 +89,22 @@ def test_the_share_hangs_on_the_arrangement_only(x, y, yaw):
 def test_points_follow_their_object():
     half = math.sqrt(0.5)
     pose = torch.tensor([[[1.0, 2, 3, half, 0, 0, half], [0, 0, 0, half, half, 0, 0]]])  # 90 deg about z; about x
-    points = torch.tensor([[[[0.1, 0, 0]], [[0, 0.1, 0]]]])
+    points = torch.tensor([[[0.1, 0, 0], [0, 0.1, 0]]])[..., None]
     moved = surface_points(pose, points)
-    assert torch.allclose(moved, torch.tensor([[[[1.0, 2.1, 3]], [[0, 0, 0.1]]]]), atol=1e-6)
+    assert torch.allclose(moved[..., 0], torch.tensor([[[1.0, 2.1, 3], [0, 0, 0.1]]]), atol=1e-6)
+
+
+def test_what_moves_far_away_does_not_count_as_motion():
+    def at(*places: tuple[float, float]) -> torch.Tensor:
+        return torch.tensor([[[x, y, 0.7, 1, 0, 0, 0] for x, y in places]])
+
+    def moved(before: torch.Tensor, now: torch.Tensor) -> bool:
+        return bool(moved_near(now, before, torch.full((1, 2), 0.05), torch.tensor([0])))
+
+    still = at((0, 0), (0.3, 0))  # within 0.226 + 0.1 m
+    assert not moved(still, still + 5e-5)
+    assert moved(still, at((0, 0), (0.3002, 0)))
+    assert moved(still, at((0.0002, 0), (0.3, 0)))  # the target
+    assert not moved(at((0, 0), (0.4, 0)), at((0, 0), (0.5, 0)))
+    assert moved(at((0, 0), (0.4, 0)), at((0, 0), (0.3, 0)))  # comes near
+    assert moved(at((0, 0), (0.3, 0)), at((0, 0), (0.4, 0)))  # leaves

@@ -55,6 +55,27 @@ def test_finger_grasps_refuses_a_force_across_the_closing_axis():
     assert terms.finger_grasps(across, -across, closing, max_angle_deg=89).all()
 
 
+def test_pressed_asks_for_both_fingers_but_no_direction():
+    left = torch.tensor([[[0, 2.0, 0], [0, 2.0, 0], [0, -2.0, 0]]])
+    right = torch.tensor([[[3.0, 0, 0], [0, 0.4, 0], [0, 0.0, 0]]])
+    assert terms.pressed(left, right).tolist() == [[True, False, False]]
+
+
+@pytest.mark.parametrize(("degrees", "shift", "expected"), [(29.0, 0.0, False), (31.0, 0.0, True), (0.0, 0.031, True)])
+def test_disturbed_is_moved_or_fallen_over(degrees, shift, expected):
+    half = math.radians(degrees) / 2
+    start = torch.tensor([[[1.0, 2.0, 3.0, *UPRIGHT]]])
+    now = torch.tensor([[[1.0 + shift, 2.0, 3.0, math.cos(half), 0, math.sin(half), 0]]])
+    assert terms.disturbed(now, start).tolist() == [[expected]]
+
+
+def test_disturbed_goes_with_what_objects_stand_on():
+    start = torch.tensor([[[1.0, 0, 0, *UPRIGHT], [1.0, 0, 0, *UPRIGHT]]])
+    now = torch.tensor([[[0.0, 1.0, 0, *YAW_90], [1.0, 0, 0, *UPRIGHT]]])  # the first went along, the second did not
+    back = torch.tensor([[0.0, 0, 0, YAW_90[0], 0, 0, -YAW_90[3]]])
+    assert terms.disturbed(now, start, back).tolist() == [[False, True]]
+
+
 def test_touched_is_any_body():
     forces = torch.zeros(2, 3, 4, 3)
     forces[0, 2, 1, 0] = 0.5
@@ -78,7 +99,9 @@ def test_basket_stands_up_to_20_degrees(degrees):
     half = math.radians(degrees) / 2
     tilted = torch.tensor([[math.cos(half), math.sin(half), 0, 0]])
     upright, origin = torch.tensor([UPRIGHT]), torch.zeros(1, 3)
-    assert math.degrees(terms.tilt(tilted, upright).item()) == pytest.approx(degrees, abs=1e-3)
+    # tilted about x, the vertical axis leans towards -y
+    lean = [0, -math.sin(2 * half), math.cos(2 * half)]
+    assert terms.upward(tilted)[0].tolist() == pytest.approx(lean, abs=1e-6)
     assert terms.stands(origin, tilted, origin, upright).item() is (degrees <= 20)
 
 

@@ -1,0 +1,105 @@
+"""What a control step costs, beside ManiSkill's PickCube-v1 and beside the physics in it, without rendering. Prints JSON.
+
+All arms make the same motion in the air. The cases take turns, so that what else the machine does meets them all; times
+are CPU time of this process, and ratios are medians over the rounds.
+
+Run: python benchmarks/step.py [--rounds 5] [--steps 100]
+"""
+
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from mani_skill.envs.tasks import PickCubeEnv  # noqa: F401  (registers it)
+
+import robocas_ms3.tasks  # noqa: F401
+from robocas_ms3.demos.record import EpisodeRecorder
+from robocas_ms3.robots.constants import ARM_JOINTS, ARM_REST, FINGER_JOINTS, FINGER_TARGETS
+
+CUBE_REST = (0.0, np.pi / 8, 0.0, -np.pi * 5 / 8, 0.0, np.pi * 3 / 4, np.pi / 4)
+AGAINST = {
+    "pick": "pick_cube",
+    "search": "pick_cube",
+    "pick_ee": "pick_cube",
+    "pick_recorded": "pick_bare",
+    "search_recorded": "search_bare",
+}
+
+
+@dataclass
+class Args:
+    rounds: int = 5
+    """How often every case has its turn."""
+    steps: int = 100
+    """Control steps a turn, 20 a second."""
+
+
+def main(args: Args) -> None:
+    torch.set_num_threads(1)
+    sway = 0.15 * np.sin(np.arange(args.steps)[:, None] / 20 + np.arange(7))
+    joints = np.column_stack([ARM_REST + sway - sway[0], np.ones(args.steps)]).astype(np.float32)
+    cube = np.column_stack([CUBE_REST + sway - sway[0], np.ones(args.steps)]).astype(np.float32)
+    deltas = np.column_stack([0.1 * np.diff(sway[:, :6], axis=0, prepend=sway[:1, :6]), np.ones(args.steps)])
+    with tempfile.TemporaryDirectory() as folder:
+        pick, search = make("RoboCASPick-v1", "none"), make("RoboCASSearch-v1", "none")
+        cases: dict[str, tuple[gym.Env, Callable[[gym.Env, np.ndarray], None], np.ndarray]] = {
+            "pick_cube": (make("PickCube-v1", "state"), steps, cube),
+            "pick": (make("RoboCASPick-v1", "state"), steps, joints),
+            "search": (make("RoboCASSearch-v1", "state"), steps, joints),
+            "pick_ee": (make("RoboCASPick-v1", "state", "pd_ee_delta_pose"), steps, deltas.astype(np.float32)),
+            "pick_recorded": (EpisodeRecorder(pick, Path(folder), "pick"), steps, joints),
+            "search_recorded": (EpisodeRecorder(search, Path(folder), "search"), steps, joints),
+            "pick_bare": (pick, bare_steps, joints),
+            "search_bare": (search, bare_steps, joints),
+        }
+        taken: dict[str, list[float]] = {name: [] for name in cases}
+        for _ in range(args.rounds):
+            for name, (env, play, actions) in cases.items():
+                env.reset(seed=0)
+                begun = time.process_time()
+                play(env, actions)
+                taken[name].append(1000 * (time.process_time() - begun) / args.steps)
+    ratios = {
+        f"{name} / {base}": round(float(np.median(np.divide(taken[name], taken[base]))), 2)
+        for name, base in AGAINST.items()
+    }
+    print(json.dumps({"ms": {n: round(float(np.median(t)), 3) for n, t in taken.items()}, "ratio": ratios}, indent=2))
+
+
+def make(env_id: str, obs_mode: str, control_mode: str = "pd_joint_pos") -> gym.Env:
+    return gym.make(env_id, obs_mode=obs_mode, control_mode=control_mode, render_backend="none")
+
+
+def steps(env: gym.Env, actions: np.ndarray) -> None:
+    for action in actions:
+        env.step(action)
+
+
+def bare_steps(env: gym.Env, actions: np.ndarray) -> None:
+    """What PhysX does while ``pd_joint_pos`` actions are played, and nothing else."""
+    base: Any = env.unwrapped
+    system, joints = base.scene.px, base.agent.robot.joints_map
+    drives = [joints[name]._objs[0] for name in (*ARM_JOINTS, *FINGER_JOINTS)]
+    low, high = FINGER_TARGETS
+    last = np.array([drive.drive_target[0] for drive in drives])
+    for action in actions.astype(float):
+        finger = low + (action[7] + 1) / 2 * (high - low)
+        target = np.array([*action[:7], finger, finger])
+        count = base.sim_freq // base.control_freq
+        for targets in np.linspace(last, target, count + 1)[1:].tolist():
+            for drive, value in zip(drives, targets, strict=True):
+                drive.set_drive_target(value)
+            system.step()
+        last = target
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

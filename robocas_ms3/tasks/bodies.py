@@ -1,0 +1,118 @@
+"""Where everything that can move is, and how fast: read from a scene at once, not actor by actor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.utils.structs import Link
+from numpy.typing import NDArray
+
+from robocas_ms3.errors import RobocasError
+
+BODY = 13
+"""Numbers of a body: position m, quaternion wxyz, linear velocity m/s, angular velocity rad/s, all in the world."""
+_PACKED_BODY = [4, 5, 6, 0, 1, 2, 3, *range(7, BODY)]  # a body as SAPIEN packs it: the quaternion comes first
+_PACKED_PER_JOINT = 4  # the positions of all joints, then their velocities, and what is not read here
+
+_Batch = TypeVar("_Batch", torch.Tensor, NDArray[np.float32])
+
+
+class Bodies:
+    """Reads the state of all bodies of a scene, in the layout of ManiSkill's flat states.
+
+    First come the A actors that can move, ``BODY`` numbers each, then of each articulation its root, qpos and qvel.
+
+    On a CPU that is one call of SAPIEN's, and what came of it is kept while the scene's bytes stay the same, so it can't
+    be out of date. On a GPU it is gathered anew from the buffers each time.
+
+    Args:
+        scene: ready to be simulated.
+
+    Raises:
+        RobocasError: this version of SAPIEN packs states otherwise.
+    """
+
+    def __init__(self, scene: ManiSkillScene) -> None:
+        self._scene, self._px = scene, scene.px
+        registry = scene.state_dict_registry
+        self._actors = [actor for actor in registry.actors.values() if actor.px_body_type != "static"]
+        self._articulations = list(registry.articulations.values())
+        self.actors = [actor.name for actor in self._actors]
+        sizes = [BODY + 2 * articulation.max_dof for articulation in self._articulations]
+        ends = len(self._actors) * BODY + np.cumsum(sizes)
+        self._columns: dict[str, dict[str, slice]] = {
+            "actors": {name: slice(i * BODY, (i + 1) * BODY) for i, name in enumerate(self.actors)},
+            "articulations": {
+                articulation.name: slice(end - size, end)
+                for articulation, size, end in zip(self._articulations, sizes, ends.tolist(), strict=True)
+            },
+        }
+        if scene.gpu_sim_enabled:
+            roots = [articulation.root for articulation in self._articulations]
+            self._rows = torch.stack([body._body_data_index for body in [*self._actors, *roots]], dim=1)
+        else:
+            self._order = self._packed_order()
+            self._packed: bytes = b""
+            self._state = torch.empty(0)
+
+    def read(self) -> torch.Tensor:
+        """(N, D) float32: the state of each env. It stays as it is while the world moves on; don't write to it."""
+        if self._scene.gpu_sim_enabled:
+            return self._gather()
+        packed = self._px.pack()
+        if packed != self._packed:
+            self._packed = packed
+            self._state = torch.from_numpy(np.frombuffer(packed, np.float32)[self._order])[None]
+        return self._state
+
+    def of_actors(self, state: torch.Tensor) -> torch.Tensor:
+        """(N, A, 13) the actors' part of a state (N, D), in the order of ``actors``."""
+        count = len(self._actors)
+        return state[:, : count * BODY].view(-1, count, BODY)
+
+    def split(self, states: _Batch) -> dict[str, dict[str, _Batch]]:
+        """Name the parts of states (..., D), as ManiSkill does: ``{"actors": {name: (..., 13)}, ...}``; all views."""
+        return {
+            kind: {name: states[..., columns] for name, columns in found.items()}
+            for kind, found in self._columns.items()
+        }
+
+    def _packed_order(self) -> NDArray[np.int64]:
+        """Which of SAPIEN's packed numbers each number of a state is."""
+        dynamic: list[Any] = self._px.rigid_dynamic_components
+        first = {body: i * BODY for i, body in enumerate(dynamic)}
+        order = [first[actor._bodies[0]] + k for actor in self._actors for k in _PACKED_BODY]
+        start, starts = len(dynamic) * BODY, {}
+        for link in self._px.articulation_link_components:
+            if link.is_root:
+                starts[link.articulation] = start
+                start += BODY + _PACKED_PER_JOINT * link.articulation.dof
+        found = len(self._px.pack())
+        if found != 4 * start:
+            fix = "Install the version of sapien that requirements.lock names."
+            raise RobocasError("SAPIEN packs states otherwise", expected=f"{4 * start} bytes", found=found, fix=fix)
+        for articulation in self._articulations:
+            start = starts[articulation._objs[0]]
+            order += [start + k for k in (*_PACKED_BODY, *range(BODY, BODY + 2 * articulation.max_dof))]
+        return np.array(order)
+
+    def _gather(self) -> torch.Tensor:
+        bodies = self._px.cuda_rigid_body_data.torch()[self._rows, :BODY]
+        if self._scene.parallel_in_single_scene:
+            bodies[..., :3] -= self._scene.scene_offsets[:, None]
+        parts = [bodies[:, : len(self._actors)].flatten(1)]
+        for i, articulation in enumerate(self._articulations, start=len(self._actors)):
+            parts += [bodies[:, i], articulation.qpos, articulation.qvel]
+        return torch.cat(parts, dim=1)
+
+
+def link_poses(scene: ManiSkillScene, links: Sequence[Link]) -> torch.Tensor:
+    """(N, L, 7) poses of links in the world: position m, quaternion wxyz."""
+    if scene.gpu_sim_enabled:
+        return torch.stack([link.pose.raw_pose for link in links], dim=1)
+    poses = [link._bodies[0].entity_pose for link in links]
+    return torch.from_numpy(np.array([[*pose.p, *pose.q] for pose in poses], np.float32))[None]

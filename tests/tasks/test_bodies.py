@@ -1,0 +1,117 @@
+"""What is read at once is what ManiSkill reads actor by actor, also right after something was set."""
+
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import sapien
+import torch
+from mani_skill.utils.structs import Articulation, Pose
+
+import robocas_ms3.tasks  # noqa: F401
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.robots.constants import ARM_REST
+from robocas_ms3.tasks.bodies import Bodies, link_poses
+from robocas_ms3.tasks.remembered import Remembered
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def env():
+    env = gym.make(
+        "RoboCASOpenPick-v1",
+        config="open_pick_drawer",
+        obs_mode="none",
+        control_mode="pd_joint_pos",
+        render_backend="none",
+    )
+    env.reset(seed=0)
+    yield env
+    env.close()
+
+
+def maniskills(base) -> torch.Tensor:
+    parts = base.scene.get_sim_state()
+    return torch.cat([state for found in parts.values() for state in found.values()], dim=1)
+
+
+def set_everything(base):
+    """Change one thing after the other, each by its own setter."""
+    drawer = next(f for f in base.fixtures.furniture.values() if isinstance(f, Articulation))
+    robot, thing = base.agent.robot, base.objects[1]
+    yield thing.set_pose(Pose.create_from_pq(torch.tensor([[1.0, 2.0, 3.0]])))
+    yield thing.set_linear_velocity(torch.tensor([[0.1, 0.2, 0.3]]))
+    yield thing.set_angular_velocity(torch.tensor([[1.0, 2.0, 3.0]]))
+    yield base.fixtures.basket.set_pose(sapien.Pose([0.5, 0, 1]))
+    yield drawer.set_qpos(drawer.get_qpos() + 0.01)
+    yield drawer.set_qvel(drawer.get_qvel() + 0.1)
+    yield robot.set_qpos(robot.get_qpos() + 0.02)
+    yield robot.set_qvel(robot.get_qvel() + 0.2)
+    yield robot.set_pose(sapien.Pose([0.1, 0.2, 0.3]))
+    yield base.scene.step()
+
+
+def test_a_read_is_never_out_of_date(env):
+    base = env.unwrapped
+    before, seen = base.get_state(), []
+    for _ in set_everything(base):
+        seen.append(base.bodies.read())
+        assert torch.equal(seen[-1], maniskills(base))
+        assert torch.equal(base.get_state(), maniskills(base))
+        assert torch.equal(base.object_poses, torch.stack([a.pose.raw_pose for a in base.objects], dim=1))
+        assert torch.equal(base.basket_pose, base.fixtures.basket.pose.raw_pose)
+    assert not any(torch.equal(one, two) for one, two in zip(seen, seen[1:], strict=False))  # and none was written over
+    base.set_state(before)
+    assert torch.equal(base.bodies.read(), maniskills(base))
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        env.step(np.array([*(ARM_REST + rng.normal(0, 0.2, 7)), -1], np.float32))
+        assert torch.equal(base.bodies.read(), maniskills(base))
+    env.reset(seed=1)
+    assert torch.equal(base.bodies.read(), maniskills(base))
+
+
+def test_a_state_dict_is_maniskills(env):
+    base = env.unwrapped
+    ours, theirs = base.get_state_dict(), base.scene.get_sim_state()
+    assert list(ours) == list(theirs) == ["actors", "articulations"]
+    for kind, found in theirs.items():
+        assert list(ours[kind]) == list(found)
+        for name, state in found.items():
+            assert torch.equal(ours[kind][name], state)
+    ours["actors"]["basket"][:] = 0  # belongs to whoever asked for it
+    assert torch.equal(base.bodies.read(), maniskills(base))
+
+
+def test_links_are_where_their_poses_say(env):
+    robot = env.unwrapped.agent.robot
+    robot.set_qpos(robot.get_qpos() + 0.1)
+    links = robot.links[3:6]
+    assert torch.equal(
+        link_poses(robot.scene, links)[0], torch.cat([link.pose.raw_pose for link in links])
+    )
+
+
+def test_another_layout_of_packed_states_is_an_error(env, monkeypatch):
+    scene = env.unwrapped.scene
+    system = SimpleNamespace(
+        rigid_dynamic_components=scene.px.rigid_dynamic_components,
+        articulation_link_components=scene.px.articulation_link_components,
+        pack=lambda packed=scene.px.pack(): packed + b"more",
+    )
+    monkeypatch.setattr(scene, "px", system)
+    with pytest.raises(RobocasError, match="packs states otherwise"):
+        Bodies(scene)
+
+
+def test_a_measure_is_taken_again_when_its_tensors_change_in_place_too():
+    taken = []
+    total = Remembered(lambda *of: taken.append(1) or sum(t.sum() for t in of))
+    values, more = torch.tensor([1.0, 2.0]), torch.tensor([4.0])
+    assert total(values, more) == 7 and total(values.clone(), more) == 7
+    assert len(taken) == 1
+    values[0] = 2.0
+    assert total(values, more) == 8
+    assert len(taken) == 2
