@@ -11,7 +11,7 @@ import numpy as np
 
 from robocas_ms3.planning.protocol import Array
 
-Valid = Callable[[Array], bool]
+AllFree = Callable[[Array], bool]
 
 
 class BudgetSpent(Exception):
@@ -52,28 +52,25 @@ class PathSearch:
     """Search in joint space.
 
     Args:
-        valid: says whether a configuration is free.
+        all_free: says whether all of some configurations (M, n) are free.
         lower: (n,) joint limits, rad.
         upper: (n,).
         step: longest extension of a tree, rad (norm over the joints).
         spacing: distance of checks along an edge, rad (norm).
     """
 
-    def __init__(self, valid: Valid, lower: Array, upper: Array, *, step: float, spacing: float) -> None:
-        self._valid, self._lower, self._upper = valid, lower, upper
+    def __init__(self, all_free: AllFree, lower: Array, upper: Array, *, step: float, spacing: float) -> None:
+        self._all_free, self._lower, self._upper = all_free, lower, upper
         self._step, self.spacing = step, spacing
         self._left = 0
 
-    def _check(self, qpos: Array) -> bool:
-        if self._left <= 0:
-            raise BudgetSpent
-        self._left -= 1
-        return self._valid(qpos)
-
     def edge_free(self, a: Array, b: Array) -> bool:
-        """Check the straight edge from ``a`` (taken as free) to ``b``; the middle first, where failures are likely."""
+        """Check the straight edge from ``a`` (taken as free) to ``b``."""
         count = max(1, int(np.ceil(np.linalg.norm(b - a) / self.spacing)))
-        return all(self._check(a + (b - a) * (i / count)) for i in _spread(count))
+        if self._left < count:
+            raise BudgetSpent
+        self._left -= count
+        return self._all_free(a + (b - a) * (np.arange(1, count + 1) / count)[:, None])
 
     def connect(
         self, start: Array, goals: list[Array], rng: np.random.Generator, *, max_checks: int
@@ -169,15 +166,3 @@ class PathSearch:
         if np.linalg.norm(b - a) > 0.98 * (high - low) or not self.edge_free(a, b):
             return path
         return [*path[: first + 1], a, b, *path[second + 1 :]]
-
-
-def _spread(count: int) -> list[int]:
-    """Order 1..count so that early indices are far apart (bisection); the end comes first."""
-    order, seen, stride = [count], {count}, count
-    while stride > 1:
-        stride = (stride + 1) // 2
-        for index in range(stride, count, stride):
-            if index not in seen:
-                seen.add(index)
-                order.append(index)
-    return order

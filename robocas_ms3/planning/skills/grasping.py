@@ -14,7 +14,7 @@ from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import inverse
 from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
-from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, Approach, filter_grasps, rank_grasps
+from robocas_ms3.scenes.grasping import NEIGHBOURHOOD, PREGRASP_DISTANCE, Approach, filter_grasps, rank_grasps
 from robocas_ms3.scenes.placement import transform
 
 GRASPS_CHECKED = 48  # grasps of which a check of collisions says whether to try them early
@@ -65,9 +65,9 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "to
     Raises:
         PlanningFailed: of the grasp that came last.
     """
-    everything, others = arm.scene.obstacles_in_base(), arm.scene.obstacles_in_base(without=slot)
+    everything, others = arm.scene.obstacles(), arm.scene.obstacles(without=slot)
     failure = PlanningFailed("grasp_sampling", "no_feasible_grasp")
-    for tcp_in_base in candidates(arm, slot, others, approach):
+    for tcp_in_base in candidates(arm, slot, approach):
         try:
             # in and out of the target's surroundings, where the target itself is no obstacle ...
             arm.planner.set_scene(others)
@@ -83,13 +83,12 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "to
     raise failure
 
 
-def candidates(arm: Arm, slot: int, others: Array, approach: Approach = "top") -> Iterator[Array]:
+def candidates(arm: Arm, slot: int, approach: Approach = "top") -> Iterator[Array]:
     """Grasps worth planning for, best first: TCP poses 4x4.
 
     Args:
         arm: the attempt's tools.
         slot: of the object.
-        others: (P, 3) obstacles without the object.
         approach: from where the gripper may come.
 
     Raises:
@@ -97,12 +96,13 @@ def candidates(arm: Arm, slot: int, others: Array, approach: Approach = "top") -
     """
     notes = arm.env.object_assets[0][slot].annotations
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
+    near = arm.scene.obstacles_in_base(without=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
     kept = filter_grasps(
         base @ object_in_base @ notes.grasps_tcp_in_object,
         notes.grasp_widths,
         arm_base_in_world=base,
         object_center_in_world=(base @ object_in_base)[:3, 3],
-        scene_points_in_world=transform(base, others),
+        scene_points_in_world=transform(base, near),
         qualities=1.1 - notes.grasp_qualities,  # upstream's scale: more is better
         approach=approach,
     )
@@ -127,10 +127,10 @@ def candidates(arm: Arm, slot: int, others: Array, approach: Approach = "top") -
     )
     if approach == "front":  # where it is narrow, first those whose arm is free as inverse kinematics found it
         order = order[:GRASPS_CHECKED]
-        arm.planner.set_scene(others)
+        arm.planner.set_scene(arm.scene.obstacles(without=slot))
         ways = np.stack([qpos_before[reachable], qpos[reachable]], axis=1)[order]
-        blocked = [any(arm.planner.collisions(ends) for ends in way) for way in ways]
-        order = order[np.argsort(blocked, kind="stable")]
+        free = arm.planner.free(ways.reshape(-1, 7)).reshape(-1, 2).all(axis=1)
+        order = order[np.argsort(~free, kind="stable")]
     for index in order[:GRASPS_PLANNED]:
         yield tcp_in_base[reachable][index]
 

@@ -39,7 +39,7 @@ def release_into_basket(arm: Arm, slot: int) -> None:
     arm.open_gripper()
     with arm.planning():
         arm.hold_nothing()
-        arm.planner.set_scene(arm.scene.obstacles_in_base(without=slot))
+        arm.planner.set_scene(arm.scene.obstacles(without=slot))
         retreat = plan_step_back(arm, start, _ways_off(arm.planner.tcp(start)))
         home = arm.plan_home(retreat.qpos[-1])
     arm.follow(retreat)
@@ -63,7 +63,7 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
     # first those in which the object fits through the opening, then those that are near
     overhang = overhangs(drops, scene.basket_in_base, *_inner_box(arm), transform(*held_object(arm, slot)))
     order = np.lexsort((np.abs(qpos - start).max(axis=1), np.ceil(overhang / 0.02)))
-    arm.planner.set_scene(scene.obstacles_in_base(without=slot))
+    arm.planner.set_scene(scene.obstacles(without=slot))
     attach_held(arm, slot)
     failure = PlanningFailed("transfer", "no_plan")
     for index in order[:DROPS_PLANNED]:
