@@ -35,9 +35,9 @@ CLOUD, ATTACHED = "cloud", "attached"
 HITTABLE = (*STATIC_LINKS, *(f"panda_link{i}" for i in range(1, 7)))  # by a held object
 REACH = 1.5  # m; obstacle points further from the arm's base never matter
 BASE_MARGIN = 0.015  # m around the parts that never move within which points of the cloud are cut out
-MARGIN = 0.003  # m that obstacles are larger than they are: about what voxels of 5 mm add on average
+MARGIN = 0.0025  # m that obstacles are larger than they are: about what voxels of 5 mm add on average
 KEPT = 16  # trees of the last clouds and hulls of the last held objects
-FIRST_LOOKS = 8  # configurations spread over a path that are checked before all others: most failures show there
+SPARSE = 12  # every so manieth configuration of a path is checked before all others
 CHUNK = 128  # configurations of a path checked at once
 
 
@@ -190,6 +190,7 @@ class ArmWorld:
         self._cut = self._box[self._carrier < 0]
         # The hand, the fingers and link 7 are rigid with the held object, whose hull may touch them.
         hittable = [i for i, name in enumerate(self._names[:-1]) if name in HITTABLE]
+        self._own_pairs = len(model.get_collision_pairs())  # without the held object
         self._pairs = np.array([*model.get_collision_pairs(), *((i, body) for i in hittable)])
 
     def _full(self, qpos: Array, finger_width: float) -> Array:
@@ -298,15 +299,23 @@ class ArmWorld:
         width = self.finger_width if finger_width is None else finger_width
         return np.array([not any(True for _ in hits) for hits in self._hits(qpos, width, obstacles)], dtype=bool)
 
-    def all_free(self, qpos: Array, *, obstacles: bool = True) -> bool:
-        """Say whether all configurations of a path (M, 7) touch nothing."""
-        spread = np.unique(np.linspace(0, len(qpos) - 1, min(FIRST_LOOKS, len(qpos))).round().astype(int))
-        rest = np.delete(np.arange(len(qpos)), spread)
-        for rows in (spread, *(rest[i : i + CHUNK] for i in range(0, len(rest), CHUNK))):
-            for hits in self._hits(qpos[rows], self.finger_width, obstacles):
+    def free_until(self, qpos: Array, *, obstacles: bool = True) -> int:
+        """How many configurations of a path (M, 7) touch nothing before the first one that does."""
+        for first in range(0, len(qpos), CHUNK):
+            for row, hits in enumerate(self._hits(qpos[first : first + CHUNK], self.finger_width, obstacles)):
                 if any(True for _ in hits):
-                    return False
-        return True
+                    return first + row
+        return len(qpos)
+
+    def all_free(self, qpos: Array, *, obstacles: bool = True) -> bool:
+        """Say whether all configurations of a path (M, 7) touch nothing; sparse ones first, where failures show."""
+        if len(qpos) > 2 * SPARSE:
+            qpos = np.concatenate([qpos[i::SPARSE] for i in (SPARSE - 1, *range(SPARSE - 1))])
+            first = len(qpos) // SPARSE
+            if self.free_until(qpos[:first], obstacles=obstacles) < first:
+                return False
+            qpos = qpos[first:]
+        return self.free_until(qpos, obstacles=obstacles) == len(qpos)
 
     def contacts(self, qpos: Array, finger_width: float) -> list[str]:
         """Name what touches at a configuration (7,): links, obstacles, 'attached'."""
@@ -316,7 +325,9 @@ class ArmWorld:
     def _hits(self, qpos: Array, width: float, obstacles: bool) -> Iterator[Iterator[tuple[str, str]]]:
         """For each configuration (M, 7) in turn the names of what touches, pair by pair, as far as one asks."""
         self.checks += len(qpos)
-        rotations, positions = self.chain.frames(qpos)
+        if not len(qpos):
+            return
+        rotations, positions, body = *self.chain.frames(qpos), len(self._parts) - 1
         pairs = self._overlapping(rotations, positions, width, obstacles)
         for row in range(len(qpos)):
             links, others = pairs.of(row)
@@ -324,7 +335,7 @@ class ArmWorld:
                 yield iter(())
                 continue
             self._robot.set_qpos(self._full(qpos[row], width), True)
-            if self._body is not None:
+            if body in others[:, 0] or (self._pairs[links[:, 0], 1] == body).any():
                 tcp = np.eye(4)
                 tcp[:3, :3], tcp[:3, 3] = rotations[7, row], positions[7, row]
                 self._body.set_transformation(matrix_to_pose(tcp @ self._object_in_tcp))
@@ -344,16 +355,15 @@ class ArmWorld:
         """The broad phase: links 1 to 7 and the TCP at rotations (8, M, 3, 3) and positions (8, M, 3)."""
         box = self._box + (self._box_opened - self._box) * (width / WIDEST)
         moving = self._moving if self._body is not None else self._moving[:-1]
-        carrier = self._carrier[moving]
-        middle, half = box[moving].mean(axis=1), (box[moving, 1] - box[moving, 0]) / 2
+        carrier, count = self._carrier[moving], rotations.shape[1]
         turned = rotations[carrier]  # (P, M, 3, 3)
+        middle, half = (box[moving, 0] + box[moving, 1]) / 2, (box[moving, 1] - box[moving, 0]) / 2
         at = positions[carrier] + np.einsum("pmij,pj->pmi", turned, middle)
         reach = np.einsum("pmij,pj->pmi", np.abs(turned), half)
-        count = rotations.shape[1]
-        low = np.broadcast_to(box[:, 0, None], (len(box), count, 3)).copy()
-        high = np.broadcast_to(box[:, 1, None], (len(box), count, 3)).copy()
+        low, high = np.empty((2, len(box), count, 3))
+        low[:], high[:] = box[:, 0, None], box[:, 1, None]
         low[moving], high[moving] = at - reach, at + reach
-        known = self._pairs if self._body is not None else self._pairs[self._pairs[:, 1] < len(self._parts) - 1]
+        known = self._pairs if self._body is not None else self._pairs[: self._own_pairs]
         a, b = known.T
         touch = np.all((low[a] <= high[b]) & (low[b] <= high[a]), axis=2)
         links = np.argwhere(touch.T)
@@ -384,13 +394,13 @@ def convex_hull(vertices: Array) -> tuple[Array, NDArray[np.int32], Array]:
 def inflated(vertices: Array, margin: float) -> tuple[Array, NDArray[np.int32]]:
     """Corners and triangles of a convex hull whose faces are moved out by ``margin``, its sharp edges a little less."""
     corners, faces, normals = convex_hull(vertices)
-    moved = np.empty_like(corners)
-    for i in range(len(corners)):
-        meeting = np.unique(normals[(faces == i).any(axis=1)].round(6), axis=0)
-        square = meeting.T @ meeting + 1e-3 * np.eye(3)  # where they are all but parallel, out along them
-        out = np.linalg.solve(square, meeting.sum(axis=0)) * margin
-        moved[i] = corners[i] + out * min(1.0, 2 * margin / float(np.linalg.norm(out)))
-    hull, faces, _ = convex_hull(moved)
+    square, total = np.tile(1e-3 * np.eye(3), (len(corners), 1, 1)), np.zeros((len(corners), 3))
+    for corner in faces.T:  # all faces that meet in a corner move out; all but parallel ones along themselves
+        np.add.at(square, corner, normals[:, :, None] * normals[:, None, :])
+        np.add.at(total, corner, normals)
+    out = margin * np.linalg.solve(square, total[:, :, None])[:, :, 0]
+    out *= np.minimum(1.0, 2 * margin / np.linalg.norm(out, axis=1, keepdims=True))
+    hull, faces, _ = convex_hull(corners + out)
     return hull, faces
 
 

@@ -1,4 +1,4 @@
-"""The mplib backend of the planner protocol: its collision checks and lines; inverse kinematics, search, timing of ours."""
+"""The mplib backend of the planner protocol: its collision checks and lines; search and timing of ours."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class MplibPlanner:
         dt: float,
         velocity_limit: float = 0.5,
         acceleration_limit: float = 0.5,
-        rrt_range: float = 0.1,
+        rrt_range: float = 0.25,
         planning_time: float = 2.0,
         voxel: float = 0.005,
     ) -> None:
@@ -69,7 +69,7 @@ class MplibPlanner:
         self._limits = {"velocity": velocity_limit, "acceleration": acceleration_limit}
         self._budget = int(planning_time * CHECKS_PER_SECOND)
         self._search = PathSearch(
-            self._world.all_free, self._kinematics.lower, self._kinematics.upper, step=rrt_range, spacing=SPACING
+            self._world.free_until, self._kinematics.lower, self._kinematics.upper, step=rrt_range, spacing=SPACING
         )
         self._rng = np.random.default_rng(0)
 
@@ -132,17 +132,18 @@ class MplibPlanner:
             raise PlanningFailed(stage, "no_ik")
         return self.plan_to_qpos(start, goals, stage=stage)
 
-    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str) -> Trajectory:
+    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, search: bool = True) -> Trajectory:
         """Plan a collision-free motion to the nearest of several configurations that can be reached.
 
         Args:
             start: (7,), free of collisions.
             goals: (7,) each.
             stage: name for errors.
+            search: look for a way around what is in the way of a straight motion.
 
         Raises:
-            PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``goal_in_collision``, ``rrt_timeout``,
-                ``path_blocked``, ``timing_failed``.
+            PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``goal_in_collision``, ``not_straight``,
+                ``rrt_timeout``, ``path_blocked``, ``timing_failed``.
         """
         start = self._checked_start(start, stage)
         wanted = np.array(goals, dtype=np.float64).reshape(-1, 7)
@@ -158,6 +159,8 @@ class MplibPlanner:
         for goal in free:
             if turn_between(goal, start) <= enough and self._straight_free(start, goal):
                 return self._timed(partial(stopping, np.array([start, goal])))
+        if not search:
+            raise PlanningFailed(stage, "not_straight")
         reason = "rrt_timeout"
         # The nearest goal alone gets a quick try, then all of them the full budget; a path that slips through something
         # between two checks is searched again with the spacing of the final check.

@@ -129,8 +129,8 @@ class Planner(Protocol):
         """
         ...
 
-    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str) -> Trajectory:
-        """Plan a collision-free motion to the best of several configurations."""
+    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, search: bool = True) -> Trajectory:
+        """Plan a collision-free motion to the best of several configurations; without ``search`` a straight one."""
         ...
 
     def plan_to_pose(self, start: Array, tcp_in_base: Array, *, stage: str) -> Trajectory:
