@@ -1,9 +1,12 @@
 """Collision checking and kinematics of one arm in its base frame, on mplib 0.1.1's FCL and Pinocchio.
 
+Whole batches of configurations go through a broad phase in numpy, boxes along the axes around links and obstacles; only
+pairs whose boxes overlap are given to FCL. mplib's ``PlanningWorld`` asks FCL for every pair of link and obstacle.
+
 mplib's own ``Planner`` is not used. Its traps that are closed here: numpy 2 ends in a segmentation fault (refused
 first); the voxel size of the cloud is the point spacing; the base pose stays at the origin, since attached bodies
 ignore it; the cloud is an object like any other, so no flag can be forgotten; an attached body is checked against the
-cloud, the links and what carries the arm.
+obstacles, the links and what carries the arm.
 """
 
 from __future__ import annotations
@@ -11,24 +14,31 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.planning.protocol import Array, AttachedBody
+from robocas_ms3.planning.chain import ARM_JOINTS, BASE_LINK, TCP_LINK, ArmChain
+from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle, Shape
 
-ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
-TCP_LINK = "panda_hand_tcp"
-BASE_LINK = "panda_link0"
+WIDEST = 0.08  # m, the gripper's opening
 STATIC_LINKS = (BASE_LINK, "base_link")  # the second one, what carries the arm, may be missing
-CLOUD = "cloud"
+CLOUD, ATTACHED = "cloud", "attached"
+HITTABLE = (*STATIC_LINKS, *(f"panda_link{i}" for i in range(1, 7)))  # by a held object
 REACH = 1.5  # m; obstacle points further from the arm's base never matter
 BASE_MARGIN = 0.015  # m around the parts that never move within which points of the cloud are cut out
-CLOUDS_KEPT = 4  # trees of the last clouds; policies switch between a few of them
+MARGIN = 0.0025  # m that obstacles are larger than they are: about what voxels of 5 mm add on average
+KEPT = 16  # trees of the last clouds and hulls of the last held objects
+SPARSE = 12  # every so manieth configuration of a path is checked before all others
+CHUNK = 128  # configurations of a path checked at once
 
 
 def require_numpy_1() -> None:
@@ -76,6 +86,40 @@ def matrix_to_pose(matrix: Array) -> Array:
     return np.concatenate([matrix[:3, 3], quaternion])
 
 
+@dataclass(frozen=True)
+class _Pieces:
+    """What FCL checks of a shape.
+
+    Attributes:
+        geometries: of FCL, one a piece.
+        vertices: (V, 3) of all pieces, in the shape's frame, m.
+        first: (H,) index of each piece's first vertex.
+    """
+
+    geometries: list[Any]
+    vertices: Array
+    first: NDArray[np.int_]
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Pairs of parts and obstacles whose boxes overlap, by configuration.
+
+    Attributes:
+        links: (n, 2) configuration and pair of parts.
+        obstacles: (m, 3) configuration, part and piece of an obstacle.
+    """
+
+    links: NDArray[np.int_]
+    obstacles: NDArray[np.int_]
+
+    def of(self, row: int) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """Pairs of parts (n, 1), and parts with pieces (m, 2), of one configuration."""
+        a, b = np.searchsorted(self.links[:, 0], (row, row + 1))
+        c, d = np.searchsorted(self.obstacles[:, 0], (row, row + 1))
+        return self.links[a:b, 1:], self.obstacles[c:d, 1:]
+
+
 class ArmWorld:
     """The arm, the obstacles and the held object.
 
@@ -93,7 +137,7 @@ class ArmWorld:
         for path in (urdf, srdf):
             if not Path(path).is_file():
                 raise RobocasError("no such robot description", where=path)
-        from mplib.pymp import ArticulatedModel, PlanningWorld
+        from mplib.pymp import ArticulatedModel
         from mplib.pymp.collision_detection import fcl
 
         self._fcl, self._voxel = fcl, voxel
@@ -108,36 +152,46 @@ class ArmWorld:
                 expected="meshes by relative path, each with its hull beside it (NAME.convex.stl)",
                 found=str(error).splitlines()[0],
             ) from error
+        self.chain = ArmChain(urdf)
         self.kinematics = self._robot.get_pinocchio_model()
         links, joints = self.kinematics.get_link_names(), self.kinematics.get_joint_names()
-        missing = [name for name in (BASE_LINK, TCP_LINK) if name not in links]
-        missing += [name for name in ARM_JOINTS if name not in joints]
-        if missing:
-            raise RobocasError("the description lacks links or joints", where=urdf, expected=", ".join(missing))
         self._robot.set_move_group(TCP_LINK)
         self.tcp_index = links.index(TCP_LINK)
         self.arm_indices = np.array([joints.index(name) for name in ARM_JOINTS])
         self._fingers = np.array([joints.index(name) for name in FINGER_JOINTS if name in joints], dtype=int)
         self.state_size = len(joints)
         self.limits = np.concatenate(self.kinematics.get_joint_limits())[self.arm_indices]
-        self.checks = 0  # collision checks so far
-        self.finger_width = 0.08
-
-        model = self._robot.get_fcl_model()
-        names, objects = model.get_collision_link_names(), model.get_collision_objects()
-        self._robot.set_qpos(np.zeros(self.state_size), True)
-        parts = list(zip(names, objects, strict=True))
-        self._cut = [_bounds(part) for name, part in parts if name in STATIC_LINKS]
-        self._bare = PlanningWorld([self._robot], ["robot"], [], [])
-        self._world = PlanningWorld([self._robot], ["robot"], [], [])
-        # The hand, the fingers and link 7 are rigid with the held object, whose hull may touch them.
-        hittable = {*STATIC_LINKS, *(f"panda_link{i}" for i in range(7))}
-        self._body_may_hit = [(name, part) for name, part in parts if name in hittable]
+        self.checks = 0  # configurations checked so far
+        self.finger_width = WIDEST
         self._request = fcl.CollisionRequest()
-        self._trees: OrderedDict[bytes, Any] = OrderedDict()
-        self._cloud: Any = None
-        self._body: Any = None
-        self._object_in_tcp = np.eye(4)
+        self._shapes: WeakKeyDictionary[Shape, _Pieces] = WeakKeyDictionary()
+        self._recent: OrderedDict[bytes, _Pieces] = OrderedDict()
+        self._object_in_tcp, self._body = np.eye(4), None
+        self._read_parts()
+        self.set_obstacles([])
+
+    def _read_parts(self) -> None:
+        """Find each part's box in the frame of the link that carries it, and which parts may touch each other."""
+        model = self._robot.get_fcl_model()
+        self._names: list[str] = [*model.get_collision_link_names(), ATTACHED]
+        self._parts: list[Any] = [*model.get_collision_objects(), None]
+        body = len(self._parts) - 1
+        carriers = {BASE_LINK: -1, "base_link": -1, **{f"panda_link{i + 1}": i for i in range(7)}}
+        self._carrier = np.array([carriers.get(name, 7) for name in self._names])  # 7: what is rigid with the TCP
+        rotations, positions = self.chain.frames(np.zeros((1, 7)))
+        frames = [*zip(rotations[:, 0], positions[:, 0], strict=True), (np.eye(3), np.zeros(3))]
+        boxes = []
+        for width in (0.0, WIDEST):
+            self._robot.set_qpos(self._full(np.zeros(7), width), True)
+            boxes.append([_bounds(part, *frames[c]) for part, c in zip(self._parts[:-1], self._carrier, strict=False)])
+            boxes[-1].append(np.zeros((2, 3)))
+        self._box, self._box_opened = np.array(boxes[0]), np.array(boxes[1])  # (parts, 2, 3) closed, open
+        self._moving = np.flatnonzero(self._carrier >= 0)
+        self._cut = self._box[self._carrier < 0]
+        # The hand, the fingers and link 7 are rigid with the held object, whose hull may touch them.
+        hittable = [i for i, name in enumerate(self._names[:-1]) if name in HITTABLE]
+        self._own_pairs = len(model.get_collision_pairs())  # without the held object
+        self._pairs = np.array([*model.get_collision_pairs(), *((i, body) for i in hittable)])
 
     def _full(self, qpos: Array, finger_width: float) -> Array:
         state = np.zeros(self.state_size)
@@ -155,75 +209,199 @@ class ArmWorld:
 
     def tcp(self, qpos: Array) -> Array:
         """Give the TCP's pose in the base frame (4x4) at arm joints (7,)."""
-        self.kinematics.compute_forward_kinematics(self.full_qpos(qpos))
-        return pose_to_matrix(np.asarray(self.kinematics.get_link_pose(self.tcp_index)))
+        return self.chain.tcp(np.asarray(qpos, dtype=np.float64)[None])[0]
 
     def set_points(self, points_in_base: Array) -> None:
-        """Replace the cloud by points (P, 3); those in the robot's own base or out of reach are dropped."""
+        """Replace the obstacles by points (P, 3); those in the robot's own base or out of reach are dropped."""
         points = np.asarray(points_in_base, dtype=np.float64).reshape(-1, 3)
         if not np.isfinite(points).all():
             raise RobocasError("obstacle points must be finite", where="set_scene")
         points = np.ascontiguousarray(points[self.keeps(points)])
-        if self._cloud is not None:
-            self._world.remove_normal_object(CLOUD)
-            self._cloud = None
         if len(points) == 0:
+            self.set_obstacles([])
             return
-        key = hashlib.blake2b(points.data).digest()
-        self._cloud = self._trees.pop(key, None) or self._fcl.CollisionObject(self._fcl.OcTree(points, self._voxel))
-        self._trees[key] = self._cloud
-        if len(self._trees) > CLOUDS_KEPT:
-            self._trees.popitem(last=False)
-        self._world.set_normal_object(CLOUD, self._cloud)
+        pieces = self._remember(points, self._tree)
+        self._place([(CLOUD, pieces, np.eye(4))])
+
+    def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Replace the obstacles by rigid bodies; they don't count against the robot's own base."""
+        known = []
+        for obstacle in obstacles:
+            if obstacle.shape not in self._shapes:
+                self._shapes[obstacle.shape] = self._pieces(obstacle.shape)
+            known.append((obstacle.name, self._shapes[obstacle.shape], obstacle.pose_in_base))
+        self._place(known)
+
+    def _place(self, bodies: list[tuple[str, _Pieces, Array]]) -> None:
+        self._obstacle_names = [name for name, pieces, _ in bodies for _ in pieces.geometries]
+        self._geometries = [(geometry, pose) for _, pieces, pose in bodies for geometry in pieces.geometries]
+        self._objects: list[Any] = [None] * len(self._geometries)  # made when first asked for
+        low, high = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        for _, pieces, pose in bodies:
+            vertices = pieces.vertices @ pose[:3, :3].T + pose[:3, 3]
+            low.append(np.minimum.reduceat(vertices, pieces.first))
+            high.append(np.maximum.reduceat(vertices, pieces.first))
+        self._low, self._high = np.concatenate(low), np.concatenate(high)
+
+    def _obstacle(self, index: int) -> Any:
+        if self._objects[index] is None:
+            geometry, pose = self._geometries[index]
+            place = matrix_to_pose(pose)
+            self._objects[index] = self._fcl.CollisionObject(geometry, place[:3], place[3:])
+        return self._objects[index]
+
+    def _pieces(self, shape: Shape) -> _Pieces:
+        if shape.points is not None:
+            return self._tree(np.ascontiguousarray(shape.points))
+        hulls = [inflated(np.asarray(vertices, dtype=np.float64), MARGIN) for vertices in shape.hulls]
+        first = np.cumsum([0, *(len(vertices) for vertices, _ in hulls[:-1])])
+        geometries = [self._fcl.Convex(vertices, faces) for vertices, faces in hulls]
+        return _Pieces(geometries, np.concatenate([vertices for vertices, _ in hulls]), first)
+
+    def _tree(self, points: Array) -> _Pieces:
+        bounds = np.array([points.min(axis=0) - self._voxel, points.max(axis=0) + self._voxel])
+        corners = np.array(list(itertools.product(*bounds.T)))
+        return _Pieces([self._fcl.OcTree(points, self._voxel)], corners, np.zeros(1, dtype=int))
+
+    def _hull(self, vertices: Array) -> _Pieces:
+        corners, faces, _ = convex_hull(vertices)
+        return _Pieces([self._fcl.Convex(corners, faces)], corners, np.zeros(1, dtype=int))
+
+    def _remember(self, points: Array, make: Any) -> _Pieces:
+        """Make something of points, or find what was made of them recently."""
+        key = hashlib.blake2b(points.data).digest() + make.__name__.encode()
+        made = self._recent.pop(key, None) or make(points)
+        self._recent[key] = made
+        if len(self._recent) > KEPT:
+            self._recent.popitem(last=False)
+        return made
 
     def keeps(self, points: Array) -> NDArray[np.bool_]:
         """Say which points (P, 3) count as obstacles: in reach, and not where the robot's own base stands."""
-        keep = np.linalg.norm(points, axis=1) <= REACH
+        keep = np.einsum("ij,ij->i", points, points) <= REACH**2
         for low, high in self._cut:
             keep &= ~np.all((points >= low - BASE_MARGIN) & (points <= high + BASE_MARGIN), axis=1)
         return keep
 
     def attach(self, body: AttachedBody | None) -> None:
         """Attach the convex hull of a held object to the TCP, or nothing."""
+        self._body = None
         if body is None:
-            self._body = None
             return
-        from scipy.spatial import ConvexHull
-
-        vertices = np.asarray(body.vertices, dtype=np.float64)
-        hull = ConvexHull(vertices)
-        outward = np.einsum("ij,ij->i", _normals(vertices, hull.simplices), hull.equations[:, :3]) > 0
-        faces = np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1])
-        used, faces = np.unique(faces, return_inverse=True)
-        geometry = self._fcl.Convex(vertices[used], faces.reshape(-1, 3).astype(np.int32))
+        pieces = self._remember(np.ascontiguousarray(body.vertices, dtype=np.float64), self._hull)
         self._object_in_tcp = np.asarray(body.object_in_tcp, dtype=np.float64)
-        self._body = self._fcl.CollisionObject(geometry)
+        self._body = self._parts[-1] = self._fcl.CollisionObject(pieces.geometries[0])
+        vertices = pieces.vertices @ self._object_in_tcp[:3, :3].T + self._object_in_tcp[:3, 3]
+        self._box[-1] = self._box_opened[-1] = vertices.min(axis=0), vertices.max(axis=0)
 
-    def free(self, qpos: Array, *, cloud: bool = True) -> bool:
-        """Say whether a configuration (7,) touches nothing; without ``cloud`` only robot and held object count."""
-        self.checks += 1
-        self._robot.set_qpos(self._full(qpos, self.finger_width), True)
-        if (self._world if cloud else self._bare).collide():
-            return False
-        return self._body is None or not self._body_touches(cloud=cloud)
+    def free(self, qpos: Array, *, obstacles: bool = True, finger_width: float | None = None) -> NDArray[np.bool_]:
+        """Say which configurations (M, 7) touch nothing; without ``obstacles`` only robot and held object count."""
+        width = self.finger_width if finger_width is None else finger_width
+        return np.array([not any(True for _ in hits) for hits in self._hits(qpos, width, obstacles)], dtype=bool)
+
+    def free_until(self, qpos: Array, *, obstacles: bool = True) -> int:
+        """How many configurations of a path (M, 7) touch nothing before the first one that does."""
+        for first in range(0, len(qpos), CHUNK):
+            for row, hits in enumerate(self._hits(qpos[first : first + CHUNK], self.finger_width, obstacles)):
+                if any(True for _ in hits):
+                    return first + row
+        return len(qpos)
+
+    def all_free(self, qpos: Array, *, obstacles: bool = True) -> bool:
+        """Say whether all configurations of a path (M, 7) touch nothing; sparse ones first, where failures show."""
+        if len(qpos) > 2 * SPARSE:
+            qpos = np.concatenate([qpos[i::SPARSE] for i in (SPARSE - 1, *range(SPARSE - 1))])
+            first = len(qpos) // SPARSE
+            if self.free_until(qpos[:first], obstacles=obstacles) < first:
+                return False
+            qpos = qpos[first:]
+        return self.free_until(qpos, obstacles=obstacles) == len(qpos)
 
     def contacts(self, qpos: Array, finger_width: float) -> list[str]:
-        """Name what touches at a configuration (7,): links, 'cloud', 'attached'."""
-        self._robot.set_qpos(self._full(qpos, finger_width), True)
-        names: set[str] = set()
-        for hit in self._world.collide_full():
-            names.update((hit.link_name1, hit.link_name2))
-        if self._body is not None:
-            names.update(self._body_touches(cloud=True))
-        return sorted(names)
+        """Name what touches at a configuration (7,): links, obstacles, 'attached'."""
+        hits = next(iter(self._hits(np.asarray(qpos, dtype=np.float64)[None], finger_width, True)))
+        return sorted({name for pair in hits for name in pair})
 
-    def _body_touches(self, *, cloud: bool) -> list[str]:
-        """Name what the held object touches, with 'attached' itself; the joints are set already."""
-        tcp = pose_to_matrix(np.asarray(self.kinematics.get_link_pose(self.tcp_index)))
-        self._body.set_transformation(matrix_to_pose(tcp @ self._object_in_tcp))
-        others = self._body_may_hit + ([(CLOUD, self._cloud)] if cloud and self._cloud is not None else [])
-        hits = [name for name, item in others if self._fcl.collide(self._body, item, self._request).is_collision()]
-        return [*hits, "attached"] if hits else []
+    def _hits(self, qpos: Array, width: float, obstacles: bool) -> Iterator[Iterator[tuple[str, str]]]:
+        """For each configuration (M, 7) in turn the names of what touches, pair by pair, as far as one asks."""
+        self.checks += len(qpos)
+        if not len(qpos):
+            return
+        rotations, positions, body = *self.chain.frames(qpos), len(self._parts) - 1
+        pairs = self._overlapping(rotations, positions, width, obstacles)
+        for row in range(len(qpos)):
+            links, others = pairs.of(row)
+            if not len(links) and not len(others):
+                yield iter(())
+                continue
+            self._robot.set_qpos(self._full(qpos[row], width), True)
+            if body in others[:, 0] or (self._pairs[links[:, 0], 1] == body).any():
+                tcp = np.eye(4)
+                tcp[:3, :3], tcp[:3, 3] = rotations[7, row], positions[7, row]
+                self._body.set_transformation(matrix_to_pose(tcp @ self._object_in_tcp))
+            yield self._touching(links, others)
+
+    def _touching(self, links: NDArray[np.int_], others: NDArray[np.int_]) -> Iterator[tuple[str, str]]:
+        parts, names, collide, request = self._parts, self._names, self._fcl.collide, self._request
+        for (pair,) in links.tolist():
+            a, b = self._pairs[pair]
+            if collide(parts[a], parts[b], request).is_collision():
+                yield names[a], names[b]
+        for part, piece in others.tolist():
+            if collide(parts[part], self._obstacle(piece), request).is_collision():
+                yield names[part], self._obstacle_names[piece]
+
+    def _overlapping(self, rotations: Array, positions: Array, width: float, obstacles: bool) -> _Pairs:
+        """The broad phase: links 1 to 7 and the TCP at rotations (8, M, 3, 3) and positions (8, M, 3)."""
+        box = self._box + (self._box_opened - self._box) * (width / WIDEST)
+        moving = self._moving if self._body is not None else self._moving[:-1]
+        carrier, count = self._carrier[moving], rotations.shape[1]
+        turned = rotations[carrier]  # (P, M, 3, 3)
+        middle, half = (box[moving, 0] + box[moving, 1]) / 2, (box[moving, 1] - box[moving, 0]) / 2
+        at = positions[carrier] + np.einsum("pmij,pj->pmi", turned, middle)
+        reach = np.einsum("pmij,pj->pmi", np.abs(turned), half)
+        low, high = np.empty((2, len(box), count, 3))
+        low[:], high[:] = box[:, 0, None], box[:, 1, None]
+        low[moving], high[moving] = at - reach, at + reach
+        known = self._pairs if self._body is not None else self._pairs[: self._own_pairs]
+        a, b = known.T
+        touch = np.all((low[a] <= high[b]) & (low[b] <= high[a]), axis=2)
+        links = np.argwhere(touch.T)
+        if not obstacles or not len(self._low):
+            return _Pairs(links, np.zeros((0, 3), dtype=int))
+        low, high = low[moving], high[moving]
+        near = np.all((self._low <= high.max(axis=(0, 1))) & (self._high >= low.min(axis=(0, 1))), axis=1)
+        pieces = np.flatnonzero(near)
+        first, last = self._low[pieces], self._high[pieces]
+        overlap = np.ones((count, len(moving), len(pieces)), dtype=bool)
+        for axis in range(3):
+            overlap &= low[:, :, axis].T[:, :, None] <= last[:, axis]
+            overlap &= high[:, :, axis].T[:, :, None] >= first[:, axis]
+        found = np.argwhere(overlap)
+        found[:, 1], found[:, 2] = moving[found[:, 1]], pieces[found[:, 2]]
+        return _Pairs(links, found)
+
+
+def convex_hull(vertices: Array) -> tuple[Array, NDArray[np.int32], Array]:
+    """Corners (V, 3) of the convex hull of points, its triangles (F, 3) seen from outside, and their normals (F, 3)."""
+    hull = ConvexHull(vertices)
+    outward = np.einsum("ij,ij->i", _normals(vertices, hull.simplices), hull.equations[:, :3]) > 0
+    faces = np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1])
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3).astype(np.int32), hull.equations[:, :3]
+
+
+def inflated(vertices: Array, margin: float) -> tuple[Array, NDArray[np.int32]]:
+    """Corners and triangles of a convex hull whose faces are moved out by ``margin``, its sharp edges a little less."""
+    corners, faces, normals = convex_hull(vertices)
+    square, total = np.tile(1e-3 * np.eye(3), (len(corners), 1, 1)), np.zeros((len(corners), 3))
+    for corner in faces.T:  # all faces that meet in a corner move out; all but parallel ones along themselves
+        np.add.at(square, corner, normals[:, :, None] * normals[:, None, :])
+        np.add.at(total, corner, normals)
+    out = margin * np.linalg.solve(square, total[:, :, None])[:, :, 0]
+    out *= np.minimum(1.0, 2 * margin / np.linalg.norm(out, axis=1, keepdims=True))
+    hull, faces, _ = convex_hull(corners + out)
+    return hull, faces
 
 
 def _normals(vertices: Array, faces: NDArray[np.int_]) -> Array:
@@ -231,12 +409,13 @@ def _normals(vertices: Array, faces: NDArray[np.int_]) -> Array:
     return np.cross(b - a, c - a)
 
 
-def _bounds(part: Any) -> tuple[Array, Array]:
-    """Give the box around a collision object in the base frame: low and high corner (3,), m."""
+def _bounds(part: Any, rotation: Array, position: Array) -> Array:
+    """Give the box (2, 3) around a collision object, low and high corner, in a frame given in the base frame, m."""
     geometry = part.get_collision_geometry()
     if hasattr(geometry, "get_vertices"):
         vertices = np.array(geometry.get_vertices())
     else:
         vertices = np.array(geometry.side) / 2 * np.array(list(itertools.product((-1, 1), repeat=3)))
     points = vertices @ np.array(part.get_rotation()).T + np.array(part.get_translation())
-    return points.min(axis=0), points.max(axis=0)
+    local = (points - position) @ rotation
+    return np.array([local.min(axis=0), local.max(axis=0)])

@@ -1,4 +1,4 @@
-"""Inverse kinematics of the arm: many starts for a pose, and continuation along a straight line."""
+"""Continuation along a straight line of the TCP."""
 
 from __future__ import annotations
 
@@ -8,11 +8,6 @@ from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.collision import ArmWorld, matrix_to_pose
 from robocas_ms3.planning.protocol import Array
 
-LIMIT_MARGIN = 0.02  # rad kept from every joint limit
-STARTS = 16  # configurations that inverse kinematics starts from, the preferred one first
-DISTINCT = 0.1  # rad (norm over the joints) between two solutions that count as different
-POSITION_TOLERANCE = 1e-4  # m
-ROTATION_TOLERANCE = 1e-3  # rad
 LINE_STEP = 0.01  # m between two poses of a straight line
 LINE_TURN = np.deg2rad(3)
 MAX_JUMP = 0.15  # rad a joint may turn between two poses of a straight line
@@ -42,7 +37,7 @@ class ArmKinematics:
 
     def __init__(self, world: ArmWorld) -> None:
         self._world = world
-        self.lower, self.upper = world.limits[:, 0] + LIMIT_MARGIN, world.limits[:, 1] - LIMIT_MARGIN
+        self.lower, self.upper = world.chain.lower, world.chain.upper
         # The solver clamps every joint of the description, the fingers too.
         full_limits = np.concatenate(world.kinematics.get_joint_limits())
         self._full_lower, self._full_upper = full_limits[:, 0].copy(), full_limits[:, 1].copy()
@@ -65,23 +60,6 @@ class ArmKinematics:
         )
         qpos = world.arm_qpos(full)
         return qpos if converged and np.all((qpos >= self.lower) & (qpos <= self.upper)) else None
-
-    def solutions(self, tcp_in_base: Array, near: Array, rng: np.random.Generator) -> list[Array]:
-        """Give distinct configurations (7,) that reach a pose (4x4), nearest to ``near`` first, free or not."""
-        pose = matrix_to_pose(tcp_in_base)
-        spread = rng.uniform(self.lower, self.upper, (STARTS - 1, 7))
-        # A third of the starts stays around the preferred configuration, since near solutions make short motions.
-        close = np.clip(near + rng.normal(0, 0.5, (STARTS // 3, 7)), self.lower, self.upper)
-        spread[: len(close)] = close
-        found: list[Array] = []
-        for start in (np.clip(near, self.lower, self.upper), *spread):
-            qpos = self._solve(pose, start, gain=0.5, iterations=100, tolerance=1e-6)
-            if qpos is None or any(np.linalg.norm(qpos - other) < DISTINCT for other in found):
-                continue
-            distance, angle = pose_error(self._world.tcp(qpos), tcp_in_base)
-            if distance <= POSITION_TOLERANCE and angle <= ROTATION_TOLERANCE:
-                found.append(qpos)
-        return sorted(found, key=lambda qpos: float(np.linalg.norm(qpos - near)))
 
     def line(self, start: Array, tcp_in_base: Array, *, stage: str) -> Array:
         """Follow a straight line of the TCP (position linear, shortest rotation) from a configuration to a pose.

@@ -1,18 +1,21 @@
-"""The first backend of the planner protocol: mplib's kinematics and collision checks, our own search and timing."""
+"""The mplib backend of the planner protocol: its collision checks and lines; search and timing of ours."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.errors import PlanningFailed, RobocasError
+from robocas_ms3.planning.chain import turn_between
 from robocas_ms3.planning.collision import ArmWorld
 from robocas_ms3.planning.kinematics import ArmKinematics
-from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
+from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle, Trajectory
+from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.rrt import PathSearch
 from robocas_ms3.planning.timing import JointPath, rounded, stopping, through, timed
 
@@ -53,7 +56,7 @@ class MplibPlanner:
         dt: float,
         velocity_limit: float = 0.5,
         acceleration_limit: float = 0.5,
-        rrt_range: float = 0.1,
+        rrt_range: float = 0.25,
         planning_time: float = 2.0,
         voxel: float = 0.005,
     ) -> None:
@@ -61,11 +64,12 @@ class MplibPlanner:
             raise RobocasError("the time step must be positive", where="dt", found=dt)
         self._world = ArmWorld(urdf, srdf, voxel=voxel)
         self._kinematics = ArmKinematics(self._world)
+        self._reachability = Reachability(self._world.chain)
         self._dt = dt
         self._limits = {"velocity": velocity_limit, "acceleration": acceleration_limit}
         self._budget = int(planning_time * CHECKS_PER_SECOND)
         self._search = PathSearch(
-            self._world.free, self._kinematics.lower, self._kinematics.upper, step=rrt_range, spacing=SPACING
+            self._world.free_until, self._kinematics.lower, self._kinematics.upper, step=rrt_range, spacing=SPACING
         )
         self._rng = np.random.default_rng(0)
 
@@ -87,9 +91,12 @@ class MplibPlanner:
         """Make everything that follows repeat exactly for the same calls."""
         self._rng = np.random.default_rng(seed)
 
-    def set_scene(self, points_in_base: Array) -> None:
-        """Replace the obstacles by a point cloud (P, 3) m; points at the robot's own base and out of reach are cut."""
-        self._world.set_points(points_in_base)
+    def set_scene(self, obstacles: Sequence[Obstacle] | Array) -> None:
+        """Replace the obstacles by bodies, or by a point cloud (P, 3) m; see the protocol."""
+        if isinstance(obstacles, np.ndarray):
+            self._world.set_points(obstacles)
+        else:
+            self._world.set_obstacles(obstacles)
 
     def attach(self, body: AttachedBody | None) -> None:
         """Attach a held object to the TCP, or nothing."""
@@ -103,10 +110,16 @@ class MplibPlanner:
         """Name what touches at a configuration (7,): links, 'cloud', 'attached'."""
         return self._world.contacts(np.asarray(qpos, dtype=np.float64), finger_width)
 
+    def free(self, qpos: Array, finger_width: float = 0.08) -> NDArray[np.bool_]:
+        """Say which configurations (M, 7) touch nothing: (M,)."""
+        return self._world.free(np.asarray(qpos, dtype=np.float64).reshape(-1, 7), finger_width=finger_width)
+
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
         """Solve inverse kinematics; see the protocol."""
-        found = self._kinematics.solutions(tcp_in_base, np.asarray(near, dtype=np.float64), self._rng)
-        return [qpos for qpos in found if self._world.free(qpos)] if avoid_collisions else found
+        found = self._reachability.solutions(tcp_in_base, np.asarray(near, dtype=np.float64))
+        if not avoid_collisions or not found:
+            return found
+        return [qpos for qpos, ok in zip(found, self._world.free(np.array(found)), strict=True) if ok]
 
     def plan_to_pose(self, start: Array, tcp_in_base: Array, *, stage: str) -> Trajectory:
         """Plan a collision-free motion (see ``plan_to_qpos``) that ends with the TCP at a pose (4x4).
@@ -119,32 +132,35 @@ class MplibPlanner:
             raise PlanningFailed(stage, "no_ik")
         return self.plan_to_qpos(start, goals, stage=stage)
 
-    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str) -> Trajectory:
+    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, search: bool = True) -> Trajectory:
         """Plan a collision-free motion to the nearest of several configurations that can be reached.
 
         Args:
             start: (7,), free of collisions.
             goals: (7,) each.
             stage: name for errors.
+            search: look for a way around what is in the way of a straight motion.
 
         Raises:
-            PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``goal_in_collision``, ``rrt_timeout``,
-                ``path_blocked``, ``timing_failed``.
+            PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``goal_in_collision``, ``not_straight``,
+                ``rrt_timeout``, ``path_blocked``, ``timing_failed``.
         """
         start = self._checked_start(start, stage)
-        goals = sorted(
-            (np.asarray(goal, dtype=np.float64) for goal in goals), key=lambda g: float(np.linalg.norm(g - start))
-        )
+        wanted = np.array(goals, dtype=np.float64).reshape(-1, 7)
         lower, upper = self._world.limits.T
-        free = [goal for goal in goals if np.all((goal >= lower) & (goal <= upper)) and self._world.free(goal)]
-        if not free:
+        wanted = wanted[np.all((wanted >= lower) & (wanted <= upper), axis=1)]
+        wanted = wanted[self._world.free(wanted)]
+        if not len(wanted):
             raise PlanningFailed(stage, "goal_in_collision")
+        free = list(wanted[np.argsort(turn_between(wanted, start), kind="stable")])
         if np.linalg.norm(free[0] - start) < STILL:
             return Trajectory(free[0][None].copy(), self._dt)
-        enough = DETOUR * float(np.linalg.norm(free[0] - start)) + 0.5
+        enough = DETOUR * turn_between(free[0], start) + 0.5
         for goal in free:
-            if np.linalg.norm(goal - start) <= enough and self._straight_free(start, goal):
+            if turn_between(goal, start) <= enough and self._straight_free(start, goal):
                 return self._timed(partial(stopping, np.array([start, goal])))
+        if not search:
+            raise PlanningFailed(stage, "not_straight")
         reason = "rrt_timeout"
         # The nearest goal alone gets a quick try, then all of them the full budget; a path that slips through something
         # between two checks is searched again with the spacing of the final check.
@@ -175,36 +191,32 @@ class MplibPlanner:
             PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``line_unreachable``, ``line_joint_jump``,
                 ``straight_line_blocked``, ``timing_failed``.
         """
-        start = self._checked_start(start, stage, cloud=check_collisions)
+        start = self._checked_start(start, stage, obstacles=check_collisions)
         waypoints = self._kinematics.line(start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
         if np.linalg.norm(waypoints[-1] - start) < STILL:
             return Trajectory(waypoints[-1:].copy(), self._dt)
         path = through(waypoints)
-        if not self._path_free(path, cloud=check_collisions):
+        if not self._path_free(path, obstacles=check_collisions):
             raise PlanningFailed(stage, "straight_line_blocked")
         trajectory = self._timed(partial(timed, path), speed)
         if trajectory is None:
             raise PlanningFailed(stage, "timing_failed")
         return trajectory
 
-    def _checked_start(self, start: Array, stage: str, *, cloud: bool = True) -> Array:
+    def _checked_start(self, start: Array, stage: str, *, obstacles: bool = True) -> Array:
         start = np.asarray(start, dtype=np.float64)
         lower, upper = self._world.limits.T
         if np.any(start < lower - 1e-3) or np.any(start > upper + 1e-3):
             raise PlanningFailed(stage, "start_outside_limits")
-        if not self._world.free(start, cloud=cloud):
+        if not self._world.all_free(start[None], obstacles=obstacles):
             raise PlanningFailed(stage, "start_in_collision")
         return start
 
     def _straight_free(self, start: Array, goal: Array) -> bool:
-        count = int(np.ceil(np.linalg.norm(goal - start) / FINE_SPACING))
-        coarse = [start + (goal - start) * (i / 8) for i in range(1, 8)]  # most failures show in a few checks
-        return all(map(self._world.free, coarse)) and all(
-            self._world.free(start + (goal - start) * (i / count)) for i in range(1, count)
-        )
+        return self._world.all_free(start + (goal - start) * _fractions(start, goal)[1:-1, None])
 
-    def _path_free(self, path: JointPath, *, cloud: bool = True) -> bool:
-        return all(self._world.free(qpos, cloud=cloud) for qpos in path.dense(FINE_SPACING))
+    def _path_free(self, path: JointPath, *, obstacles: bool = True) -> bool:
+        return self._world.all_free(path.dense(FINE_SPACING), obstacles=obstacles)
 
     def _finish(self, waypoints: list[Array]) -> Trajectory | None:
         """Round corners, check the very path that will be driven, and time it; none when it touches something."""
@@ -220,15 +232,16 @@ class MplibPlanner:
                 trajectory = self._timed(partial(timed, path))
                 if trajectory is not None:
                     return trajectory
-        polyline = [a + (b - a) * s for a, b in zip(corners[:-1], corners[1:], strict=True) for s in _fractions(a, b)]
-        return self._timed(partial(stopping, corners)) if all(map(self._world.free, polyline)) else None
+        legs = zip(corners[:-1], corners[1:], strict=True)
+        polyline = np.concatenate([a + (b - a) * _fractions(a, b)[:, None] for a, b in legs])
+        return self._timed(partial(stopping, corners)) if self._world.all_free(polyline) else None
 
     def _timed(self, time: Callable[..., Timed], speed: float = 1.0) -> Timed:
         """Time a motion within a fraction of the limits, and slower where the TCP would be faster than its limit."""
         limits = {name: value * speed for name, value in self._limits.items()}
         trajectory = time(**limits, dt=self._dt)
         if trajectory is not None and len(trajectory.qpos) > 1:
-            places = np.array([self.tcp(qpos)[:3, 3] for qpos in trajectory.qpos])
+            places = self._world.chain.tcp(trajectory.qpos)[:, :3, 3]
             fastest = float(np.linalg.norm(np.diff(places, axis=0), axis=1).max()) / self._dt
             if fastest > TCP_SPEED_LIMIT:
                 # Slower by s: velocities by s, accelerations by its square. Then all of the motion is, ramps too.

@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
+from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import Array
-from robocas_ms3.planning.reachability import Reachability, twist
 
 MAX_SLIP = np.deg2rad(50)  # of the gripper about the bar, from straight in; further on the palm meets the front
 MAX_JUMP = 0.2  # rad a joint may turn between two poses of the handle
-ITERATIONS = 25
+ITERATIONS = 14
 SETTLING = 6  # iterations in which the free motion is used to leave joint limits
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 2e-4, 2e-3  # m, rad
+
+# OpenBLAS starts threads even for 6 x 6 matrices: ten times slower, and the last bits hang on their number.
+_BLAS = ThreadpoolController()
 
 
 def turned_about_bar(tcp: Array, angle: float) -> Array:
@@ -26,11 +30,11 @@ def turned_about_bar(tcp: Array, angle: float) -> Array:
     return tcp @ turn
 
 
-def track(reachability: Reachability, starts: Array, goals: Array, *, max_slip: float = MAX_SLIP) -> Array:
+def track(chain: ArmChain, starts: Array, goals: Array, *, max_slip: float = MAX_SLIP) -> Array:
     """Follow poses of a bar with the TCP, free to turn about the bar by up to ``max_slip``.
 
     Args:
-        reachability: the arm.
+        chain: the arm.
         starts: (N, 7) configurations at (or near) the first pose.
         goals: (T, 4, 4) TCP poses in the arm's base frame that hold the bar squarely, a centimetre or so apart; or
             (T, N, 4, 4), each start's own.
@@ -39,16 +43,16 @@ def track(reachability: Reachability, starts: Array, goals: Array, *, max_slip: 
     Returns:
         (T, N, 7) rad; NaN from where a start leads no further: out of reach, a joint limit, or a jump.
     """
-    with reachability.one_thread():
-        return _track(reachability, np.array(starts, dtype=np.float64), goals, max_slip)
+    with _BLAS.limit(limits=1, user_api="blas"):
+        return _track(chain, np.array(starts, dtype=np.float64), goals, max_slip)
 
 
-def _track(reachability: Reachability, qpos: Array, goals: Array, max_slip: float) -> Array:
+def _track(chain: ArmChain, qpos: Array, goals: Array, max_slip: float) -> Array:
     path = np.full((len(goals), len(qpos), 7), np.nan)
     alive = np.arange(len(qpos))
     for step, goal in enumerate(goals):
         wanted = np.broadcast_to(goal, (len(qpos), 4, 4))[alive]
-        found, solved = _solve(reachability, qpos[alive], wanted, max_slip)
+        found, solved = _solve(chain, qpos[alive], wanted, max_slip)
         if step:
             solved &= np.abs(found - qpos[alive]).max(axis=1) <= MAX_JUMP
         alive, found = alive[solved], found[solved]
@@ -62,14 +66,14 @@ def reached(path: Array) -> NDArray[np.int_]:
     return np.isfinite(path[:, :, 0]).sum(axis=0)
 
 
-def _solve(reachability: Reachability, starts: Array, goals: Array, max_slip: float) -> tuple[Array, NDArray[np.bool_]]:
+def _solve(chain: ArmChain, starts: Array, goals: Array, max_slip: float) -> tuple[Array, NDArray[np.bool_]]:
     """Damped least squares from (M, 7) to (M, 4, 4); gives (M, 7) and (M,) whether it got there."""
-    qpos, lower, upper = starts.copy(), reachability.lower, reachability.upper
+    qpos, lower, upper = starts.copy(), chain.lower, chain.upper
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     solved = np.zeros(len(qpos), dtype=bool)
     bar = goals[:, :3, 0]
     for iteration in range(ITERATIONS):
-        pose, jacobian = reachability.jacobian(qpos)
+        pose, jacobian = chain.jacobian(qpos)
         error = twist(pose, goals)
         lag = (error[:, 3:] * bar).sum(axis=1)
         free = np.abs(lag) <= max_slip
@@ -90,3 +94,15 @@ def _solve(reachability: Reachability, starts: Array, goals: Array, max_slip: fl
         step *= np.minimum(0.3 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12), 1.0)
         qpos = np.clip(qpos + step, lower, upper)
     return qpos, solved
+
+
+def twist(pose: Array, goal: Array) -> Array:
+    """Position differences and rotation vectors (M, 6), in the base frame, that take ``pose`` to ``goal`` (M, 4, 4)."""
+    turn = np.einsum("mij,mkj->mik", goal[:, :3, :3], pose[:, :3, :3])
+    axis = 0.5 * np.stack(
+        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1
+    )
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(turn, axis1=1, axis2=2) - 1))
+    scale = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0)
+    return np.concatenate([goal[:, :3, 3] - pose[:, :3, 3], axis * scale[:, None]], axis=1)

@@ -11,7 +11,10 @@ import numpy as np
 
 from robocas_ms3.planning.protocol import Array
 
-Valid = Callable[[Array], bool]
+FreeUntil = Callable[[Array], int]
+
+
+SPARSE = 8  # every so manieth configuration of an edge is checked before all others
 
 
 class BudgetSpent(Exception):
@@ -52,28 +55,31 @@ class PathSearch:
     """Search in joint space.
 
     Args:
-        valid: says whether a configuration is free.
+        free_until: says how many of some configurations (M, n) are free before the first one that is not.
         lower: (n,) joint limits, rad.
         upper: (n,).
         step: longest extension of a tree, rad (norm over the joints).
         spacing: distance of checks along an edge, rad (norm).
     """
 
-    def __init__(self, valid: Valid, lower: Array, upper: Array, *, step: float, spacing: float) -> None:
-        self._valid, self._lower, self._upper = valid, lower, upper
+    def __init__(self, free_until: FreeUntil, lower: Array, upper: Array, *, step: float, spacing: float) -> None:
+        self._free_until, self._lower, self._upper = free_until, lower, upper
         self._step, self.spacing = step, spacing
         self._left = 0
 
-    def _check(self, qpos: Array) -> bool:
-        if self._left <= 0:
+    def _checked(self, a: Array, b: Array) -> Array:
+        """Configurations (M, n) along the edge from ``a`` (taken as free) to ``b``; they are paid for."""
+        count = max(1, int(np.ceil(np.linalg.norm(b - a) / self.spacing)))
+        if self._left < count:
             raise BudgetSpent
-        self._left -= 1
-        return self._valid(qpos)
+        self._left -= count
+        return a + (b - a) * (np.arange(1, count + 1) / count)[:, None]
 
     def edge_free(self, a: Array, b: Array) -> bool:
-        """Check the straight edge from ``a`` (taken as free) to ``b``; the middle first, where failures are likely."""
-        count = max(1, int(np.ceil(np.linalg.norm(b - a) / self.spacing)))
-        return all(self._check(a + (b - a) * (i / count)) for i in _spread(count))
+        """Check the straight edge from ``a`` (taken as free) to ``b``; sparse ones first, where failures show early."""
+        points = self._checked(a, b)
+        points = np.concatenate([points[i::SPARSE] for i in (SPARSE - 1, *range(SPARSE - 1))])
+        return self._free_until(points) == len(points)
 
     def connect(
         self, start: Array, goals: list[Array], rng: np.random.Generator, *, max_checks: int
@@ -110,20 +116,23 @@ class PathSearch:
         return rng.uniform(np.maximum(low, self._lower), np.minimum(high, self._upper))
 
     def _extend(self, tree: _Tree, target: Array, *, greedy: bool) -> tuple[int | None, bool]:
-        """Grow a tree towards ``target``, by a step or all the way; give the last new node and whether it is there."""
-        node, added = tree.nearest(target), None
-        while True:
-            here = tree.qpos[node]
-            distance = float(np.linalg.norm(target - here))
-            if distance <= 1e-9:
-                return node, True
-            arrives = distance <= self._step
-            there = target if arrives else here + (target - here) * (self._step / distance)
-            if not self.edge_free(here, there):
-                return added, False
-            node = added = tree.add(there, node)
-            if arrives or not greedy:
-                return added, arrives
+        """Grow a tree towards ``target``, by a step or all the way, as far as it is free.
+
+        Returns:
+            The last new node, or the nearest one where it is there already; and whether it is at ``target``.
+        """
+        node = tree.nearest(target)
+        here = tree.qpos[node].copy()
+        distance = float(np.linalg.norm(target - here))
+        if distance <= 1e-9:
+            return node, True
+        arrives = greedy or distance <= self._step
+        points = self._checked(here, target if arrives else here + (target - here) * (self._step / distance))
+        free = self._free_until(points)
+        every = max(1, round(self._step / self.spacing))
+        for index in [*range(every, free, every), free] if free else []:
+            node = tree.add(points[index - 1], node)
+        return (node if free else None), arrives and free == len(points)
 
     def shorten(self, path: list[Array], rng: np.random.Generator, *, tries: int, max_checks: int) -> list[Array]:
         """Cut corners: first drop waypoints greedily, then join random points of the path by straight edges."""
@@ -169,15 +178,3 @@ class PathSearch:
         if np.linalg.norm(b - a) > 0.98 * (high - low) or not self.edge_free(a, b):
             return path
         return [*path[: first + 1], a, b, *path[second + 1 :]]
-
-
-def _spread(count: int) -> list[int]:
-    """Order 1..count so that early indices are far apart (bisection); the end comes first."""
-    order, seen, stride = [count], {count}, count
-    while stride > 1:
-        stride = (stride + 1) // 2
-        for index in range(stride, count, stride):
-            if index not in seen:
-                seen.add(index)
-                order.append(index)
-    return order

@@ -1,8 +1,8 @@
-"""What a planner has to know of an environment: obstacle clouds, poses as matrices."""
+"""What a planner has to know of an environment: obstacles as bodies and as clouds, poses as matrices."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 import torch
@@ -10,7 +10,8 @@ from mani_skill.utils.structs import Articulation
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.kinematics import link_poses
-from robocas_ms3.planning.protocol import Array
+from robocas_ms3.assets.pack import Part
+from robocas_ms3.planning.protocol import Array, Obstacle, Shape
 from robocas_ms3.scenes.placement import transform
 from robocas_ms3.tasks.transfer import TransferEnv
 
@@ -39,22 +40,46 @@ def inverse(pose: Array) -> Array:
     return result
 
 
+_SHAPES: dict[int, tuple[Part, Shape]] = {}  # by the part's id, which stays its own since the part is kept
+
+
+def shape_of(part: Part) -> Shape:
+    """The shape of an asset's part, the same object for as long as the process runs."""
+    if id(part) not in _SHAPES:
+        _SHAPES[id(part)] = part, Shape(tuple(part.hulls))
+    return _SHAPES[id(part)][1]
+
+
+def seen_from(obstacles_in_world: Iterable[Obstacle], arm_base_in_world: Array) -> list[Obstacle]:
+    """Bodies whose poses are the world's, in the frame of an arm's base (4x4)."""
+    to_base = inverse(arm_base_in_world)
+    return [Obstacle(body.name, body.shape, to_base @ body.pose_in_base) for body in obstacles_in_world]
+
+
 class PlanningScene:
-    """Reads one environment (``num_envs`` = 1) as a planner sees it. All clouds are in the arm's base frame, m."""
+    """Reads one environment (``num_envs`` = 1) as a planner sees it. All poses and clouds are in the arm's base frame.
+
+    Bodies (`obstacles`) are for planners, clouds (`obstacles_in_base`) for whatever reasons about surfaces.
+    """
 
     def __init__(self, env: TransferEnv) -> None:
         self.env = env
 
-    def _furniture_in_world(self, without: tuple[str, str] | None) -> Array:
-        """Samples (P, 3) of the surfaces of all furniture, its doors and drawers as they stand."""
-        pieces = []
+    def _bodies(
+        self, left_out: Collection[int], without_link: tuple[str, str] | None
+    ) -> Iterator[tuple[str, Part, float, Array]]:
+        """Name, part, spacing of its samples (m) and pose in the world (4x4) of all that is there."""
         for name, asset in self.env.model.furniture.items():
             frame = self.env.model.furniture_poses[name]
-            pieces.append(transform(frame, asset.surface_points(FURNITURE_SPACING)))
+            yield name, asset, FURNITURE_SPACING, frame
             for link, pose in link_poses(asset.asset.links, self.joint_positions(name)).items():
-                if (name, link) != without:
-                    pieces.append(transform(frame @ pose, asset.links[link].surface_points(FURNITURE_SPACING)))
-        return np.concatenate(pieces)
+                if (name, link) != without_link:
+                    yield f"{name}/{link}", asset.links[link], FURNITURE_SPACING, frame @ pose
+        yield "basket", self.env.model.basket, SPACING, matrix(self.env.fixtures.basket.pose.raw_pose[0])
+        present = self.env.present[0].tolist()
+        for slot, asset in enumerate(self.env.object_assets[0]):
+            if present[slot] and slot not in left_out:
+                yield asset.asset.id, asset, SPACING, matrix(self.env.objects[slot].pose.raw_pose[0])
 
     def joint_positions(self, furniture: str) -> dict[str, float]:
         """Positions of a piece of furniture's joints by name, m or rad."""
@@ -87,29 +112,50 @@ class PlanningScene:
         """4x4 of the basket's frame in the arm's base frame."""
         return inverse(self.arm_base_in_world) @ matrix(self.env.fixtures.basket.pose.raw_pose[0])
 
+    def obstacles(
+        self,
+        *,
+        without: int | Collection[int] = (),
+        without_link: tuple[str, str] | None = None,
+    ) -> list[Obstacle]:
+        """Furniture, basket and the objects that are there, as bodies for a planner; arguments as below."""
+        return seen_from(self.obstacles_in_world(without=without, without_link=without_link), self.arm_base_in_world)
+
+    def obstacles_in_world(
+        self,
+        *,
+        without: int | Collection[int] = (),
+        without_link: tuple[str, str] | None = None,
+    ) -> list[Obstacle]:
+        """The same with their poses in the world, for where the base might stand (`seen_from`)."""
+        left_out = {without} if isinstance(without, int) else without
+        return [Obstacle(name, shape_of(part), pose) for name, part, _, pose in self._bodies(left_out, without_link)]
+
     def obstacles_in_base(
         self,
         *,
         without: int | Collection[int] = (),
         without_link: tuple[str, str] | None = None,
         radius: float = RADIUS,
+        around: Array | None = None,
     ) -> Array:
         """Samples (P, 3) of the collision surfaces of furniture, basket and the objects that are there.
 
         Args:
             without: slot or slots of objects to leave out.
             without_link: a piece of furniture and its moving part to leave out.
-            radius: m, from the arm's base as it stands; beyond it they are left out.
+            radius: m, beyond it they are left out.
+            around: (3,) of what; default: the arm's base as it stands.
         """
         to_base = inverse(self.arm_base_in_world)
-        left_out = {without} if isinstance(without, int) else set(without)
-        present = self.env.present[0].tolist()
-        pieces = [
-            transform(to_base, self._furniture_in_world(without_link)),
-            transform(self.basket_in_base, self.env.model.basket.surface_points(SPACING)),
-        ]
-        for slot, asset in enumerate(self.env.object_assets[0]):
-            if present[slot] and slot not in left_out:
-                pieces.append(transform(self.object_in_base(slot), asset.surface_points(SPACING)))
-        points = np.concatenate(pieces)
-        return points[np.linalg.norm(points, axis=1) <= radius]
+        center = np.zeros(3) if around is None else around
+        left_out = {without} if isinstance(without, int) else without
+        pieces = [np.zeros((0, 3))]
+        for _, part, spacing, pose in self._bodies(left_out, without_link):
+            in_base, points = to_base @ pose, part.surface_points(spacing)
+            if np.isfinite(radius):
+                away = points - (center - in_base[:3, 3]) @ in_base[:3, :3]
+                points = points[np.einsum("ij,ij->i", away, away) <= radius**2]
+            if len(points):
+                pieces.append(transform(in_base, points))
+        return np.concatenate(pieces)

@@ -109,9 +109,13 @@ def gripper_is_clear(
     near = np.all((points_in_world >= centers.min(0) - reach) & (points_in_world <= centers.max(0) + reach), axis=1)
     points = points_in_world[near]
     for i, pose in enumerate(tcp_in_world):
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        # Most points are above or below everything; the rest is tested against the three boxes, both halves at once.
-        local = local[(local[:, 2] <= high[:, 2].max()) & (np.abs(local[:, 0]) <= high[:, 0].max())]
+        # Most points are above or below everything, of the others most beside; the rest is tested against the three
+        # boxes, both halves at once.
+        away = points - pose[:3, 3]
+        along = away @ pose[:3, 2]
+        away = away[(along >= low[:, 2].min()) & (along <= high[:, 2].max())]
+        away = away[np.abs(away @ pose[:3, 0]) <= high[:, 0].max()]
+        local = away @ pose[:3, :3]
         local[:, 1] = np.abs(local[:, 1])
         clear[i] = not any(np.any(np.all((local >= a) & (local <= b), axis=1)) for a, b in zip(low, high, strict=True))
     return clear

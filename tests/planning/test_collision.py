@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from planning_scenes import REST, Box, cloud, top_down
+from planning_scenes import REST, Box, Checker, cloud, corners, table_scene, top_down
 
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.planning.collision import ArmWorld, matrix_to_pose, pose_to_matrix
-from robocas_ms3.planning.protocol import AttachedBody
+from robocas_ms3.planning.collision import ArmWorld, convex_hull, inflated, matrix_to_pose, pose_to_matrix
+from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_a_cloud_of_5_mm_spacing_has_no_holes(world):
         world.set_points((plane + shift + [0, 0, -0.004]) @ tcp[:3, :3].T + lowest)
         assert world.contacts(REST, 0.08) == ["cloud", "panda_leftfinger", "panda_rightfinger"]
         world.set_points((plane + shift + [0, 0, 0.010]) @ tcp[:3, :3].T + lowest)
-        assert world.free(REST)
+        assert world.free(REST[None])[0]
 
 
 def test_the_cloud_counts_in_the_very_first_check_and_can_be_replaced(world, make_planner):
@@ -68,14 +68,14 @@ def test_the_cloud_counts_in_the_very_first_check_and_can_be_replaced(world, mak
 
 def test_recent_clouds_come_back_unchanged(world):
     wide = cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))])
-    clouds = [cloud([Box((0.6, 0, 0.1 * i), (0.1, 0.1, 0.1))]) for i in range(6)]
+    clouds = [cloud([Box((0.6, 0, 0.1 * i), (0.1, 0.1, 0.1))]) for i in range(20)]
     for _ in range(2):
         world.set_points(wide)
-        assert not world.free(REST)
+        assert not world.free(REST[None])[0]
         for points in clouds:
             world.set_points(points)
-            assert world.free(REST)
-    assert len(world._trees) == 4
+            assert world.free(REST[None])[0]
+    assert len(world._recent) == 16
 
 
 def test_the_base_stays_at_the_origin(world):
@@ -103,10 +103,10 @@ def test_points_must_be_finite(world):
 
 def test_without_the_cloud_the_robot_still_counts(world):
     world.set_points(cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))]))
-    assert not world.free(REST)
-    assert world.free(REST, cloud=False)
+    assert not world.free(REST[None])[0]
+    assert world.free(REST[None], obstacles=False)[0]
     folded = np.array([0.0, -1.7, 0.0, -3.0, 0.0, 0.0, 0.0])
-    assert not world.free(folded, cloud=False)
+    assert not world.free(folded[None], obstacles=False)[0]
     assert len(world.contacts(folded, 0.08)) >= 2
 
 
@@ -117,7 +117,7 @@ def test_closed_fingers_fit_where_open_ones_do_not(world):
     assert world.contacts(REST, 0.08) == ["cloud", "panda_leftfinger"]
     assert world.contacts(REST, 0.0) == []
     world.finger_width = 0.0
-    assert world.free(REST)
+    assert world.free(REST[None])[0]
 
 
 @pytest.mark.parametrize("quality", ["box", "cloud of points"])
@@ -131,7 +131,7 @@ def test_any_set_of_vertices_can_be_attached(world, quality):
     below = np.eye(4)
     below[2, 3] = 0.05
     world.attach(AttachedBody(vertices, below))
-    assert world.free(REST)
+    assert world.free(REST[None])[0]
     tcp = world.tcp(REST)
     world.set_points((tcp[:3, 3] + 0.075 * tcp[:3, 2])[None])  # 25 mm below its centre: inside
     assert world.contacts(REST, 0.08) in (["attached", "cloud"], [])
@@ -143,3 +143,89 @@ def test_the_rest_pose_and_top_down_poses_are_free(make_planner):
     planner = make_planner()
     assert planner.collisions(REST) == []
     assert len(planner.ik(top_down(0.5, 0.0, 0.2), REST)) >= 3
+
+
+def body(box: Box) -> Obstacle:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = box.matrix(), box.center
+    return Obstacle("box", Shape((corners(*(np.array(box.size) / 2)),)), pose)
+
+
+def test_bodies_are_met_where_their_clouds_are(world):
+    """Random configurations over a table of boxes: as FCL finds them with a tree of points, within the margin."""
+    boxes = table_scene(0)
+    low, high = world.chain.lower, world.chain.upper
+    qpos = np.clip(REST + np.random.default_rng(0).normal(0, 0.6, (400, 7)), low, high)
+    world.set_points(cloud(boxes))
+    by_points = world.free(qpos)
+    world.set_obstacles([body(box) for box in boxes])
+    by_bodies = world.free(qpos)
+    assert 20 < np.sum(~by_bodies) < 380
+    assert np.mean(by_points == by_bodies) > 0.98
+    assert [world.all_free(q[None]) for q in qpos] == by_bodies.tolist()
+    first = int(np.argmin(by_bodies))
+    assert world.free_until(qpos) == first
+    assert world.free_until(qpos[by_bodies]) == by_bodies.sum()
+    assert not world.all_free(qpos)
+    assert world.all_free(qpos[by_bodies])
+
+
+def test_no_pair_that_touches_is_lost_in_the_broad_phase(world, checker: Checker):
+    """Whatever an independent check finds more than the margin deep is found."""
+    rng = np.random.default_rng(2)
+    places = rng.uniform((0.25, -0.5, 0.1), (0.7, 0.5, 0.8), (15, 3))
+    boxes = [Box(tuple(place), tuple(rng.uniform(0.03, 0.15, 3)), rng.uniform(-3, 3)) for place in places]
+    world.set_obstacles([body(box) for box in boxes])
+    qpos = np.clip(REST + np.random.default_rng(1).normal(0, 0.5, (120, 7)), world.chain.lower, world.chain.upper)
+    deep = np.array([checker.penetration(q[None], boxes) > 0.001 for q in qpos])
+    assert deep.sum() > 10
+    free = world.free(qpos)
+    assert not free[deep].any()
+    assert free.sum() > 10
+
+
+def test_a_body_is_larger_by_the_margin_and_can_be_moved(world):
+    tcp = world.tcp(REST)
+    tip = tcp[2, 3] - 0.008 - 0.0005  # of the pads, pointing down within a degree
+    flat = Shape((corners(0.1, 0.1, 0.01),))
+
+    def touched(top: float) -> list[str]:
+        pose = np.eye(4)
+        pose[:3, 3] = tcp[0, 3], tcp[1, 3], top - 0.01
+        world.set_obstacles([Obstacle("plate", flat, pose)])
+        return world.contacts(REST, 0.08)
+
+    assert touched(tip - 0.02) == []
+    assert touched(tip - 0.006) == []
+    assert touched(tip + 0.001) == ["panda_leftfinger", "panda_rightfinger", "plate"]
+
+
+def test_an_inflated_box_has_its_faces_moved_out():
+    box = corners(0.05, 0.03, 0.02)
+    larger, faces = inflated(box, 0.002)
+    assert np.abs(larger).max(axis=0) == pytest.approx([0.052, 0.032, 0.022], abs=1e-4)
+    assert len(larger) == 8 and len(faces) == 12
+    # a flat wedge: its sharp edge moves out by twice the margin at most
+    wedge = np.array([[0, 0, 0], [0, 0.1, 0], [0.1, 0, 0.005], [0.1, 0.1, 0.005], [0.1, 0, -0.005], [0.1, 0.1, -0.005]])
+    larger, _ = inflated(wedge, 0.002)
+    assert larger[:, 0].min() >= -0.004 - 1e-9
+
+
+def test_faces_of_a_hull_are_seen_from_outside():
+    vertices, faces, normals = convex_hull(np.concatenate([corners(1, 1, 1), np.zeros((1, 3))]))
+    assert len(vertices) == 8  # the one inside is gone
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), normals) > 0).all()
+
+
+def test_an_attached_body_is_met_by_bodies(world):
+    held = np.eye(4)
+    held[2, 3] = 0.05
+    world.attach(AttachedBody(corners(0.03, 0.03, 0.03), held))
+    tcp = world.tcp(REST)
+    below = np.eye(4)
+    below[:3, 3] = tcp[:3, 3] + 0.085 * tcp[:3, 2]
+    world.set_obstacles([Obstacle("crumb", Shape((corners(0.006, 0.006, 0.006),)), below)])
+    assert world.contacts(REST, 0.08) == ["attached", "crumb"]
+    world.attach(None)
+    assert world.contacts(REST, 0.08) == []

@@ -12,10 +12,10 @@ from planning_scenes import REST
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.protocol import AttachedBody
+from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.planning.pulling import reached, track, turned_about_bar
 from robocas_ms3.planning.reachability import Reachability
-from robocas_ms3.planning.skills.driving import _routes, body_is_free, free_route
+from robocas_ms3.planning.skills.driving import Surroundings, _routes, body_is_free, free_route
 from robocas_ms3.planning.skills.part import Part
 
 SLIDE = Joint(name="slide", kind="prismatic", axis=(-1.0, 0.0, 0.0), limits=(0.0, 0.6), friction=0, damping=0)
@@ -58,12 +58,12 @@ def test_every_pose_of_a_pull_holds_the_bar_where_the_joint_has_it(reachability,
     solved, start = reachability.reachable(goals[:1], np.array(REST))
     assert solved.all()
     limit = np.deg2rad(30)
-    path = track(reachability, start, goals, max_slip=limit)[:, 0]
+    path = track(reachability.chain, start, goals, max_slip=limit)[:, 0]
     assert reached(path[:, None])[0] == 25
     assert np.abs(np.diff(path, axis=0)).max() <= 0.2
     assert (path >= reachability.lower).all()
     assert (path <= reachability.upper).all()
-    found, _ = reachability.jacobian(path)
+    found, _ = reachability.chain.jacobian(path)
     assert found[:, :3, 3] == pytest.approx(goals[:, :3, 3], abs=1e-3)
     assert found[:, :3, 0] == pytest.approx(goals[:, :3, 0], abs=5e-3)  # the bar stays across the fingers
     slips = [abs(angle_about_bar(a, b)) for a, b in zip(found, goals, strict=True)]
@@ -75,7 +75,7 @@ def test_a_pull_ends_where_the_arm_does(reachability):
     away = Joint(name="away", kind="prismatic", axis=(1, 0, 0), limits=(0, 2), friction=0, damping=0)
     goals = np.array([joint_motion(away, q) @ hold for q in np.arange(0, 1.0, 0.02)])
     _, start = reachability.reachable(goals[:1], np.array(REST))
-    path = track(reachability, start, goals)
+    path = track(reachability.chain, start, goals)
     count = int(reached(path)[0])
     assert 0.6 + 0.02 * count < 1.2  # the Panda's reach, long fingers included
     assert count > 3
@@ -112,7 +112,9 @@ def test_a_drive_keeps_what_is_held_clear(planner):
     beyond = planner.tcp(arm.at) @ np.array(
         [0, 0, 0.10, 1]
     )  # 0.10 m beyond the tips, where the base stands at the goal
-    spot = beyond[:3] + [0.24, 0, 0.49] + np.random.default_rng(0).uniform(-0.01, 0.01, (600, 3))
+    spot, there = np.random.default_rng(0).uniform(-0.01, 0.01, (600, 3)), np.eye(4)
+    there[:3, 3] = beyond[:3] + [0.24, 0, 0.49]
+    spot = Surroundings([Obstacle("spot", Shape(points=spot), there)], spot + there[:3, 3])
     assert len(free_route(arm, start, goal, spot, leaving=False)) == 1
     corners = np.stack(np.meshgrid((-0.02, 0.02), (-0.02, 0.02), (-0.02, 0.15)), axis=-1).reshape(-1, 3)
     planner.attach(AttachedBody(corners, np.eye(4)))

@@ -6,22 +6,47 @@ import numpy as np
 import pytest
 import torch
 
-from robocas_ms3.planning.scene import PlanningScene
+from robocas_ms3.planning.scene import PlanningScene, seen_from
 
 
 class Parked(PlanningScene):
-    """Three objects of one point each, 1 m apart above the basket's point; no furniture but its own point."""
+    """Three objects of one point each, 1 m apart above the basket's point; furniture of a body and a door."""
 
-    arm_base_in_world = property(lambda self: np.eye(4))
-    basket_in_base = property(lambda self: np.eye(4))
+    arm_base_in_world = property(lambda self: at(0, 0, 0))
 
-    def _furniture_in_world(self, without):
-        return np.array([[9.0, 0, 0]])
+    def joint_positions(self, furniture):
+        return {}
 
-    def object_in_base(self, slot):
-        pose = np.eye(4)
-        pose[2, 3] = 1 + slot
-        return pose
+
+def at(x, y, z):
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def actor(x, y, z):
+    return SimpleNamespace(pose=SimpleNamespace(raw_pose=torch.tensor([[x, y, z, 1.0, 0, 0, 0]])))
+
+
+def part(name):
+    return SimpleNamespace(
+        surface_points=lambda spacing: np.zeros((1, 3)),
+        hulls=[np.zeros((4, 3))],
+        asset=SimpleNamespace(id=name, links={}),
+        links={},
+    )
+
+
+def environment(present):
+    return SimpleNamespace(
+        present=torch.tensor([present], dtype=torch.bool),
+        object_assets=[[part(f"object {slot}") for slot in range(3)]],
+        objects=[actor(0, 0, 1.0 + slot) for slot in range(3)],
+        fixtures=SimpleNamespace(basket=actor(0, 0, 0)),
+        model=SimpleNamespace(
+            basket=part("basket"), furniture={"table": part("table")}, furniture_poses={"table": at(9, 0, 0)}
+        ),
+    )
 
 
 @pytest.mark.parametrize(
@@ -29,11 +54,22 @@ class Parked(PlanningScene):
     [([1, 1, 1], (), [1, 2, 3]), ([1, 0, 1], (), [1, 3]), ([1, 0, 1], 2, [1]), ([0, 1, 1], [0, 1], [3])],
 )
 def test_objects_that_wait_elsewhere_are_no_obstacles(present, without, heights):
-    point = SimpleNamespace(surface_points=lambda spacing: np.zeros((1, 3)))
-    env = SimpleNamespace(
-        present=torch.tensor([present], dtype=torch.bool),
-        object_assets=[[point] * 3],
-        model=SimpleNamespace(basket=point),
-    )
-    seen = Parked(env).obstacles_in_base(without=without, radius=np.inf)
-    assert seen[:, 2].tolist() == [0, 0, *heights]
+    scene = Parked(environment(present))
+    assert scene.obstacles_in_base(without=without, radius=np.inf)[:, 2].tolist() == [0, 0, *heights]
+    bodies = scene.obstacles(without=without)
+    assert [body.name for body in bodies[:2]] == ["table", "basket"]
+    assert [body.pose_in_base[2, 3] for body in bodies[2:]] == heights
+
+
+def test_only_what_is_near_a_place_is_sampled():
+    scene = Parked(environment([1, 1, 1]))
+    assert scene.obstacles_in_base()[:, 2].tolist() == [0, 1]  # within 1.5 m of the arm's base
+    assert scene.obstacles_in_base(radius=0.5, around=np.array([0, 0, 2.2]))[:, 2].tolist() == [2]
+
+
+def test_a_part_has_one_shape_and_a_body_is_seen_from_another_base():
+    scene = Parked(environment([1, 0, 0]))
+    (*_, first), (*_, again) = scene.obstacles(), scene.obstacles()
+    assert first.shape is again.shape
+    world = scene.obstacles_in_world()
+    assert seen_from(world, at(0.5, 0, 1))[-1].pose_in_base[:3, 3].tolist() == [-0.5, 0, 0]

@@ -175,7 +175,7 @@ def test_a_pull_opens_by_contact_and_leaves_the_handle(tmp_path):
         # the gripper is open and off the handle
         bar = part.in_base(arm, np.array([part.position(arm)]))[0] @ part.hold
         assert (np.linalg.inv(bar) @ arm.scene.tcp_in_base)[2, 3] < -0.05
-        arm.planner.set_scene(arm.scene.obstacles_in_base())
+        arm.planner.set_scene(arm.scene.obstacles())
         assert arm.planner.collisions(arm.scene.arm_qpos) == []
         assert int(arm.env.evaluate()["disturbed"][0]) == 0
 
@@ -201,7 +201,7 @@ def test_it_drives_to_a_handle_that_is_out_of_reach(tmp_path):
 
     def share(arm) -> float:
         part = Part.of(arm)
-        others = arm.scene.obstacles_in_base(without_link=(part.furniture, part.handle.link))
+        others = arm.scene.obstacles(without_link=(part.furniture, part.handle.link))
         return pull_share(arm, part, arm.scene.arm_base_in_world, others)
 
     def policy(arm) -> None:

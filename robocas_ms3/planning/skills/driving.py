@@ -6,12 +6,13 @@ Base poses are joint positions (3,): x m, y m, yaw rad, in the frame of the robo
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.protocol import Array
-from robocas_ms3.planning.scene import inverse, matrix
+from robocas_ms3.planning.protocol import Array, Obstacle
+from robocas_ms3.planning.scene import matrix, seen_from
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.timing import stopping
 from robocas_ms3.robots.constants import ARM_BASE_ABOVE_BASE_LINK, BASE_LIMITS, BASE_LINK_HEIGHT
@@ -22,7 +23,6 @@ SPEED, ACCELERATION = 0.25, 0.4  # m/s and rad/s; m/s^2 and rad/s^2
 SETTLE_SECONDS = 0.4
 ARRIVED = 0.01  # m, rad
 CHECK_STEP = 0.08  # m or rad between poses at which a drive is checked
-ARM_LENGTH = 1.2  # m from its base to the tips, hand and what it holds included
 THINNED = 3  # every third point of the clouds will do: nothing thinner than 2 cm could slip between them
 LIMIT_MARGIN = 0.01  # m, rad
 MAX_YAW = 0.6  # rad
@@ -30,6 +30,26 @@ SAMPLES, TRIED = 400, 14  # base poses drawn; those of them that are judged
 DISTANCES = (0.45, 0.80)  # m from the arm's base to what it reaches for, level
 BEST_DISTANCE = 0.58
 DETOURS = (0.15, 0.30)  # m straight back first
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is in the way of a drive, in the world.
+
+    Attributes:
+        obstacles: for the arm.
+        cloud: (P, 3) thinned samples of the same surfaces, for the body on the floor, m.
+    """
+
+    obstacles: list[Obstacle]
+    cloud: Array
+
+
+def surroundings(arm: Arm, *, without: int | tuple[()] = ()) -> Surroundings:
+    """Everything that is there, but for an object."""
+    cloud = arm.scene.obstacles_in_base(without=without, radius=np.inf)[::THINNED]
+    obstacles = arm.scene.obstacles_in_world(without=without)
+    return Surroundings(obstacles, transform(arm.scene.arm_base_in_world, cloud))
 
 
 def base_at(arm: Arm) -> Array:
@@ -74,13 +94,15 @@ def places_before(arm: Arm, center: Array) -> Array:
     return goals[order[possible[order]]]
 
 
-def best_route(arm: Arm, goals: Array, cloud: Array, judge: Callable[[Array], float], *, enough: float) -> list[Array]:
+def best_route(
+    arm: Arm, goals: Array, around: Surroundings, judge: Callable[[Array], float], *, enough: float
+) -> list[Array]:
     """Base poses that lead to the best of the first few goals where the body is free; the first one that is enough.
 
     Args:
         arm: the attempt's tools.
         goals: (N, 3), the most promising first.
-        cloud: (P, 3) surfaces of all obstacles, world, m.
+        around: what is in the way.
         judge: what a base pose (3,) is good for, the more the better; 0: nothing.
         enough: look no further.
 
@@ -90,13 +112,13 @@ def best_route(arm: Arm, goals: Array, cloud: Array, judge: Callable[[Array], fl
     best: tuple[float, list[Array]] = (0.0, [])
     tried = 0
     for goal in goals:
-        if not body_is_free(arm_base_in_world(arm, goal), cloud):
+        if not body_is_free(arm_base_in_world(arm, goal), around.cloud):
             continue
         tried += 1
         if tried > TRIED:
             break
         share = judge(goal)
-        if share > best[0] and (route := free_route(arm, base_at(arm), goal, cloud, leaving=False)):
+        if share > best[0] and (route := free_route(arm, base_at(arm), goal, around, leaving=False)):
             best = share, route
             if share >= enough:
                 break
@@ -105,19 +127,19 @@ def best_route(arm: Arm, goals: Array, cloud: Array, judge: Callable[[Array], fl
     return best[1]
 
 
-def free_route(arm: Arm, start: Array, goal: Array, cloud: Array, *, leaving: bool) -> list[Array] | None:
+def free_route(arm: Arm, start: Array, goal: Array, around: Surroundings, *, leaving: bool) -> list[Array] | None:
     """Base poses to drive to one after the other: straight, or by way of a place behind the narrower end.
 
     Args:
         arm: the attempt's tools; the arm stays as it stands.
         start: (3,).
         goal: (3,).
-        cloud: (P, 3) surfaces of all obstacles, world, m.
+        around: what is in the way.
         leaving: whether ``start`` is the narrower end, so that the robot backs out first; else it moves up last.
     """
     for route in _routes(start, goal, leaving):
         poses = [start, *route]
-        if all(_leg_is_free(arm, a, b, cloud) for a, b in zip(poses[:-1], poses[1:], strict=True)):
+        if all(_leg_is_free(arm, a, b, around) for a, b in zip(poses[:-1], poses[1:], strict=True)):
             return route
     return None
 
@@ -131,16 +153,14 @@ def _routes(start: Array, goal: Array, leaving: bool) -> Iterator[list[Array]]:
             yield [via, goal]
 
 
-def _leg_is_free(arm: Arm, start: Array, goal: Array, cloud: Array) -> bool:
+def _leg_is_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> bool:
     count = max(2, int(np.ceil(np.abs(goal - start).max() / CHECK_STEP)) + 1)
-    cloud = cloud[::THINNED]
     width = arm.planner.finger_width
     for pose in np.linspace(start, goal, count)[1:]:
         frame = arm_base_in_world(arm, pose)
-        if not body_is_free(frame, cloud):
+        if not body_is_free(frame, around.cloud):
             return False
-        local = transform(inverse(frame), cloud)
-        arm.planner.set_scene(local[np.linalg.norm(local, axis=1) < ARM_LENGTH])
+        arm.planner.set_scene(seen_from(around.obstacles, frame))
         if arm.planner.collisions(arm.at, width):
             return False
     return True

@@ -7,24 +7,34 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import inverse
 from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
-from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, Approach, filter_grasps, rank_grasps
-from robocas_ms3.scenes.placement import transform
+from robocas_ms3.scenes.grasping import (
+    NEIGHBOURHOOD,
+    PREGRASP_DISTANCE,
+    Approach,
+    filter_grasps,
+    gripper_is_clear,
+    rank_grasps,
+)
 
 GRASPS_CHECKED = 48  # grasps of which a check of collisions says whether to try them early
+CLEARED_AT_ONCE = 12
+ENTRIES = 4  # pre-grasp configurations of one grasp
+WAYS = 6  # pre-grasp configurations that are searched for together
 GRASPS_PLANNED = 12  # grasps that motions are planned for before an attempt gives up
 # m; the least makes a stage of the tasks (3 cm), the others go over what stands in front: the first with a way out
 FRONT_LIFTS = (0.04, 0.08, 0.14, 0.2)
 WITHDRAWALS = (0.25, 0.18, 0.12)  # m, straight back; the first one that can be reached
 
-
-Entry = tuple[Array, Trajectory, tuple[Trajectory, ...]]  # pre-grasp configuration, way in, way out
+_Way = tuple[Array, Trajectory, tuple[Trajectory, ...]]  # pre-grasp configuration, way in, way out
 
 
 @dataclass(frozen=True)
@@ -65,31 +75,53 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "to
     Raises:
         PlanningFailed: of the grasp that came last.
     """
-    everything, others = arm.scene.obstacles_in_base(), arm.scene.obstacles_in_base(without=slot)
-    failure = PlanningFailed("grasp_sampling", "no_feasible_grasp")
-    for tcp_in_base in candidates(arm, slot, others, approach):
-        try:
-            # in and out of the target's surroundings, where the target itself is no obstacle ...
-            arm.planner.set_scene(others)
-            entries = _entries(arm, slot, tcp_in_base, lift_height, approach)
-            # ... and there with the target as one
-            arm.planner.set_scene(everything)
-            reach = arm.planner.plan_to_qpos(arm.at, [entry[0] for entry in entries], stage="reach")
-        except PlanningFailed as error:
-            failure = error
-            continue
-        chosen = min(entries, key=lambda entry: float(np.abs(entry[0] - reach.qpos[-1]).max()))
-        return GraspPlan(reach, chosen[1], chosen[2])
+    planner, failure = arm.planner, PlanningFailed("grasp_sampling", "no_feasible_grasp")
+    everything, others = arm.scene.obstacles(), arm.scene.obstacles(without=slot)
+    ways: list[_Way] = []
+
+    def searched() -> GraspPlan:
+        planner.set_scene(everything)
+        reach = planner.plan_to_qpos(arm.at, [way[0] for way in ways], stage="reach")
+        _, inward, out = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
+        return GraspPlan(reach, inward, out)
+
+    for tcp_in_base in candidates(arm, slot, approach):
+        # in and out of the target's surroundings, where the target itself is no obstacle; it is one on the way there
+        planner.set_scene(others)
+        starts = planner.ik(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)[:ENTRIES]
+        failure = failure if starts else PlanningFailed("approach", "no_ik")
+        for start in starts:
+            try:
+                planner.set_scene(everything)
+                reach = planner.plan_to_qpos(arm.at, [start], stage="reach", search=False)
+            except PlanningFailed:
+                reach = None
+            try:
+                planner.set_scene(others)
+                inward, out = _plan_way_in_and_out(arm, slot, start, tcp_in_base, lift_height, approach)
+            except PlanningFailed as error:
+                failure = error
+                continue
+            if reach is not None:
+                return GraspPlan(reach, inward, out)
+            ways.append((start, inward, out))
+        # a search for a way round costs as much as all else, and takes several goals at once
+        if len(ways) >= WAYS:
+            try:
+                return searched()
+            except PlanningFailed as error:
+                failure, ways = error, []
+    if ways:
+        return searched()
     raise failure
 
 
-def candidates(arm: Arm, slot: int, others: Array, approach: Approach = "top") -> Iterator[Array]:
+def candidates(arm: Arm, slot: int, approach: Approach = "top") -> Iterator[Array]:
     """Grasps worth planning for, best first: TCP poses 4x4.
 
     Args:
         arm: the attempt's tools.
         slot: of the object.
-        others: (P, 3) obstacles without the object.
         approach: from where the gripper may come.
 
     Raises:
@@ -102,21 +134,19 @@ def candidates(arm: Arm, slot: int, others: Array, approach: Approach = "top") -
         notes.grasp_widths,
         arm_base_in_world=base,
         object_center_in_world=(base @ object_in_base)[:3, 3],
-        scene_points_in_world=transform(base, others),
+        scene_points_in_world=np.zeros((0, 3)),  # the dearest test comes last
         qualities=1.1 - notes.grasp_qualities,  # upstream's scale: more is better
         approach=approach,
     )
     tcp_in_base = inverse(base) @ kept.tcp_in_world
-    if not len(tcp_in_base):
-        raise PlanningFailed("grasp_sampling", "all_filtered")
     pregrasp = tcp_in_base.copy()
     pregrasp[:, :3, 3] -= PREGRASP_DISTANCE * pregrasp[:, :3, 2]
     solved, qpos = arm.reachability.reachable(tcp_in_base, arm.at)
     solved_before, qpos_before = arm.reachability.reachable(pregrasp, arm.at)
-    reachable = solved & solved_before
-    if not reachable.any():
-        raise PlanningFailed("grasp_sampling", "unreachable")
-    order = rank_grasps(
+    reachable = np.flatnonzero(solved & solved_before)
+    if not len(reachable):
+        raise PlanningFailed("grasp_sampling", "unreachable" if len(kept) else "all_filtered")
+    ranks = rank_grasps(
         tcp_in_base[reachable],
         kept.qualities[reachable],
         object_center=object_in_base[:3, 3],
@@ -125,34 +155,41 @@ def candidates(arm: Arm, slot: int, others: Array, approach: Approach = "top") -
         rng=arm.rng,
         approach=approach,
     )
+    near = arm.scene.obstacles_in_base(without=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
+    clear = _clear(tcp_in_base, reachable[ranks], near)
     if approach == "front":  # where it is narrow, first those whose arm is free as inverse kinematics found it
-        order = order[:GRASPS_CHECKED]
-        arm.planner.set_scene(others)
-        ways = np.stack([qpos_before[reachable], qpos[reachable]], axis=1)[order]
-        blocked = [any(arm.planner.collisions(ends) for ends in way) for way in ways]
-        order = order[np.argsort(blocked, kind="stable")]
-    for index in order[:GRASPS_PLANNED]:
-        yield tcp_in_base[reachable][index]
+        looked_at = list(islice(clear, GRASPS_CHECKED))
+        arm.planner.set_scene(arm.scene.obstacles(without=slot))
+        ways = np.stack([qpos_before[looked_at], qpos[looked_at]], axis=1)
+        free = arm.planner.free(ways.reshape(-1, 7)).reshape(-1, 2).all(axis=1)
+        clear = iter([looked_at[i] for i in np.argsort(~free, kind="stable")])
+    found = False
+    for index in islice(clear, GRASPS_PLANNED):
+        found = True
+        yield tcp_in_base[index]
+    if not found:
+        raise PlanningFailed("grasp_sampling", "all_filtered")
 
 
-def _entries(arm: Arm, slot: int, tcp_in_base: Array, lift_height: float, approach: Approach) -> list[Entry]:
-    """Pre-grasp configurations from which straight approach and way out are free, nearest first."""
-    failure = PlanningFailed("approach", "no_ik")
-    entries: list[Entry] = []
-    for qpos in arm.planner.ik(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)[:4]:
-        try:
-            inward = arm.planner.plan_straight(qpos, tcp_in_base, stage="approach")
-            if approach == "top":
-                retreat = (arm.first_line(inward.qpos[-1], _ways_up(tcp_in_base, lift_height), stage="lift"),)
-            else:
-                retreat = _plan_withdrawal(arm, slot, inward.qpos[-1], tcp_in_base)
-        except PlanningFailed as error:
-            failure = error
-            continue
-        entries.append((qpos, inward, retreat))
-    if not entries:
-        raise failure
-    return entries
+def _clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -> Iterator[int]:
+    """Those of the grasps, in their order, whose gripper meets no point on its way in; a few are tested at a time."""
+    for first in range(0, len(order), CLEARED_AT_ONCE):
+        some = order[first : first + CLEARED_AT_ONCE]
+        yield from some[gripper_is_clear(tcp_in_base[some], points_in_base)].tolist()
+
+
+def _plan_way_in_and_out(
+    arm: Arm, slot: int, qpos: Array, tcp_in_base: Array, lift_height: float, approach: Approach
+) -> tuple[Trajectory, tuple[Trajectory, ...]]:
+    """Plan straight from a pre-grasp configuration (7,) to a grasp, and out with the object.
+
+    Raises:
+        PlanningFailed: one of them is blocked or out of reach.
+    """
+    inward = arm.planner.plan_straight(qpos, tcp_in_base, stage="approach")
+    if approach == "top":
+        return inward, (arm.first_line(inward.qpos[-1], _ways_up(tcp_in_base, lift_height), stage="lift"),)
+    return inward, _plan_withdrawal(arm, slot, inward.qpos[-1], tcp_in_base)
 
 
 def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> tuple[Trajectory, Trajectory]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.protocol import Array, Trajectory
+from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.pulling import reached, track, turned_about_bar
 from robocas_ms3.planning.scene import inverse
 from robocas_ms3.planning.skills.arm import Arm, moved_back
@@ -79,7 +79,7 @@ def pull(arm: Arm, part: Part) -> None:
     arm.open_gripper()
     with arm.planning():
         arm.hold_nothing()
-        arm.planner.set_scene(arm.scene.obstacles_in_base())
+        arm.planner.set_scene(arm.scene.obstacles())
         back = _plan_retreat(arm, arm.at, try_free=True)
     arm.follow(back)
 
@@ -99,8 +99,8 @@ def plan_pull(arm: Arm, part: Part) -> PullPlan:
     order = [i for i in order if ends[i] >= least]
     if not order:
         raise PlanningFailed("pull", "unreachable")
-    everything = arm.scene.obstacles_in_base()
-    others = arm.scene.obstacles_in_base(without_link=(part.furniture, part.handle.link))
+    everything = arm.scene.obstacles()
+    others = arm.scene.obstacles(without_link=(part.furniture, part.handle.link))
     order = _fitting(arm, part, paths[0], order, frames, others)
     if not order:
         raise PlanningFailed("handle", "blocked")
@@ -121,14 +121,14 @@ def plan_pull(arm: Arm, part: Part) -> PullPlan:
     raise failure
 
 
-def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: Array) -> float:
+def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: list[Obstacle]) -> float:
     """How far towards open the arm could pull a part in one go if its base stood elsewhere; 1: comfortably open.
 
     Args:
         arm: the attempt's tools.
         part: what is opened.
         arm_base_in_world: 4x4.
-        others: (P, 3) surfaces of all but the part, in that base's frame, m.
+        others: all but the part, in that base's frame.
     """
     positions = part.way(arm)
     opened = arm.env.model.opened_position
@@ -161,11 +161,11 @@ def _paths(arm: Arm, part: Part, frames: Array) -> tuple[Array, NDArray[np.int_]
     solved, qpos = arm.reachability.reachable(np.array(starts), arm.at)
     if not solved.any():
         raise PlanningFailed("handle", "unreachable")
-    path = track(arm.reachability, qpos[solved], held[:, solved])
+    path = track(arm.reachability.chain, qpos[solved], held[:, solved])
     return path, reached(path)
 
 
-def _fitting(arm: Arm, part: Part, starts: Array, order: list[int], frames: Array, others: Array) -> list[int]:
+def _fitting(arm: Arm, part: Part, starts: Array, order: list[int], frames: Array, others: list[Obstacle]) -> list[int]:
     """Those of the ways to hold the handle in which it is between the open fingers, which touch nothing.
 
     Args:
@@ -174,32 +174,32 @@ def _fitting(arm: Arm, part: Part, starts: Array, order: list[int], frames: Arra
         starts: (N, 7) of each way; NaN in those that are not in the order.
         order: of ways.
         frames: (T, 4, 4) of the part during the pull.
-        others: (P, 3) surfaces of all but the part.
+        others: all but the part.
     """
     surface = transform(frames[0], part.surface(arm))
     near = surface[np.linalg.norm(surface - (frames[0] @ part.hold)[:3, 3], axis=1) < NEAR]
-    arm.planner.set_scene(np.concatenate([others, surface]))
+    arm.planner.set_scene([*others, part.obstacle(arm, frames[0])])
 
-    def fits(start: Array) -> bool:
+    def holds(start: Array) -> bool:
         between = np.abs(transform(inverse(arm.planner.tcp(start)), near)) < BETWEEN
-        return bool(between.all(axis=1).any()) and not arm.planner.collisions(start, MAX_WIDTH)
+        return bool(between.all(axis=1).any())
 
-    return [i for i in order if fits(starts[i])]
+    order = [i for i in order if holds(starts[i])]
+    return [i for i, free in zip(order, arm.planner.free(starts[order], MAX_WIDTH), strict=True) if free]
 
 
-def _free_length(arm: Arm, part: Part, path: Array, frames: Array, others: Array) -> int:
+def _free_length(arm: Arm, part: Part, path: Array, frames: Array, others: list[Obstacle]) -> int:
     """How many configurations of a path (T, 7) keep clear of everything else and of the part at its poses (T, 4, 4)."""
     planner, width = arm.planner, part.handle.width
     planner.set_scene(others)
-    length = len(path)
-    for i in range(0, len(path), 3):
-        if planner.collisions(path[i], width):
-            length = i
-            break
-    points = part.surface(arm)
-    for i in np.linspace(0, length - 1, CHECKED).round().astype(int) if length else ():
-        cloud = transform(frames[i], points)
-        planner.set_scene(cloud[np.linalg.norm(cloud - planner.tcp(path[i])[:3, 3], axis=1) > CUT])
+    blocked = np.flatnonzero(~planner.free(path[::3], width))
+    length = 3 * int(blocked[0]) if len(blocked) else len(path)
+    if not length:
+        return 0
+    points, held = part.surface(arm), transform(inverse(frames[0]), planner.tcp(path[0])[None, :3, 3])
+    rest = Shape(points=points[np.linalg.norm(points - held, axis=1) > CUT])
+    for i in np.linspace(0, length - 1, CHECKED).round().astype(int):
+        planner.set_scene([Obstacle(part.handle.link, rest, frames[i])])
         if planner.collisions(path[i], width):
             return int(i * (1 - 1 / CHECKED))
     return length

@@ -51,10 +51,11 @@ def plan_look(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> 
     else:
         raise PlanningFailed("look", "unreachable")
     qpos = qpos[solved]
-    arm.planner.set_scene(arm.scene.obstacles_in_base())
+    arm.planner.set_scene(arm.scene.obstacles())
     near = qpos[np.argsort(np.abs(qpos - arm.at).max(axis=1), kind="stable")]
-    goals = [q for q in near[: 4 * VIEWS_PLANNED] if not arm.planner.collisions(q, arm.planner.finger_width)]
-    return arm.planner.plan_to_qpos(arm.at, goals[:VIEWS_PLANNED], stage="look")
+    near = near[: 4 * VIEWS_PLANNED]
+    goals = near[arm.planner.free(near, arm.planner.finger_width)][:VIEWS_PLANNED]
+    return arm.planner.plan_to_qpos(arm.at, list(goals), stage="look")
 
 
 def hidden_share(arm: Arm, slot: int) -> float:

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.protocol import Array
-from robocas_ms3.planning.scene import SPACING, inverse
+from robocas_ms3.planning.protocol import Array, Obstacle
+from robocas_ms3.planning.scene import SPACING, inverse, shape_of
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.scenes.lookup import OPENED_AT_MOST
 from robocas_ms3.tasks import terms
@@ -73,6 +73,11 @@ class Part:
     def in_base(self, arm: Arm, positions: Array) -> Array:
         """The same in the arm's base frame."""
         return inverse(arm.scene.arm_base_in_world) @ self.in_world(arm, positions)
+
+    def obstacle(self, arm: Arm, pose_in_base: Array) -> Obstacle:
+        """The part as a body at a pose (4x4)."""
+        part = arm.env.model.furniture[self.furniture].links[self.handle.link]
+        return Obstacle(self.handle.link, shape_of(part), pose_in_base)
 
     def surface(self, arm: Arm) -> Array:
         """Samples (P, 3) of the part's surface in its own frame, m."""

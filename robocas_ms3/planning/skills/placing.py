@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.chain import turn_between
 from robocas_ms3.planning.drops import overhangs, sample_drops
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import inverse, matrix
@@ -12,7 +13,7 @@ from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
 from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.scenes.placement import transform
 
-DROPS_SAMPLED, DROPS_PLANNED = 192, 10
+DROPS_SAMPLED, DROPS_CHECKED, DROPS_PLANNED = 192, 64, 10
 RETREAT_HEIGHT = 0.05  # m, upstream's
 
 
@@ -39,7 +40,7 @@ def release_into_basket(arm: Arm, slot: int) -> None:
     arm.open_gripper()
     with arm.planning():
         arm.hold_nothing()
-        arm.planner.set_scene(arm.scene.obstacles_in_base(without=slot))
+        arm.planner.set_scene(arm.scene.obstacles(without=slot))
         retreat = plan_step_back(arm, start, _ways_off(arm.planner.tcp(start)))
         home = arm.plan_home(retreat.qpos[-1])
     arm.follow(retreat)
@@ -62,17 +63,29 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
     drops, qpos = drops[solved], qpos[solved]
     # first those in which the object fits through the opening, then those that are near
     overhang = overhangs(drops, scene.basket_in_base, *_inner_box(arm), transform(*held_object(arm, slot)))
-    order = np.lexsort((np.abs(qpos - start).max(axis=1), np.ceil(overhang / 0.02)))
-    arm.planner.set_scene(scene.obstacles_in_base(without=slot))
+    order = np.lexsort((turn_between(qpos, start), np.ceil(overhang / 0.02)))
+    arm.planner.set_scene(scene.obstacles(without=slot))
     attach_held(arm, slot)
-    failure = PlanningFailed("transfer", "no_plan")
-    for index in order[:DROPS_PLANNED]:
+    order = order[:DROPS_CHECKED]
+    order = order[arm.planner.free(qpos[order], arm.planner.finger_width)][:DROPS_PLANNED]
+    if not len(order):
+        raise PlanningFailed("transfer", "no_free_place")
+    for index in order:
         try:
-            carry = arm.planner.plan_to_pose(start, drops[index], stage="transfer")
+            carry = arm.planner.plan_to_qpos(start, [qpos[index]], stage="transfer", search=False)
             plan_step_back(arm, carry.qpos[-1], _ways_off(drops[index]))  # no way up from there: no place to let go
             return carry
+        except PlanningFailed:
+            continue
+    failure = PlanningFailed("transfer", "no_plan")
+    for _ in range(len(order)):
+        carry = arm.planner.plan_to_qpos(start, list(qpos[order]), stage="transfer")
+        chosen = int(np.argmin(np.abs(qpos[order] - carry.qpos[-1]).max(axis=1)))
+        try:
+            plan_step_back(arm, carry.qpos[-1], _ways_off(drops[order[chosen]]))
+            return carry
         except PlanningFailed as error:
-            failure = error
+            failure, order = error, np.delete(order, chosen)
     raise failure
 
 

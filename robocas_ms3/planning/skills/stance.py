@@ -10,12 +10,12 @@ from collections.abc import Callable
 import numpy as np
 
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.protocol import Array
-from robocas_ms3.planning.scene import inverse
+from robocas_ms3.planning.protocol import Array, Obstacle
+from robocas_ms3.planning.scene import inverse, seen_from
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.driving import (
-    ARM_LENGTH,
     THINNED,
+    Surroundings,
     arm_base_in_world,
     base_at,
     best_route,
@@ -23,12 +23,13 @@ from robocas_ms3.planning.skills.driving import (
     drive,
     free_route,
     places_before,
+    surroundings,
 )
 from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.handles import open_part, pull_share
 from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.placing import attach_held, drop_poses
-from robocas_ms3.scenes.grasping import HALF_TURN, PREGRASP_DISTANCE, directions_ok, gripper_is_clear
+from robocas_ms3.scenes.grasping import HALF_TURN, NEIGHBOURHOOD, PREGRASP_DISTANCE, directions_ok, gripper_is_clear
 from robocas_ms3.scenes.placement import transform
 
 PLACES = 3  # to do one thing from
@@ -84,18 +85,17 @@ def drive_to_object(arm: Arm, slot: int, *, elsewhere: bool = False) -> None:
     if not arm.executor.drives:
         return
     with arm.planning():
-        others = transform(arm.scene.arm_base_in_world, arm.scene.obstacles_in_base(without=slot, radius=np.inf))
-        grasps = clear_grasps(arm, slot, others)
+        others, grasps = arm.scene.obstacles_in_world(without=slot), clear_grasps(arm, slot)
         if not elsewhere and reach_share(arm, base_at(arm), grasps, others) >= COMFORTABLE:
             return
-    cloud = _fold(arm)
+    around = _fold(arm)
     with arm.planning():
         center = (arm.scene.arm_base_in_world @ arm.scene.object_in_base(slot))[:3, 3]
         goals = places_before(arm, center)
         seen = np.array([len(_from_here(arm, arm_base_in_world(arm, goal), grasps)) for goal in goals])
         goals = goals[seen >= max(1, 0.3 * seen.max(initial=0))]
         route = best_route(
-            arm, goals, cloud, lambda goal: reach_share(arm, goal, grasps, others), enough=2 * COMFORTABLE
+            arm, goals, around, lambda goal: reach_share(arm, goal, grasps, others), enough=2 * COMFORTABLE
         )
     drive(arm, *route)
 
@@ -118,19 +118,18 @@ def drive_to_handle(arm: Arm, *, elsewhere: bool = False) -> None:
         frame = arm_base_in_world(arm, goal)
         if not body_is_free(frame, swept):  # what opens would run into it
             return 0.0
-        return pull_share(arm, part, frame, transform(inverse(frame), others))
+        return pull_share(arm, part, frame, seen_from(others, frame))
 
     with arm.planning():
-        base, unseen = arm.scene.arm_base_in_world, (part.furniture, part.handle.link)
-        others = transform(base, arm.scene.obstacles_in_base(without_link=unseen, radius=np.inf))
+        others = arm.scene.obstacles_in_world(without_link=(part.furniture, part.handle.link))
         moved = part.in_world(arm, part.way(arm))
         swept = np.concatenate([transform(frame, part.surface(arm)[::THINNED]) for frame in moved[::THINNED]])
         if not elsewhere and share(base_at(arm)) >= PULLED:
             return
-    cloud = _fold(arm)
+    around = _fold(arm)
     with arm.planning():
         center = (moved @ part.hold)[:, :3, 3].mean(axis=0)
-        route = best_route(arm, places_before(arm, center), cloud, share, enough=PULLED)
+        route = best_route(arm, places_before(arm, center), around, share, enough=PULLED)
     drive(arm, *route)
 
 
@@ -152,56 +151,51 @@ def drive_to_basket(arm: Arm, slot: int) -> None:
 
     with arm.planning():
         attach_held(arm, slot)
-        cloud = transform(arm.scene.arm_base_in_world, arm.scene.obstacles_in_base(without=slot, radius=np.inf))
+        around = surroundings(arm, without=slot)
         start, here = np.zeros(3), base_at(arm)
         route = None
         if np.any(here) and share(start) >= ABOVE_BASKET:
-            route = free_route(arm, here, start, cloud, leaving=True)
+            route = free_route(arm, here, start, around, leaving=True)
         if route is None and share(here) >= ABOVE_BASKET:
             return
         if route is None:
             center = arm.env.fixtures.basket.pose.p[0].cpu().numpy()
-            route = best_route(arm, places_before(arm, center), cloud, share, enough=ABOVE_BASKET)
+            route = best_route(arm, places_before(arm, center), around, share, enough=ABOVE_BASKET)
     drive(arm, *route)
     if not arm.holds(slot):
         raise PlanningFailed("drive", "dropped")
 
 
-def _fold(arm: Arm) -> Array:
-    """Go to the rest configuration; gives the surfaces (P, 3) of all obstacles, world, m."""
+def _fold(arm: Arm) -> Surroundings:
+    """Go to the rest configuration; gives what is there."""
     with arm.planning():
-        in_base = arm.scene.obstacles_in_base(radius=np.inf)
-        arm.planner.set_scene(in_base)
+        arm.planner.set_scene(arm.scene.obstacles())
         home = arm.plan_home(arm.at)
+        around = surroundings(arm)
     arm.follow(home)
-    return transform(arm.scene.arm_base_in_world, in_base)
+    return around
 
 
-def clear_grasps(arm: Arm, slot: int, others: Array) -> Array:
-    """An object's grasps (G, 4, 4) in the world, whichever side they come from, whose way in is clear.
-
-    Args:
-        arm: the attempt's tools.
-        slot: of the object.
-        others: (P, 3) surfaces of everything else, world, m.
-    """
-    object_in_world = arm.scene.arm_base_in_world @ arm.scene.object_in_base(slot)
+def clear_grasps(arm: Arm, slot: int) -> Array:
+    """An object's grasps (G, 4, 4) in the world, whichever side they come from, whose way in is clear."""
+    base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
+    object_in_world = base @ object_in_base
     notes = arm.env.object_assets[0][slot].annotations
     poses = object_in_world @ notes.grasps_tcp_in_object[:: max(1, len(notes.grasp_widths) // GRASPS_LOOKED_AT)]
     tests = directions_ok(poses, np.ones(3), arm.env.task_config.target.approach)
     poses = poses[np.all([passed for name, passed in tests.items() if name != SIDE], axis=0)]
-    near = others[np.linalg.norm(others - object_in_world[:3, 3], axis=1) < 0.5]
-    return poses[gripper_is_clear(poses, near)]
+    near = arm.scene.obstacles_in_base(without=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
+    return poses[gripper_is_clear(poses, transform(base, near))]
 
 
-def reach_share(arm: Arm, base: Array, grasps: Array, others: Array) -> float:
+def reach_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle]) -> float:
     """Share of grasps that the arm reaches from a base pose without touching anything, pre-grasps included.
 
     Args:
         arm: the attempt's tools.
         base: (3,).
         grasps: (G, 4, 4) from ``clear_grasps``; those that come from the far side count as out of reach.
-        others: (P, 3) surfaces of everything but the object, world, m.
+        others: everything but the object, in the world.
     """
     frame = arm_base_in_world(arm, base)
     chosen = _from_here(arm, frame, grasps)
@@ -212,10 +206,9 @@ def reach_share(arm: Arm, base: Array, grasps: Array, others: Array) -> float:
     before = poses.copy()
     before[:, :3, 3] -= PREGRASP_DISTANCE * before[:, :3, 2]
     solved, qpos = arm.reachability.reachable(np.concatenate([poses, before]), arm.at)
-    local = transform(inverse(frame), others[::THINNED])
-    arm.planner.set_scene(local[np.linalg.norm(local, axis=1) < ARM_LENGTH])
-    free = [bool(ok) and not arm.planner.collisions(q) for ok, q in zip(solved, qpos, strict=True)]
-    held, entered = np.array(free).reshape(2, 2, -1)  # grasp or pre-grasp; as annotated or its twin; which
+    arm.planner.set_scene(seen_from(others, frame))
+    solved[solved] = arm.planner.free(qpos[solved])
+    held, entered = solved.reshape(2, 2, -1)  # grasp or pre-grasp; as annotated or its twin; which
     return float((held & entered).any(axis=0).mean())
 
 

@@ -1,0 +1,128 @@
+"""The arm as a chain of links: forward kinematics and Jacobians of many configurations at once, in numpy.
+
+No BLAS: its threads take longer to start than 3 x 3 matrices take, and the last bits would hang on their number.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.planning.protocol import Array
+
+ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
+TCP_LINK = "panda_hand_tcp"
+BASE_LINK = "panda_link0"
+HAND_LINK = "panda_hand"
+LIMIT_MARGIN = 0.02  # rad kept from every joint limit
+
+
+class ArmChain:
+    """Seven joints that turn about z of their own links, and the TCP fixed to the last.
+
+    Args:
+        arm_urdf: the arm alone, rooted at ``panda_link0``, with the TCP as ``panda_hand_tcp``.
+
+    Attributes:
+        links: eight fixed transforms 4x4: from each link to the next one at 0 rad, the last to the TCP.
+        hand_in_tcp: 4x4.
+        lower: (7,) joint limits with a margin, rad.
+        upper: (7,).
+
+    Raises:
+        RobocasError: the file is missing or is not the Panda's.
+    """
+
+    def __init__(self, arm_urdf: Path | str) -> None:
+        if not Path(arm_urdf).is_file():
+            raise RobocasError("no such robot description", where=arm_urdf)
+        root = ElementTree.parse(arm_urdf).getroot()
+        joints = {child.attrib["link"]: joint for joint in root.iterfind("joint") for child in joint.findall("child")}
+        chain: list[ElementTree.Element] = []
+        link = TCP_LINK
+        while link in joints and link != BASE_LINK:
+            chain.insert(0, joints[link])
+            link = next(parent.attrib["link"] for parent in joints[link].findall("parent"))
+        turning = [joint for joint in chain if joint.attrib["type"] == "revolute"]
+        names = tuple(joint.attrib["name"] for joint in turning)
+        axes = [axis.attrib["xyz"].split() for joint in turning for axis in joint.findall("axis")]
+        if link != BASE_LINK or names != ARM_JOINTS or any([float(v) for v in axis] != [0, 0, 1] for axis in axes):
+            raise RobocasError("not a Panda", where=arm_urdf, expected=", ".join(ARM_JOINTS), found=", ".join(names))
+        self.links, self.hand_in_tcp = [], np.eye(4)
+        pending, after_hand = np.eye(4), False
+        for joint in chain:
+            pending = pending @ _origin(joint)
+            if after_hand:
+                self.hand_in_tcp = self.hand_in_tcp @ _origin(joint)
+            if joint in turning:
+                self.links.append(pending)
+                pending = np.eye(4)
+            after_hand |= any(child.attrib["link"] == HAND_LINK for child in joint.findall("child"))
+        self.links.append(pending)
+        self.hand_in_tcp = np.linalg.inv(self.hand_in_tcp)
+        limits = np.array(
+            [[float(e.attrib[key]) for key in ("lower", "upper")] for joint in turning for e in joint.findall("limit")]
+        )
+        self.lower, self.upper = limits[:, 0] + LIMIT_MARGIN, limits[:, 1] - LIMIT_MARGIN
+
+    def frames(self, qpos: Array) -> tuple[Array, Array]:
+        """Give rotations (8, M, 3, 3) and positions (8, M, 3) of links 1 to 7 and the TCP in the base at (M, 7)."""
+        count = len(qpos)
+        rotations, positions = np.empty((8, count, 3, 3)), np.empty((8, count, 3))
+        fixed = np.array(self.links)[:, None, :3, :3]
+        cosine, sine = np.cos(qpos).T[:, :, None], np.sin(qpos).T[:, :, None]
+        # each link in the one before
+        local = np.empty((8, count, 3, 3))
+        local[:7, ..., 0] = fixed[:7, ..., 0] * cosine + fixed[:7, ..., 1] * sine
+        local[:7, ..., 1] = fixed[:7, ..., 1] * cosine - fixed[:7, ..., 0] * sine
+        local[:7, ..., 2], local[7] = fixed[:7, ..., 2], fixed[7]
+        rotations[0], positions[0] = local[0], self.links[0][:3, 3]
+        for i in range(1, 8):
+            np.einsum("mij,mjk->mik", rotations[i - 1], local[i], out=rotations[i])
+            np.einsum("mij,j->mi", rotations[i - 1], self.links[i][:3, 3], out=positions[i])
+            positions[i] += positions[i - 1]
+        return rotations, positions
+
+    def tcp(self, qpos: Array) -> Array:
+        """Give TCP poses (M, 4, 4) in the base frame at (M, 7)."""
+        rotations, positions = self.frames(qpos)
+        return _poses(rotations[7], positions[7])
+
+    def jacobian(self, qpos: Array) -> tuple[Array, Array]:
+        """Give TCP poses (M, 4, 4) and Jacobians (M, 6, 7), linear rows first, in the base frame, at (M, 7)."""
+        rotations, positions = self.frames(qpos)
+        axes = rotations[:7, :, :, 2].transpose(1, 2, 0)
+        arm = (positions[7] - positions[:7]).transpose(1, 2, 0)
+        jacobian = np.empty((len(qpos), 6, 7))
+        for row, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+            jacobian[:, row] = axes[:, j] * arm[:, k] - axes[:, k] * arm[:, j]
+        jacobian[:, 3:] = axes
+        return _poses(rotations[7], positions[7]), jacobian
+
+
+def turn_between(qpos: Array, near: Array) -> Array:
+    """How far apart configurations (..., 7) are: the largest turn, which sets the time, and a little of all others."""
+    away = np.abs(qpos - near)
+    return away.max(axis=-1) + 0.2 * np.sqrt((away * away).sum(axis=-1))
+
+
+def _poses(rotation: Array, position: Array) -> Array:
+    pose = np.tile(np.eye(4), (len(position), 1, 1))
+    pose[:, :3, :3], pose[:, :3, 3] = rotation, position
+    return pose
+
+
+def _origin(joint: ElementTree.Element) -> Array:
+    pose, origin = np.eye(4), joint.find("origin")
+    if origin is not None:
+        pose[:3, :3] = Rotation.from_euler("xyz", _numbers(origin.attrib.get("rpy", "0 0 0"))).as_matrix()
+        pose[:3, 3] = _numbers(origin.attrib.get("xyz", "0 0 0"))
+    return pose
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(value) for value in text.split()]
