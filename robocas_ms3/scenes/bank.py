@@ -25,8 +25,7 @@ from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
 
-LAYOUT_FORMAT = 6  # raised when the same seed gives another layout, or the files change
-MOVED_FORMAT = 7  # the same of configurations that move robot or basket: since 7 both have to be able to stand
+LAYOUT_FORMAT = 8  # raised when the same seed gives another layout, or the files change
 ABOUT = "about.json"  # in the folder of a bank: all that its layouts depend on
 _A_FOLDER = 1000  # layouts in one
 _NO_MATTER = (
@@ -184,10 +183,9 @@ def about(model: SceneModel) -> dict[str, Any]:
         k: v for k, v in config["randomisation"].items() if k not in {"room", "lights", "cameras"}
     }
     config.pop("room")
-    moved = model.config.randomisation.robot or model.config.randomisation.basket
     parts: dict[str, LoadedFurniture] = {**model.furniture, "basket": model.basket}
     return {
-        "layout_format": MOVED_FORMAT if moved else LAYOUT_FORMAT,
+        "layout_format": LAYOUT_FORMAT,
         "config": config,
         "object_pack": {"name": model.object_pack.name, "manifest": sha256(model.object_pack.root / MANIFEST)},
         "furniture": {name: part.asset.model_dump(mode="json", exclude={"quality"}) for name, part in parts.items()},

@@ -12,10 +12,11 @@ from mani_skill.render.utils import can_render
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Actor, Articulation, Pose
-from mani_skill.utils.structs.types import SimConfig
+from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
+from robocas_ms3.assets.physics import CONTACT_OFFSET
 from robocas_ms3.config import TaskConfig, load_task_config
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.robots.constants import HAND_LINK
@@ -100,7 +101,8 @@ class RoboCASEnv(SeededEnv):
 
     @property
     def _default_sim_config(self) -> SimConfig:
-        return SimConfig(sim_freq=100, control_freq=20, spacing=10)
+        contacts = SceneConfig(contact_offset=CONTACT_OFFSET)
+        return SimConfig(sim_freq=100, control_freq=20, spacing=10, scene_config=contacts)
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
