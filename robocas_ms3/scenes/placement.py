@@ -77,25 +77,26 @@ def sample_scattered(
         LayoutError: the objects don't fit.
     """
     tries = 0
+    all_areas = [np.array([shapely.Polygon(footprint).area for footprint in p.footprints]) for p in placeables]
     while tries < max_tries:
         poses = np.zeros((len(placeables), 4, 4))
         # Where it gets tight, objects rather stand than lie: of several poses drawn, the one covering least is taken.
         tightness = tries / max_tries
         draws = 1 + int(8 * tightness)
-        choices = [_choose_pose(rng, placeable, draws) for placeable in placeables]
-        areas = [shapely.Polygon(p.footprints[c]).area for p, c in zip(placeables, choices, strict=True)]
+        choices = [_choose_pose(rng, p, areas, draws) for p, areas in zip(placeables, all_areas, strict=True)]
         placed: list[shapely.Polygon] = []
-        for index in np.argsort(areas)[::-1]:
+        for index in np.argsort([areas[c] for areas, c in zip(all_areas, choices, strict=True)])[::-1]:
             placeable, choice = placeables[index], choices[index]
             tries += _TRIES_AT_ONCE
             yaws, positions, outlines = _candidates(rng, placeable.footprints[choice], region)
             if placed and len(yaws):
-                gaps = shapely.distance(outlines[:, None], np.array(placed)[None]).min(axis=1)
-                yaws, positions, outlines = (values[gaps >= min_gap] for values in (yaws, positions, outlines))
+                free = ~shapely.dwithin(np.array(placed), outlines[:, None], min_gap).any(axis=1)
+                yaws, positions, outlines = (values[free] for values in (yaws, positions, outlines))
             if not len(yaws):
                 break  # no room for this one: start over
             # and they rather stand in a corner or close to each other than anywhere, so that room is left for the rest
             best = 0 if tightness < _TIGHT else _snuggest(outlines, placed, region)
+            shapely.prepare(outlines[best])
             placed.append(outlines[best])
             x, y = positions[best]
             poses[index] = planar_pose(x, y, region.z, yaws[best]) @ placeable.resting_poses[choice]
@@ -132,10 +133,10 @@ def _candidates(rng: np.random.Generator, footprint: Array, region: Region) -> t
     return yaws[fits], positions[fits], shapely.polygons((turned + positions[:, None])[fits])
 
 
-def _choose_pose(rng: np.random.Generator, placeable: Placeable, draws: int) -> int:
+def _choose_pose(rng: np.random.Generator, placeable: Placeable, areas: Array, draws: int) -> int:
     weights = np.asarray(placeable.probabilities, dtype=float)
     drawn = rng.choice(len(weights), size=draws, p=weights / weights.sum())
-    return int(min(drawn, key=lambda index: shapely.Polygon(placeable.footprints[index]).area))
+    return int(drawn[np.argmin(areas[drawn])])
 
 
 def choose_objects(rng: np.random.Generator, ids: list[str], count: int) -> list[str]:

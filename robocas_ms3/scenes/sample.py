@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject
-from robocas_ms3.config.task import OrderlyLayout, ScatteredLayout
+from robocas_ms3.config.task import OrderlyLayout, ScatteredLayout, StackedLayout
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout
 from robocas_ms3.scenes.lookup import resolve_ids
@@ -96,7 +96,7 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
             basket_pose = place_basket(model, robot_pose, basket_rng)
             unsettled += 1
             continue
-        settled = settle(used, placed, model, basket_pose)
+        settled = settle(used, placed, model, basket_pose, may_tip=isinstance(config.layout, StackedLayout))
         if not settled.stable:
             unsettled += 1
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import sapien
@@ -24,14 +25,21 @@ from robocas_ms3.assets.physics import (
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes.placement import Array, Region, planar_pose, transform
 
-SECONDS_EACH = 1.0  # of simulation before the next object falls (upstream's); less where everything lies still
-SETTLE_SECONDS = 2.0  # after the walls are gone
+FALL_SECONDS = 0.5  # of simulation before the next object falls; it takes 0.25 to land
+BUCKET_SECONDS = 1.0  # at most, after the last one
+SPREAD_SECONDS, OPEN_SECONDS = 2.0, 0.5  # at most: within a fence along the sides of the region, and without it
 ORDER_NOISE = 0.5  # of the logarithm of an object's size
 BUCKET = 0.8  # of the region's sides: narrower buckets make higher heaps, which spread when the walls are gone
 SPREAD = 0.05  # m that centres of mass may lie outside the region in the end
 WALL = 0.05  # m, half its thickness
 _LOOK_EVERY = 10  # steps between two looks at whether everything lies still
 _TRIES = 40
+
+# Evenly spread unit vectors (64, 3), a Fibonacci lattice: an object's extreme points along them make its outline
+_HEIGHTS = 1 - (2 * np.arange(64) + 1) / 64
+_TURNS = np.arange(64) * np.pi * (3 - np.sqrt(5))
+_RADII = np.sqrt(1 - _HEIGHTS**2)
+_DIRECTIONS = np.stack([_RADII * np.cos(_TURNS), _RADII * np.sin(_TURNS), _HEIGHTS], axis=1)
 
 
 def drop_heap(
@@ -46,7 +54,8 @@ def drop_heap(
     """Drop objects into a frictionless bucket on a plane, then take the bucket away (upstream's way).
 
     Other than upstream's, the bucket is a little smaller than the region, and small objects rather fall first: this
-    buries more of them (docs/layouts.md has figures).
+    buries more of them (docs/layouts.md has figures). They fall as one convex hull each, one soon after the other; the
+    heap then spreads as what it really is, at first within a fence, which stops what would roll away.
 
     Args:
         rng: source of all randomness.
@@ -84,29 +93,59 @@ def drop_heap(
 def _drop(
     rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, height: float, tumble: float
 ) -> Array:
-    low, high = np.array(region.min_xy), np.array(region.max_xy)
-    middle, half = (low + high) / 2, BUCKET * (high - low) / 2
-    bodies: dict[int, physx.PhysxRigidDynamicComponent] = {}
+    """A heap (K, 4, 4), at rest as far as it came to."""
     with engine_settings():
-        scene = new_scene()
-        add_ground(scene, np.array([*middle, region.z]))
-        walls = _add_walls(scene, middle, half, region.z)
-        for index in falling_order(rng, assets):
-            asset = assets[index]
-            pose = _falling_pose(rng, asset, tumble)
-            points = transform(pose, np.concatenate(asset.hulls))
-            room = np.maximum(half - np.abs(points[:, :2]).max(axis=0), 0)
-            x, y = middle + rng.uniform(-1, 1, 2) * room
-            top = max((_top(b, assets[i]) for i, b in bodies.items()), default=region.z)
-            pose = planar_pose(x, y, top + height - points[:, 2].min(), 0) @ pose
-            bodies[int(index)] = add_body(scene, solid_of(asset), pose)
-            _run(scene, SECONDS_EACH, bodies)
-        for wall in walls:
-            wall.remove_from_scene()
-        for body in bodies.values():
-            body.wake_up()
-        _run(scene, SETTLE_SECONDS, bodies)
-        return np.stack([pose_matrix(bodies[i]) for i in range(len(assets))])
+        return _spread(assets, _fill_bucket(rng, assets, region, height, tumble), region)
+
+
+def _fill_bucket(
+    rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, height: float, tumble: float
+) -> Array:
+    """Objects (K, 4, 4) that have fallen into the bucket, with their outlines for bodies."""
+    middle, half = _middle(region), BUCKET * np.subtract(region.max_xy, region.min_xy) / 2
+    scene = new_scene()
+    add_ground(scene, np.array([*middle, region.z]))
+    _add_walls(scene, middle, half, region.z)
+    bodies: dict[int, physx.PhysxRigidDynamicComponent] = {}
+    outlines = [outline(asset) for asset in assets]
+    for index in falling_order(rng, assets).tolist():
+        asset = assets[index]
+        pose = _falling_pose(rng, asset, tumble)
+        points = transform(pose, outlines[index])
+        room = np.maximum(half - np.abs(points[:, :2]).max(axis=0), 0)
+        x, y = middle + rng.uniform(-1, 1, 2) * room
+        top = max((transform(pose_matrix(b), outlines[i])[:, 2].max() for i, b in bodies.items()), default=region.z)
+        pose = planar_pose(x, y, top + height - points[:, 2].min(), 0) @ pose
+        bodies[index] = add_body(scene, replace(solid_of(asset), hulls=[outlines[index]]), pose)
+        _run(scene, FALL_SECONDS, list(bodies.values()))
+    _run(scene, BUCKET_SECONDS, list(bodies.values()))
+    return np.stack([pose_matrix(bodies[i]) for i in range(len(assets))])
+
+
+def _spread(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Array:
+    """Objects (K, 4, 4) after the bucket is gone, and then the fence."""
+    middle = _middle(region)
+    scene = new_scene()
+    add_ground(scene, np.array([*middle, region.z]))
+    fence = _add_walls(scene, middle, np.subtract(region.max_xy, region.min_xy) / 2, region.z)
+    bodies = [add_body(scene, solid_of(asset), pose) for asset, pose in zip(assets, poses, strict=True)]
+    _run(scene, SPREAD_SECONDS, bodies)
+    for wall in fence:
+        wall.remove_from_scene()
+    for body in bodies:
+        body.wake_up()
+    _run(scene, OPEN_SECONDS, bodies)
+    return np.stack([pose_matrix(body) for body in bodies])
+
+
+def outline(asset: LoadedObject) -> Array:
+    """Points (V, 3), at most 64, whose convex hull is about that of the object, m, in the asset's frame."""
+    points = np.concatenate(asset.hulls)
+    return points[np.unique(np.argmax(points @ _DIRECTIONS.T, axis=0))]
+
+
+def _middle(region: Region) -> Array:
+    return np.add(region.min_xy, region.max_xy) / 2
 
 
 def falling_order(rng: np.random.Generator, assets: Sequence[LoadedObject]) -> NDArray[np.intp]:
@@ -143,18 +182,12 @@ def _add_walls(scene: sapien.Scene, middle: Array, half: Array, z: float) -> lis
     return walls
 
 
-def _top(body: physx.PhysxRigidDynamicComponent, asset: LoadedObject) -> float:
-    return float(transform(pose_matrix(body), np.concatenate(asset.hulls))[:, 2].max())
-
-
-def _run(scene: sapien.Scene, seconds: float, bodies: dict[int, physx.PhysxRigidDynamicComponent]) -> None:
+def _run(scene: sapien.Scene, seconds: float, bodies: Sequence[physx.PhysxRigidDynamicComponent]) -> None:
     """Simulate for a while, or until nothing moves."""
-    steps = round(seconds / TIME_STEP)
-    for step in range(steps):
+    for step in range(round(seconds / TIME_STEP)):
         scene.step()
-        if step >= 3 * _LOOK_EVERY and step % _LOOK_EVERY == 0:
-            speeds = [
-                np.linalg.norm(b.linear_velocity) + 0.05 * np.linalg.norm(b.angular_velocity) for b in bodies.values()
-            ]
-            if max(speeds) < 0.01:
+        if step >= 2 * _LOOK_EVERY and step % _LOOK_EVERY == 0:
+            linear, angular = (np.stack([getattr(b, f"{n}_velocity") for b in bodies]) for n in ("linear", "angular"))
+            speeds = np.linalg.norm(linear, axis=1) + 0.05 * np.linalg.norm(angular, axis=1)
+            if speeds.max() < 0.01:
                 return
