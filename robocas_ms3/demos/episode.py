@@ -23,9 +23,9 @@ from robocas_ms3.demos.resimulation import Resimulation
 from robocas_ms3.demos.sampling import sample_stride
 from robocas_ms3.demos.trials import Trials
 from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
+from robocas_ms3.planning.backends import DEFAULT, make_planner
 from robocas_ms3.planning.decisions import Straight
 from robocas_ms3.planning.executor import Executor, Seconds
-from robocas_ms3.planning.mplib_backend import MplibPlanner
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.skills.arm import Arm
@@ -139,7 +139,7 @@ class EpisodeGenerator:
         base_env = self.env.unwrapped
         assert isinstance(base_env, RoboCASEnv)
         files = robot_files()
-        self.planner: Planner = MplibPlanner(str(files.arm_urdf), str(files.arm_srdf), dt=base_env.control_timestep)
+        self.planner: Planner = make_planner(DEFAULT, files.arm_urdf, files.arm_srdf, dt=base_env.control_timestep)
         self.reachability = Reachability(str(files.arm_urdf))
         # a scripted policy tries once, from wherever the episode stands, and raises PlanningFailed
         self.policy: Callable[[Arm], None] = import_module(TASKS[settings.task].solver).attempt

@@ -16,8 +16,8 @@ from robocas_ms3.demos.sampling import dataset_actions, sample_states
 from robocas_ms3.errors import EpisodeLost
 from robocas_ms3.robots.constants import ROBOT_UID
 
-# m by which the target may be off the recording at the end of a part. What else lies about may roll elsewhere: where that
-# matters, what comes next goes wrong, and shows it.
+# m by which the target may be off the recording at the end of a part. What else lies about may roll elsewhere: where
+# that matters, what comes next goes wrong, and shows it.
 PARTED = 0.02
 
 States = dict[str, dict[str, NDArray[np.float32]]]

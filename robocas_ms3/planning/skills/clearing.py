@@ -92,7 +92,7 @@ class Heap:
         yield from (Move("push", slot) for slot in slots[2:])
         yield from (Move("push", slot, turn) for slot in slots[:2] for turn in TURNS_DEG)
         yield from (Move("lift", slot) for slot in slots[2:])
-        if not slots:  # it leans on something, or lies so that no grasp comes from above: it has to come to lie otherwise
+        if not slots:  # no grasp comes from above as it lies: it has to lie otherwise
             yield from (Move("push", self.target, turn) for turn in (0.0, 90.0, -90.0, 180.0))
 
     def make(self, move: Move) -> float:
