@@ -11,8 +11,8 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Link
 from numpy.typing import NDArray
 
-# m between two bodies that can't have touched in the last physics step, at whose beginning contacts are found: more than
-# they go in 10 ms, and than the distance at which PhysX begins to generate contacts
+# m between bodies that can't have touched in the last physics step, at whose beginning contacts are found: more than
+# they go in 10 ms, and than where PhysX begins to look for contacts
 _NEAR = 0.1
 
 

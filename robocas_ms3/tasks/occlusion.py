@@ -60,9 +60,7 @@ def surface_points(poses: Tensor, points: Tensor) -> Tensor:
     return rotation @ points + poses[..., :3, None]
 
 
-def moved_near(
-    poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, *, least: float = LEAST_MOTION
-) -> Tensor:
+def moved_near(poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, *, least: float = LEAST_MOTION) -> Tensor:
     """Whether anything that `clutter` looks at has moved, the targets included.
 
     Args:
