@@ -28,7 +28,8 @@ class Contacts:
     """
 
     def __init__(self, scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor | Link]) -> None:
-        self._scene, self._px = scene, scene.px
+        self._scene = scene
+        self._px: Any = scene.px
         self._shape = (len(bodies), len(objects))
         if scene.gpu_sim_enabled:
             pairs = [
