@@ -1,4 +1,4 @@
-"""What a control step costs, beside ManiSkill's PickCube-v1 and beside the physics in it, without rendering. Prints JSON.
+"""What a control step costs, beside ManiSkill's PickCube-v1 and the physics in it, without rendering. Prints JSON.
 
 All arms make the same motion in the air. The cases take turns, so that what else the machine does meets them all; times
 are CPU time of this process, and ratios are medians over the rounds.

@@ -117,7 +117,7 @@ class EpisodeRecorder(gym.Wrapper):
         assert info is not None, "the environment was made by gym.make"
         kwargs = {key: value for key, value in info["env_kwargs"].items() if key not in _LOCAL_KWARGS}
         return {
-            # With the module's name in front, gymnasium imports this package by itself: ManiSkill's own tools then work.
+            # with the module's name in front gymnasium imports this package by itself: ManiSkill's own tools then work
             "env_id": f"robocas_ms3:{info['env_id']}",
             "env_kwargs": kwargs,
             "max_episode_steps": find_max_episode_steps_value(self.env),

@@ -152,8 +152,9 @@ class FingersController(DirectDrives, PDJointPosMimicController):
 
     def set_action(self, action: Any) -> None:
         """Take the position (N, 1) of every finger."""
-        self._target_qpos = self._preprocess_action(action).repeat(1, len(self.joints))
-        self.set_drive_targets(self._target_qpos)
+        targets = cast("torch.Tensor", self._preprocess_action(action)).repeat(1, len(self.joints))
+        self._target_qpos = targets
+        self.set_drive_targets(targets)
 
 
 @dataclass
@@ -350,7 +351,7 @@ class RoboCASEEPoseController(DirectDrives, PDEEPoseController):
         if not self.config.use_target or self._target_pose is None:
             return self.ee_pose_at_base
         far, turned = EE_HELD_BACK
-        now = relative_pose(self.root_link, self.ee_link)
+        now = relative_pose(cast("Link", self.root_link), self.ee_link)
         distance = torch.linalg.vector_norm(self._target_pose.p - now.p, dim=1)
         cosine = (self._target_pose.q * now.q).sum(dim=1).abs()  # of half the angle between them
         lost = (distance > far) | (cosine < np.cos(turned / 2))

@@ -26,8 +26,8 @@ class Bodies:
 
     First come the A actors that can move, ``BODY`` numbers each, then of each articulation its root, qpos and qvel.
 
-    On a CPU that is one call of SAPIEN's, and what came of it is kept while the scene's bytes stay the same, so it can't
-    be out of date. On a GPU it is gathered anew from the buffers each time.
+    On a CPU that is one call of SAPIEN's, and what came of it is kept while the scene's bytes stay the same, so it is
+    never out of date. On a GPU it is gathered anew from the buffers each time.
 
     Args:
         scene: ready to be simulated.
@@ -37,7 +37,8 @@ class Bodies:
     """
 
     def __init__(self, scene: ManiSkillScene) -> None:
-        self._scene, self._px = scene, scene.px
+        self._scene = scene
+        self._px: Any = scene.px
         registry = scene.state_dict_registry
         self._actors = [actor for actor in registry.actors.values() if actor.px_body_type != "static"]
         self._articulations = list(registry.articulations.values())

@@ -11,8 +11,8 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Link
 from numpy.typing import NDArray
 
-# m between two bodies that can't have touched in the last physics step, at whose beginning contacts are found: more than
-# they go in 10 ms, and than the distance at which PhysX begins to generate contacts
+# m between bodies that can't have touched in the last physics step, at whose beginning contacts are found: more than
+# they go in 10 ms, and than where PhysX begins to look for contacts
 _NEAR = 0.1
 
 
@@ -28,7 +28,8 @@ class Contacts:
     """
 
     def __init__(self, scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor | Link]) -> None:
-        self._scene, self._px = scene, scene.px
+        self._scene = scene
+        self._px: Any = scene.px
         self._shape = (len(bodies), len(objects))
         if scene.gpu_sim_enabled:
             pairs = [

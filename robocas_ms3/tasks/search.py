@@ -37,12 +37,12 @@ class RoboCASSearchEnv(TransferEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
-        self._measured: tuple[torch.Tensor, torch.Tensor] | None = None
+        self._last_clutter: tuple[torch.Tensor, torch.Tensor] | None = None
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
         """Set the state; see `RoboCASEnv`."""
         super().set_state_dict(state, env_idx)
-        self._measured = None  # else what follows would hang on what was before
+        self._last_clutter = None  # else what follows would hang on what was before
 
     def clutter(self) -> occlusion.Clutter:
         """What hides and surrounds each env's target right now."""
@@ -61,12 +61,12 @@ class RoboCASSearchEnv(TransferEnv):
     def _cleared(self) -> torch.Tensor:
         """(N,) bool of `clutter`, as it was measured when something in the heap last moved."""
         poses = self.object_states[..., :7]
-        if self._measured is not None:
-            before, cleared = self._measured
+        if self._last_clutter is not None:
+            before, cleared = self._last_clutter
             if torch.equal(poses, before) or not self._moved(poses, before):
                 return cleared
         cleared = self.clutter().cleared
-        self._measured = poses, cleared
+        self._last_clutter = poses, cleared
         return cleared
 
     def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:

@@ -26,15 +26,14 @@ class RoboCASSelectEnv(TransferEnv):
         self._kinds = torch.tensor([[row.index(name) for name in row] for row in names], device=self.device)
 
     def target_measures(
-        self, touched: torch.Tensor | None = None, objects: torch.Tensor | None = None
+        self,
+        touched: torch.Tensor | None = None,
+        objects: torch.Tensor | None = None,
+        basket: torch.Tensor | None = None,
     ) -> dict[str, torch.Tensor]:
         """As of `TransferEnv`, and ``others_out``: no other object of the target's name is in the basket."""
         objects = self.object_states if objects is None else objects
-        others_in = terms.another_of_its_kind(self.in_basket(objects), self._kinds, self.target_slot)
-        return {**super().target_measures(touched, objects), "others_out": ~others_in}
-
-    def in_basket(self, objects: torch.Tensor) -> torch.Tensor:
-        """(N, K) bool: whose centre of mass is in the basket's inner volume, from states or poses (N, K, >= 7)."""
-        basket = self.basket_pose
-        centers = objects[..., :3] + terms.rotate(objects[..., 3:7], self._centers_of_mass)
-        return terms.inside_box(centers, basket[:, :3], basket[:, 3:], self._basket_low, self._basket_high)
+        basket = self.basket_pose if basket is None else basket
+        inside = self.in_basket(objects[..., :7], self._centers_of_mass, basket)
+        others_in = terms.another_of_its_kind(inside, self._kinds, self.target_slot)
+        return {**super().target_measures(touched, objects, basket), "others_out": ~others_in}

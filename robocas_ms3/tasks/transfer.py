@@ -41,8 +41,8 @@ class TransferEnv(RoboCASEnv):
             self._stages = dict(zip(self.STAGES, self._reached, strict=True))  # views
         self._reached[:, env_idx] = False
         # most of the time nothing moves; what is remembered holds for an episode, as where it began counts too
-        self._basket_stands, self._target_in_basket = Remembered(self._stands_of), Remembered(self._target_in)
-        self._count_disturbed, self._undo = Remembered(self._disturbed_of), Remembered(self._undo_of)
+        self._measured, self._undo = Remembered(self._measure), Remembered(self._undo_of)
+        self._count_disturbed = Remembered(self._disturbed_of)
         said = {env: self._instruct(env) for env in env_idx.tolist()}
         kept = getattr(self, "instructions", [])
         self.instructions = [said[env] if env in said else kept[env] for env in range(self.num_envs)]
@@ -68,24 +68,31 @@ class TransferEnv(RoboCASEnv):
         """Stages and success of each env, (N,) bool each; ``disturbed`` (N,) int."""
         # right after a reset the engine still tells the contacts of before
         forces = self.gripper_forces() * (self.elapsed_steps > 0)[:, None, None, None]
-        objects = self.object_states
-        touched, grasped = terms.touched(forces), self.grasped(forces)
-        lifted = terms.lifted(objects[..., 2], self.start_poses[..., 2], grasped)
-        measures = self.target_measures(touched, objects)
+        grasped, objects = self.grasped(forces), self.object_states
         self.target_held = terms.of_target(grasped, self.target_slot)
+        now, holds = self._measured(forces, grasped, objects, self.basket_pose)
+        now = {**now, **self.task_stages()}
+        self._reached |= torch.stack([now.get(stage, reached) for stage, reached in self._stages.items()])
+        stages = dict(zip(self.STAGES, self._reached.clone(), strict=True))
+        success = self._stages["target_lifted"] & holds
+        return {**stages, "success": success, "disturbed": self._disturbed(objects[..., :7])}
+
+    def _measure(
+        self, forces: torch.Tensor, grasped: torch.Tensor, objects: torch.Tensor, basket: torch.Tensor
+    ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """The stages all tasks share, as of this moment, and whether all of `target_measures` hold: (N,) bool each."""
+        touched = terms.touched(forces)
+        lifted = terms.lifted(objects[..., 2], self.start_poses[..., 2], grasped)
+        measures = self.target_measures(touched, objects, basket)
         now = {
             "reached_any": touched.any(dim=1),
             "picked_any": lifted.any(dim=1),
             "reached_target": terms.of_target(touched, self.target_slot),
-            "target_grasped": self.target_held,
+            "target_grasped": terms.of_target(grasped, self.target_slot),
             "target_lifted": terms.of_target(lifted, self.target_slot),
             "target_in_basket": measures["in_basket"],
-            **self.task_stages(),
         }
-        self._reached |= torch.stack([now.get(stage, reached) for stage, reached in self._stages.items()])
-        success = self._stages["target_lifted"] & torch.stack(list(measures.values())).all(dim=0)
-        stages = dict(zip(self.STAGES, self._reached.clone(), strict=True))
-        return {**stages, "success": success, "disturbed": self._disturbed(objects[..., :7])}
+        return now, torch.stack(list(measures.values())).all(dim=0)
 
     def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """(N,) float32: 1 where the task has succeeded at this moment, else 0."""
@@ -96,33 +103,40 @@ class TransferEnv(RoboCASEnv):
         return {}
 
     def target_measures(
-        self, touched: torch.Tensor | None = None, objects: torch.Tensor | None = None
+        self,
+        touched: torch.Tensor | None = None,
+        objects: torch.Tensor | None = None,
+        basket: torch.Tensor | None = None,
     ) -> dict[str, torch.Tensor]:
         """What has to hold at the same moment for success, besides the target having been lifted: (N,) bool each.
 
         Args:
             touched: (N, K) bool, which objects the gripper touches, if that is known already.
             objects: (N, K, 13) their states, likewise.
+            basket: (N, 7) its pose, likewise.
         """
-        if touched is None:
-            touched = terms.touched(self.gripper_forces())
+        touched = terms.touched(self.gripper_forces()) if touched is None else touched
         objects = self.object_states if objects is None else objects
-        target, basket = terms.of_target(objects, self.target_slot), self.basket_pose
+        basket = self.basket_pose if basket is None else basket
+        start, slot = self.basket_at_start, self.target_slot
+        target, center = terms.of_target(objects, slot), terms.of_target(self._centers_of_mass, slot)
         return {
-            "in_basket": self._target_in_basket(target[:, :7], basket),
-            "untouched": ~terms.of_target(touched, self.target_slot),
+            "in_basket": self.in_basket(target[:, :7], center, basket),
+            "untouched": ~terms.of_target(touched, slot),
             "at_rest": terms.at_rest(target[:, 7:10], target[:, 10:]),
-            "basket_stands": self._basket_stands(basket),
+            "basket_stands": terms.stands(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:]),
         }
 
-    def _target_in(self, target: torch.Tensor, basket: torch.Tensor) -> torch.Tensor:
-        """(N,) bool of `in_basket`, of the targets alone, from poses (N, 7)."""
-        center = target[:, :3] + terms.rotate(target[:, 3:], terms.of_target(self._centers_of_mass, self.target_slot))
-        return terms.inside_box(center, basket[:, :3], basket[:, 3:], self._basket_low, self._basket_high)
+    def in_basket(self, poses: torch.Tensor, centers_of_mass: torch.Tensor, basket: torch.Tensor) -> torch.Tensor:
+        """(N,) or (N, K) bool: whose centre of mass is in the basket's inner volume.
 
-    def _stands_of(self, basket: torch.Tensor) -> torch.Tensor:
-        start = self.basket_at_start
-        return terms.stands(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:])
+        Args:
+            poses: (N, 7) or (N, K, 7) of objects in the world.
+            centers_of_mass: (N, 3) or (N, K, 3) in their frames.
+            basket: (N, 7) pose in the world.
+        """
+        centers = poses[..., :3] + terms.rotate(poses[..., 3:], centers_of_mass)
+        return terms.inside_box(centers, basket[:, :3], basket[:, 3:], self._basket_low, self._basket_high)
 
     def _disturbed(self, poses: torch.Tensor) -> torch.Tensor:
         """(N,) how many objects other than the target no longer stand as they stood, from poses (N, K, 7)."""

@@ -89,17 +89,16 @@ def test_links_are_where_their_poses_say(env):
     robot = env.unwrapped.agent.robot
     robot.set_qpos(robot.get_qpos() + 0.1)
     links = robot.links[3:6]
-    assert torch.equal(
-        link_poses(robot.scene, links)[0], torch.cat([link.pose.raw_pose for link in links])
-    )
+    assert torch.equal(link_poses(robot.scene, links)[0], torch.cat([link.pose.raw_pose for link in links]))
 
 
 def test_another_layout_of_packed_states_is_an_error(env, monkeypatch):
     scene = env.unwrapped.scene
+    packed = scene.px.pack()
     system = SimpleNamespace(
         rigid_dynamic_components=scene.px.rigid_dynamic_components,
         articulation_link_components=scene.px.articulation_link_components,
-        pack=lambda packed=scene.px.pack(): packed + b"more",
+        pack=lambda: packed + b"more",
     )
     monkeypatch.setattr(scene, "px", system)
     with pytest.raises(RobocasError, match="packs states otherwise"):
