@@ -6,6 +6,7 @@ with another turn of the wrist, so both are candidates.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Literal
 
@@ -207,14 +208,16 @@ def rank_grasps(
     return np.argsort(-(score + temperature * rng.gumbel(size=len(score))), kind="stable")
 
 
-def count_free_grasps(
+def has_free_grasps(
     asset: LoadedObject,
     object_in_world: Array,
     scene_points_in_world: Array,
     robot_xy: Array,
     approach: Approach = "top",
-) -> int:
-    """How many of an object's grasps come from the robot's side and pass clear of everything else on their way in.
+    *,
+    at_least: int,
+) -> bool:
+    """Say whether enough of an object's grasps come from the robot's side and pass clear of everything else.
 
     Args:
         asset: the object.
@@ -222,18 +225,30 @@ def count_free_grasps(
         scene_points_in_world: (P, 3) surfaces of everything else.
         robot_xy: (2,) where the arm's base stands, m.
         approach: from where the gripper may come.
+        at_least: how many are enough.
     """
     notes, center = asset.annotations, object_in_world[:3, 3]
-    near = scene_points_in_world[np.linalg.norm(scene_points_in_world - center, axis=1) < NEIGHBOURHOOD]
-    base = np.eye(4)
-    base[:2, 3] = robot_xy
-    kept = filter_grasps(
-        object_in_world @ notes.grasps_tcp_in_object,
-        notes.grasp_widths,
-        arm_base_in_world=base,
-        object_center_in_world=center,
-        scene_points_in_world=near,
-        side_clearance=SIDE_CLEARANCE,
-        approach=approach,
-    )
-    return len(kept) // 2
+    grasps = object_in_world @ notes.grasps_tcp_in_object
+    good = notes.grasp_widths <= MAX_WIDTH
+    for passed in directions_ok(grasps, center[:2] - robot_xy, approach).values():
+        good &= passed
+    grasps = grasps[good]
+    if at_least == 0 or len(grasps) < at_least:
+        return at_least == 0
+    low, high = _swept_bounds(grasps)
+    near = scene_points_in_world[np.all((scene_points_in_world >= low) & (scene_points_in_world <= high), axis=1)]
+    free, batch = 0, 2 * at_least  # mostly the first batch decides
+    for start in range(0, len(grasps), batch):
+        if free >= at_least or free + len(grasps) - start < at_least:
+            break
+        free += int(gripper_is_clear(grasps[start : start + batch], near, side_clearance=SIDE_CLEARANCE).sum())
+    return free >= at_least
+
+
+def _swept_bounds(tcp_in_world: Array) -> tuple[Array, Array]:
+    """Low and high corner (3,) of all that the open gripper passes on its way to grasps (G, 4, 4)."""
+    high = GRIPPER_BOXES[:, 1].max(axis=0) + (SIDE_CLEARANCE, SIDE_CLEARANCE, 0)
+    low = np.array([-high[0], -high[1], GRIPPER_BOXES[:, 0, 2].min() - PREGRASP_DISTANCE])
+    corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
+    points = (tcp_in_world[:, None, :3, :3] @ corners[:, :, None])[..., 0] + tcp_in_world[:, None, :3, 3]
+    return points.min(axis=(0, 1)), points.max(axis=(0, 1))

@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.assets.gripper import GRIPPER_RADIUS
 from robocas_ms3.assets.pack import LoadedObject
-from robocas_ms3.scenes.grasping import count_free_grasps
+from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, has_free_grasps
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array, transform
 from robocas_ms3.scenes.relations import related
@@ -80,21 +81,34 @@ class Arrangement:
         graspable = np.array([asset.asset.grasp_count >= rules.min_grasps for asset in self.assets])
         return self.candidate & near & graspable
 
+    @cached_property
+    def fixture_points(self) -> Array:
+        """(P, 3) samples of opened furniture and basket, world, m."""
+        return self.model.fixture_points(self.basket_pose, opened=True)
+
     def has_free_grasps(self, slot: int) -> bool:
         """Whether enough of an object's grasps are clear of everything else."""
         rules = self.model.config.target
-        points = [self.model.fixture_points(self.basket_pose, opened=True)]
+        points = [self.fixture_points]
         for other in np.flatnonzero(self.present):
-            if other != slot:
+            if other != slot and self._within_reach(slot, other):
                 points.append(transform(self.opened_poses[other], self.assets[other].surface_points()))
-        free = count_free_grasps(
+        return has_free_grasps(
             self.assets[slot],
             self.opened_poses[slot],
             np.concatenate(points),
             self.robot_pose[:2, 3],
             rules.approach,
+            at_least=rules.min_free_grasps,
         )
-        return free >= rules.min_free_grasps
+
+    def _within_reach(self, slot: int, other: int) -> bool:
+        """Whether any of an object comes near enough to another one to be in its grasps' way; cheap, to be sure."""
+        centers = self.opened_poses[[slot, other], :3, 3]
+        radius = np.linalg.norm(np.concatenate(self.assets[other].hulls), axis=1).max()
+        grasps = self.assets[slot].annotations.grasps_tcp_in_object[:, :3, 3]
+        reach = np.linalg.norm(grasps, axis=1).max() + GRIPPER_RADIUS + PREGRASP_DISTANCE
+        return bool(np.linalg.norm(centers[1] - centers[0]) <= radius + reach)
 
 
 def choose_target(rng: np.random.Generator, scene: Arrangement) -> Choice | None:

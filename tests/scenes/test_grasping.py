@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.scenes.grasping import directions_ok, filter_grasps, gripper_is_clear, rank_grasps
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.scenes.grasping import (
+    SIDE_CLEARANCE,
+    directions_ok,
+    filter_grasps,
+    gripper_is_clear,
+    has_free_grasps,
+    rank_grasps,
+)
 
 BASE = np.eye(4)
 CENTER = np.array([0.5, 0.0, 0.05])
@@ -259,3 +267,28 @@ class TestRanking:
         # Scores 0.15 apart at temperature 0.15: the lesser comes first with probability 1 / (1 + e) = 0.27.
         first = [self.rank([grasp()] * 2, [1.0, 0.85], seed=seed, temperature=0.15)[0] for seed in range(1000)]
         assert np.mean(first) == pytest.approx(1 / (1 + np.e), abs=0.04)
+
+
+def test_a_batch_of_grasps_is_counted_as_one_by_one():
+    asset = load_pack("builtin").objects["sugar_box"]
+    notes, pose = asset.annotations, np.eye(4)
+    pose[:3] = notes.resting_poses[notes.display_pose][:3]
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-0.4, -0.4, -0.1), (0.4, 0.4, 0.6), (400, 3))
+    points = points[np.linalg.norm(points[:, :2], axis=1) > 0.06]  # some are in the way of some grasps
+    robot = np.array([0.0, -0.7])
+    base = np.eye(4)
+    base[:2, 3] = robot
+    kept = filter_grasps(
+        pose @ notes.grasps_tcp_in_object,
+        notes.grasp_widths,
+        arm_base_in_world=base,
+        object_center_in_world=pose[:3, 3],
+        scene_points_in_world=points,
+        side_clearance=SIDE_CLEARANCE,
+    )
+    free = len(kept) // 2
+    assert free > 0 and kept.rejected["gripper_is_clear"] > 0
+    assert has_free_grasps(asset, pose, points, robot, at_least=free)
+    assert not has_free_grasps(asset, pose, points, robot, at_least=free + 1)
+    assert has_free_grasps(asset, pose, points, robot, at_least=0)
