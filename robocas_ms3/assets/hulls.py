@@ -113,9 +113,13 @@ def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
     for index, hull in enumerate(hulls):
         points = sample_triangles(hull.vertices[hull.faces], spacing)
         for other, planes in enumerate(equations):
-            if other != index and len(points):
-                depth = np.max(points @ planes[:, :3].T + planes[:, 3], axis=1)
-                points = points[depth > -_HIDDEN_DEPTH]
+            if other == index:
+                continue
+            low, high = hulls[other].vertices.min(axis=0), hulls[other].vertices.max(axis=0)
+            close = np.flatnonzero(np.all((points >= low) & (points <= high), axis=1))  # the others can't be inside
+            if len(close):
+                depth = np.max(points[close] @ planes[:, :3].T + planes[:, 3], axis=1)
+                points = np.delete(points, close[depth <= -_HIDDEN_DEPTH], axis=0)
         kept.append(points)
     return thin(np.concatenate(kept), spacing)
 
@@ -141,7 +145,9 @@ def sample_triangles(corners: Array, spacing: float) -> Array:
 def thin(points: Array, spacing: float) -> Array:
     """Keep one point (P, 3) per cube of edge ``spacing / 2``: the first one given."""
     cells = np.floor(points / (spacing / 2) + 0.25).astype(np.int64)
-    first = np.unique(cells, axis=0, return_index=True)[1]
+    low, high = cells.min(axis=0), cells.max(axis=0)
+    key = np.ravel_multi_index(tuple((cells - low).T), tuple(high - low + 1))  # one number a cell sorts faster
+    first = np.unique(key, return_index=True)[1]
     return points[np.sort(first)]
 
 
