@@ -15,8 +15,9 @@ from robocas_ms3.errors import AssetError, MissingExtraError
 
 Array = NDArray[np.float64]
 
-MAX_VERTICES = 48  # a hull; PhysX takes up to 64 on a GPU, but thins hulls of more than about 50 by itself
-FEWER_VERTICES = 40  # of a hull that stands for a whole body: the more facets, the longer an oval rocks on them
+GPU_LIMIT = 64  # vertices, and faces, of a hull on a GPU; PhysX cuts off what is more
+MAX_VERTICES = 34  # they make 64 triangles; more only where enough of them share flat faces
+UNFELT = 0.0007  # m: PhysX drops vertices that lie less than this outside of the hull of others
 MAX_HULLS = 32
 WANTED_OVERLAP = 0.9  # the fewest hulls that reach it are taken
 THRESHOLDS = (0.2, 0.12, 0.08, 0.05)  # CoACD's concavity, coarse first
@@ -24,7 +25,8 @@ FINE = (0.05, 0.03)  # for hollow things, whose walls coarse cuts fill the insid
 SMOOTHED = 0.002  # of the diagonal: detail that CoACD is spared
 HOLLOW = 0.5  # volume over that of the convex hull, below which a thing is hollow or thin
 WANTED_DISTANCE = 0.002  # m, 95th percentile between the surfaces of a hollow thing and of its hulls
-TRIES = 4  # mergers in a row that are too much
+BOX = 8  # vertices: as few are left as they are
+TRIES = 8  # mergers in a row that are too much
 LOST_OVERLAP = 0.02  # that merging the hulls of a hollow thing may cost
 
 
@@ -55,7 +57,7 @@ def decompose(closed: trimesh.Trimesh) -> Decomposition:
         raise AssetError("can't decompose a mesh that isn't closed", expected="watertight, volume > 0")
     best: Decomposition | None = None
     if closed.volume / closed.convex_hull.volume >= WANTED_OVERLAP - 0.02:
-        hulls = [few_vertices(np.asarray(closed.vertices), FEWER_VERTICES)]
+        hulls = [few_vertices(np.asarray(closed.vertices))]
         best = Decomposition(hulls, volume_iou(closed, hulls))
         if best.volume_iou >= WANTED_OVERLAP:
             return best
@@ -92,26 +94,46 @@ def volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
     return float(shared / (solid.volume() + union.volume() - shared))
 
 
-def few_vertices(points: Array, limit: int = MAX_VERTICES) -> Array:
-    """Vertices of the convex hull of points, or ``limit`` of them that keep most of its shape and all of its volume.
+def few_vertices(points: Array) -> Array:
+    """Vertices of the convex hull of points, m, thinned to what the engine keeps: same volume, most of its shape.
 
-    Beginning with a few extreme ones, the vertex farthest outside of the hull so far is added, again and again. What is
-    left lies inside of the hull, so that it is blown up a little to the hull's volume.
+    Beginning with a few extreme ones, the vertex farthest outside of the hull so far is added, again and again, until
+    none is felt: at most 34, or 64 where their hull has no more than 64 flat faces. What is left lies inside of the
+    hull, so that it is blown up a little to the hull's volume.
     """
     hull = ConvexHull(points)
     vertices = points[hull.vertices]
-    if len(vertices) <= limit:
+    if len(vertices) <= BOX:
         return vertices
     directions = np.concatenate([np.eye(3), -np.eye(3), np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T])
     chosen = list(dict.fromkeys(np.argmax(vertices @ directions.T, axis=0).tolist()))
-    while len(chosen) < limit:
-        planes = ConvexHull(vertices[chosen]).equations
-        outside = (vertices @ planes[:, :3].T + planes[:, 3]).max(axis=1)
-        outside[chosen] = -1
-        chosen.append(int(outside.argmax()))
+    while len(chosen) < min(GPU_LIMIT, len(vertices)):
+        outside = _outside(vertices, vertices[chosen])
+        farthest = int(outside.argmax())
+        if outside[farthest] <= UNFELT:
+            break
+        chosen.append(farthest)
+    unfelt = min(UNFELT, hull.volume / hull.area / 2)  # a quarter of a thin plate's thickness
+    for index in list(chosen):  # the first ones were taken whether they are felt or not
+        others = [other for other in chosen if other != index]
+        if _outside(vertices[[index]], vertices[others])[0] <= unfelt:
+            chosen = others
+    if len(chosen) > MAX_VERTICES and flat_faces(vertices[chosen]) > GPU_LIMIT:
+        chosen = chosen[:MAX_VERTICES]
     kept = vertices[chosen]
     center = kept.mean(axis=0)
     return center + (kept - center) * np.cbrt(hull.volume / ConvexHull(kept).volume)
+
+
+def _outside(points: Array, corners: Array) -> Array:
+    """How far points (P, 3) lie outside of the convex hull of others (V, 3); negative within, m."""
+    planes = ConvexHull(corners).equations
+    return (points @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+
+
+def flat_faces(points: Array) -> int:
+    """How many faces the convex hull of points (V, 3) has, triangles in one plane being one."""
+    return len(np.unique(np.round(ConvexHull(points).equations, 6), axis=0))
 
 
 def is_hollow(closed: trimesh.Trimesh) -> bool:
@@ -175,8 +197,6 @@ def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
         mcts_iterations=20,
         mcts_nodes=20,
         mcts_max_depth=1,  # cuts that are not looked ahead for are mended by merging, in a tenth of the time
-        max_ch_vertex=MAX_VERTICES,
-        decimate=True,
         seed=0,
     )
     return [few_vertices(np.asarray(vertices, dtype=float)) for vertices, _ in parts if len(vertices) >= 4]

@@ -22,6 +22,7 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 from scipy.spatial import QhullError
 
+from robocas_ms3.assets.cooking import cooking_faults
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, Asset, FurnitureAsset, ObjectAsset, PackManifest
 from robocas_ms3.assets.pack import MANIFEST, sha256
 from robocas_ms3.errors import AssetError, OutputExistsError, RobocasError
@@ -241,7 +242,7 @@ def write_pack(
         on_made: called after each asset.
 
     Raises:
-        AssetError: an asset can't be made, naming it and why; or none can.
+        AssetError: an asset can't be made, or not be simulated as it is, naming it and why; or none can.
     """
     check_target(folder)
     results = []
@@ -251,6 +252,7 @@ def write_pack(
                 raise AssetError(made.error.rstrip("."), fix="Mend it, or pass --skip-bad to leave it out.")
             results.append(made)
             on_made(made)
+        results = _without_miscooked(results, tmp, skip_bad)
         assets = sorted((made.asset for made in results if made.asset), key=lambda asset: (asset.kind, asset.id))
         if not assets:
             raise AssetError("none of the assets could be made", where=folder, found=results[0].error)
@@ -260,6 +262,18 @@ def write_pack(
             bad = sorted(made.id for made in results if made.asset is None)
             write_json(tmp / MADE_FROM, {"content": {job.id: job.content for job in jobs}, "left_out": bad})
     return results
+
+
+def _without_miscooked(results: list[Made], folder: Path, skip_bad: bool) -> list[Made]:
+    """Give up, or leave them out, where the physics engine makes less of hulls than their files say."""
+    faults: dict[str, str] = {}
+    for fault in cooking_faults(folder):
+        faults.setdefault(fault.asset.partition("/")[0], str(fault))
+    if faults and not skip_bad:
+        raise AssetError("; ".join(faults.values()), fix="Mend it, or pass --skip-bad to leave it out.")
+    for name in faults:
+        shutil.rmtree(folder / name)
+    return [Made(made.id, None, faults[made.id]) if made.id in faults else made for made in results]
 
 
 def check_target(folder: Path) -> None:

@@ -93,7 +93,7 @@ class Model:
         if np.abs(factor - 1).max() > 0.2:
             raise ValueError(f"the parts give {self.body.extents} mm for a shape of {size} m")
         points = (self.body.vertices - self.body.bounds.mean(0)) * MM * factor
-        pieces = tuple((piece - self.body.bounds.mean(0)) * MM * factor for piece in self._pieces())
+        pieces = tuple(few_vertices((piece - self.body.bounds.mean(0)) * MM * factor) for piece in self._pieces())
         return unwrapped(np.asarray(points), np.asarray(self.body.faces), self.texture_size, pieces)
 
     def paint(self, shape: Shape, rng: np.random.Generator) -> Image.Image:
@@ -118,7 +118,7 @@ class Model:
         return paint_in_space(shape, colours)
 
     def _pieces(self) -> list[np.ndarray]:
-        """Hulls (k, 3) of what lies in each box, mm."""
+        """Points (k, 3) of what lies in each box, mm."""
         import manifold3d
 
         solid = manifold3d.Manifold(
@@ -128,7 +128,7 @@ class Model:
         for low, high in self.hulls:
             tool = manifold3d.Manifold.cube(tuple(np.subtract(high, low).tolist())).translate(low)
             inside = (solid ^ tool).to_mesh()
-            pieces.append(few_vertices(np.asarray(inside.vert_properties[:, :3], float)))
+            pieces.append(np.asarray(inside.vert_properties[:, :3], float))
         return pieces
 
 

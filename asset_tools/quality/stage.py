@@ -13,7 +13,7 @@ from asset_tools.sources import FurnitureSource
 from robocas_ms3.assets.kinematics import joint_frame
 from robocas_ms3.assets.manifest import Handle, Link, Surface
 from robocas_ms3.assets.pack import LoadedFurniture
-from robocas_ms3.assets.physics import add_component, cook, new_scene, pose_matrix
+from robocas_ms3.assets.physics import add_component, new_scene, pose_matrix, shape_of
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray
@@ -100,7 +100,7 @@ class Stage:
     def _attach(self, component: physx.PhysxRigidBaseComponent, pieces: Sequence[Array]) -> None:
         for piece in pieces:
             try:
-                component.attach(cook(piece, self.material))
+                component.attach(shape_of(piece, self.material))
             except RuntimeError as error:
                 raise AssetError("the physics engine refused a convex hull", found=error) from error
 

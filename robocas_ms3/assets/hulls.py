@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ Array = NDArray[np.float64]
 
 # Points of one hull count as hidden when they lie deeper than this in another, m
 _HIDDEN_DEPTH = 0.0005
+# How far the corners of a box may be from where they ought to be, m: files round to a ten thousandth of a millimetre
+_SQUARE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,19 @@ class Hull:
 
     vertices: Array
     faces: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Box:
+    """A hull that is a box.
+
+    Attributes:
+        half_size: (3,) m along its axes.
+        pose: (4, 4) of its axes, through its centre, in the frame of the hull.
+    """
+
+    half_size: Array
+    pose: Array
 
 
 def read_hulls(path: Path) -> list[Hull]:
@@ -96,6 +112,50 @@ def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
     inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
     faces[inward] = faces[inward][:, ::-1]
     return vertices, faces
+
+
+def box_of(vertices: Array) -> Box | None:
+    """The box of which points (8, 3) are the corners, however it is turned; none if they are none of a box's.
+
+    Its axes are in the order, and look the way, that turns it least: a box along x, y and z is not turned at all.
+    """
+    if len(vertices) != 8:
+        return None
+    return _box_of(np.ascontiguousarray(vertices, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=4096)  # the same furniture is built again and again
+def _box_of(corners: bytes) -> Box | None:
+    vertices = np.frombuffer(corners).reshape(8, 3)
+    center = vertices.mean(axis=0)
+    edges = _edges(vertices[1:] - vertices[0])
+    if edges is None:
+        return None
+    order = np.argsort(np.argmax(np.abs(edges), axis=1), kind="stable")
+    edges = edges[order] * np.where(np.diagonal(edges[order]) < 0, -1.0, 1.0)[:, None]
+    if np.linalg.det(edges) < 0:
+        edges[2] *= -1
+    # the rotation nearest to the edges as they are: the longest say most
+    left, _, right = np.linalg.svd(edges.T)
+    axes = left @ right
+    half = np.linalg.norm(edges, axis=1) / 2
+    signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
+    ought = center + (signs * half) @ axes.T
+    apart = np.linalg.norm(vertices[:, None] - ought, axis=2)
+    if max(apart.min(axis=0).max(), apart.min(axis=1).max()) > _SQUARE:
+        return None
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = axes, center
+    return Box(_frozen(half), _frozen(pose))
+
+
+def _edges(ways: Array) -> Array | None:
+    """The three edges (3, 3) of a box at a corner, of the ways (7, 3) from there to the others."""
+    found: list[Array] = []
+    for way in ways[np.argsort(np.linalg.norm(ways, axis=1), kind="stable")]:
+        if all(abs(way @ edge) <= _SQUARE * np.linalg.norm(way) for edge in found):
+            found.append(way)
+    return np.stack(found) if len(found) == 3 else None
 
 
 def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import sapien
 from sapien import physx
 
-from robocas_ms3.assets.pack import LoadedObject
+from robocas_ms3.assets.hulls import Box, box_of
+from robocas_ms3.assets.pack import LoadedObject, Part
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray
@@ -19,7 +21,7 @@ TIME_STEP = 0.01  # s, the environments'
 # m, the environments'. Shapes that come nearer than twice this are a pair that costs time; with ManiSkill's 0.02 a heap
 # has three times as many pairs, and rests, holds and stays no better.
 CONTACT_OFFSET = 0.005
-DAMPING = 0.1  # 1/s, linear and angular, of every free body
+DAMPING = 0.1  # 1/s, linear and angular, of every free body; upstream's
 TABLE_FRICTION = 0.99
 SPACING = 10.0  # m between objects that are simulated at once
 
@@ -77,7 +79,7 @@ def add_body(scene: sapien.Scene, solid: Solid, pose: Array) -> physx.PhysxRigid
     free = physx.PhysxRigidDynamicComponent()
     try:
         for piece in solid.hulls:
-            free.attach(cook(piece, material))
+            free.attach(shape_of(piece, material))
     except RuntimeError as error:
         raise AssetError("the physics engine refused a convex hull", found=error) from error
     free.mass = solid.mass
@@ -100,7 +102,7 @@ def add_fixed(scene: sapien.Scene, hulls: Sequence[Array], pose: Array, friction
     material = physx.PhysxMaterial(friction, friction, 0.0)
     body = physx.PhysxRigidStaticComponent()
     for piece in hulls:
-        body.attach(cook(piece, material))
+        body.attach(shape_of(piece, material))
     add_component(scene, body, sapien.Pose(pose))
 
 
@@ -119,11 +121,58 @@ def places(count: int) -> Array:
     return origins
 
 
+def shape_of(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShape:
+    """The engine's shape of a convex hull of points (V, 3): a box if they are one's corners, which is exact and fast.
+
+    Raises:
+        RuntimeError: the engine makes no hull of them.
+    """
+    box = box_of(vertices)
+    return cook(vertices, material) if box is None else _box_shape(box, material)
+
+
 def cook(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeConvexMesh:
-    """The engine's shape of a convex hull of points (V, 3)."""
+    """What the engine makes of points (V, 3) that are no box's corners; it may leave some out (`cooking`).
+
+    Raises:
+        RuntimeError: the engine makes no hull of them.
+    """
     return physx.PhysxCollisionShapeConvexMesh(
         vertices=np.asarray(vertices, np.float32), scale=[1, 1, 1], material=material
     )
+
+
+def shapes_of(part: Part, material: physx.PhysxMaterial) -> list[physx.PhysxCollisionShape]:
+    """The same of all hulls of an asset; bodies made of one file share what the engine makes of it.
+
+    Raises:
+        AssetError: the engine makes no shape of a hull.
+    """
+    boxes = [box_of(hull) for hull in part.hulls]
+    # of a file of boxes nothing is cooked: the engine complains of slender ones on a GPU
+    loaded = [] if all(boxes) else _load(part.hulls_path, material)
+    if loaded and len(loaded) != len(boxes):
+        raise AssetError(
+            "the physics engine refused a convex hull",
+            where=part.hulls_path,
+            expected=f"{len(boxes)} hulls",
+            found=len(loaded),
+            fix="Import the asset again.",
+        )
+    return [_box_shape(box, material) if box is not None else loaded[i] for i, box in enumerate(boxes)]
+
+
+def _load(path: Path, material: physx.PhysxMaterial) -> list[physx.PhysxCollisionShapeConvexMesh]:
+    try:
+        return physx.PhysxCollisionShapeConvexMesh.load_multiple(str(path), [1, 1, 1], material)
+    except RuntimeError as error:
+        raise AssetError("the physics engine refused a convex hull", where=path, found=error) from error
+
+
+def _box_shape(box: Box, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeBox:
+    shape = physx.PhysxCollisionShapeBox(np.asarray(box.half_size, np.float32), material)
+    shape.local_pose = sapien.Pose(box.pose)
+    return shape
 
 
 def add_component(scene: sapien.Scene, component: physx.PhysxRigidBaseComponent, pose: sapien.Pose) -> None:

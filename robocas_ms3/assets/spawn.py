@@ -13,10 +13,8 @@ from mani_skill.utils.structs import Actor, Articulation
 from robocas_ms3.assets.kinematics import joint_frame
 from robocas_ms3.assets.manifest import BODY, FurnitureAsset, Link, ObjectAsset
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Part, VisualLevel
+from robocas_ms3.assets.physics import DAMPING, shapes_of
 from robocas_ms3.errors import AssetError
-
-# Upstream's: linear and angular damping of every free body
-DAMPING = 0.1
 
 
 def spawn(
@@ -56,8 +54,6 @@ def spawn(
         return builder.build_static(name)
     _set_mass(builder, facts)
     actor = builder.build_dynamic(name)
-    for body in actor._bodies:
-        _check_shapes(body, asset)
     actor.set_linear_damping(DAMPING)
     actor.set_angular_damping(DAMPING)
     return actor
@@ -99,16 +95,20 @@ def spawn_articulation(
     frictions = {link.joint.name: link.joint.friction for link in facts.links}
     for joint in articulation.active_joints:  # the builder drops what it is told of friction
         joint.set_friction(frictions[joint.name])
-    parts: dict[str, Part] = {BODY: asset, **asset.links}
-    for link in articulation.links:
-        for body in link._bodies:
-            _check_shapes(body, parts[link.name])
     return articulation
 
 
 def _add_shapes(builder: Any, part: Part, friction: float, level: VisualLevel, *, render: bool) -> None:
-    material = sapien.physx.PhysxMaterial(friction, friction, 0.0)
-    builder.add_multiple_convex_collisions_from_file(str(part.hulls_path), material=material)
+    make = builder.build_physx_component
+
+    def build(link_parent: Any = None) -> Any:
+        # not by the builder's own means: it makes no boxes of a file's hulls, and drops those that can't be cooked
+        component = make(link_parent)
+        for shape in shapes_of(part, sapien.physx.PhysxMaterial(friction, friction, 0.0)):
+            component.attach(shape)
+        return component
+
+    builder.build_physx_component = build
     if render:
         builder.add_visual_from_file(str(part.visual(level)))
 
@@ -118,15 +118,3 @@ def _set_mass(builder: Any, facts: ObjectAsset | FurnitureAsset | Link) -> None:
         raise AssetError("a body with a mass needs its inertia too", where=getattr(facts, "id", ""))
     frame = sapien.Pose(list(facts.center_of_mass), list(facts.inertia_wxyz))
     builder.set_mass_and_inertia(facts.mass, frame, np.array(facts.inertia))
-
-
-def _check_shapes(body: Any, part: Part) -> None:
-    """ManiSkill's builder drops shapes that can't be cooked without a word."""
-    if len(body.collision_shapes) != len(part.hulls):
-        raise AssetError(
-            "the physics engine refused a convex hull",
-            where=part.hulls_path,
-            expected=f"{len(part.hulls)} hulls",
-            found=len(body.collision_shapes),
-            fix="Import the asset again.",
-        )

@@ -32,7 +32,10 @@ class Info:
 
 @dataclass
 class Verify:
-    """Check every file of a pack against its manifest, and with --physics every asset in simulation."""
+    """Check a pack's files and what the physics engine makes of its hulls; with --physics, every asset in simulation.
+
+    Files against the manifest's hashes; hulls as they are cooked on a CPU, and as a GPU takes them.
+    """
 
     pack: Annotated[str, tyro.conf.Positional]
     """Its name, or its folder."""
@@ -118,15 +121,20 @@ def verify(command: Verify) -> int:
     """Run ``verify``; 1 where an asset falls short of what is asked of packs."""
     from rich.console import Console
 
+    from robocas_ms3.assets.cooking import cooking_faults
     from robocas_ms3.assets.pack import load_pack
 
     pack = load_pack(command.pack)
     for loaded in pack.objects.values():
-        _ = loaded.hulls, loaded.annotations
-    for loaded in pack.furniture.values():
-        _ = loaded.hulls, [part.hulls for part in loaded.links.values()]
-    Console(highlight=False).print(f"{pack.name}: {len(pack.manifest.assets)} assets, every file is as it should be")
-    return _verify_physics(pack, command.jobs or os.cpu_count() or 1, command.json) if command.physics else 0
+        _ = loaded.annotations
+    faults = cooking_faults(pack.root)
+    console = Console(highlight=False, soft_wrap=True)
+    console.print(f"{pack.name}: {len(pack.manifest.assets)} assets, every file is as it should be")
+    for fault in faults:
+        console.print(str(fault), style="red")
+    if command.physics:
+        return max(_verify_physics(pack, command.jobs or os.cpu_count() or 1, command.json), int(bool(faults)))
+    return int(bool(faults))
 
 
 def sheet(command: Sheet) -> int:

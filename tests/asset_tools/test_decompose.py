@@ -11,7 +11,7 @@ import sapien
 import trimesh
 from sapien import physx
 
-from asset_tools.decompose import MAX_VERTICES, decompose, few_vertices, is_hollow, volume_iou
+from asset_tools.decompose import MAX_VERTICES, decompose, few_vertices, flat_faces, is_hollow, volume_iou
 from asset_tools.prepare import prepare
 from asset_tools.quality.hulls import hull_quality
 from asset_tools.repair import close
@@ -119,9 +119,26 @@ def test_overlap_of_shifted_boxes_is_known():
 
 def test_few_vertices_keep_volume():
     ball = trimesh.creation.icosphere(subdivisions=4)
-    kept = few_vertices(np.asarray(ball.vertices), 48)
-    assert len(kept) == 48
+    kept = few_vertices(np.asarray(ball.vertices))
+    assert len(kept) == MAX_VERTICES == 34
     assert trimesh.convex.convex_hull(kept).volume == pytest.approx(ball.volume, rel=1e-6)
+
+
+def test_few_flat_faces_keep_their_vertices():
+    angles = np.arange(30) * 2 * np.pi / 30
+    ring = 0.2 * np.stack([np.cos(angles), np.sin(angles)], axis=1)  # each corner is 4 mm outside of the others' hull
+    column = np.concatenate([np.column_stack([ring, np.full(30, z)]) for z in (0.0, 0.5)])
+    assert flat_faces(column) == 32
+    assert sorted(few_vertices(column).round(9).tolist()) == sorted(column.round(9).tolist())
+
+
+def test_vertices_that_the_engine_would_drop_are_left_out():
+    cube = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)])
+    bumps = [[0.05, 0.05, 0.1006], [0.05, 0.05, -0.0006], [0.1006, 0.05, 0.05]]
+    kept = few_vertices(np.concatenate([cube, bumps]))
+    assert 8 <= len(kept) < 11
+    higher = few_vertices(np.concatenate([cube, [[0.05, 0.05, 0.102]]]))
+    assert len(higher) == 9
 
 
 def test_a_box_is_one_hull_and_a_u_is_several():

@@ -7,23 +7,30 @@ import time
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 
 from asset_tools.pipeline import Job, content_hash, made_of, make_assets, write_pack
+from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality
 from robocas_ms3.assets.pack import HULLS, VISUALS, load_pack, sha256
 from robocas_ms3.errors import AssetError, OutputExistsError
 
+CUBE = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)])
+BALL = 0.05 * np.asarray(trimesh.creation.icosphere(subdivisions=1).vertices)  # 80 faces: too many for a GPU
 
-def make(id_, folder, log, fail="", seconds=0.0):
+
+def make(id_, folder, log, fail="", seconds=0.0, hull=CUBE):
     """An asset of four small files; says in a log that it was made."""
     with log.open("a") as file:
         file.write(f"{id_}\n")
     time.sleep(seconds)
     if fail:
         raise AssetError(fail)
-    for name in (*VISUALS.values(), HULLS):
-        (folder / name).write_text(f"v 0 0 0\n# {id_} {name}")
+    for name in VISUALS.values():
+        (folder / name).write_text(f"{id_} {name}")
+    write_hulls(folder / HULLS, [hull])
     return FurnitureAsset(
         id=id_,
         name=id_,
@@ -65,6 +72,20 @@ def test_a_kept_asset_that_was_damaged_is_made_again(tmp_path):
     write_pack(jobs(log, a="1" * 64), tmp_path / "pack", kept)
     assert made_in(log) == ["a", "a"]
     load_pack(tmp_path / "pack")
+
+
+def test_hulls_that_the_engine_would_shrink_make_no_pack(tmp_path):
+    log = tmp_path / "log"
+    todo = [*jobs(log, cube="1" * 64), Job("ball", partial(make, "ball", log=log, hull=BALL), "2" * 64)]
+    with pytest.raises(AssetError, match=r"ball: hull 0 shrinks by \d+\.\d mm on a GPU"):
+        write_pack(todo, tmp_path / "pack", tmp_path / "kept")
+    assert not (tmp_path / "pack").exists()
+    results = write_pack(todo, tmp_path / "pack", tmp_path / "kept", skip_bad=True)
+    assert [(made.id, made.asset is None) for made in sorted(results, key=lambda m: m.id)] == [
+        ("ball", True),
+        ("cube", False),
+    ]
+    assert load_pack(tmp_path / "pack").furniture.keys() == {"cube"}
 
 
 def test_a_pack_knows_what_a_pack_was_made_from(tmp_path):

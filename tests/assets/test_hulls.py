@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from robocas_ms3.assets.hulls import convex_faces, read_hulls, sample_surface, sample_triangles, write_hulls
+from robocas_ms3.assets.hulls import box_of, convex_faces, read_hulls, sample_surface, sample_triangles, write_hulls
 from robocas_ms3.errors import AssetError
 
 CUBE = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)], dtype=float)
@@ -51,3 +52,33 @@ def test_surface_of_a_union_leaves_out_what_is_inside(tmp_path):
     side = np.stack(np.meshgrid(np.linspace(0, 0.15, 31), np.linspace(0, 0.1, 21)), -1).reshape(-1, 2)
     top = np.column_stack([side, np.full(len(side), 0.1)])
     assert cKDTree(points).query(top)[0].max() < 0.005
+
+
+def test_a_box_along_the_axes_is_not_turned():
+    box = box_of(CUBE * [1, 2, 30] + [0.5, 0, -1])
+    np.testing.assert_allclose(box.half_size, [0.05, 0.1, 1.5], atol=1e-12)
+    np.testing.assert_allclose(box.pose[:3, 3], [0.55, 0.1, 0.5], atol=1e-12)
+    np.testing.assert_array_equal(box.pose[:3, :3], np.eye(3))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_box_is_known_however_it_is_turned_and_its_corners_ordered(seed):
+    rng = np.random.default_rng(seed)
+    size, turn = rng.uniform(0.002, 1.0, 3), Rotation.random(random_state=seed).as_matrix()
+    corners = np.round((CUBE / 0.1 - 0.5) * size @ turn.T + [0.3, -0.2, 0.7], 7)[rng.permutation(8)]
+    box = box_of(corners)
+    assert sorted(box.half_size) == pytest.approx(sorted(size / 2), abs=1e-6)
+    np.testing.assert_allclose(box.pose[:3, 3], [0.3, -0.2, 0.7], atol=1e-6)
+    assert np.linalg.det(box.pose[:3, :3]) == pytest.approx(1)
+    found = (CUBE / 0.1 - 0.5) * 2 * box.half_size @ box.pose[:3, :3].T + box.pose[:3, 3]
+    assert cKDTree(found).query(corners)[0].max() < 2e-6
+
+
+def test_what_is_no_box_is_none():
+    assert box_of(CUBE[:7]) is None
+    moved = CUBE.copy()
+    moved[3] += [0, 0, 5e-5]  # a corner that is off by a twentieth of a millimetre
+    assert box_of(moved) is None
+    assert box_of(CUBE + np.outer(CUBE[:, 2], [0.1, 0, 0])) is None  # sheared
+    assert box_of(CUBE * (1 - CUBE[:, 2:])) is None  # narrower at the top
+    assert box_of(np.random.default_rng(0).uniform(size=(8, 3))) is None

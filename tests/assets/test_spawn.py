@@ -5,10 +5,12 @@ import torch
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.system.backend import parse_sim_and_render_backend
 from mani_skill.utils.structs import Actor, Articulation
+from sapien.physx import PhysxCollisionShapeBox, PhysxCollisionShapeConvexMesh, PhysxMaterial
 
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, Joint, Link
 from robocas_ms3.assets.pack import LoadedFurniture, Part
+from robocas_ms3.assets.physics import shapes_of
 from robocas_ms3.assets.spawn import spawn, spawn_articulation
 from robocas_ms3.errors import AssetError
 
@@ -75,6 +77,27 @@ def test_furniture_without_moving_parts_is_a_static_actor(scene, cabinet):
     plain = LoadedFurniture(cabinet.folder, asset=cabinet.asset.model_copy(update={"links": ()}))
     built = spawn(scene, plain, name="board", pose=sapien.Pose())
     assert isinstance(built, Actor) and built.px_body_type == "static"
+
+
+def test_hulls_are_built_as_boxes_where_they_are_boxes_and_each_in_its_place(scene, tmp_path):
+    wedge = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+    write_hulls(tmp_path / "hulls.obj", [wedge, box((0.2, 0, 0), (0.3, 0.4, 0.6)), wedge + [0.5, 0, 0]])
+    first, second, third = shapes_of(Part(tmp_path), PhysxMaterial(0.5, 0.5, 0.0))
+    assert isinstance(second, PhysxCollisionShapeBox)
+    np.testing.assert_allclose(second.half_size, [0.05, 0.2, 0.3], atol=1e-7)
+    np.testing.assert_allclose(second.local_pose.p, [0.25, 0.2, 0.3], atol=1e-7)
+    for shape, shift in ((first, 0.0), (third, 0.5)):
+        assert isinstance(shape, PhysxCollisionShapeConvexMesh)
+        np.testing.assert_allclose(shape.vertices.min(axis=0), [shift, 0, 0], atol=1e-6)
+        np.testing.assert_allclose(shape.vertices.max(axis=0), [shift + 0.1, 0.1, 0.1], atol=1e-6)
+
+
+def test_a_body_keeps_its_mass_and_all_its_shapes(scene, cabinet):
+    built = spawn_articulation(scene, cabinet, name="cabinet", pose=sapien.Pose())
+    body = built.links_map["drawer"]._bodies[0]
+    assert body.mass == pytest.approx(1.5) and len(body.collision_shapes) == 1
+    np.testing.assert_allclose(body.inertia, [0.006, 0.006, 0.01], rtol=1e-6)
+    np.testing.assert_allclose(body.cmass_local_pose.p, [0.1, 0.1, 0.065], rtol=1e-6)
 
 
 def test_an_unknown_finish_is_named(cabinet):

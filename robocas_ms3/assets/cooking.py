@@ -1,0 +1,130 @@
+"""Whether the physics engine makes of convex hulls what their files say: on a CPU, and as a GPU takes them.
+
+PhysX "cooks" hulls: it leaves out vertices that lie less than 0.7 mm outside of the others, and for a GPU whatever goes
+beyond 64 vertices or 64 faces, which can shrink a hull by millimetres without a word.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from sapien import physx
+from scipy.spatial import ConvexHull
+
+from robocas_ms3.assets.hulls import Array, box_of, read_hulls
+from robocas_ms3.assets.pack import HULLS
+from robocas_ms3.assets.physics import cook
+
+SHRINKAGE = 0.001  # m that a hull may lose anywhere
+
+
+@dataclass(frozen=True)
+class CookedHull:
+    """What became of a hull.
+
+    Attributes:
+        lost: m, how far its farthest vertex lies outside of what the engine made; infinite: it made nothing.
+        oblong: whether it is too slender to take part in collisions on a GPU.
+    """
+
+    lost: float
+    oblong: bool
+
+
+@dataclass(frozen=True)
+class CookingFault:
+    """A hull that the engine makes less of than its file says.
+
+    Attributes:
+        asset: its folder in the pack; of a moving part ``<furniture>/links/<link>``.
+        hull: its number in the file, from 0 on.
+        way: ``CPU`` or ``GPU``.
+        cooked: what became of it.
+    """
+
+    asset: str
+    hull: int
+    way: str
+    cooked: CookedHull
+
+    def __str__(self) -> str:
+        if not np.isfinite(self.cooked.lost):
+            what = "can't be built"
+        elif self.cooked.lost > SHRINKAGE:
+            what = f"shrinks by {1e3 * self.cooked.lost:.1f} mm"
+        else:
+            what = "is too slender"
+        return f"{self.asset}: hull {self.hull} {what} on a {self.way}"
+
+
+def cooking_faults(folder: Path) -> list[CookingFault]:
+    """Cook all hulls in a pack's folder both ways and say which are not what their files say.
+
+    Boxes are not cooked, in simulation neither. The GPU's way needs no GPU, but a process of its own.
+
+    Raises:
+        AssetError: a file of hulls can't be read.
+    """
+    named: list[tuple[str, int, Array]] = []
+    for path in sorted(folder.rglob(HULLS)):
+        name = path.parent.relative_to(folder).as_posix()
+        hulls = enumerate(read_hulls(path))
+        named += [(name, number, hull.vertices) for number, hull in hulls if box_of(hull.vertices) is None]
+    if not named:
+        return []
+    pieces = [vertices for _, _, vertices in named]
+    with ProcessPoolExecutor(1, get_context("spawn"), _enable_gpu) as pool:
+        ways = {"GPU": pool.submit(cook_hulls, pieces).result(), "CPU": cook_hulls(pieces)}
+    return [
+        CookingFault(name, number, way, result)
+        for way, results in ways.items()
+        for (name, number, _), result in zip(named, results, strict=True)
+        if result.lost > SHRINKAGE or result.oblong
+    ]
+
+
+def cook_hulls(hulls: Sequence[Array]) -> list[CookedHull]:
+    """Let the engine, as this process has it, make something of convex hulls of points (V, 3)."""
+    material = physx.PhysxMaterial(0.5, 0.5, 0.0)
+    results = []
+    for vertices in hulls:
+        with _output() as said:
+            try:
+                shape = cook(vertices, material)
+            except RuntimeError:
+                results.append(CookedHull(np.inf, oblong=False))
+                continue
+        planes = ConvexHull(shape.vertices).equations
+        lost = max(0.0, float((vertices @ planes[:, :3].T + planes[:, 3]).max()))
+        results.append(CookedHull(lost, oblong=any("oblong" in line for line in said)))
+    return results
+
+
+def _enable_gpu() -> None:
+    physx._enable_gpu()
+
+
+@contextmanager
+def _output() -> Iterator[list[str]]:
+    """Lines that native code writes meanwhile: the engine reports oblong hulls nowhere else."""
+    lines: list[str] = []
+    kept = {number: os.dup(number) for number in (1, 2)}
+    with tempfile.TemporaryFile() as file:
+        for number in kept:
+            os.dup2(file.fileno(), number)
+        try:
+            yield lines
+        finally:
+            for number, copy in kept.items():
+                os.dup2(copy, number)
+                os.close(copy)
+            file.seek(0)
+            lines += file.read().decode(errors="replace").splitlines()
