@@ -26,7 +26,7 @@ FRONT_ELEVATION_DEG = (-60.0, 10.0)  # of a front approach above the horizontal
 FREE_LEAN_DEG = 15.0  # an approach this close to straight down has no horizontal direction to speak of
 PREGRASP_DISTANCE = 0.1  # m
 
-# m to either side that a free grasp leaves: planners see what stands around in voxels of 5 mm.
+# m to either side that a free grasp leaves: planners take what stands around for larger than it is.
 SIDE_CLEARANCE = 0.005
 NEIGHBOURHOOD = 0.5  # m from an object's centre, beyond which the gripper at one of its grasps does not reach
 
