@@ -54,7 +54,9 @@ class PandaGeometry:
             (M, 4, 7) rad; NaN where a branch doesn't exist or breaks a joint limit.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
-            return self._solve(np.asarray(tcp_in_base, dtype=np.float64), np.asarray(joint7, dtype=np.float64))
+            return self._solve(
+                np.asarray(tcp_in_base, dtype=np.float64), np.ascontiguousarray(joint7, dtype=np.float64)
+            )
 
     def _solve(self, tcp_in_base: Array, joint7: Array) -> Array:
         flange = np.einsum("mij,jk->mik", tcp_in_base, self.link7_in_tcp)
@@ -92,13 +94,13 @@ class PandaGeometry:
             y3 = -_cross(to_wrist, to_meeting)
             y3 /= _norm(y3)[:, None]
             x3 = _cross(y3, z3)
+            # Copies: numpy's arctan2 of strided numbers differs in the last bit by where in memory they lie.
+            x, y = z3[:, 0].copy(), z3[:, 1].copy()
             lean = np.arccos(np.clip(z3[:, 2], -1, 1))
             elbow_at = self.d3 * z3 + self.a4 * x3 - to_wrist + self.d5 * forearm
             x5, y5 = x6 * c6 - y6 * s6, -z6
             q5 = -np.arctan2(_dot(y5, elbow_at), _dot(x5, elbow_at))
-            for side, (q1, q2) in enumerate(
-                ((np.arctan2(z3[:, 1], z3[:, 0]), lean), (np.arctan2(-z3[:, 1], -z3[:, 0]), -lean))
-            ):
+            for side, (q1, q2) in enumerate(((np.arctan2(y, x), lean), (np.arctan2(-y, -x), -lean))):
                 c1, s1, c2, s2 = np.cos(q1), np.sin(q1), np.cos(q2), np.sin(q2)
                 # x3 in the frame of link 2
                 across = x3[:, 0] * c1 * c2 + x3[:, 1] * s1 * c2 - x3[:, 2] * s2

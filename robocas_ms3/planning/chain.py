@@ -71,7 +71,7 @@ class ArmChain:
 
     def frames(self, qpos: Array) -> tuple[Array, Array]:
         """Give rotations (8, M, 3, 3) and positions (8, M, 3) of links 1 to 7 and the TCP in the base at (M, 7)."""
-        count = len(qpos)
+        count, qpos = len(qpos), np.ascontiguousarray(qpos)
         rotations, positions = np.empty((8, count, 3, 3)), np.empty((8, count, 3))
         fixed = np.array(self.links)[:, None, :3, :3]
         cosine, sine = np.cos(qpos).T[:, :, None], np.sin(qpos).T[:, :, None]

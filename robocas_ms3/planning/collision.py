@@ -166,7 +166,8 @@ class ArmWorld:
         self._request = fcl.CollisionRequest()
         self._shapes: WeakKeyDictionary[Shape, _Pieces] = WeakKeyDictionary()
         self._recent: OrderedDict[bytes, _Pieces] = OrderedDict()
-        self._object_in_tcp, self._body = np.eye(4), None
+        self._object_in_tcp = np.eye(4)
+        self._body: Any = None
         self._read_parts()
         self.set_obstacles([])
 

@@ -27,7 +27,7 @@ FRONT_ELEVATION_DEG = (-60.0, 10.0)  # of a front approach above the horizontal
 FREE_LEAN_DEG = 15.0  # an approach this close to straight down has no horizontal direction to speak of
 PREGRASP_DISTANCE = 0.1  # m
 
-# m to either side that a free grasp leaves: planners see what stands around in voxels of 5 mm.
+# m to either side that a free grasp leaves: planners take what stands around for larger than it is.
 SIDE_CLEARANCE = 0.005
 NEIGHBOURHOOD = 0.5  # m from an object's centre, beyond which the gripper at one of its grasps does not reach
 
@@ -109,14 +109,17 @@ def gripper_is_clear(
     reach = GRIPPER_RADIUS + sweep
     near = np.all((points_in_world >= centers.min(0) - reach) & (points_in_world <= centers.max(0) + reach), axis=1)
     points = points_in_world[near]
+    columns = np.ascontiguousarray(points.T)
+    least, most = low.min(axis=0), high.max(axis=0)  # of the half at positive y
+    middle, half = (least + most) / 2 * (1, 0, 1), np.array([(most - least)[0] / 2, most[1], (most - least)[2] / 2])
     for i, pose in enumerate(tcp_in_world):
-        # Most points are above or below everything, of the others most beside; the rest is tested against the three
-        # boxes, both halves at once.
-        away = points - pose[:3, 3]
-        along = away @ pose[:3, 2]
-        away = away[(along >= low[:, 2].min()) & (along <= high[:, 2].max())]
-        away = away[np.abs(away @ pose[:3, 0]) <= high[:, 0].max()]
-        local = away @ pose[:3, :3]
+        # Most points are outside a box along the axes around it all; the rest is tested against the three boxes, both
+        # halves at once.
+        center, extent = pose[:3, :3] @ middle + pose[:3, 3], np.abs(pose[:3, :3]) @ half
+        inside = np.arange(len(points))
+        for axis in range(3):
+            inside = inside[np.abs(columns[axis][inside] - center[axis]) <= extent[axis] + 1e-9]
+        local = (points[inside] - pose[:3, 3]) @ pose[:3, :3]
         local[:, 1] = np.abs(local[:, 1])
         clear[i] = not any(np.any(np.all((local >= a) & (local <= b), axis=1)) for a, b in zip(low, high, strict=True))
     return clear
