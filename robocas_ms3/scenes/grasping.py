@@ -31,6 +31,13 @@ PREGRASP_DISTANCE = 0.1  # m
 SIDE_CLEARANCE = 0.005
 NEIGHBOURHOOD = 0.5  # m from an object's centre, beyond which the gripper at one of its grasps does not reach
 
+# What lies between the pads, in the TCP's frame, and how a robot may miss: across the pads, and not deep enough, m
+PAD_HALF_WIDTH, PAD_BEHIND_TCP, PAD_BEFORE_TCP = 0.009, -0.012, 0.008
+GRIP_SHIFTS = ((0.0, 0.0), (0.006, 0.0), (-0.006, 0.0), (0.0, -0.006), (0.004, -0.004), (-0.004, -0.004))
+PAD_POINTS = 10  # of a surface at 5 mm: a third of what fits
+ROOM_BESIDE = 0.006  # m between an object and each open finger
+MARGIN_WEIGHT = 1.0
+
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # of the wrist, about the approach
 
 
@@ -169,10 +176,34 @@ def filter_grasps(
     return GraspFilter(kept, widths[both], qualities[both], both, rejected)
 
 
+def grip_margins(tcp: Array, widths: Array, surface: Array) -> Array:
+    """How much of an object is between the pads even where a grasp comes out a little otherwise than planned.
+
+    Args:
+        tcp: (N, 4, 4) grasps, in the frame of the points.
+        widths: (N,) of the object there, m.
+        surface: (P, 3) of the object, m, 5 mm apart.
+
+    Returns:
+        (N,) in 0..1: 1 where at least ``PAD_POINTS`` lie between the pads of each of several shifted grasps, and
+        ``ROOM_BESIDE`` beside the object while the gripper is open.
+    """
+    tcp = np.asarray(tcp, dtype=np.float64)
+    local = np.einsum("nij,npi->npj", tcp[:, :3, :3], surface[None] - tcp[:, None, :3, 3])
+    between = np.abs(local[..., 1]) <= MAX_WIDTH / 2
+    margin = np.clip((MAX_WIDTH - np.asarray(widths)) / 2 / ROOM_BESIDE, 0, 1)
+    for across, deeper in GRIP_SHIFTS:
+        inside = between & (np.abs(local[..., 0] - across) <= PAD_HALF_WIDTH)
+        inside &= (local[..., 2] >= PAD_BEHIND_TCP + deeper) & (local[..., 2] <= PAD_BEFORE_TCP + deeper)
+        margin = np.minimum(margin, inside.sum(axis=1) / PAD_POINTS)
+    return margin
+
+
 def rank_grasps(
     tcp: Array,
     qualities: Array,
     *,
+    margins: Array | None = None,
     object_center: Array,
     qpos: Array,
     near: Array,
@@ -184,11 +215,12 @@ def rank_grasps(
 
     The score adds quality (relative to the best), nearness of the TCP to the object's centre (falls by e every 3 cm),
     steepness (1 straight down, 0 level; from the front the other way round), nearness in joint space (falls by e every
-    rad of the joint that turns most).
+    rad of the joint that turns most), and the margin.
 
     Args:
         tcp: (N, 4, 4) in any upright frame.
         qualities: (N,), more is better.
+        margins: (N,) of ``grip_margins``; default: all alike.
         object_center: (3,) in the same frame.
         qpos: (N, 7) a configuration for each.
         near: (7,) where the arm is.
@@ -207,6 +239,8 @@ def rank_grasps(
     turn = np.abs(np.asarray(qpos) - near).max(axis=1)
     steep = -tcp[:, 2, 2] if approach == "top" else np.linalg.norm(tcp[:, :2, 2], axis=1)
     score = quality + np.exp(-distance / 0.03) + 0.7 * steep + 0.7 * np.exp(-turn)
+    if margins is not None:
+        score = score + MARGIN_WEIGHT * margins
     # Gumbel noise turns scores into draws without replacement, weighted by exp(score / temperature).
     return np.argsort(-(score + temperature * rng.gumbel(size=len(score))), kind="stable")
 

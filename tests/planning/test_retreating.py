@@ -29,7 +29,7 @@ class Way(Arm):
             task_config=SimpleNamespace(target=SimpleNamespace(approach=approach)), target_slot=torch.tensor([TARGET])
         )
         self.at, self.planner, self.blocking = REST, self, blocking
-        self.scene = SimpleNamespace(tcp_in_base=tcp, obstacles_in_base=lambda without=None: without)
+        self.scene = SimpleNamespace(tcp_in_base=tcp, obstacles=lambda without=None: without)
         self.lines, self.followed, self.opened = [], [], False
 
     env = property(lambda self: self._env)

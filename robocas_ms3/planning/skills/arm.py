@@ -139,7 +139,7 @@ class Arm:
         """
         for rises in range(RISES + 1):
             with self.planning():
-                self.planner.set_scene(self.scene.obstacles_in_base(without=without))
+                self.planner.set_scene(self.scene.obstacles(without=without))
                 if not self.planner.collisions(self.at, self.planner.finger_width):
                     return
                 if rises == RISES:

@@ -81,7 +81,12 @@ class Heap:
         """Ways to make room, those first that promise most: of the highest obstacles, then of what blocks grasps.
 
         A push takes less time than a lift.
+
+        Raises:
+            EpisodeLost: enough has been moved.
         """
+        if sum(self.arm.executor.facts.values()) >= MOVES:
+            raise EpisodeLost("horizon", "too_many_obstacles")
         obstacles = np.flatnonzero(self.clutter().obstacles[0].cpu().numpy()).tolist()
         obstacles.sort(key=lambda slot: -self._points(slot)[:, 2].max())
         order = dict.fromkeys(obstacles[:LOOKED_AT])
@@ -100,11 +105,9 @@ class Heap:
 
         Raises:
             PlanningFailed: it can't be planned, was in vain, or brought an object to the edge.
-            EpisodeLost: something fell off the surface, or enough has been moved.
+            EpisodeLost: something fell off the surface.
         """
         arm, facts = self.arm, self.arm.executor.facts
-        if sum(facts.values()) >= MOVES:
-            raise EpisodeLost("horizon", "too_many_obstacles")
         before, target, begun = self.middle(move.slot), self.middle(self.target), len(arm.executor.actions)
         arm.rise_clear()
         if move.skill == "push":

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
-from robocas_ms3.planning.scene import inverse
+from robocas_ms3.planning.scene import SPACING, inverse
 from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
 from robocas_ms3.scenes.grasping import (
     NEIGHBOURHOOD,
     PREGRASP_DISTANCE,
     Approach,
     filter_grasps,
+    grip_margins,
     gripper_is_clear,
     rank_grasps,
 )
@@ -29,6 +30,8 @@ GRASPS_CHECKED = 48  # grasps of which a check of collisions says whether to try
 CLEARED_AT_ONCE = 12
 ENTRIES = 4  # pre-grasp configurations of one grasp
 WAYS = 6  # pre-grasp configurations that are searched for together
+GRASPS_COMPARED = 96  # of which kinds are told apart
+ALIKE = 0.02, np.deg2rad(30)  # m, rad between two grasps of a kind
 GRASPS_PLANNED = 12  # grasps that motions are planned for before an attempt gives up
 # m; the least makes a stage of the tasks (3 cm), the others go over what stands in front: the first with a way out
 FRONT_LIFTS = (0.04, 0.08, 0.14, 0.2)
@@ -46,7 +49,9 @@ class GraspPlan:
     retreat: tuple[Trajectory, ...]
 
 
-def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, approach: Approach | None = None) -> None:
+def grasp(
+    arm: Arm, slot: int, *, lift_height: float = 0.10, approach: Approach | None = None, other_than: int = 0
+) -> None:
     """Plan a grasp of an object, run it, and lift (from the front: lift and withdraw) the object.
 
     Args:
@@ -54,12 +59,13 @@ def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, approach: Approach 
         slot: of the object.
         lift_height: when grasping from above, m (upstream: 0.10 when picking, 0.15 when searching).
         approach: from where the gripper comes; default: as the configuration says.
+        other_than: how many kinds of grasps to leave out, the best first.
 
     Raises:
         PlanningFailed: no grasp can be planned, or the object was missed or slipped.
     """
     with arm.planning():
-        plan = plan_grasp(arm, slot, lift_height, approach or arm.env.task_config.target.approach)
+        plan = plan_grasp(arm, slot, lift_height, approach or arm.env.task_config.target.approach, other_than)
     arm.follow(plan.reach, plan.approach)
     arm.close_gripper()
     if not arm.holds(slot):
@@ -69,7 +75,7 @@ def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, approach: Approach 
         raise PlanningFailed("lift", "slipped")
 
 
-def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "top") -> GraspPlan:
+def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "top", other_than: int = 0) -> GraspPlan:
     """Plan the best grasp that has a way in and out.
 
     Raises:
@@ -85,7 +91,7 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "to
         _, inward, out = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
         return GraspPlan(reach, inward, out)
 
-    for tcp_in_base in candidates(arm, slot, approach):
+    for tcp_in_base in candidates(arm, slot, approach, other_than):
         # in and out of the target's surroundings, where the target itself is no obstacle; it is one on the way there
         planner.set_scene(others)
         starts = planner.ik(moved_back(tcp_in_base, PREGRASP_DISTANCE), arm.at)[:ENTRIES]
@@ -116,13 +122,14 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "to
     raise failure
 
 
-def candidates(arm: Arm, slot: int, approach: Approach = "top") -> Iterator[Array]:
+def candidates(arm: Arm, slot: int, approach: Approach = "top", other_than: int = 0) -> Iterator[Array]:
     """Grasps worth planning for, best first: TCP poses 4x4.
 
     Args:
         arm: the attempt's tools.
         slot: of the object.
         approach: from where the gripper may come.
+        other_than: how many kinds of them to leave out, the best first.
 
     Raises:
         PlanningFailed: no grasp passes the filters, or none can be reached.
@@ -146,6 +153,7 @@ def candidates(arm: Arm, slot: int, approach: Approach = "top") -> Iterator[Arra
     reachable = np.flatnonzero(solved & solved_before)
     if not len(reachable):
         raise PlanningFailed("grasp_sampling", "unreachable" if len(kept) else "all_filtered")
+    surface = arm.env.object_assets[0][slot].surface_points(SPACING)
     ranks = rank_grasps(
         tcp_in_base[reachable],
         kept.qualities[reachable],
@@ -153,6 +161,7 @@ def candidates(arm: Arm, slot: int, approach: Approach = "top") -> Iterator[Arra
         qpos=qpos[reachable],
         near=arm.at,
         rng=arm.rng,
+        margins=grip_margins(notes.grasps_tcp_in_object[kept.index[reachable]], kept.widths[reachable], surface),
         approach=approach,
     )
     near = arm.scene.obstacles_in_base(without=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
@@ -163,12 +172,31 @@ def candidates(arm: Arm, slot: int, approach: Approach = "top") -> Iterator[Arra
         ways = np.stack([qpos_before[looked_at], qpos[looked_at]], axis=1)
         free = arm.planner.free(ways.reshape(-1, 7)).reshape(-1, 2).all(axis=1)
         clear = iter([looked_at[i] for i in np.argsort(~free, kind="stable")])
+    if other_than:
+        looked_at = list(islice(clear, GRASPS_COMPARED))
+        clear = (looked_at[i] for i in _of_other_kinds(tcp_in_base[looked_at], other_than))
     found = False
     for index in islice(clear, GRASPS_PLANNED):
         found = True
         yield tcp_in_base[index]
     if not found:
         raise PlanningFailed("grasp_sampling", "all_filtered")
+
+
+def _of_other_kinds(tcp: Array, count: int) -> list[int]:
+    """Indices of those of the grasps (N, 4, 4) that are none of the first few kinds, in their order.
+
+    A kind is what lies within ``ALIKE`` of a grasp that is of no kind before it, but for a half turn of the wrist.
+    """
+    left = np.ones(len(tcp), dtype=bool)
+    for _ in range(count):
+        if not left.any():
+            break
+        first = tcp[int(np.argmax(left))]
+        near = np.linalg.norm(tcp[:, :3, 3] - first[:3, 3], axis=1) <= ALIKE[0]
+        turned = [np.abs(tcp[:, :3, axis] @ first[:3, axis]) for axis in (1, 2)]  # the closing axis has no sign
+        left &= ~(near & (np.min(turned, axis=0) >= np.cos(ALIKE[1])))
+    return np.flatnonzero(left).tolist()
 
 
 def _clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -> Iterator[int]:

@@ -10,7 +10,7 @@ import torch
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.executor import CLOSED
-from robocas_ms3.planning.protocol import Array, Trajectory
+from robocas_ms3.planning.protocol import Array, Obstacle, Trajectory
 from robocas_ms3.planning.pushes import STAND_OFF, YAWS, Push, candidates
 from robocas_ms3.planning.scene import SPACING, inverse
 from robocas_ms3.planning.skills.arm import Arm, raised
@@ -79,7 +79,7 @@ def _plan_lift(arm: Arm, direction: Array) -> Trajectory:
     """
     width, arm.planner.finger_width = arm.planner.finger_width, 0.0
     try:
-        arm.planner.set_scene(_fixed(arm))
+        arm.planner.set_scene(_fixed_bodies(arm))
         tcp = arm.planner.tcp(arm.at)
         return arm.first_line(arm.at, [_lifted(tcp, direction), raised(tcp, LIFT)], stage="push")
     finally:
@@ -95,7 +95,12 @@ def _lifted(tcp_in_base: Array, direction: Array) -> Array:
 
 def _fixed(arm: Arm) -> Array:
     """Surfaces (P, 3) of furniture and basket in the arm's base frame, m."""
-    return arm.scene.obstacles_in_base(without=range(len(arm.env.object_assets[0])))
+    return arm.scene.obstacles_in_base(without=range(len(arm.env.objects)))
+
+
+def _fixed_bodies(arm: Arm) -> list[Obstacle]:
+    """The same as bodies."""
+    return arm.scene.obstacles(without=range(len(arm.env.objects)))
 
 
 def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPlan:
@@ -107,52 +112,67 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
     Raises:
         PlanningFailed: of the push that came last.
     """
-    slots = set(range(len(arm.env.object_assets[0])))
-    try:
-        return _plan_push(arm, slot, target, turn_deg, movable={slot})
-    except PlanningFailed:
-        return _plan_push(arm, slot, target, turn_deg, movable=slots - {target})
-
-
-def _plan_push(arm: Arm, slot: int, target: int, turn_deg: float, movable: set[int]) -> PushPlan:
-    planner, everything = arm.planner, arm.scene.obstacles_in_base()
-    others = arm.scene.obstacles_in_base(without=slot)
-    failure = PlanningFailed("push", "no_room")
+    planner = arm.planner
     width, planner.finger_width = planner.finger_width, 0.0
     try:
-        planner.set_scene(everything)
-        begun: list[tuple[Push, Array, Trajectory]] = []
-        for push, qpos in reachable_pushes(arm, slot, target, others, turn_deg):
-            try:
-                begun.append((push, qpos, planner.plan_straight(qpos, push.start, stage="push")))
-            except PlanningFailed as error:
-                failure = error
-            if len(begun) == PUSHES_PLANNED:
-                break
-        along_scene, fixed = arm.scene.obstacles_in_base(without=movable), _fixed(arm)
-        ways: list[tuple[Array, Trajectory, Trajectory, Trajectory]] = []
-        first = np.zeros(3)
-        for push, qpos, down in begun:
-            if ways and push.direction @ first < 1 - 1e-6:
-                break
-            try:
-                planner.set_scene(along_scene)  # what may move is no obstacle on the way along
-                along = planner.plan_straight(down.qpos[-1], push.end, stage="push", speed=SPEED)
-                planner.set_scene(fixed)  # the pushed object may lean on the tool
-                lift = planner.plan_straight(along.qpos[-1], _lifted(push.end, push.direction), stage="push")
-                ways.append((qpos, down, along, lift))
-                first = push.direction
-            except PlanningFailed as error:
-                failure = error
-        planner.set_scene(everything)
-        if ways:
-            # one direction, several turns of the tool: the one that is nearest
-            reach = planner.plan_to_qpos(arm.at, [way[0] for way in ways], stage="push")
-            _, *way = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
-            return PushPlan(reach, *way, direction=first)
+        begun = _begun(arm, slot, target, turn_deg)
+        try:
+            return _plan_along(arm, begun, movable={slot})
+        except PlanningFailed:
+            return _plan_along(arm, begun, movable=set(range(len(arm.env.objects))) - {target})
     finally:
         planner.finger_width = width
-    raise failure
+
+
+def _begun(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push, Array, Trajectory]]:
+    """Pushes whose way down to the object is clear of everything: with a configuration (7,) above, and that way.
+
+    Raises:
+        PlanningFailed: there is none.
+    """
+    arm.planner.set_scene(arm.scene.obstacles())
+    failure, begun = PlanningFailed("push", "no_room"), []
+    for push, qpos in reachable_pushes(arm, slot, target, arm.scene.obstacles_in_base(without=slot), turn_deg):
+        try:
+            begun.append((push, qpos, arm.planner.plan_straight(qpos, push.start, stage="push")))
+        except PlanningFailed as error:
+            failure = error
+        if len(begun) == PUSHES_PLANNED:
+            break
+    if not begun:
+        raise failure
+    return begun
+
+
+def _plan_along(arm: Arm, begun: list[tuple[Push, Array, Trajectory]], movable: set[int]) -> PushPlan:
+    """Plan on from where pushes begin, with some objects that may be moved on the way along.
+
+    Raises:
+        PlanningFailed: of the push that came last.
+    """
+    planner, failure = arm.planner, PlanningFailed("push", "no_room")
+    along_scene, fixed = arm.scene.obstacles(without=movable), _fixed_bodies(arm)
+    ways: list[tuple[Array, Trajectory, Trajectory, Trajectory]] = []
+    first = np.zeros(3)
+    for push, qpos, down in begun:
+        if ways and push.direction @ first < 1 - 1e-6:
+            break
+        try:
+            planner.set_scene(along_scene)  # what may move is no obstacle on the way along
+            along = planner.plan_straight(down.qpos[-1], push.end, stage="push", speed=SPEED)
+            planner.set_scene(fixed)  # the pushed object may lean on the tool
+            lift = planner.plan_straight(along.qpos[-1], _lifted(push.end, push.direction), stage="push")
+            ways.append((qpos, down, along, lift))
+            first = push.direction
+        except PlanningFailed as error:
+            failure = error
+    if not ways:
+        raise failure
+    planner.set_scene(arm.scene.obstacles())
+    # one direction, several turns of the tool: the one that is nearest
+    reach = planner.plan_to_qpos(arm.at, [way[0] for way in ways], stage="push")
+    _, *way = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
+    return PushPlan(reach, *way, direction=first)
 
 
 def reachable_pushes(

@@ -128,7 +128,7 @@ def plan_place(arm: Arm, slot: int) -> tuple[Trajectory, Trajectory]:
     else:
         raise failure
     places, above, qpos = places[solved], above[solved], qpos[solved]
-    arm.planner.set_scene(others)
+    arm.planner.set_scene(scene.obstacles(without=slot))
     attach_held(arm, slot)
     for index in np.argsort(np.abs(qpos - start).max(axis=1), kind="stable")[:PLACES_PLANNED]:
         try:

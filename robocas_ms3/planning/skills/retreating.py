@@ -49,7 +49,7 @@ def back_out(arm: Arm) -> None:
     arm.open_gripper()
     with arm.planning():
         tcp = arm.planner.tcp(arm.at)
-        arm.planner.set_scene(arm.scene.obstacles_in_base())
+        arm.planner.set_scene(arm.scene.obstacles())
         if arm.env.task_config.target.approach == "top" and tcp[2, 2] < POINTS_DOWN:
             motion = arm.plan_rise(arm.scene.tcp_in_base, BACK_OUT_RISE, stage="recover")
         else:
@@ -61,5 +61,5 @@ def _plan_back_out(arm: Arm, goals: list[Array]) -> Trajectory:
     try:
         return plan_step_back(arm, arm.at, goals, only_free=True)
     except PlanningFailed:
-        arm.planner.set_scene(arm.scene.obstacles_in_base(without=int(arm.env.target_slot[0])))
+        arm.planner.set_scene(arm.scene.obstacles(without=int(arm.env.target_slot[0])))
         return plan_step_back(arm, arm.at, goals, only_free=True)

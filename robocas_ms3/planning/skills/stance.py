@@ -32,6 +32,7 @@ from robocas_ms3.planning.skills.placing import attach_held, drop_poses
 from robocas_ms3.scenes.grasping import HALF_TURN, NEIGHBOURHOOD, PREGRASP_DISTANCE, directions_ok, gripper_is_clear
 from robocas_ms3.scenes.placement import transform
 
+KINDS = 4  # of grasps that attempts take one after the other
 PLACES = 3  # to do one thing from
 GRASPS = 10  # grasps that stand for all when reach is judged
 GRASPS_LOOKED_AT = 250
@@ -46,7 +47,12 @@ def grasp_from_reach(arm: Arm, slot: int) -> None:
     Raises:
         PlanningFailed: no place to grasp from, or the object was missed or slipped.
     """
-    _from_some_place(arm, lambda elsewhere: drive_to_object(arm, slot, elsewhere=elsewhere), lambda: grasp(arm, slot))
+    kind = arm.path[-1] % KINDS  # not again what has failed before
+    _from_some_place(
+        arm,
+        lambda elsewhere: drive_to_object(arm, slot, elsewhere=elsewhere),
+        lambda: grasp(arm, slot, other_than=kind),
+    )
 
 
 def open_from_reach(arm: Arm) -> None:

@@ -18,7 +18,7 @@ from robocas_ms3.planning.skills.removing import hang_clear
 LIFT_HEIGHT = 0.15  # m, upstream's
 AHEAD = 3  # moves that are compared
 ENOUGH = -10.0  # s; a move after which nothing is left to do, and which took no longer, is not compared with others
-GRASPS = 3  # of the target that are tried
+GRASPS = 3  # kinds of grasps of the target that are tried
 
 
 def attempt(arm: Arm) -> None:
@@ -62,9 +62,9 @@ def _grasp(arm: Arm, slot: int) -> bool:
     """Grasp the target and lift it; False where it can't be done, with nothing moved."""
     done = len(arm.executor.actions)
 
-    def play(_: int) -> float:
+    def play(kind: int) -> float:
         arm.executor.gripper = OPEN  # it opens on the way
-        grasp(arm, slot, lift_height=LIFT_HEIGHT)
+        grasp(arm, slot, lift_height=LIFT_HEIGHT, other_than=kind)
         hang_clear(arm, slot)
         return 0.0
 
