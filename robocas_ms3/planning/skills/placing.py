@@ -14,6 +14,8 @@ from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.scenes.placement import transform
 
 DROPS_SAMPLED, DROPS_CHECKED, DROPS_PLANNED = 192, 64, 10
+DROP_MARGIN = 0.025  # m
+LEAN_WEIGHT = 0.7  # rad of a joint that a rad of the gripper's is worth
 RETREAT_HEIGHT = 0.05  # m, upstream's
 
 
@@ -61,9 +63,13 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
     if not solved.any():
         raise PlanningFailed("transfer", "unreachable")
     drops, qpos = drops[solved], qpos[solved]
-    # first those in which the object fits through the opening, then those that are near
-    overhang = overhangs(drops, scene.basket_in_base, *_inner_box(arm), transform(*held_object(arm, slot)))
-    order = np.lexsort((turn_between(qpos, start), np.ceil(overhang / 0.02)))
+    # first those in which the object fits through the opening with room to spare, then those that are near; off a steep
+    # gripper it falls straight, off a leaning one it slides
+    low, high = _inner_box(arm)
+    margin = np.array([DROP_MARGIN, DROP_MARGIN, 0])
+    overhang = overhangs(drops, scene.basket_in_base, low + margin, high - margin, transform(*held_object(arm, slot)))
+    lean = np.arccos(np.clip(-drops[:, 2, 2], -1, 1))
+    order = np.lexsort((turn_between(qpos, start) + LEAN_WEIGHT * lean, np.ceil(overhang / 0.015)))
     arm.planner.set_scene(scene.obstacles(without=slot))
     attach_held(arm, slot)
     order = order[:DROPS_CHECKED]
