@@ -164,7 +164,7 @@ class ArmWorld:
         self.checks = 0  # configurations checked so far
         self.finger_width = WIDEST
         self._request = fcl.CollisionRequest()
-        self._shapes: WeakKeyDictionary[Shape, _Pieces] = WeakKeyDictionary()
+        self._shapes: WeakKeyDictionary[Shape, dict[float, _Pieces]] = WeakKeyDictionary()
         self._recent: OrderedDict[bytes, _Pieces] = OrderedDict()
         self._object_in_tcp = np.eye(4)
         self._body: Any = None
@@ -228,9 +228,10 @@ class ArmWorld:
         """Replace the obstacles by rigid bodies; they don't count against the robot's own base."""
         known = []
         for obstacle in obstacles:
-            if obstacle.shape not in self._shapes:
-                self._shapes[obstacle.shape] = self._pieces(obstacle.shape)
-            known.append((obstacle.name, self._shapes[obstacle.shape], obstacle.pose_in_base))
+            sizes = self._shapes.setdefault(obstacle.shape, {})
+            if obstacle.room not in sizes:
+                sizes[obstacle.room] = self._pieces(obstacle.shape, obstacle.room)
+            known.append((obstacle.name, sizes[obstacle.room], obstacle.pose_in_base))
         self._place(known)
 
     def _place(self, bodies: list[tuple[str, _Pieces, Array]]) -> None:
@@ -251,10 +252,10 @@ class ArmWorld:
             self._objects[index] = self._fcl.CollisionObject(geometry, place[:3], place[3:])
         return self._objects[index]
 
-    def _pieces(self, shape: Shape) -> _Pieces:
+    def _pieces(self, shape: Shape, room: float) -> _Pieces:
         if shape.points is not None:
             return self._tree(np.ascontiguousarray(shape.points))
-        hulls = [inflated(np.asarray(vertices, dtype=np.float64), MARGIN) for vertices in shape.hulls]
+        hulls = [inflated(np.asarray(vertices, dtype=np.float64), MARGIN + room) for vertices in shape.hulls]
         first = np.cumsum([0, *(len(vertices) for vertices, _ in hulls[:-1])])
         geometries = [self._fcl.Convex(vertices, faces) for vertices, faces in hulls]
         return _Pieces(geometries, np.concatenate([vertices for vertices, _ in hulls]), first)

@@ -17,7 +17,7 @@ def sample_drops(
     inner_high: Array,
     vertices_in_tcp: Array,
     center_in_tcp: Array,
-    clearance: tuple[float, float] = (0.02, 0.06),
+    clearance: tuple[float, float] = (0.03, 0.07),
     max_tilt_deg: float = 70.0,
     spread: float = 0.25,
 ) -> Array:

@@ -69,11 +69,13 @@ class Obstacle:
         name: for people.
         shape: its form.
         pose_in_base: 4x4 of its frame.
+        room: to keep to it, m.
     """
 
     name: str
     shape: Shape
     pose_in_base: Array
+    room: float = 0.0
 
 
 class Planner(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ SPACING = 0.005
 # no link fits between two points a centimetre apart.
 FURNITURE_SPACING = 0.01
 RADIUS = 1.5
+BASKET = "basket"  # its name among obstacles
 
 
 def matrix(raw_pose: torch.Tensor) -> Array:
@@ -53,7 +55,7 @@ def shape_of(part: Part) -> Shape:
 def seen_from(obstacles_in_world: Iterable[Obstacle], arm_base_in_world: Array) -> list[Obstacle]:
     """Bodies whose poses are the world's, in the frame of an arm's base (4x4)."""
     to_base = inverse(arm_base_in_world)
-    return [Obstacle(body.name, body.shape, to_base @ body.pose_in_base) for body in obstacles_in_world]
+    return [replace(body, pose_in_base=to_base @ body.pose_in_base) for body in obstacles_in_world]
 
 
 class PlanningScene:
@@ -75,7 +77,7 @@ class PlanningScene:
             for link, pose in link_poses(asset.asset.links, self.joint_positions(name)).items():
                 if (name, link) != without_link:
                     yield f"{name}/{link}", asset.links[link], FURNITURE_SPACING, frame @ pose
-        yield "basket", self.env.model.basket, SPACING, matrix(self.env.fixtures.basket.pose.raw_pose[0])
+        yield BASKET, self.env.model.basket, SPACING, matrix(self.env.fixtures.basket.pose.raw_pose[0])
         present = self.env.present[0].tolist()
         for slot, asset in enumerate(self.env.object_assets[0]):
             if present[slot] and slot not in left_out:
@@ -117,9 +119,17 @@ class PlanningScene:
         *,
         without: int | Collection[int] = (),
         without_link: tuple[str, str] | None = None,
+        room_at_basket: float = 0.0,
     ) -> list[Obstacle]:
-        """Furniture, basket and the objects that are there, as bodies for a planner; arguments as below."""
-        return seen_from(self.obstacles_in_world(without=without, without_link=without_link), self.arm_base_in_world)
+        """Furniture, basket and the objects that are there, as bodies for a planner.
+
+        Args:
+            without, without_link: as below.
+            room_at_basket: to keep to it, m.
+        """
+        bodies = self.obstacles_in_world(without=without, without_link=without_link)
+        bodies = [replace(body, room=room_at_basket) if body.name == BASKET else body for body in bodies]
+        return seen_from(bodies, self.arm_base_in_world)
 
     def obstacles_in_world(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.chain import turn_between
@@ -16,6 +17,8 @@ from robocas_ms3.scenes.placement import transform
 DROPS_SAMPLED, DROPS_CHECKED, DROPS_PLANNED = 192, 64, 10
 DROP_MARGIN = 0.025  # m
 LEAN_WEIGHT = 0.7  # rad of a joint that a rad of the gripper's is worth
+ROOM_AT_BASKET = 0.025  # m
+ELBOW, STRETCHED, STRETCH_WEIGHT = 3, -0.7, 5.0  # joint; rad from which on the arm is nearly straight
 RETREAT_HEIGHT = 0.05  # m, upstream's
 
 
@@ -54,44 +57,71 @@ def release_into_basket(arm: Arm, slot: int) -> None:
 def plan_carry(arm: Arm, slot: int) -> Trajectory:
     """Plan from where the arm is to a pose above the basket from which it can also step back.
 
+    Where there is such a way, it keeps off the basket by what a robot may miss it, which would push it away.
+
     Raises:
         PlanningFailed: of the pose that came last.
     """
-    scene, start = arm.scene, arm.at
-    drops = drop_poses(arm, slot, scene.arm_base_in_world)
-    solved, qpos = arm.reachability.reachable(drops, start)
+    drops = drop_poses(arm, slot, arm.scene.arm_base_in_world)
+    solved, qpos = arm.reachability.reachable(drops, arm.at)
     if not solved.any():
         raise PlanningFailed("transfer", "unreachable")
-    drops, qpos = drops[solved], qpos[solved]
-    # first those in which the object fits through the opening with room to spare, then those that are near; off a steep
-    # gripper it falls straight, off a leaning one it slides
+    order = _ranked(arm, slot, drops[solved], qpos[solved])
+    drops, qpos = drops[solved][order], qpos[solved][order]
+    attach_held(arm, slot)
+    failure = PlanningFailed("transfer", "no_plan")
+    for room in (ROOM_AT_BASKET, 0.0):
+        arm.planner.set_scene(arm.scene.obstacles(without=slot, room_at_basket=room))
+        try:
+            return _plan_to_one_of(arm, drops, qpos)
+        except PlanningFailed as error:
+            failure = error
+    raise failure
+
+
+def _ranked(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.int_]:
+    """Order of drops (N, 4, 4), reached at (N, 7).
+
+    First those in which the object fits through the opening with room to spare. Of those the ones that are near, not at
+    the end of the arm's reach, and steep: off a leaning gripper an object slides.
+    """
     low, high = _inner_box(arm)
     margin = np.array([DROP_MARGIN, DROP_MARGIN, 0])
-    overhang = overhangs(drops, scene.basket_in_base, low + margin, high - margin, transform(*held_object(arm, slot)))
+    vertices = transform(*held_object(arm, slot))
+    overhang = overhangs(drops, arm.scene.basket_in_base, low + margin, high - margin, vertices)
     lean = np.arccos(np.clip(-drops[:, 2, 2], -1, 1))
-    order = np.lexsort((turn_between(qpos, start) + LEAN_WEIGHT * lean, np.ceil(overhang / 0.015)))
-    arm.planner.set_scene(scene.obstacles(without=slot))
-    attach_held(arm, slot)
-    order = order[:DROPS_CHECKED]
-    order = order[arm.planner.free(qpos[order], arm.planner.finger_width)][:DROPS_PLANNED]
-    if not len(order):
+    stretched = np.maximum(qpos[:, ELBOW] - STRETCHED, 0)
+    cost = turn_between(qpos, arm.at) + LEAN_WEIGHT * lean + STRETCH_WEIGHT * stretched
+    return np.lexsort((cost, np.ceil(overhang / 0.015)))
+
+
+def _plan_to_one_of(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
+    """Plan to the first of several drops (N, 4, 4), reached at (N, 7), that is free.
+
+    Raises:
+        PlanningFailed: of the drop that came last.
+    """
+    start = arm.at
+    chosen = np.flatnonzero(arm.planner.free(qpos[:DROPS_CHECKED], arm.planner.finger_width))[:DROPS_PLANNED]
+    if not len(chosen):
         raise PlanningFailed("transfer", "no_free_place")
-    for index in order:
+    drops, qpos = drops[chosen], qpos[chosen]
+    for drop, goal in zip(drops, qpos, strict=True):
         try:
-            carry = arm.planner.plan_to_qpos(start, [qpos[index]], stage="transfer", search=False)
-            plan_step_back(arm, carry.qpos[-1], _ways_off(drops[index]))  # no way up from there: no place to let go
+            carry = arm.planner.plan_to_qpos(start, [goal], stage="transfer", search=False)
+            plan_step_back(arm, carry.qpos[-1], _ways_off(drop))  # no way up from there: no place to let go
             return carry
         except PlanningFailed:
             continue
-    failure = PlanningFailed("transfer", "no_plan")
-    for _ in range(len(order)):
-        carry = arm.planner.plan_to_qpos(start, list(qpos[order]), stage="transfer")
-        chosen = int(np.argmin(np.abs(qpos[order] - carry.qpos[-1]).max(axis=1)))
+    failure, left = PlanningFailed("transfer", "no_plan"), np.arange(len(drops))
+    while len(left):
+        carry = arm.planner.plan_to_qpos(start, list(qpos[left]), stage="transfer")
+        reached = int(np.argmin(np.abs(qpos[left] - carry.qpos[-1]).max(axis=1)))
         try:
-            plan_step_back(arm, carry.qpos[-1], _ways_off(drops[order[chosen]]))
+            plan_step_back(arm, carry.qpos[-1], _ways_off(drops[left[reached]]))
             return carry
         except PlanningFailed as error:
-            failure, order = error, np.delete(order, chosen)
+            failure, left = error, np.delete(left, reached)
     raise failure
 
 
