@@ -19,6 +19,7 @@ from robocas_ms3.scenes.placement import transform
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE, Clutter
 from robocas_ms3.tasks.search import FALLEN, RoboCASSearchEnv
 
+FACTS = ("pushes", "removals")  # what is counted
 MOVES = 8  # pushes and removals a demonstration may hold
 MOVED = 0.02  # m by which a push moves its object at least; less is one in vain
 LOOKED_AT = 4  # obstacles, of those that are highest
@@ -63,6 +64,11 @@ class Heap:
         assert isinstance(env, RoboCASSearchEnv)
         return env
 
+    @property
+    def moves_made(self) -> int:
+        """Since the reset."""
+        return sum(self.arm.executor.facts[fact] for fact in FACTS)
+
     def clutter(self) -> Clutter:
         """What hides and surrounds the target."""
         return self.env.clutter()
@@ -85,7 +91,7 @@ class Heap:
         Raises:
             EpisodeLost: enough has been moved.
         """
-        if sum(self.arm.executor.facts.values()) >= MOVES:
+        if self.moves_made >= MOVES:
             raise EpisodeLost("horizon", "too_many_obstacles")
         obstacles = np.flatnonzero(self.clutter().obstacles[0].cpu().numpy()).tolist()
         obstacles.sort(key=lambda slot: -self._points(slot)[:, 2].max())

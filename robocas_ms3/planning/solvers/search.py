@@ -9,7 +9,7 @@ from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.clearing import Heap
+from robocas_ms3.planning.skills.clearing import FACTS, Heap
 from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.looking import FAR, NEAR, look_at
 from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
@@ -31,7 +31,7 @@ def attempt(arm: Arm) -> None:
     words = arm.env.target_asset().asset.name, arm.env.task_config.support
     find, take = subgoal("find the object", *words), subgoal("move and grasp", *words)
     heap = Heap(arm, slot)
-    for fact in ("pushes", "removals"):
+    for fact in FACTS:
         arm.executor.facts.setdefault(fact, 0)
     arm.executor.label(**find)
     look_at(arm, heap.middle(slot), FAR)
@@ -42,7 +42,7 @@ def attempt(arm: Arm) -> None:
                 break
             arm.executor.label(**find)
         try:
-            arm.choose(heap.moves(), heap.make, ahead=AHEAD, enough=ENOUGH)
+            arm.choose(heap.moves(), heap.make, ahead=AHEAD, tries=tries(heap.moves_made), enough=ENOUGH)
         except PlanningFailed:
             # nothing can be moved: perhaps it can be grasped as things stand
             arm.executor.label(**take)
@@ -56,6 +56,11 @@ def attempt(arm: Arm) -> None:
     carry_to_basket(arm, slot)
     heap.check_surface()
     release_into_basket(arm, slot)
+
+
+def tries(moves_made: int) -> int:
+    """How many moves are gone on from: fewer the more were made, as what made one fail tends to lie farther back."""
+    return max(1, 3 - moves_made // 2)
 
 
 def _grasp(arm: Arm, slot: int) -> bool:
