@@ -13,6 +13,8 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from asset_tools.decompose import few_vertices
 from asset_tools.repair import close
+from robocas_ms3.assets.cooking import OBLONG
+from robocas_ms3.assets.hulls import box_of, slenderness
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray
@@ -27,6 +29,7 @@ FLAT = 0.0005  # m
 LEVEL = 0.9  # of a normal's z
 FILLED = 0.1  # share of the surface that closing may add; more is a lid on something open
 LARGEST_FACETS = 40  # of an open shell
+SLENDER = 0.95 * OBLONG
 MOST = 40  # pieces of a link
 SAMPLES = 300
 DENSE = 1000  # triangles: of carved work; distances from more are measured to points on it
@@ -73,6 +76,24 @@ def pieces_of(parts: Sequence[Part], middle: Array) -> list[Array]:
         order = np.argsort([-np.ptp(hull, axis=0).max() for hull in hulls], kind="stable")[:MOST]
         hulls = [hulls[index] for index in sorted(order)]
     return hulls
+
+
+def for_gpu(hull: Array) -> list[Array]:
+    """A hull (V, 3); where it is too slender for a GPU its two halves, or the box around it, which may be slender."""
+    if _sturdy(hull):
+        return [hull]
+    axis = int(np.ptp(hull, axis=0).argmax())
+    middle = float(hull[:, axis].min() + hull[:, axis].max()) / 2
+    corners = hull[ConvexHull(hull).simplices]
+    halves = [few_vertices(_half(corners, axis, middle, side).reshape(-1, 3)) for side in (1.0, -1.0)]
+    if all(_sturdy(half) for half in halves):
+        return halves
+    to_middle, extents = trimesh.bounds.oriented_bounds(hull)
+    return [np.asarray(trimesh.creation.box(extents, np.linalg.inv(to_middle)).vertices)]
+
+
+def _sturdy(hull: Array) -> bool:
+    return box_of(hull) is not None or slenderness(hull) < SLENDER
 
 
 def _size(points: Array, rank: int) -> float:

@@ -13,7 +13,7 @@ from asset_tools.build import build_furniture
 from asset_tools.import_scans import object_id
 from asset_tools.partnet.annotation import Annotation, JointNote, find_annotation
 from asset_tools.partnet.clearance import trimmed
-from asset_tools.partnet.collision import Part, pieces_of
+from asset_tools.partnet.collision import Part, for_gpu, pieces_of
 from asset_tools.partnet.looks import merged
 from asset_tools.partnet.obj import Faces, read_obj
 from asset_tools.partnet.urdf import URDF, Mobility, MovingLink, Visual, read_urdf
@@ -62,6 +62,7 @@ def read_partnet(folder: Path, annotation: Annotation) -> FurnitureSource:
     for link in model.links:
         others = [piece for name, group in pieces.items() if name not in _carried(model, link.name) for piece in group]
         pieces[link.name] = trimmed(pieces[link.name], others, joints[link.name])
+    pieces = {name: [part for piece in group for part in for_gpu(piece)] for name, group in pieces.items()}
     links = []
     for link in model.links:
         note = notes.get(link.joint, JointNote())

@@ -158,6 +158,20 @@ def _edges(ways: Array) -> Array | None:
     return np.stack(found) if len(found) == 3 else None
 
 
+def slenderness(points: Array) -> float:
+    """How far the convex hull of points (V, 3) reaches along x, y or z, over its least depth, from its centre of mass.
+
+    A cube has 1, as seen from its middle.
+    """
+    hull = ConvexHull(points)
+    inside = points.mean(axis=0)
+    corners = points[hull.simplices] - inside
+    volumes = np.abs(np.linalg.det(corners))
+    center = inside + volumes @ corners.sum(axis=1) / 4 / volumes.sum()
+    depth = -(hull.equations @ np.append(center, 1.0)).max()
+    return float(np.abs(points - center).max() / depth)
+
+
 def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
     """Points on the surface of the union of hulls, about ``spacing`` apart and the same on every call.
 

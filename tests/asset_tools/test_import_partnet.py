@@ -10,10 +10,12 @@ from sapien import physx
 
 from asset_tools.partnet.annotation import SHIPPED, Annotation, find_annotation, load_annotation
 from asset_tools.partnet.clearance import overlaps
+from asset_tools.partnet.collision import for_gpu
 from asset_tools.partnet.importer import partnet_jobs, read_partnet
 from asset_tools.partnet.template import template
 from asset_tools.pipeline import write_pack
 from asset_tools.quality.furniture import examine_furniture
+from robocas_ms3.assets.hulls import box_of
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.errors import AssetError
 
@@ -86,6 +88,18 @@ def test_a_drawer_is_hollow(chest):
     inside = trimesh.creation.box(bounds=[(-0.1, -0.1, 0.03), (0.1, 0.1, 0.1)]).vertices
     for piece in link.pieces:
         assert not trimesh.convex.convex_hull(piece).contains(inside).any()
+
+
+def test_what_is_too_slender_for_a_gpu_is_halved_or_becomes_a_box():
+    # a bar whose section is a triangle with sides of 3, 4 and 5 cm: 8 mm from its middle to the nearest face
+    section = np.array([[0, 0, 0], [0, 0.03, 0], [0, 0, 0.04]])
+    bars = {length: np.concatenate([section, section + [length, 0, 0]]) for length in (1.5, 1.6, 4.0)}
+    assert [piece.tolist() for piece in for_gpu(bars[1.5])] == [bars[1.5].tolist()]
+    halves = for_gpu(bars[1.6])
+    assert [len(half) for half in halves] == [6, 6]
+    assert sorted(half[:, 0].max() for half in halves) == pytest.approx([0.8, 1.6])
+    (box,) = [box_of(piece) for piece in for_gpu(bars[4.0])]
+    assert box is not None and 8 * np.prod(box.half_size) == pytest.approx(4.0 * 0.03 * 0.04)
 
 
 def test_colours_are_kept(chest):

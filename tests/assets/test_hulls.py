@@ -3,7 +3,15 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.assets.hulls import box_of, convex_faces, read_hulls, sample_surface, sample_triangles, write_hulls
+from robocas_ms3.assets.hulls import (
+    box_of,
+    convex_faces,
+    read_hulls,
+    sample_surface,
+    sample_triangles,
+    slenderness,
+    write_hulls,
+)
 from robocas_ms3.errors import AssetError
 
 CUBE = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)], dtype=float)
@@ -82,3 +90,11 @@ def test_what_is_no_box_is_none():
     assert box_of(CUBE + np.outer(CUBE[:, 2], [0.1, 0, 0])) is None  # sheared
     assert box_of(CUBE * (1 - CUBE[:, 2:])) is None  # narrower at the top
     assert box_of(np.random.default_rng(0).uniform(size=(8, 3))) is None
+
+
+def test_slenderness_is_reach_over_depth_from_the_centre_of_mass():
+    assert slenderness(CUBE) == pytest.approx(1)
+    assert slenderness(CUBE * [1, 1, 12]) == pytest.approx(12)
+    # a right tetrahedron: its centre of mass is a quarter up each leg, so 3/4 from its tips and 1/4 / sqrt(3) deep
+    legs = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
+    assert slenderness(legs) == pytest.approx(0.75 / (0.25 / np.sqrt(3)))
