@@ -27,7 +27,7 @@ TURNS_DEG = (30.0, -30.0)  # off the paper's direction of a push, where that one
 AT_EDGE = 0.01  # m from the surface's edge, nearer than which no object may come
 
 # What a move is worth, in seconds of the demonstration that it makes needless or costs
-PER_OBSTACLE, PER_HIDDEN_SHARE, NO_GRASP, PER_METRE_OF_TARGET = 10.0, 30.0, 8.0, 40.0
+PER_OBSTACLE, PER_HIDDEN_SHARE, NO_GRASP, PER_METRE_OF_TARGET = 10.0, 30.0, 8.0, 120.0
 
 
 @dataclass(frozen=True)
