@@ -37,6 +37,14 @@ class Generate:
     replay_rate: int | None = None
     """Rate in Hz at which an episode's own 7-D actions are tried open loop; an attempt whose actions don't succeed
     again is undone. 0: no trial. Default: 5, or the control rate where 5 doesn't divide it."""
+    noisy_trials: int = 1
+    """How often they are tried with a robot's noise as well. 0: not at all."""
+    noise: tuple[float, float] = (0.5, 0.2)
+    """That noise: standard deviations in mm and degrees, of each component of each action."""
+    noisy_failures: int = 5
+    """Attempts that may fail for noise alone; after so many an episode counts without, and its record says so."""
+    fork: bool = True
+    """Undo what fails by forking the process, where that is safe. The episodes are the same without, only slower."""
     keep_recoveries: bool = False
     """Leave failed attempts in the episode, as one continuous motion, instead of undoing them."""
     resume: bool = False
@@ -69,7 +77,16 @@ def main(cfg: Generate) -> int:
     if rate is None:
         rate = 5 if cfg.control_freq % 5 == 0 else cfg.control_freq
     settings = EpisodeSettings(
-        cfg.task, config, cfg.pack, cfg.control_freq, cfg.max_attempts, cfg.keep_recoveries, rate
+        cfg.task,
+        config,
+        cfg.pack,
+        cfg.control_freq,
+        cfg.max_attempts,
+        cfg.keep_recoveries,
+        rate,
+        cfg.noisy_trials,
+        cfg.noisy_failures,
+        *cfg.noise,
     )
     columns = (
         TextColumn("{task.description}"),
@@ -98,6 +115,7 @@ def main(cfg: Generate) -> int:
             episodes=cfg.episodes,
             first_seed=cfg.seed,
             jobs=cfg.jobs,
+            fork=cfg.fork,
             resume=cfg.resume,
             overwrite=cfg.overwrite,
             on_start=on_start,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,11 @@ def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int
             expected=f"one of {', '.join(str(f) for f in range(1, SIM_FREQ + 1) if SIM_FREQ % f == 0)}",
             found=settings.control_freq,
         )
+    check_number("noisy_trials", settings.noisy_trials, 0)
+    check_number("noisy_failures", settings.noisy_failures, 0)
+    for name, value in (("noise_mm", settings.noise_mm), ("noise_deg", settings.noise_deg)):
+        if not 0 <= value < math.inf:
+            raise RobocasError("this number is out of range", where=name, expected="at least 0", found=value)
     check_number("replay_rate", settings.replay_rate, 0, settings.control_freq)
     if settings.replay_rate and (settings.control_freq % settings.replay_rate or SIM_FREQ % settings.replay_rate):
         raise RobocasError(

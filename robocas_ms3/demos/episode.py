@@ -21,7 +21,7 @@ from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.demos.record import EpisodeRecorder
 from robocas_ms3.demos.resimulation import Resimulation
 from robocas_ms3.demos.sampling import sample_stride
-from robocas_ms3.demos.trials import Trials
+from robocas_ms3.demos.trials import NOISY, Trials
 from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.planning.backends import DEFAULT, make_planner
 from robocas_ms3.planning.decisions import Straight
@@ -52,6 +52,7 @@ class EpisodeSettings:
             open loop (`trials`), and none goes beyond [-1, 1]. 0: not tried; nor is it where the base drives, which
             those actions leave out.
         noisy_trials: how often they are tried with noise, besides once without.
+        noisy_failures: attempts that may fail for noise alone; after so many an episode counts without, and says so.
         noise_mm: its standard deviation, of each component of each action's translation, mm.
         noise_deg: the same of its Euler angles.
     """
@@ -64,6 +65,7 @@ class EpisodeSettings:
     keep_recoveries: bool = False
     replay_rate: int = 5
     noisy_trials: int = 1
+    noisy_failures: int = 5
     noise_mm: float = 0.5
     noise_deg: float = 0.2
 
@@ -91,6 +93,11 @@ class EpisodeResult:
     failures: list[Failure] = field(default_factory=list)
     max_attempts: int = 1
     begun: float = field(default_factory=time.perf_counter)
+
+    @property
+    def noisy_failures(self) -> int:
+        """How many attempts failed for noise alone."""
+        return sum(failure.reason.startswith(NOISY) for failure in self.failures)
 
     @property
     def exhausted(self) -> bool:
@@ -168,7 +175,7 @@ class EpisodeGenerator:
         recorder = EpisodeRecorder(self.env, folder, name)
         executor = Executor(recorder, seed)
         result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=self.settings.max_attempts)
-        executor.rehearse = lambda: self._rehearse(executor, recorder)
+        executor.rehearse = lambda: self._rehearse(executor, recorder, result)
         try:
             if self.settings.keep_recoveries:
                 self._keep_trying(executor, recorder, result)
@@ -224,12 +231,15 @@ class EpisodeGenerator:
             with executor.seconds.spent_on("reset"):
                 self.trials.reset(executor.seed)
 
-    def _rehearse(self, executor: Executor, recorder: EpisodeRecorder, *, finished: bool = False) -> None:
+    def _rehearse(
+        self, executor: Executor, recorder: EpisodeRecorder, result: EpisodeResult, *, finished: bool = False
+    ) -> None:
         """Try what was done so far; see `trials`."""
         if self.trials is not None:
             gripper = np.array([action[7] for action in executor.actions])
+            noisy = result.noisy_failures < self.settings.noisy_failures
             with executor.seconds.spent_on("trial"):
-                self.trials.follow(recorder.states, gripper, finished=finished)
+                self.trials.follow(recorder.states, gripper, finished=finished, noisy=noisy)
 
     def _finish(
         self, executor: Executor, recorder: EpisodeRecorder, result: EpisodeResult, recoveries: list[dict[str, Any]]
@@ -245,10 +255,17 @@ class EpisodeGenerator:
             raise EpisodeLost("horizon", "too_long")
         if not executor.flag("success"):
             raise PlanningFailed("episode", "no_success")
-        self._rehearse(executor, recorder, finished=True)
+        self._rehearse(executor, recorder, result, finished=True)
         result.success, result.steps = True, len(executor.actions)
-        attempts = len(result.failures) + 1
-        recorder.finish({**self._describe(executor), "attempts": attempts, "recoveries": recoveries})
+        noisy = self.settings.noisy_trials if result.noisy_failures < self.settings.noisy_failures else 0
+        recorder.finish(
+            {
+                **self._describe(executor),
+                "attempts": len(result.failures) + 1,
+                "noisy_trials": noisy if self.trials is not None else None,
+                "recoveries": recoveries,
+            }
+        )
 
     def _describe(self, executor: Executor) -> dict[str, Any]:
         env = executor.base_env

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from itertools import count
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from robocas_ms3.demos.record import merge, open_trajectory, read_json
 from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
+from robocas_ms3.planning.executor import Seconds
 
 _BEGINNINGS = {"run.json", "failures.jsonl", "episodes"}  # of a run that has not finished a seed yet
 
@@ -30,7 +31,7 @@ class Summary:
         trajectory: the HDF5 file.
         episodes: episodes in it.
         seeds: seeds tried for them.
-        mean_seconds: per seed tried: reset, planning, simulation.
+        mean_seconds: CPU seconds per seed tried: reset, planning, simulation, trial.
         mean_steps: control steps an episode.
         failures: ``{"stage: reason": count}`` of all attempts.
         gave_up: seeds without an episode.
@@ -57,6 +58,7 @@ def generate(
     episodes: int,
     first_seed: int = 0,
     jobs: int = 1,
+    fork: bool = True,
     resume: bool = False,
     overwrite: bool = False,
     on_start: Callable[[], None] = lambda: None,
@@ -75,6 +77,7 @@ def generate(
         episodes: successful episodes wanted.
         first_seed: seeds are counted from here.
         jobs: worker processes.
+        fork: undo what fails by forking where that is safe.
         resume: go on with what is in ``out``.
         overwrite: replace what is in ``out``.
         on_start: called once arguments, configuration, pack and output turned out right.
@@ -97,7 +100,7 @@ def generate(
         make_folder(out)
         write_json(out / "run.json", run)
         on_start()
-        return _generate_in(out, settings, episodes, first_seed, jobs, on_result)
+        return _generate_in(out, settings, episodes, first_seed, jobs, fork, on_result)
 
 
 def _only_begun(out: Path) -> bool:
@@ -113,6 +116,7 @@ def _generate_in(
     episodes: int,
     first_seed: int,
     jobs: int,
+    fork: bool,
     on_result: Callable[[EpisodeResult], None],
 ) -> Summary:
     shards, ledger = make_folder(out / "episodes"), Ledger(out / "failures.jsonl")
@@ -122,7 +126,7 @@ def _generate_in(
     results: list[EpisodeResult] = []
     good = 0
     try:
-        with closing(generate_seeds(settings, missing, shards, jobs)) as new:
+        with closing(generate_seeds(settings, missing, shards, jobs, fork=fork)) as new:
             for seed in count(first_seed):
                 if good >= episodes:
                     break
@@ -201,7 +205,7 @@ def _finish(
     if new:
         merge(([trajectory] if merged else []) + new, trajectory)
     shutil.rmtree(shards)
-    parts = ("reset", "planning", "simulation")
+    parts = [part.name for part in fields(Seconds)]
     seconds = {p: round(float(np.mean([getattr(r.seconds, p) for r in results] or [0])), 3) for p in parts}
     summary = Summary(
         trajectory,

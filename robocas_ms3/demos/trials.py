@@ -19,6 +19,7 @@ from robocas_ms3.robots.constants import ROBOT_UID
 # m by which the target may be off the recording at the end of a part. What else lies about may roll elsewhere: where
 # that matters, what comes next goes wrong, and shows it.
 PARTED = 0.02
+NOISY = "noisy_"
 
 States = dict[str, dict[str, NDArray[np.float32]]]
 
@@ -42,32 +43,39 @@ class Trials:
             world.reset(seed)
         self._seed, self._played = seed, 0
 
-    def follow(self, states: States, gripper: NDArray[np.floating], *, finished: bool = False) -> None:
+    def follow(
+        self, states: States, gripper: NDArray[np.floating], *, finished: bool = False, noisy: bool = True
+    ) -> None:
         """Play what was recorded since the last call, and compare.
 
         Args:
             states: ManiSkill's, after the reset and after each control step; see ``EpisodeRecorder.states``.
             gripper: (S,) its commands.
             finished: the recording has ended: the last action may be a shorter one, and the task must succeed.
+            noisy: play it with noise too; without, those worlds stay behind.
 
         Raises:
             EpisodeLost: ``clipped``, an action goes beyond the range of ``pd_ee_delta_pose``; ``parted``, the target is
-                elsewhere than recorded; ``no_success``.
+                elsewhere than recorded; ``no_success``; with noise ``NOISY`` and the same.
         """
         samples = sample_states(len(gripper), self._stride)
         if not finished:
             samples = samples[samples % self._stride == 0]
         new = samples[self._played :]
         actions = dataset_actions(states["articulations"][ROBOT_UID], gripper, new).astype(np.float64)
-        for number, world in enumerate(self._worlds):
+        for number, world in enumerate(self._worlds if noisy else self._worlds[:1]):
             self._play(world, number, actions)
-            if world.clipped:
-                raise EpisodeLost("replay", "clipped")
-            if finished and not world.settle():
-                raise EpisodeLost("replay", "no_success")
-            if not finished and _distance(world, states, int(new[-1])) > PARTED:
-                raise EpisodeLost("replay", "parted")
+            reason = self._what_is_wrong(world, states, int(new[-1]), finished)
+            if reason:
+                raise EpisodeLost("replay", f"{NOISY}{reason}" if number else reason)
         self._played += len(actions)
+
+    def _what_is_wrong(self, world: OpenLoop, states: States, sample: int, finished: bool) -> str:
+        if world.clipped:
+            return "clipped"
+        if finished:
+            return "" if world.settle() else "no_success"
+        return "parted" if _distance(world, states, sample) > PARTED else ""
 
     def _play(self, world: OpenLoop, number: int, actions: NDArray[np.float64]) -> None:
         if number:

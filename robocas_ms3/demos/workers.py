@@ -21,25 +21,27 @@ def shard_name(seed: int) -> str:
 
 
 def generate_seeds(
-    settings: EpisodeSettings, seeds: Iterator[int], folder: Path, jobs: int
+    settings: EpisodeSettings, seeds: Iterator[int], folder: Path, jobs: int, *, fork: bool = True
 ) -> Generator[EpisodeResult, None, None]:
     """Results in the order of the seeds, which never end."""
     if jobs <= 1:
-        generator = EpisodeGenerator(settings)
+        generator = EpisodeGenerator(settings, fork=fork)
         try:
             for seed in seeds:
                 yield generator.generate(seed, folder, shard_name(seed))
         finally:
             generator.close()
         return
-    context = multiprocessing.get_context("spawn")  # neither PhysX nor torch survives a fork
+    context = multiprocessing.get_context("spawn")  # what was loaded so far, a renderer perhaps, may not survive a fork
     waiting: list[int] = []  # seeds whose results are still to come
     suspects = (
         0  # how many of them were under way when a worker died: they run one by one, which shows whose fault it is
     )
     while True:
         # A crash of a worker (mplib's C++) breaks the pool: make a new one and run what was under way again.
-        with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(settings,)) as pool:
+        with ProcessPoolExecutor(
+            jobs, mp_context=context, initializer=_start_worker, initargs=(settings, fork)
+        ) as pool:
             under_way: dict[int, Future[EpisodeResult]] = {}
             try:
                 while True:
@@ -64,11 +66,11 @@ def generate_seeds(
                 raise
 
 
-def _start_worker(settings: EpisodeSettings) -> None:
+def _start_worker(settings: EpisodeSettings, fork: bool) -> None:
     global _worker  # noqa: PLW0603  (one generator a process)
     leave_with_parent()
     try:
-        _worker = EpisodeGenerator(settings)
+        _worker = EpisodeGenerator(settings, fork=fork)
     except Exception as error:  # noqa: BLE001  (raised by the first task: an initializer's own error breaks the pool)
         _worker = error
 

@@ -1,5 +1,6 @@
 """End to end on the builtin pack: generation, the record, determinism, resuming, replay."""
 
+import hashlib
 import json
 
 import h5py
@@ -7,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
+from mani_skill.utils.structs import Pose
 
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings, horizon
 from robocas_ms3.demos.generate import generate
-from robocas_ms3.demos.open_loop import OpenLoop, Played
 from robocas_ms3.demos.record import merge, open_trajectory, read_json
 from robocas_ms3.demos.replay import replay
-from robocas_ms3.demos.trials import TRIALS
+from robocas_ms3.demos.trials import Trials
 from robocas_ms3.errors import DatasetError, EpisodeLost, OutputExistsError, PlanningFailed, RobocasError
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Trajectory
@@ -22,6 +23,7 @@ from robocas_ms3.robots.constants import ARM_SLICE
 pytestmark = pytest.mark.slow
 SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
 SEEDS = 3
+SEARCH_SEED = 3
 TOO_LONG = "horizon", "too_long"
 
 
@@ -155,7 +157,7 @@ def call_it_done(monkeypatch):
     """Let policies that only stir count as successful: what is tested is how attempts are kept or undone."""
     flag = Executor.flag
     monkeypatch.setattr(Executor, "flag", lambda self, name: name == "success" or flag(self, name))
-    monkeypatch.setattr(OpenLoop, "play_recording", lambda *args: Played(True, np.zeros((1, 3)), 0))
+    monkeypatch.setattr(Trials, "follow", lambda *args, **how: None)
 
 
 def waiting(steps):
@@ -221,38 +223,65 @@ def test_that_a_policy_is_done_is_no_success(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_way_back_to_a_checkpoint_is_part_of_the_record(tmp_path, monkeypatch):
-    """A policy that stirs the heap, marks, stirs on and fails; the next attempt finds what the first one marked."""
-    call_it_done(monkeypatch)
-    generator = EpisodeGenerator(EpisodeSettings("search", "search_table_small_heap", "builtin", max_attempts=2))
-    seen = []
+def stirring(log):
+    """A policy that stirs the heap, may come back there, stirs on and fails at first; notes what it found."""
 
     def stir(arm, steps):
-        for step in range(steps):
-            turned = arm.at + np.eye(7)[1] * 0.06  # the shoulder: down into the heap
-            arm.at = turned
-            arm.executor.follow(Trajectory(turned[None], arm.executor.dt))
-            arm.executor.facts["stirred"] = step
+        for _ in range(steps):
+            arm.at = arm.at + np.eye(7)[1] * 0.06  # the shoulder: down into the heap
+            arm.executor.follow(Trajectory(arm.at[None], arm.executor.dt))
+            arm.executor.facts["stirred"] = len(arm.executor.actions)
 
     def policy(arm):
-        if not seen:
-            stir(arm, 12)
-            arm.executor.mark()
-        seen.append((arm.env.get_state().clone(), dict(arm.executor.facts), len(arm.executor.actions)))
+        stir(arm, 12)
+        arm.come_back_here()
+        state = hashlib.sha256(arm.env.get_state().numpy().tobytes()).hexdigest()
+        found = [state, arm.executor.facts["stirred"], len(arm.executor.actions), float(arm.rng.random())]
+        with log.open("a") as file:
+            file.write(json.dumps(found) + "\n")
         stir(arm, 6)
-        if len(seen) == 1:
+        if arm.path == (0, 0):
             raise PlanningFailed("stir", "enough")
 
-    generator.policy = policy
+    return policy
+
+
+@pytest.mark.parametrize("fork", [True, False])
+def test_the_way_back_to_a_decision_leaves_no_trace(tmp_path, monkeypatch, fork):
+    call_it_done(monkeypatch)
+    settings = EpisodeSettings("search", "search_table_small_heap", "builtin", max_attempts=2)
+    generator = EpisodeGenerator(settings, fork=fork)
+    generator.policy = stirring(tmp_path / "log")
     result = generator.generate(1, tmp_path, "stirred")
     generator.close()
     assert [(failure.stage, failure.reason) for failure in result.failures] == [("stir", "enough")]
-    (first, facts, length), (again, facts_again, length_again) = seen
-    assert torch.equal(first, again)  # bit for bit
-    assert (facts, length) == (facts_again, length_again) == ({"stirred": 11}, 12)
+    first, again = map(json.loads, (tmp_path / "log").read_text().splitlines())
+    assert first[:3] == again[:3]  # the same state, bit for bit
+    assert first[1:3] == [12, 12]
+    assert first[3] != again[3]  # with other random numbers
     data = read_json(tmp_path / "stirred.h5")["episodes"][0]
     assert data["elapsed_steps"] == result.steps == 18
+    assert data["robocas"]["attempts"] == result.attempts == 2
     assert len(load(tmp_path / "stirred.h5")["traj_0"]["actions"]) == 18
+
+
+def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path):
+    episodes = []
+    for fork in (True, False):
+        generator = EpisodeGenerator(EpisodeSettings("search", "search_table_small_heap", "builtin"), fork=fork)
+        result = generator.generate(SEARCH_SEED, tmp_path, f"fork_{fork}")
+        generator.close()
+        assert result.success
+        assert result.steps > 0
+        episodes.append((load(tmp_path / f"fork_{fork}.h5")["traj_0"], result))
+    (forked, one), (again, other) = episodes
+    assert [(f.stage, f.reason) for f in one.failures] == [(f.stage, f.reason) for f in other.failures]
+    np.testing.assert_array_equal(forked["actions"], again["actions"])
+    for name, values in forked["states"].items():
+        np.testing.assert_array_equal(values, again["states"][name], err_msg=name)
+    (replayed,) = replay(tmp_path / "fork_True.h5")
+    assert replayed.success
+    assert replayed.state_error == 0.0
 
 
 def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch):
@@ -279,22 +308,43 @@ def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch):
     assert read_json(tmp_path / "kept.h5")["episodes"][0]["robocas"]["recoveries"] == []
 
 
-@pytest.mark.parametrize(
-    ("spoiled", "reason"),
-    [(Played(False, np.zeros((1, 3)), 0), "no_success"), (Played(True, np.zeros((1, 3)), 1), "clipped")],
-)
-def test_an_attempt_whose_own_actions_do_not_succeed_again_is_undone(tmp_path, monkeypatch, spoiled, reason):
+@pytest.mark.parametrize("reason", ["no_success", "clipped", "parted"])
+def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_path, monkeypatch, reason):
     generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin"))
-    play, outcomes = OpenLoop.play_recording, []
+    world, spoilt = generator.worlds[-1], []
+    step, settle = world.step, world.settle
 
-    def first_is_spoiled(*args):
-        outcomes.append(play(*args))
-        return spoiled if len(outcomes) == 1 else outcomes[-1]
+    def spoil(action):
+        step(action)
+        if not spoilt:
+            world.clipped += reason == "clipped"
+            if reason == "parted":
+                target = world.env.objects[int(world.env.target_slot[0])]
+                target.set_pose(Pose.create_from_pq(target.pose.p + torch.tensor([[0.3, 0.0, 0.0]]), target.pose.q))
+            if reason != "no_success":
+                spoilt.append(reason)
 
-    monkeypatch.setattr(OpenLoop, "play_recording", first_is_spoiled)
+    def fail():
+        spoilt.append(reason)
+        return False if len(spoilt) == 1 and reason == "no_success" else settle()
+
+    monkeypatch.setattr(world, "step", spoil)
+    monkeypatch.setattr(world, "settle", fail)
     result = generator.generate(1, tmp_path, "again")
     generator.close()
     assert result.success
-    assert [(failure.stage, failure.reason) for failure in result.failures] == [("replay", reason)]
-    assert len(outcomes) == 1 + TRIALS
-    assert read_json(tmp_path / "again.h5")["episodes"][0]["robocas"]["replay_rate"] == 5
+    assert result.failures[0].stage == "replay"
+    assert result.failures[0].reason == f"noisy_{reason}"
+    data = read_json(tmp_path / "again.h5")["episodes"][0]["robocas"]
+    assert (data["replay_rate"], data["noisy_trials"]) == (5, 1)
+
+
+def test_where_noise_alone_spoils_attempts_an_episode_counts_without_in_the_end(tmp_path, monkeypatch):
+    settings = EpisodeSettings("pick", "pick_table_scattered", "builtin", noisy_failures=2)
+    generator = EpisodeGenerator(settings)
+    monkeypatch.setattr(generator.worlds[1], "settle", lambda: False)
+    result = generator.generate(1, tmp_path, "spoilt")
+    generator.close()
+    assert result.success
+    assert [failure.reason for failure in result.failures].count("noisy_no_success") == 2
+    assert read_json(tmp_path / "spoilt.h5")["episodes"][0]["robocas"]["noisy_trials"] == 0

@@ -19,7 +19,7 @@ from robocas_ms3.scenes.grasping import MAX_WIDTH
 from robocas_ms3.tasks.transfer import TransferEnv
 
 T = TypeVar("T")
-OPEN_SECONDS, CLOSE_SECONDS = 0.60, 0.60  # a dataset at 5 Hz may give either command 0.2 s later
+OPEN_SECONDS, CLOSE_SECONDS = 0.50, 0.50  # a dataset at 5 Hz may give either command 0.2 s later
 RISE, RISES = 0.04, 4  # m a step, steps
 
 
