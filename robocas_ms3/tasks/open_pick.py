@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Articulation
 
+from robocas_ms3.arrays import native
 from robocas_ms3.tasks.spec import OPEN_PICK
 from robocas_ms3.tasks.transfer import STAGES, TransferEnv
 
@@ -46,8 +49,7 @@ class RoboCASOpenPickEnv(TransferEnv):
         index = [active.name for active in furniture.active_joints].index(joint.name)
         return furniture.get_qpos()[:, index]
 
-    def task_stages(self) -> dict[str, torch.Tensor]:
+    def _task_stages(self, objects: Any, held: Any) -> dict[str, Any]:
         """Whether the furniture is open, (N,) bool."""
-        goal = self.model.opened_position
-        position = self.opening_position()
+        goal, position = self.model.opened_position, native(self.opening_position())
         return {"furniture_opened": position >= goal if goal > 0 else position <= goal}

@@ -73,6 +73,21 @@ def test_a_read_is_never_out_of_date(env):
     assert torch.equal(base.bodies.read(), maniskills(base))
 
 
+def test_others_stay_the_same_while_only_the_robot_moves(env):
+    base = env.unwrapped
+    robot, before = base.agent.robot, base.bodies.read()
+    others = base.bodies.others
+    robot.set_qpos(robot.get_qpos() + 0.02)
+    robot.set_pose(sapien.Pose([0.1, 0.2, 0.3]))
+    assert not torch.equal(base.bodies.read(), before)
+    assert base.bodies.others == others
+    for _, moved in zip(range(6), set_everything(base), strict=False):
+        assert moved is None
+        base.bodies.read()
+        assert base.bodies.others != others
+        others = base.bodies.others
+
+
 def test_a_state_dict_is_maniskills(env):
     base = env.unwrapped
     ours, theirs = base.get_state_dict(), base.scene.get_sim_state()
@@ -102,7 +117,7 @@ def test_another_layout_of_packed_states_is_an_error(env, monkeypatch):
     )
     monkeypatch.setattr(scene, "px", system)
     with pytest.raises(RobocasError, match="packs states otherwise"):
-        Bodies(scene)
+        Bodies(scene, env.unwrapped.agent.robot)
 
 
 def test_a_measure_is_taken_again_when_its_tensors_change_in_place_too():
