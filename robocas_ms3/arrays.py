@@ -24,6 +24,23 @@ def as_tensor(array: Any) -> Tensor:
     return array if isinstance(array, Tensor) else torch.from_numpy(array)
 
 
+def choose(condition: Array, yes: Array, no: Array) -> Array:
+    """``yes`` where the condition holds, ``no`` elsewhere."""
+    return torch.where(condition, yes, no) if isinstance(condition, Tensor) else np.where(condition, yes, no)
+
+
+def clamp(values: Array, low: Any, high: Any) -> Array:
+    """Values within limits, which are numbers or arrays of the same kind."""
+    if isinstance(values, Tensor):
+        return values.clamp(low, high)
+    return np.minimum(np.maximum(values, low), high)  # `np.clip` takes three times as long
+
+
+def join(arrays: list[Array]) -> Array:
+    """Arrays as one, along their last axis."""
+    return torch.cat(arrays, dim=-1) if isinstance(arrays[0], Tensor) else np.concatenate(arrays, axis=-1)
+
+
 def length(vectors: Array) -> Array:
     """(...) lengths of vectors (..., D)."""
     return (vectors * vectors).sum(-1) ** 0.5
