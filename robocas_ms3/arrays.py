@@ -11,8 +11,6 @@ from torch import Tensor
 
 Array = TypeVar("Array", Tensor, NDArray[Any])
 
-_NEXT = [1, 2, 0]
-
 
 def native(tensor: Tensor) -> Any:
     """A tensor as the kind of array that is fast where it lies: on a CPU NumPy's, which shares its memory."""
@@ -44,19 +42,6 @@ def join(arrays: list[Array]) -> Array:
 def length(vectors: Array) -> Array:
     """(...) lengths of vectors (..., D)."""
     return (vectors * vectors).sum(-1) ** 0.5
-
-
-def cross(first: Array, second: Array) -> Array:
-    """(..., 3) cross products of vectors (..., 3)."""
-    if isinstance(first, Tensor):
-        return torch.linalg.cross(first, second)
-    # NumPy's own takes several times as long
-    return (first * second[..., _NEXT] - first[..., _NEXT] * second)[..., _NEXT]
-
-
-def stack(arrays: list[Array]) -> Array:
-    """Arrays of one shape as one, along a new last axis."""
-    return torch.stack(arrays, dim=-1) if isinstance(arrays[0], Tensor) else np.stack(arrays, axis=-1)
 
 
 def count_up(count: int, like: Array) -> Array:

@@ -242,6 +242,25 @@ class RoboCASEnv(SeededEnv):
         """Batch of poses from 4x4 matrices."""
         return Pose.create(torch.as_tensor(_raw_poses(np.stack(matrices)), device=self.device))
 
+    # ------------------------------------------------------------------ step
+
+    def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict]:
+        """Step; see ``BaseEnv``, whose step takes longer on a CPU where neither observation nor reward is wanted."""
+        plain = self._obs_mode == "none" and self._reward_mode == "none" and isinstance(action, np.ndarray)
+        if not plain or self.gpu_sim_enabled or action.shape != self._orig_single_action_space.shape:
+            return super().step(action)
+        self.agent.set_action(torch.from_numpy(action.astype(np.float32, copy=False))[None])
+        self._before_control_step()
+        for _ in range(self._sim_steps_per_control):
+            self.agent.before_simulation_step()
+            self._before_simulation_step()
+            self.scene.step()
+            self._after_simulation_step()
+        self._after_control_step()
+        self._elapsed_steps += 1
+        info, self._last_obs = self.get_info(), {}
+        return {}, torch.zeros(1), info["success"].clone(), torch.zeros(1, dtype=torch.bool), info
+
     # ------------------------------------------------------------------ state
 
     @property

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from robocas_ms3.arrays import as_tensor
 
 # m between bodies that can't have touched in the last physics step, at whose beginning contacts are found: more than
-# they go in 10 ms, and than where PhysX begins to look for contacts
-_NEAR = 0.1
+# they go in 10 ms, at 4 m/s, and where PhysX begins to look for contacts
+_NEAR = 0.05
 
 _Boxes = tuple[NDArray[np.float32], NDArray[np.float32]]
 

@@ -6,28 +6,59 @@ They take tensors or NumPy's arrays, see `arrays`: all arguments of one kind, wh
 from __future__ import annotations
 
 import math
+from functools import cache
 
-from robocas_ms3.arrays import Array, count_up, cross, length, stack
+import numpy as np
+import torch
+from torch import Tensor
+
+from robocas_ms3.arrays import Array, count_up, length
+
+# The entries of a rotation matrix, row by row, in the products of a quaternion's numbers, ww, wx, wy, ..., zz.
+_PRODUCTS = np.array(
+    [
+        # ww wx wy wz  xw xx xy xz  yw yx yy yz  zw zx zy zz
+        [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1],
+        [0, 0, 0, -2, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0],
+        [0, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0],
+        [0, 0, 0, 2, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0],
+        [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1],
+        [0, -2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0],
+        [0, 0, -2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0],
+        [0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0],
+        [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1],
+    ],
+    np.float32,
+).T
+
+
+@cache
+def _products_on(device: torch.device) -> Tensor:
+    return torch.from_numpy(_PRODUCTS).to(device)
+
+
+def rotation(quaternion: Array) -> Array:
+    """(..., 3, 3) matrices of unit quaternions (..., 4) wxyz."""
+    # few operations, as each takes longer than its arithmetic
+    products = quaternion[..., :, None] * quaternion[..., None, :]
+    table = _products_on(quaternion.device) if isinstance(quaternion, Tensor) else _PRODUCTS
+    shape = quaternion.shape[:-1]
+    return (products.reshape(*shape, 16) @ table).reshape(*shape, 3, 3)
 
 
 def rotate_inverse(quaternion: Array, vector: Array) -> Array:
     """Rotate vectors (..., 3) by the inverse of unit quaternions (..., 4) wxyz."""
-    w, xyz = quaternion[..., :1], quaternion[..., 1:]
-    t = cross(vector, xyz)
-    return vector + 2 * (w * t + cross(t, xyz))
+    return (vector[..., None, :] @ rotation(quaternion))[..., 0, :]
 
 
 def rotate(quaternion: Array, vector: Array) -> Array:
     """Rotate vectors (..., 3) by unit quaternions (..., 4) wxyz."""
-    w, xyz = quaternion[..., :1], quaternion[..., 1:]
-    t = cross(xyz, vector)
-    return vector + 2 * (w * t + cross(xyz, t))
+    return (rotation(quaternion) @ vector[..., None])[..., 0]
 
 
 def upward(quaternion: Array) -> Array:
     """(..., 3) the vertical axes of bodies with unit quaternions (..., 4) wxyz."""
-    w, x, y, z = quaternion[..., 0], quaternion[..., 1], quaternion[..., 2], quaternion[..., 3]
-    return stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    return rotation(quaternion)[..., 2]
 
 
 def inside_box(points: Array, box_position: Array, box_quaternion: Array, low: Array, high: Array) -> Array:
@@ -72,11 +103,14 @@ def finger_grasps(left_force: Array, right_force: Array, closing_axis: Array, *,
     Returns:
         (N, K) bool.
     """
-    least, axis = math.cos(math.radians(max_angle_deg)), closing_axis[:, None]
-    left, right = length(left_force), length(right_force)
-    left_aligned = (left_force * axis).sum(-1) >= least * left
-    right_aligned = -(right_force * axis).sum(-1) >= least * right
-    return (left >= MIN_GRASP_FORCE) & (right >= MIN_GRASP_FORCE) & left_aligned & right_aligned
+    opening = closing_axis[:, None]
+    return _presses(left_force, opening, max_angle_deg) & _presses(right_force, -opening, max_angle_deg)
+
+
+def _presses(force: Array, opening: Array, max_angle_deg: float) -> Array:
+    size = length(force)
+    aligned = (force * opening).sum(-1) >= math.cos(math.radians(max_angle_deg)) * size
+    return (size >= MIN_GRASP_FORCE) & aligned
 
 
 def touched(forces: Array, *, min_force: float = 1e-3) -> Array:

@@ -1,7 +1,9 @@
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3 import arrays
 from robocas_ms3.tasks import terms
@@ -21,9 +23,10 @@ def make(request):
     return as_kind
 
 
-def test_cross_is_right_handed(make):
-    x, y = make([[1.0, 0, 0]]), make([[[0.0, 2, 0], [0, 0, 3]]])
-    assert arrays.cross(x[:, None], y).tolist() == [[[0, 0, 2], [0, -3, 0]]]
+def test_rotations_are_scipys(make):
+    found = Rotation.random(5, random_state=0)
+    quaternions = make(found.as_quat()[:, [3, 0, 1, 2]].astype("float32").reshape(1, 5, 4))
+    assert abs(np.asarray(terms.rotation(quaternions))[0] - found.as_matrix()).max() < 1e-6
 
 
 def test_arrays_of_a_cpu_are_numpys_and_share_memory():
