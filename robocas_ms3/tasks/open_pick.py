@@ -39,15 +39,19 @@ class RoboCASOpenPickEnv(TransferEnv):
         middle = np.append(held[:2] + 0.3 * out, held[2] + 0.1)
         return eye, middle
 
-    def opening_position(self) -> torch.Tensor:
-        """(N,) m or rad, where the joint stands that has to be opened."""
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
         opening, joint = self.task_config.opening, self.model.opened_joint
         assert opening is not None  # the configuration saw to it
         assert joint is not None
         furniture = self.fixtures.furniture[opening.furniture]
         assert isinstance(furniture, Articulation)
-        index = [active.name for active in furniture.active_joints].index(joint.name)
-        return furniture.get_qpos()[:, index]
+        self._opening = furniture, [active.name for active in furniture.active_joints].index(joint.name)
+
+    def opening_position(self) -> torch.Tensor:
+        """(N,) m or rad, where the joint stands that has to be opened."""
+        furniture, joint = self._opening
+        return furniture.get_qpos()[:, joint]
 
     def _task_stages(self, objects: Any, held: Any) -> dict[str, Any]:
         """Whether the furniture is open, (N,) bool."""

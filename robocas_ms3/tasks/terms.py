@@ -181,15 +181,37 @@ def another_of_its_kind(marked: Array, kinds: Array, target: Array) -> Array:
     return (marked & alike).any(1)
 
 
+def way_back(body: Array, part: Array, part_before: Array) -> tuple[Array, Array]:
+    """The motion that brings a part of a body, such as a drawer, back to where it was, in the world.
+
+    Args:
+        body: (N, 7) pose in the world.
+        part: (N, 7) the same of the part.
+        part_before: (4, 4) pose of the part in the body's frame, as it was.
+
+    Returns:
+        Rotation (N, 3, 3) and translation (N, 3), m, to be applied after it.
+    """
+    turned = rotation(body[:, 3:])
+    turn = turned @ part_before[:3, :3] @ rotation(part[:, 3:]).swapaxes(1, 2)
+    position = body[:, :3] + turned @ part_before[:3, 3]
+    return turn, position - (turn @ part[:, :3, None])[..., 0]
+
+
 def disturbed(
-    poses: Array, start: Array, undo: Array | None = None, *, max_shift: float = 0.03, max_tilt_deg: float = 30.0
+    poses: Array,
+    start: Array,
+    undo: tuple[Array, Array] | None = None,
+    *,
+    max_shift: float = 0.03,
+    max_tilt_deg: float = 30.0,
 ) -> Array:
     """Which objects are no longer where they stood, or have fallen over.
 
     Args:
         poses: (N, K, 7) now: position, quaternion wxyz.
         start: (N, K, 7) as they stood.
-        undo: (N, 7) motion that brings what they stand on back to where it was; none: it can't move.
+        undo: `way_back` of what they stand on; none: it can't move.
         max_shift: m.
         max_tilt_deg: degrees.
 
@@ -198,8 +220,8 @@ def disturbed(
     """
     position, up = poses[..., :3], upward(poses[..., 3:])
     if undo is not None:
-        turn = undo[:, None, 3:]
-        position, up = undo[:, None, :3] + rotate(turn, position), rotate(turn, up)
+        turn, shift = undo
+        position, up = shift[:, None] + position @ turn.swapaxes(1, 2), up @ turn.swapaxes(1, 2)
     upright = (up * upward(start[..., 3:])).sum(-1)  # cosine of the tilt
     shift = length(position - start[..., :3])
     return (shift > max_shift) | (upright < math.cos(math.radians(max_tilt_deg)))

@@ -7,9 +7,8 @@ from operator import and_
 from typing import Any, ClassVar, cast
 
 import numpy as np
-import sapien
 import torch
-from mani_skill.utils.structs import Articulation, Pose
+from mani_skill.utils.structs import Articulation
 
 from robocas_ms3.arrays import as_tensor, count_up, native
 from robocas_ms3.assets.manifest import BODY
@@ -18,7 +17,6 @@ from robocas_ms3.language.instructions import Instruction, choose_instruction, p
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses
-from robocas_ms3.tasks.remembered import Remembered
 
 _LANGUAGE = 100  # stream of an episode's seed; those of layouts are in scenes/sample.py
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
@@ -37,13 +35,17 @@ class TransferEnv(RoboCASEnv):
 
     STAGES: ClassVar[tuple[str, ...]] = STAGES
 
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        shut = self.model.support_motion(opened=False)
+        self._support_shut = torch.as_tensor(shut, dtype=torch.float32, device=self.device)
+
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
         if not hasattr(self, "_reached"):
             self._reached = torch.zeros(len(self.STAGES), self.num_envs, dtype=torch.bool, device=self.device)
             self._stages = dict(zip(self.STAGES, self._reached, strict=True))  # views
         self._reached[:, env_idx] = False
-        self._undo = Remembered(self._undo_of)  # furniture stands still most of the time
         self._last: tuple[object, dict[str, torch.Tensor]] | None = None
         said = {env: self._instruct(env) for env in env_idx.tolist()}
         kept = getattr(self, "instructions", [])
@@ -168,15 +170,11 @@ class TransferEnv(RoboCASEnv):
         support, undo = self.fixtures.furniture[self.task_config.surface.furniture], None
         if isinstance(support, Articulation) and self.model.support_link:
             links = [support.links_map[name] for name in (BODY, self.model.support_link)]
-            undo = native(self._undo(link_poses(self.scene, links)))
+            body, part = native(link_poses(self.scene, links)).swapaxes(0, 1)
+            undo = terms.way_back(body, part, native(self._support_shut))
         moved = terms.disturbed(poses, native(self.start_poses), undo) & native(self.present)
         slots = count_up(moved.shape[1], moved)
         return (moved & (slots != native(self.target_slot)[:, None])).sum(1)
-
-    def _undo_of(self, links: torch.Tensor) -> torch.Tensor:
-        """(N, 7) motion that brings the part that objects stand on back, from the poses of body and part (N, 2, 7)."""
-        before = Pose.create(sapien.Pose(self.model.support_motion(opened=False)), device=self.device)
-        return (Pose.create(links[:, 0]) * before * Pose.create(links[:, 1]).inv()).raw_pose
 
     def get_language_instruction(self) -> list[str]:
         """The instruction of each env."""

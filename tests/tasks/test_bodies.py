@@ -13,7 +13,6 @@ import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.robots.constants import ARM_REST
 from robocas_ms3.tasks.bodies import Bodies, link_poses
-from robocas_ms3.tasks.remembered import Remembered
 
 pytestmark = pytest.mark.slow
 
@@ -118,14 +117,3 @@ def test_another_layout_of_packed_states_is_an_error(env, monkeypatch):
     monkeypatch.setattr(scene, "px", system)
     with pytest.raises(RobocasError, match="packs states otherwise"):
         Bodies(scene, env.unwrapped.agent.robot)
-
-
-def test_a_measure_is_taken_again_when_its_tensors_change_in_place_too():
-    taken = []
-    total = Remembered(lambda *of: taken.append(1) or sum(t.sum() for t in of))
-    values, more = torch.tensor([1.0, 2.0]), torch.tensor([4.0])
-    assert total(values, more) == 7 and total(values.clone(), more) == 7
-    assert len(taken) == 1
-    values[0] = 2.0
-    assert total(values, more) == 8
-    assert len(taken) == 2

@@ -101,8 +101,25 @@ def test_disturbed_is_moved_or_fallen_over(make, degrees, shift, expected):
 def test_disturbed_goes_with_what_objects_stand_on(make):
     start = make([[[1.0, 0, 0, *UPRIGHT], [1.0, 0, 0, *UPRIGHT]]])
     now = make([[[0.0, 1.0, 0, *YAW_90], [1.0, 0, 0, *UPRIGHT]]])  # the first went along, the second did not
-    back = make([[0.0, 0, 0, YAW_90[0], 0, 0, -YAW_90[3]]])
+    back = make([[[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]]), make([[0.0, 0, 0]])
     assert terms.disturbed(now, start, back).tolist() == [[False, True]]
+
+
+def test_a_drawer_is_brought_back(make):
+    # a cabinet at (1, 2, 0), facing y; its drawer was 0.5 m along the cabinet's own x, and is out by another 0.2 m
+    body, part = make([[1.0, 2, 0, *YAW_90]]), make([[1.0, 2.7, 0, *YAW_90]])
+    before = make([[1.0, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    turn, shift = terms.way_back(body, part, before)
+    assert abs(turn[0] - make([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])).max() < 1e-6
+    assert abs(shift[0] - make([0.0, -0.2, 0])).max() < 1e-6
+    # a door at the origin that has turned by 90 degrees about its hinge at (1, 0, 0)
+    turn, shift = terms.way_back(make([[0.0, 0, 0, *UPRIGHT]]), make([[1.0, 0, 0, *YAW_90]]), make(hinge_at_1()))
+    on_the_door = turn[0] @ make([1.0, 0.4, 0]) + shift[0]
+    assert abs(on_the_door - make([1.4, 0, 0])).max() < 1e-6
+
+
+def hinge_at_1() -> list[list[float]]:
+    return [[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 
 def test_touched_is_any_body(make):
