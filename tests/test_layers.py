@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "robocas_ms3"
 # Lowest first; a module imports from its own layer and those before it.
 LAYERS = (
-    ("errors", "paths", "files"),
+    ("errors", "paths", "files", "arrays"),
     ("config",),
     ("assets",),
     ("scenes",),
@@ -28,6 +28,7 @@ LAYERS = (
 )
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 SIMULATOR_FREE = (
+    "arrays",
     "config",
     *(
         f"scenes.{name}"

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
+import sapien
 import torch
 from gymnasium import spaces
 from mani_skill.agents.controllers import (
@@ -24,16 +25,12 @@ from mani_skill.agents.controllers import (
     PDJointPosMimicControllerConfig,
 )
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
-from mani_skill.utils import gym_utils
-from mani_skill.utils.geometry.rotation_conversions import (
-    euler_angles_to_matrix,
-    matrix_to_quaternion,
-    quaternion_apply,
-    quaternion_multiply,
-)
 from mani_skill.utils.structs import Link, Pose
 from sapien.physx import PhysxArticulationJoint
 from scipy.spatial.transform import Rotation
+
+from robocas_ms3.arrays import Array, as_tensor, choose, clamp, join, length, native
+from robocas_ms3.robots import rotations
 
 POSITION_SCALE, ROTATION_SCALE = 0.1, 0.5  # m and rad at |action| = 1, end effector
 JOINT_SCALE = 0.1  # rad, arm joints
@@ -68,9 +65,7 @@ def to_ee_delta_action(
     return np.concatenate([translation / POSITION_SCALE, angles / ROTATION_SCALE], axis=-1).astype(np.float32)
 
 
-def ee_delta_target(
-    position: torch.Tensor, quaternion: torch.Tensor, delta: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def ee_delta_target(position: Array, quaternion: Array, delta: Array) -> tuple[Array, Array]:
     """Apply a motion given in the end effector's frame to its pose in any parent frame.
 
     Args:
@@ -81,19 +76,24 @@ def ee_delta_target(
     Returns:
         Position (N, 3) and quaternion (N, 4) of the target in the parent frame.
     """
-    rotation = matrix_to_quaternion(euler_angles_to_matrix(delta[:, 3:6], "XYZ"))
-    return position + quaternion_apply(quaternion, delta[:, :3]), quaternion_multiply(quaternion, rotation)
+    rotation = rotations.from_euler(delta[:, 3:6])
+    return position + rotations.turn(quaternion, delta[:, :3]), rotations.multiply(quaternion, rotation)
 
 
 def relative_pose(frame: Link, link: Link) -> Pose:
     """(N,) poses of a link in the frame of another; on a CPU by SAPIEN, ten times faster than by tensors."""
+    return Pose(raw_pose=as_tensor(_relative_pose(frame, link)))
+
+
+def _relative_pose(frame: Link, link: Link) -> Any:
+    """(N, 7) native (`arrays`) poses of a link in the frame of another."""
     if frame.scene.gpu_sim_enabled:
-        return frame.pose.inv() * link.pose
+        return (frame.pose.inv() * link.pose).raw_pose
     pose = frame._bodies[0].entity_pose.inv() * link._bodies[0].entity_pose
     position, quaternion = pose.p, pose.q
     if quaternion[0] < 0:  # as ManiSkill's products
         quaternion = -quaternion
-    return Pose(raw_pose=torch.from_numpy(np.concatenate([position, quaternion]))[None])
+    return np.concatenate([position, quaternion])[None]
 
 
 def batched_ik(
@@ -124,18 +124,44 @@ def batched_ik(
 
 
 class DirectDrives(PDJointPosController):
-    """Sets drive targets, on a CPU without ManiSkill's wrapper of each joint, which takes longer than the physics."""
+    """Works on native arrays (`arrays`), and on a CPU without ManiSkill's wrapper of each joint.
+
+    These would take longer than the physics.
+    """
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
         self._drives: list[PhysxArticulationJoint] = [joint._objs[0] for joint in self.joints]
+        self._columns = native(self.active_joint_indices)
+
+    def _clip_and_scale_action_space(self) -> None:
+        super()._clip_and_scale_action_space()
+        low, high = native(self.action_space_low), native(self.action_space_high)
+        self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
+
+    def _clip_and_scale_action(self, action: Any) -> Any:
+        return self._middle + self._half * clamp(action, -1, 1)
+
+    def _taken(self, action: Any) -> Any:
+        """An action (N, size) tensor, native and scaled."""
+        return self._preprocess_action(native(action))
+
+    def _now(self) -> Any:
+        """(N, joints) present positions, rad or m, native."""
+        if self.scene.gpu_sim_enabled:
+            return self.qpos
+        return self.articulation._objs[0].qpos[None, self._columns]
 
     def set_drive_targets(self, targets: torch.Tensor) -> None:
         """Set the targets (N, joints), rad or m, of all joints."""
         if self.scene.gpu_sim_enabled:
             super().set_drive_targets(targets)
-            return
-        for drive, target in zip(self._drives, targets[0].tolist(), strict=True):
+        else:
+            self._drive_to(targets[0].tolist())
+
+    def _drive_to(self, targets: list[float]) -> None:
+        """`set_drive_targets` on a CPU."""
+        for drive, target in zip(self._drives, targets, strict=True):
             drive.set_drive_target(target)
 
     def set_drive_velocities(self, velocities: torch.Tensor) -> None:
@@ -147,14 +173,47 @@ class DirectDrives(PDJointPosController):
             drive.set_drive_velocity_target(velocity)
 
 
+class EvenDrives(DirectDrives):
+    """Moves the drive targets evenly from one to the next within a control step."""
+
+    def _initialize_joints(self) -> None:
+        super()._initialize_joints()
+        shares = torch.arange(1, self._sim_steps + 1, device=self.device) / self._sim_steps
+        self._shares = shares[:, None, None]
+        self._ahead: list[Any] = []
+
+    def _move_evenly(self, start: Any, end: Any) -> None:
+        """Plan the control step's drive targets, from after ``start`` (N, joints) to ``end``, native."""
+        targets = torch.lerp(as_tensor(start), as_tensor(end), self._shares)  # (steps, N, joints)
+        self._ahead = list(targets) if self.scene.gpu_sim_enabled else targets[:, 0].tolist()
+        self._step = 0
+
+    def before_simulation_step(self) -> None:
+        """Move the drive targets on."""
+        if self._step >= len(self._ahead):
+            return
+        targets = self._ahead[self._step]
+        self._step += 1
+        if self.scene.gpu_sim_enabled:
+            self.set_drive_targets(targets)
+            cast("Any", self.scene.px).gpu_apply_articulation_target_position()
+        else:
+            self._drive_to(targets)
+
+    def reset(self) -> None:
+        """Start from the present configuration."""
+        super().reset()
+        self._ahead = []
+
+
 class FingersController(DirectDrives, PDJointPosMimicController):
     """Absolute positions of fingers that all do the same; ManiSkill's, without its detours."""
 
     def set_action(self, action: Any) -> None:
         """Take the position (N, 1) of every finger."""
-        targets = cast("torch.Tensor", self._preprocess_action(action)).repeat(1, len(self.joints))
-        self._target_qpos = targets
-        self.set_drive_targets(targets)
+        action = self._taken(action)
+        self._target_qpos = as_tensor(join([action] * len(self.joints)))
+        self.set_drive_targets(self._target_qpos)
 
 
 @dataclass
@@ -164,7 +223,7 @@ class FingersControllerConfig(PDJointPosMimicControllerConfig):
     controller_cls = FingersController
 
 
-class SmoothJointPosController(DirectDrives):
+class SmoothJointPosController(EvenDrives):
     """Joint positions, absolute or relative to the last target, whose drive target moves evenly within a control step.
 
     A target that jumps at 5 Hz makes the arm start and stop with every step, at twice the planned velocity. ManiSkill's
@@ -175,35 +234,22 @@ class SmoothJointPosController(DirectDrives):
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
-        self._limits = self.articulation.get_qlimits()[0, self.active_joint_indices]
+        limits = native(self.articulation.get_qlimits()[0, self.active_joint_indices])
+        self._low, self._high = limits[:, 0], limits[:, 1]
 
     def set_action(self, action: Any) -> None:
         """Take the positions (N, joints), rad or m, to command at the end of the control step."""
-        action = self._preprocess_action(action)
+        action = self._taken(action)
         assert self._target_qpos is not None, "the controller has not been reset"
-        now = self.qpos
-        start = torch.where((self._target_qpos - now).abs() > ARM_SET_FROM_OUTSIDE, now, self._target_qpos)
+        now, last = self._now(), native(self._target_qpos)
+        start = choose(abs(last - now) > ARM_SET_FROM_OUTSIDE, now, last)
         travel = action if self.config.use_delta else action - start
         if self.config.max_speed is not None:
             furthest = self.config.max_speed / self._control_freq
-            travel = travel.clamp(-furthest, furthest)
-        self._step = 0
-        self._start_qpos = start
-        self._target_qpos = torch.clamp(start + travel, self._limits[:, 0], self._limits[:, 1])
-
-    def before_simulation_step(self) -> None:
-        """Move the drive target on."""
-        if self._start_qpos is None or self._target_qpos is None or self._step >= self._sim_steps:
-            return
-        self._step += 1
-        self.set_drive_targets(torch.lerp(self._start_qpos, self._target_qpos, self._step / self._sim_steps))
-        if self.scene.gpu_sim_enabled:
-            cast("Any", self.scene.px).gpu_apply_articulation_target_position()
-
-    def reset(self) -> None:
-        """Start from the present configuration."""
-        super().reset()
-        self._step = self._sim_steps
+            travel = clamp(travel, -furthest, furthest)
+        target = clamp(start + travel, self._low, self._high)
+        self._target_qpos = as_tensor(target)
+        self._move_evenly(start, target)
 
 
 @dataclass
@@ -230,9 +276,8 @@ class HeldJointsController(DirectDrives):
     def set_action(self, action: Any) -> None:
         """Keep the drive targets, unless the state was set from outside: then hold the joints where they are now."""
         assert self._target_qpos is not None, "the controller has not been reset"
-        now = self.qpos
-        moved = (self._target_qpos - now).abs() > HELD_SET_FROM_OUTSIDE
-        self._target_qpos = torch.where(moved, now, self._target_qpos)
+        now, held = self._now(), native(self._target_qpos)
+        self._target_qpos = as_tensor(choose(abs(held - now) > HELD_SET_FROM_OUTSIDE, now, held))
         self.set_drive_targets(self._target_qpos)
 
 
@@ -248,7 +293,7 @@ class HeldJointsControllerConfig(PDJointPosControllerConfig):
     controller_cls = HeldJointsController
 
 
-class RoboCASEEPoseController(DirectDrives, PDEEPoseController):
+class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
     """End-effector pose control: deltas in the end effector's frame, or absolute poses in the arm's base frame.
 
     Differs from ManiSkill's: rotations have their natural sign; body-frame deltas work on a GPU too, since the target
@@ -261,23 +306,22 @@ class RoboCASEEPoseController(DirectDrives, PDEEPoseController):
     def _check_gpu_sim_works(self) -> None:
         """Every frame works: ``set_action`` hands poses in the root frame to inverse kinematics."""
 
-    def _clip_and_scale_action(self, action: torch.Tensor) -> torch.Tensor:
-        position = gym_utils.clip_and_scale_action(action[:, :3], self.action_space_low[:3], self.action_space_high[:3])
-        rotation = action[:, 3:]
-        rotation = rotation / torch.linalg.norm(rotation, dim=1, keepdim=True).clamp(min=1.0)
-        return torch.hstack([position, rotation * self.action_space_high[3:]])
+    def _clip_and_scale_action(self, action: Any) -> Any:
+        position = self._middle[:3] + self._half[:3] * clamp(action[:, :3], -1, 1)
+        rotation, most = action[:, 3:], native(self.action_space_high)[3:]
+        size = native(torch.linalg.vector_norm(as_tensor(rotation), dim=1, keepdim=True).clamp(min=1.0))
+        return join([position, rotation / size * most])
 
-    def compute_target_pose(self, prev_ee_pose_at_base: Pose | None, action: torch.Tensor) -> Pose:
-        """Compute the target in the arm's base frame.
+    def _wanted_pose(self, reference: Any, action: Any) -> Any:
+        """(N, 7) the target in the arm's base frame, native.
 
         Args:
-            prev_ee_pose_at_base: (N,) the pose that deltas refer to; None where actions are poses.
+            reference: (N, 7) the pose that deltas refer to; None where actions are poses.
             action: (N, 6) scaled: m and rad.
         """
-        if prev_ee_pose_at_base is not None:
-            return Pose.create_from_pq(*ee_delta_target(prev_ee_pose_at_base.p, prev_ee_pose_at_base.q, action))
-        rotation = matrix_to_quaternion(euler_angles_to_matrix(action[:, 3:6], "XYZ"))
-        return Pose.create_from_pq(action[:, :3], rotation)
+        if reference is not None:
+            return join([*ee_delta_target(reference[:, :3], reference[:, 3:], action)])
+        return join([action[:, :3], rotations.from_euler(action[:, 3:6])])
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
@@ -294,26 +338,25 @@ class RoboCASEEPoseController(DirectDrives, PDEEPoseController):
 
     def set_action(self, action: Any) -> None:
         """Drive the arm towards the pose; where no inverse kinematics is found it stays where it is."""
-        action = self._preprocess_action(action)
-        self._step = 0
-        reference = self.reference_pose() if self.config.use_delta else None
-        last = now = self.qpos
+        action = self._taken(action)
+        reference = self._reference_pose() if self.config.use_delta else None
+        last = now = self._now()
         if self._target_qpos is not None:
-            last = self._target_qpos
-        moved = (last - now).abs() > ARM_SET_FROM_OUTSIDE
+            last = native(self._target_qpos)
+        moved = abs(last - now) > ARM_SET_FROM_OUTSIDE
         if self._forgotten is not None:
-            moved |= self._forgotten[:, None]
-        self._start_qpos = torch.where(moved, now, last)
-        wanted = self.compute_target_pose(reference, action)
+            moved |= native(self._forgotten)[:, None]
+        start, wanted = choose(moved, now, last), self._wanted_pose(reference, action)
         target = self._solve(wanted)
         if target is None:
-            target, wanted = now, self.reference_pose() if reference is None else reference
-        self._target_pose = wanted
-        self._target_qpos, self._forgotten = target, None
+            target, wanted = now, self._reference_pose() if reference is None else reference
+        self._target_pose = Pose(raw_pose=as_tensor(wanted))
+        self._target_qpos, self._forgotten = as_tensor(target), None
         if self.config.use_delta:
-            self._drive_with(self._start_qpos, (target - self._start_qpos) * self._control_freq)
+            self._drive_with(start, (target - start) * self._control_freq)
+            self._move_evenly(start, target)
         else:
-            self._drive_with(target, torch.zeros_like(target))
+            self._drive_with(target, torch.zeros_like(as_tensor(target)))
 
     def forget_targets(self, env_idx: torch.Tensor | None = None) -> None:
         """Let the next action start from where the arm is: its state was set from outside.
@@ -327,54 +370,46 @@ class RoboCASEEPoseController(DirectDrives, PDEEPoseController):
         forgotten[slice(None) if env_idx is None else env_idx] = True
         self._forgotten = forgotten
 
-    def before_simulation_step(self) -> None:
-        """Move the drive target of deltas on."""
-        if not self.config.use_delta or self._step >= self._sim_steps or self._target_qpos is None:
-            return
-        self._step += 1
-        self.set_drive_targets(torch.lerp(self._start_qpos, self._target_qpos, self._step / self._sim_steps))
-        if self.scene.gpu_sim_enabled:
-            cast("Any", self.scene.px).gpu_apply_articulation_target_position()
-
-    def _drive_with(self, targets: torch.Tensor, velocities: torch.Tensor) -> None:
+    def _drive_with(self, targets: Any, velocities: Any) -> None:
         """Set drive targets and their velocities: an arm that is told its velocity does not lag."""
         self.set_drive_targets(targets)
         self.set_drive_velocities(velocities)
 
-    def reset(self) -> None:
-        """Start from the present configuration, at rest."""
-        super().reset()
-        self._step = self._sim_steps
-
     def reference_pose(self) -> Pose:
         """(N,) poses in the arm's base frame that the next deltas start from."""
+        return Pose(raw_pose=as_tensor(self._reference_pose()))
+
+    def _reference_pose(self) -> Any:
+        """`reference_pose`, (N, 7) native."""
         if not self.config.use_target or self._target_pose is None:
-            return self.ee_pose_at_base
+            return native(self.ee_pose_at_base.raw_pose)
         far, turned = EE_HELD_BACK
-        now = relative_pose(cast("Link", self.root_link), self.ee_link)
-        distance = torch.linalg.vector_norm(self._target_pose.p - now.p, dim=1)
-        cosine = (self._target_pose.q * now.q).sum(dim=1).abs()  # of half the angle between them
+        now = _relative_pose(cast("Link", self.root_link), self.ee_link)
+        target = native(self._target_pose.raw_pose)
+        distance = length(target[:, :3] - now[:, :3])
+        cosine = abs((target[:, 3:] * now[:, 3:]).sum(1))  # of half the angle between them
         lost = (distance > far) | (cosine < np.cos(turned / 2))
         if self._forgotten is not None:
-            lost |= self._forgotten
+            lost |= native(self._forgotten)
         if not lost.any():
-            return self._target_pose
-        return Pose.create(torch.where(lost[:, None], self.ee_pose_at_base.raw_pose, self._target_pose.raw_pose))
+            return target
+        return choose(lost[:, None], native(self.ee_pose_at_base.raw_pose), target)
 
-    def _solve(self, target: Pose) -> torch.Tensor | None:
-        """(N, joints) that reach poses in the arm's base frame; None: not found, on a CPU."""
-        kinematics, qpos = self.kinematics, self.articulation.get_qpos()
+    def _solve(self, target: Any) -> Any:
+        """(N, joints) that reach poses (N, 7) in the arm's base frame, native; None: not found, on a CPU."""
+        kinematics = self.kinematics
         if self.scene.gpu_sim_enabled:
-            return batched_ik(kinematics, target, qpos, self.active_joint_indices, self.ee_pose_at_base)
+            qpos, pose = self.articulation.get_qpos(), Pose(raw_pose=target)
+            return batched_ik(kinematics, pose, qpos, self.active_joint_indices, self.ee_pose_at_base)
         # what ManiSkill's `compute_ik` does, without its conversions
         found, success, _ = kinematics.pmodel.compute_inverse_kinematics(
             kinematics.end_link_idx,
-            target.sp,
-            initial_qpos=qpos[0].numpy()[self._chain],
+            sapien.Pose(target[0, :3], target[0, 3:]),
+            initial_qpos=self.articulation._objs[0].qpos[self._chain],
             active_qmask=self._free,
             max_iterations=100,
         )
-        return torch.from_numpy(found[self._arm].astype(np.float32))[None] if success else None
+        return found[self._arm].astype(np.float32)[None] if success else None
 
 
 @dataclass

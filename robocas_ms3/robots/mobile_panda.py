@@ -24,6 +24,7 @@ from robocas_ms3.robots.controllers import (
     JOINT_SCALE,
     POSITION_SCALE,
     ROTATION_SCALE,
+    EvenDrives,
     FingersControllerConfig,
     HeldJointsControllerConfig,
     RoboCASEEPoseController,
@@ -197,9 +198,16 @@ class RoboCASMobilePanda(BaseAgent):
             raise ValueError("Action cannot be NaN. Environment received:", action)
         self.controller.set_action(action)
 
+    def before_simulation_step(self) -> None:
+        """Move on the drive targets that go from one to the next within a control step."""
+        for controller in self._within_a_step:
+            controller.before_simulation_step()
+
     def set_control_mode(self, control_mode: str | None = None) -> None:
         """Change the control mode; what the last one told the arm about its velocity is forgotten."""
         super().set_control_mode(cast("str", control_mode))
+        controllers: Any = self.controller
+        self._within_a_step = [part for part in controllers.controllers.values() if isinstance(part, EvenDrives)]
         if hasattr(self, "tcp"):  # not while the robot is being made
             self._still()
 

@@ -15,6 +15,7 @@ from mani_skill.utils.structs import Actor, Articulation, Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.arrays import as_tensor, native
 from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
 from robocas_ms3.config import TaskConfig, load_task_config
@@ -181,7 +182,7 @@ class RoboCASEnv(SeededEnv):
 
     def _after_reconfigure(self, options: dict) -> None:
         super()._after_reconfigure(options)
-        self.bodies = Bodies(self.scene)
+        self.bodies = Bodies(self.scene, self.agent.robot)
         rows = [self.bodies.actors.index(actor.name) for actor in self.objects]
         assert rows == list(range(rows[0], rows[0] + len(rows))), "the objects are built one after the other"
         self._object_rows = slice(rows[0], rows[-1] + 1)
@@ -241,12 +242,31 @@ class RoboCASEnv(SeededEnv):
         """Batch of poses from 4x4 matrices."""
         return Pose.create(torch.as_tensor(_raw_poses(np.stack(matrices)), device=self.device))
 
+    # ------------------------------------------------------------------ step
+
+    def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict]:
+        """Step; see ``BaseEnv``, whose step takes longer on a CPU where neither observation nor reward is wanted."""
+        plain = self._obs_mode == "none" and self._reward_mode == "none" and isinstance(action, np.ndarray)
+        if not plain or self.gpu_sim_enabled or action.shape != self._orig_single_action_space.shape:
+            return super().step(action)
+        self.agent.set_action(torch.from_numpy(action.astype(np.float32, copy=False))[None])
+        self._before_control_step()
+        for _ in range(self._sim_steps_per_control):
+            self.agent.before_simulation_step()
+            self._before_simulation_step()
+            self.scene.step()
+            self._after_simulation_step()
+        self._after_control_step()
+        self._elapsed_steps += 1
+        info, self._last_obs = self.get_info(), {}
+        return {}, torch.zeros(1), info["success"].clone(), torch.zeros(1, dtype=torch.bool), info
+
     # ------------------------------------------------------------------ state
 
     @property
     def object_states(self) -> torch.Tensor:
         """(N, K, 13) poses of the objects, linear and angular velocities (`bodies.BODY`); don't write to it."""
-        return self.bodies.of_actors(self.bodies.read())[:, self._object_rows]
+        return self._objects_in(self.bodies.read())
 
     @property
     def object_poses(self) -> torch.Tensor:
@@ -256,7 +276,13 @@ class RoboCASEnv(SeededEnv):
     @property
     def basket_pose(self) -> torch.Tensor:
         """(N, 7) pose of the basket in the world; don't write to it."""
-        return self.bodies.of_actors(self.bodies.read())[:, self._basket_row, :7]
+        return self._basket_in(self.bodies.read())
+
+    def _objects_in(self, state: torch.Tensor) -> torch.Tensor:
+        return self.bodies.of_actors(state)[:, self._object_rows]
+
+    def _basket_in(self, state: torch.Tensor) -> torch.Tensor:
+        return self.bodies.of_actors(state)[:, self._basket_row, :7]
 
     def target_asset(self, env: int = 0) -> LoadedObject:
         """The target's asset in one env."""
@@ -264,21 +290,21 @@ class RoboCASEnv(SeededEnv):
 
     def gripper_forces(self) -> torch.Tensor:
         """(N, 3, K, 3) N: force of each object on left finger, right finger and hand, world frame."""
-        return self._gripper_contacts.forces()
+        return as_tensor(self._gripper_contacts.forces())
 
-    def grasped(self, forces: torch.Tensor | None = None) -> torch.Tensor:
-        """(N, K) bool: which objects both fingers hold right now.
+    def grasped(self) -> torch.Tensor:
+        """(N, K) bool: which objects both fingers hold right now."""
+        return as_tensor(self._grasped_by(self._gripper_contacts.forces()))
 
-        Args:
-            forces: of ``gripper_forces``, if they are known already.
-        """
-        forces = self.gripper_forces() if forces is None else forces
+    def _grasped_by(self, forces: Any) -> Any:
+        """`grasped` from the gripper's forces, both native (`arrays`)."""
         pressed = terms.pressed(forces[:, 0], forces[:, 1])
         if not pressed.any():  # as most of the time: no need to ask in which direction
             return pressed
-        finger = link_poses(self.scene, [self.agent.finger1_link])[:, 0]
+        finger = native(link_poses(self.scene, [self.agent.finger1_link]))[:, 0]
         # the left finger opens along its own +y
-        return terms.finger_grasps(forces[:, 0], forces[:, 1], terms.rotate(finger[:, 3:], self._sideways))
+        opening = terms.rotate(finger[:, 3:], native(self._sideways))
+        return terms.finger_grasps(forces[:, 0], forces[:, 1], opening)
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         """Nothing in visual modes; in state modes what only a simulator knows."""

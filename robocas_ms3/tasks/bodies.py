@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from mani_skill.envs.scene import ManiSkillScene
-from mani_skill.utils.structs import Link
+from mani_skill.utils.structs import Articulation, Link
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import RobocasError
@@ -31,12 +31,13 @@ class Bodies:
 
     Args:
         scene: ready to be simulated.
+        robot: what `others` leaves out.
 
     Raises:
         RobocasError: this version of SAPIEN packs states otherwise.
     """
 
-    def __init__(self, scene: ManiSkillScene) -> None:
+    def __init__(self, scene: ManiSkillScene, robot: Articulation) -> None:
         self._scene = scene
         self._px: Any = scene.px
         registry = scene.state_dict_registry
@@ -56,7 +57,7 @@ class Bodies:
             roots = [articulation.root for articulation in self._articulations]
             self._rows = torch.stack([body._body_data_index for body in [*self._actors, *roots]], dim=1)
         else:
-            self._order = self._packed_order()
+            self._order, self._robot = self._packed_order(robot)
             self._packed: bytes = b""
             self._state = torch.empty(0)
 
@@ -70,6 +71,13 @@ class Bodies:
             self._state = torch.from_numpy(np.frombuffer(packed, np.float32)[self._order])[None]
         return self._state
 
+    @property
+    def others(self) -> tuple[bytes, bytes] | None:
+        """All but the robot at the last `read`, to be compared: the same means that nothing moved; None on a GPU."""
+        if self._scene.gpu_sim_enabled:
+            return None
+        return self._packed[: self._robot.start], self._packed[self._robot.stop :]
+
     def of_actors(self, state: torch.Tensor) -> torch.Tensor:
         """(N, A, 13) the actors' part of a state (N, D), in the order of ``actors``."""
         count = len(self._actors)
@@ -82,8 +90,8 @@ class Bodies:
             for kind, found in self._columns.items()
         }
 
-    def _packed_order(self) -> NDArray[np.int64]:
-        """Which of SAPIEN's packed numbers each number of a state is."""
+    def _packed_order(self, robot: Articulation) -> tuple[NDArray[np.int64], slice]:
+        """Which of SAPIEN's packed numbers each number of a state is, and which of its bytes are the robot's."""
         dynamic: list[Any] = self._px.rigid_dynamic_components
         first = {body: i * BODY for i, body in enumerate(dynamic)}
         order = [first[actor._bodies[0]] + k for actor in self._actors for k in _PACKED_BODY]
@@ -99,7 +107,8 @@ class Bodies:
         for articulation in self._articulations:
             start = starts[articulation._objs[0]]
             order += [start + k for k in (*_PACKED_BODY, *range(BODY, BODY + 2 * articulation.max_dof))]
-        return np.array(order)
+        start = starts[robot._objs[0]]
+        return np.array(order), slice(4 * start, 4 * (start + BODY + _PACKED_PER_JOINT * robot.max_dof))
 
     def _gather(self) -> torch.Tensor:
         bodies = self._px.cuda_rigid_body_data.torch()[self._rows, :BODY]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Articulation
 
+from robocas_ms3.arrays import native
 from robocas_ms3.tasks.spec import OPEN_PICK
 from robocas_ms3.tasks.transfer import STAGES, TransferEnv
 
@@ -36,18 +39,21 @@ class RoboCASOpenPickEnv(TransferEnv):
         middle = np.append(held[:2] + 0.3 * out, held[2] + 0.1)
         return eye, middle
 
-    def opening_position(self) -> torch.Tensor:
-        """(N,) m or rad, where the joint stands that has to be opened."""
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
         opening, joint = self.task_config.opening, self.model.opened_joint
         assert opening is not None  # the configuration saw to it
         assert joint is not None
         furniture = self.fixtures.furniture[opening.furniture]
         assert isinstance(furniture, Articulation)
-        index = [active.name for active in furniture.active_joints].index(joint.name)
-        return furniture.get_qpos()[:, index]
+        self._opening = furniture, [active.name for active in furniture.active_joints].index(joint.name)
 
-    def task_stages(self) -> dict[str, torch.Tensor]:
+    def opening_position(self) -> torch.Tensor:
+        """(N,) m or rad, where the joint stands that has to be opened."""
+        furniture, joint = self._opening
+        return furniture.get_qpos()[:, joint]
+
+    def _task_stages(self, objects: Any, held: Any) -> dict[str, Any]:
         """Whether the furniture is open, (N,) bool."""
-        goal = self.model.opened_position
-        position = self.opening_position()
+        goal, position = self.model.opened_position, native(self.opening_position())
         return {"furniture_opened": position >= goal if goal > 0 else position <= goal}

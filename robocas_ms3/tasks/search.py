@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from mani_skill.utils.registration import register_env
 
+from robocas_ms3.arrays import as_tensor, native
 from robocas_ms3.tasks import occlusion, terms
 from robocas_ms3.tasks.spec import SEARCH
 from robocas_ms3.tasks.transfer import STAGES, TransferEnv
@@ -49,18 +52,17 @@ class RoboCASSearchEnv(TransferEnv):
         points = occlusion.surface_points(self.object_states[..., :7], self._surface_points)
         return occlusion.clutter(points, self.present, self.target_slot)
 
-    def task_stages(self) -> dict[str, torch.Tensor]:
+    def _task_stages(self, objects: Any, held: Any) -> dict[str, Any]:
         """``obstacles_cleared``, (N,) bool, of this moment."""
-        taken = self.target_held | self._stages["target_grasped"]
-        if (taken | self._stages["obstacles_cleared"]).all():  # nothing can change it any more
+        taken = held | native(self._stages["target_grasped"])
+        if (taken | native(self._stages["obstacles_cleared"])).all():  # nothing can change it any more
             return {}
         surface = float(self.model.support_pose[2, 3]) + self.model.region.z
-        lies = terms.of_target(self.object_states[..., 2], self.target_slot) > surface - FALLEN
-        return {"obstacles_cleared": self._cleared() & lies & ~taken}
+        lies = terms.of_target(objects[..., 2], native(self.target_slot)) > surface - FALLEN
+        return {"obstacles_cleared": native(self._cleared(as_tensor(objects[..., :7]))) & lies & ~taken}
 
-    def _cleared(self) -> torch.Tensor:
-        """(N,) bool of `clutter`, as it was measured when something in the heap last moved."""
-        poses = self.object_states[..., :7]
+    def _cleared(self, poses: torch.Tensor) -> torch.Tensor:
+        """(N,) bool of `clutter` at these poses (N, K, 7), as it was when something in the heap last moved."""
         if self._last_clutter is not None:
             before, cleared = self._last_clutter
             if torch.equal(poses, before) or not self._moved(poses, before):

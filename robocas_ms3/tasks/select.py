@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from mani_skill.utils.registration import register_env
 
+from robocas_ms3.arrays import native
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.spec import SELECT
 from robocas_ms3.tasks.transfer import TransferEnv
@@ -25,15 +28,8 @@ class RoboCASSelectEnv(TransferEnv):
         names = [[asset.asset.name for asset in row] for row in self.object_assets]
         self._kinds = torch.tensor([[row.index(name) for name in row] for row in names], device=self.device)
 
-    def target_measures(
-        self,
-        touched: torch.Tensor | None = None,
-        objects: torch.Tensor | None = None,
-        basket: torch.Tensor | None = None,
-    ) -> dict[str, torch.Tensor]:
+    def _target_measures(self, touched: Any, objects: Any, basket: Any) -> dict[str, Any]:
         """As of `TransferEnv`, and ``others_out``: no other object of the target's name is in the basket."""
-        objects = self.object_states if objects is None else objects
-        basket = self.basket_pose if basket is None else basket
-        inside = self.in_basket(objects[..., :7], self._centers_of_mass, basket)
-        others_in = terms.another_of_its_kind(inside, self._kinds, self.target_slot)
-        return {**super().target_measures(touched, objects, basket), "others_out": ~others_in}
+        inside = self._in_basket(objects[..., :7], native(self._centers_of_mass), basket)
+        others_in = terms.another_of_its_kind(inside, native(self._kinds), native(self.target_slot))
+        return {**super()._target_measures(touched, objects, basket), "others_out": ~others_in}

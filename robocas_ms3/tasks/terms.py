@@ -1,34 +1,67 @@
-"""Terms of success and stages: pure functions on batched tensors. N envs, K object slots; metres, N, m/s; wxyz."""
+"""Terms of success and stages: pure functions on batched arrays. N envs, K object slots; metres, N, m/s; wxyz.
+
+They take tensors or NumPy's arrays, see `arrays`: all arguments of one kind, which is also that of what they give.
+"""
 
 from __future__ import annotations
 
 import math
+from functools import cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from robocas_ms3.arrays import Array, count_up, length
 
-def rotate_inverse(quaternion: Tensor, vector: Tensor) -> Tensor:
+# The entries of a rotation matrix, row by row, in the products of a quaternion's numbers, ww, wx, wy, ..., zz.
+_PRODUCTS = np.array(
+    [
+        # ww wx wy wz  xw xx xy xz  yw yx yy yz  zw zx zy zz
+        [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1],
+        [0, 0, 0, -2, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0],
+        [0, 0, 2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0],
+        [0, 0, 0, 2, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0],
+        [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1],
+        [0, -2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0],
+        [0, 0, -2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0],
+        [0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0],
+        [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1],
+    ],
+    np.float32,
+).T
+
+
+@cache
+def _products_on(device: torch.device) -> Tensor:
+    return torch.from_numpy(_PRODUCTS).to(device)
+
+
+def rotation(quaternion: Array) -> Array:
+    """(..., 3, 3) matrices of unit quaternions (..., 4) wxyz."""
+    # few operations, as each takes longer than its arithmetic
+    products = quaternion[..., :, None] * quaternion[..., None, :]
+    table = _products_on(quaternion.device) if isinstance(quaternion, Tensor) else _PRODUCTS
+    shape = quaternion.shape[:-1]
+    return (products.reshape(*shape, 16) @ table).reshape(*shape, 3, 3)
+
+
+def rotate_inverse(quaternion: Array, vector: Array) -> Array:
     """Rotate vectors (..., 3) by the inverse of unit quaternions (..., 4) wxyz."""
-    w, xyz = quaternion[..., :1], quaternion[..., 1:]
-    t = torch.linalg.cross(vector, xyz)
-    return vector + 2 * (w * t + torch.linalg.cross(t, xyz))
+    return (vector[..., None, :] @ rotation(quaternion))[..., 0, :]
 
 
-def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
+def rotate(quaternion: Array, vector: Array) -> Array:
     """Rotate vectors (..., 3) by unit quaternions (..., 4) wxyz."""
-    w, xyz = quaternion[..., :1], quaternion[..., 1:]
-    t = torch.linalg.cross(xyz, vector)
-    return vector + 2 * (w * t + torch.linalg.cross(xyz, t))
+    return (rotation(quaternion) @ vector[..., None])[..., 0]
 
 
-def upward(quaternion: Tensor) -> Tensor:
+def upward(quaternion: Array) -> Array:
     """(..., 3) the vertical axes of bodies with unit quaternions (..., 4) wxyz."""
-    w, x, y, z = quaternion.unbind(-1)
-    return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
+    return rotation(quaternion)[..., 2]
 
 
-def inside_box(points: Tensor, box_position: Tensor, box_quaternion: Tensor, low: Tensor, high: Tensor) -> Tensor:
+def inside_box(points: Array, box_position: Array, box_quaternion: Array, low: Array, high: Array) -> Array:
     """Whether points lie in a box fixed to a moving frame.
 
     Args:
@@ -44,21 +77,18 @@ def inside_box(points: Tensor, box_position: Tensor, box_quaternion: Tensor, low
     if points.ndim == 3:
         box_position, box_quaternion = box_position[:, None], box_quaternion[:, None]
     local = rotate_inverse(box_quaternion, points - box_position)
-    return ((local >= low) & (local <= high)).all(dim=-1)
+    return ((local >= low) & (local <= high)).all(-1)
 
 
 MIN_GRASP_FORCE = 0.5  # N, on each finger
 
 
-def pressed(left_force: Tensor, right_force: Tensor) -> Tensor:
+def pressed(left_force: Array, right_force: Array) -> Array:
     """(N, K) bool: which objects press on both fingers, in whatever direction, from forces (N, K, 3) in N."""
-    sizes = torch.linalg.vector_norm(torch.stack([left_force, right_force]), dim=-1)
-    return (sizes >= MIN_GRASP_FORCE).all(dim=0)
+    return (length(left_force) >= MIN_GRASP_FORCE) & (length(right_force) >= MIN_GRASP_FORCE)
 
 
-def finger_grasps(
-    left_force: Tensor, right_force: Tensor, closing_axis: Tensor, *, max_angle_deg: float = 85.0
-) -> Tensor:
+def finger_grasps(left_force: Array, right_force: Array, closing_axis: Array, *, max_angle_deg: float = 85.0) -> Array:
     """Which objects both fingers press on, each along its own opening direction.
 
     The rule of ManiSkill's ``Panda.is_grasping``: the force on each finger is at least ``MIN_GRASP_FORCE`` and within
@@ -73,14 +103,17 @@ def finger_grasps(
     Returns:
         (N, K) bool.
     """
-    forces = torch.stack([left_force, -right_force])
-    size = torch.linalg.vector_norm(forces, dim=-1)
-    along = (forces * closing_axis[:, None]).sum(-1)
-    aligned = along >= math.cos(math.radians(max_angle_deg)) * size
-    return ((size >= MIN_GRASP_FORCE) & aligned).all(dim=0)
+    opening = closing_axis[:, None]
+    return _presses(left_force, opening, max_angle_deg) & _presses(right_force, -opening, max_angle_deg)
 
 
-def touched(forces: Tensor, *, min_force: float = 1e-3) -> Tensor:
+def _presses(force: Array, opening: Array, max_angle_deg: float) -> Array:
+    size = length(force)
+    aligned = (force * opening).sum(-1) >= math.cos(math.radians(max_angle_deg)) * size
+    return (size >= MIN_GRASP_FORCE) & aligned
+
+
+def touched(forces: Array, *, min_force: float = 1e-3) -> Array:
     """Which objects any of the gripper's bodies touches.
 
     Args:
@@ -90,10 +123,10 @@ def touched(forces: Tensor, *, min_force: float = 1e-3) -> Tensor:
     Returns:
         (N, K) bool.
     """
-    return (torch.linalg.vector_norm(forces, dim=-1) >= min_force).any(dim=1)
+    return (length(forces) >= min_force).any(1)
 
 
-def lifted(height: Tensor, rest_height: Tensor, grasped: Tensor, *, by: float = 0.03) -> Tensor:
+def lifted(height: Array, rest_height: Array, grasped: Array, *, by: float = 0.03) -> Array:
     """Which objects the gripper holds at least ``by`` metres above where they rested (upstream: 0.03 m).
 
     Args:
@@ -106,35 +139,33 @@ def lifted(height: Tensor, rest_height: Tensor, grasped: Tensor, *, by: float = 
 
 
 def at_rest(
-    linear_velocity: Tensor, angular_velocity: Tensor, *, max_linear: float = 0.03, max_angular: float = 0.5
-) -> Tensor:
+    linear_velocity: Array, angular_velocity: Array, *, max_linear: float = 0.03, max_angular: float = 0.5
+) -> Array:
     """(N,) whether bodies with velocities (N, 3) in m/s and rad/s have come to rest."""
-    return (torch.linalg.vector_norm(linear_velocity, dim=-1) <= max_linear) & (
-        torch.linalg.vector_norm(angular_velocity, dim=-1) <= max_angular
-    )
+    return (length(linear_velocity) <= max_linear) & (length(angular_velocity) <= max_angular)
 
 
 def stands(
-    position: Tensor,
-    quaternion: Tensor,
-    position_before: Tensor,
-    quaternion_before: Tensor,
+    position: Array,
+    quaternion: Array,
+    position_before: Array,
+    quaternion_before: Array,
     *,
     max_shift: float = 0.1,
     max_tilt_deg: float = 20.0,
-) -> Tensor:
+) -> Array:
     """(N,) whether a body still stands where it stood: moved and tilted no more than upstream allows a basket."""
-    shift = torch.linalg.vector_norm(position - position_before, dim=-1)
+    shift = length(position - position_before)
     upright = (upward(quaternion) * upward(quaternion_before)).sum(-1)  # cosine of the tilt
     return (shift <= max_shift) & (upright >= math.cos(math.radians(max_tilt_deg)))
 
 
-def of_target(values: Tensor, target: Tensor) -> Tensor:
+def of_target(values: Array, target: Array) -> Array:
     """Pick the target's entry of per-object values: (N, K, ...) and (N,) indices -> (N, ...)."""
-    return values[torch.arange(len(target), device=values.device), target]
+    return values[count_up(len(target), values), target]
 
 
-def another_of_its_kind(marked: Tensor, kinds: Tensor, target: Tensor) -> Tensor:
+def another_of_its_kind(marked: Array, kinds: Array, target: Array) -> Array:
     """Whether an object of the target's kind, other than the target, is marked.
 
     Args:
@@ -145,20 +176,42 @@ def another_of_its_kind(marked: Tensor, kinds: Tensor, target: Tensor) -> Tensor
     Returns:
         (N,) bool.
     """
-    slots = torch.arange(kinds.shape[1], device=kinds.device)
+    slots = count_up(kinds.shape[1], kinds)
     alike = (kinds == of_target(kinds, target)[:, None]) & (slots != target[:, None])
-    return (marked & alike).any(dim=1)
+    return (marked & alike).any(1)
+
+
+def way_back(body: Array, part: Array, part_before: Array) -> tuple[Array, Array]:
+    """The motion that brings a part of a body, such as a drawer, back to where it was, in the world.
+
+    Args:
+        body: (N, 7) pose in the world.
+        part: (N, 7) the same of the part.
+        part_before: (4, 4) pose of the part in the body's frame, as it was.
+
+    Returns:
+        Rotation (N, 3, 3) and translation (N, 3), m, to be applied after it.
+    """
+    turned = rotation(body[:, 3:])
+    turn = turned @ part_before[:3, :3] @ rotation(part[:, 3:]).swapaxes(1, 2)
+    position = body[:, :3] + turned @ part_before[:3, 3]
+    return turn, position - (turn @ part[:, :3, None])[..., 0]
 
 
 def disturbed(
-    poses: Tensor, start: Tensor, undo: Tensor | None = None, *, max_shift: float = 0.03, max_tilt_deg: float = 30.0
-) -> Tensor:
+    poses: Array,
+    start: Array,
+    undo: tuple[Array, Array] | None = None,
+    *,
+    max_shift: float = 0.03,
+    max_tilt_deg: float = 30.0,
+) -> Array:
     """Which objects are no longer where they stood, or have fallen over.
 
     Args:
         poses: (N, K, 7) now: position, quaternion wxyz.
         start: (N, K, 7) as they stood.
-        undo: (N, 7) motion that brings what they stand on back to where it was; none: it can't move.
+        undo: `way_back` of what they stand on; none: it can't move.
         max_shift: m.
         max_tilt_deg: degrees.
 
@@ -167,8 +220,8 @@ def disturbed(
     """
     position, up = poses[..., :3], upward(poses[..., 3:])
     if undo is not None:
-        turn = undo[:, None, 3:]
-        position, up = undo[:, None, :3] + rotate(turn, position), rotate(turn, up)
+        turn, shift = undo
+        position, up = shift[:, None] + position @ turn.swapaxes(1, 2), up @ turn.swapaxes(1, 2)
     upright = (up * upward(start[..., 3:])).sum(-1)  # cosine of the tilt
-    shift = torch.linalg.vector_norm(position - start[..., :3], dim=-1)
+    shift = length(position - start[..., :3])
     return (shift > max_shift) | (upright < math.cos(math.radians(max_tilt_deg)))

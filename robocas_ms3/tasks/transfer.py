@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import and_
 from typing import Any, ClassVar, cast
 
 import numpy as np
-import sapien
 import torch
-from mani_skill.utils.structs import Articulation, Pose
+from mani_skill.utils.structs import Articulation
 
+from robocas_ms3.arrays import as_tensor, count_up, native
 from robocas_ms3.assets.manifest import BODY
 from robocas_ms3.config.relations import Relation
 from robocas_ms3.language.instructions import Instruction, choose_instruction, part_name
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses
-from robocas_ms3.tasks.remembered import Remembered
 
 _LANGUAGE = 100  # stream of an episode's seed; those of layouts are in scenes/sample.py
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
@@ -34,15 +35,18 @@ class TransferEnv(RoboCASEnv):
 
     STAGES: ClassVar[tuple[str, ...]] = STAGES
 
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        shut = self.model.support_motion(opened=False)
+        self._support_shut = torch.as_tensor(shut, dtype=torch.float32, device=self.device)
+
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
         if not hasattr(self, "_reached"):
             self._reached = torch.zeros(len(self.STAGES), self.num_envs, dtype=torch.bool, device=self.device)
             self._stages = dict(zip(self.STAGES, self._reached, strict=True))  # views
         self._reached[:, env_idx] = False
-        # most of the time nothing moves; what is remembered holds for an episode, as where it began counts too
-        self._measured, self._undo = Remembered(self._measure), Remembered(self._undo_of)
-        self._count_disturbed = Remembered(self._disturbed_of)
+        self._last: tuple[object, dict[str, torch.Tensor]] | None = None
         said = {env: self._instruct(env) for env in env_idx.tolist()}
         kept = getattr(self, "instructions", [])
         self.instructions = [said[env] if env in said else kept[env] for env in range(self.num_envs)]
@@ -64,71 +68,93 @@ class TransferEnv(RoboCASEnv):
             synonyms=config.language.synonyms,
         )
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
-        """Stages and success of each env, (N,) bool each; ``disturbed`` (N,) int."""
-        # right after a reset the engine still tells the contacts of before
-        forces = self.gripper_forces() * (self.elapsed_steps > 0)[:, None, None, None]
-        grasped, objects = self.grasped(forces), self.object_states
-        self.target_held = terms.of_target(grasped, self.target_slot)
-        now, holds = self._measured(forces, grasped, objects, self.basket_pose)
-        now = {**now, **self.task_stages()}
-        self._reached |= torch.stack([now.get(stage, reached) for stage, reached in self._stages.items()])
-        stages = dict(zip(self.STAGES, self._reached.clone(), strict=True))
-        success = self._stages["target_lifted"] & holds
-        return {**stages, "success": success, "disturbed": self._disturbed(objects[..., :7])}
+    def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
+        """Set the state; see `RoboCASEnv`."""
+        super().set_state_dict(state, env_idx)
+        self._last = None
 
-    def _measure(
-        self, forces: torch.Tensor, grasped: torch.Tensor, objects: torch.Tensor, basket: torch.Tensor
-    ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """The stages all tasks share, as of this moment, and whether all of `target_measures` hold: (N,) bool each."""
-        touched = terms.touched(forces)
-        lifted = terms.lifted(objects[..., 2], self.start_poses[..., 2], grasped)
-        measures = self.target_measures(touched, objects, basket)
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Stages and success of each env, (N,) bool each; ``disturbed`` (N,) int. Don't write to them."""
+        state = self.bodies.read()
+        forces = self._gripper_contacts.forces(self.bodies.others)
+        found_by = self._known_by(forces)
+        if self._last is not None and found_by is not None and self._last[0] == found_by:
+            return dict(self._last[1])
+        # right after a reset the engine still tells the contacts of before
+        forces = forces * native(self.elapsed_steps > 0)[:, None, None, None]
+        found = self._evaluated(forces, native(self._objects_in(state)), native(self._basket_in(state)))
+        self._last = self._known_by(forces), found
+        return dict(found)
+
+    def _known_by(self, forces: Any) -> object:
+        """What decides the next evaluation on a CPU while nothing touches the gripper; None: not to be known."""
+        others = self.bodies.others
+        return None if others is None or forces.any() else (others, native(self._reached).tobytes())
+
+    def _evaluated(self, forces: Any, objects: Any, basket: Any) -> dict[str, torch.Tensor]:
+        """`evaluate` from forces (N, 3, K, 3), states (N, K, 13) and the basket's pose (N, 7), all native."""
+        slot = native(self.target_slot)
+        grasped, touched = self._grasped_by(forces), terms.touched(forces)
+        lifted = terms.lifted(objects[..., 2], native(self.start_poses)[..., 2], grasped)
+        measures = self._target_measures(touched, objects, basket)
+        held = terms.of_target(grasped, slot)
         now = {
-            "reached_any": touched.any(dim=1),
-            "picked_any": lifted.any(dim=1),
-            "reached_target": terms.of_target(touched, self.target_slot),
-            "target_grasped": terms.of_target(grasped, self.target_slot),
-            "target_lifted": terms.of_target(lifted, self.target_slot),
+            "reached_any": touched.any(1),
+            "picked_any": lifted.any(1),
+            "reached_target": terms.of_target(touched, slot),
+            "target_grasped": held,
+            "target_lifted": terms.of_target(lifted, slot),
             "target_in_basket": measures["in_basket"],
+            **self._task_stages(objects, held),
         }
-        return now, torch.stack(list(measures.values())).all(dim=0)
+        reached = native(self._reached)
+        for row, stage in enumerate(self.STAGES):
+            if stage in now:
+                reached[row] |= now[stage]
+        success = native(self._stages["target_lifted"]) & reduce(and_, measures.values())
+        stages = dict(zip(self.STAGES, self._reached.clone(), strict=True))
+        disturbed = self._disturbed(objects[..., :7])
+        return {**stages, "success": as_tensor(success), "disturbed": as_tensor(disturbed)}
 
     def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """(N,) float32: 1 where the task has succeeded at this moment, else 0."""
         return info["success"].float()
 
     def task_stages(self) -> dict[str, torch.Tensor]:
-        """What a task adds to the stages: (N,) bool each, of this moment; ``target_held`` (N,) is known then."""
+        """What a task adds to the stages: (N,) bool each, of this moment."""
+        held = terms.of_target(native(self.grasped()), native(self.target_slot))
+        found = self._task_stages(native(self.object_states), held)
+        return {name: as_tensor(stage) for name, stage in found.items()}
+
+    def _task_stages(self, objects: Any, held: Any) -> dict[str, Any]:
+        """`task_stages`, native (`arrays`), from states (N, K, 13) and whether the target is held (N,)."""
         return {}
 
-    def target_measures(
-        self,
-        touched: torch.Tensor | None = None,
-        objects: torch.Tensor | None = None,
-        basket: torch.Tensor | None = None,
-    ) -> dict[str, torch.Tensor]:
-        """What has to hold at the same moment for success, besides the target having been lifted: (N,) bool each.
+    def target_measures(self) -> dict[str, torch.Tensor]:
+        """What has to hold at the same moment for success, besides the target having been lifted: (N,) bool each."""
+        touched = terms.touched(self._gripper_contacts.forces())
+        found = self._target_measures(touched, native(self.object_states), native(self.basket_pose))
+        return {name: as_tensor(measure) for name, measure in found.items()}
+
+    def _target_measures(self, touched: Any, objects: Any, basket: Any) -> dict[str, Any]:
+        """`target_measures`, native (`arrays`).
 
         Args:
-            touched: (N, K) bool, which objects the gripper touches, if that is known already.
-            objects: (N, K, 13) their states, likewise.
-            basket: (N, 7) its pose, likewise.
+            touched: (N, K) bool, which objects the gripper touches.
+            objects: (N, K, 13) their states.
+            basket: (N, 7) its pose in the world.
         """
-        touched = terms.touched(self.gripper_forces()) if touched is None else touched
-        objects = self.object_states if objects is None else objects
-        basket = self.basket_pose if basket is None else basket
-        start, slot = self.basket_at_start, self.target_slot
-        target, center = terms.of_target(objects, slot), terms.of_target(self._centers_of_mass, slot)
+        start, slot = native(self.basket_at_start), native(self.target_slot)
+        target, center = terms.of_target(objects, slot), terms.of_target(native(self._centers_of_mass), slot)
         return {
-            "in_basket": self.in_basket(target[:, :7], center, basket),
+            "in_basket": self._in_basket(target[:, :7], center, basket),
             "untouched": ~terms.of_target(touched, slot),
             "at_rest": terms.at_rest(target[:, 7:10], target[:, 10:]),
             "basket_stands": terms.stands(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:]),
         }
 
-    def in_basket(self, poses: torch.Tensor, centers_of_mass: torch.Tensor, basket: torch.Tensor) -> torch.Tensor:
-        """(N,) or (N, K) bool: whose centre of mass is in the basket's inner volume.
+    def _in_basket(self, poses: Any, centers_of_mass: Any, basket: Any) -> Any:
+        """(N,) or (N, K) bool: whose centre of mass is in the basket's inner volume; all native (`arrays`).
 
         Args:
             poses: (N, 7) or (N, K, 7) of objects in the world.
@@ -136,25 +162,19 @@ class TransferEnv(RoboCASEnv):
             basket: (N, 7) pose in the world.
         """
         centers = poses[..., :3] + terms.rotate(poses[..., 3:], centers_of_mass)
-        return terms.inside_box(centers, basket[:, :3], basket[:, 3:], self._basket_low, self._basket_high)
+        low, high = native(self._basket_low), native(self._basket_high)
+        return terms.inside_box(centers, basket[:, :3], basket[:, 3:], low, high)
 
-    def _disturbed(self, poses: torch.Tensor) -> torch.Tensor:
+    def _disturbed(self, poses: Any) -> Any:
         """(N,) how many objects other than the target no longer stand as they stood, from poses (N, K, 7)."""
-        support = self.fixtures.furniture[self.task_config.surface.furniture]
+        support, undo = self.fixtures.furniture[self.task_config.surface.furniture], None
         if isinstance(support, Articulation) and self.model.support_link:
             links = [support.links_map[name] for name in (BODY, self.model.support_link)]
-            return self._count_disturbed(poses, self._undo(link_poses(self.scene, links))).clone()
-        return self._count_disturbed(poses).clone()
-
-    def _disturbed_of(self, poses: torch.Tensor, undo: torch.Tensor | None = None) -> torch.Tensor:
-        moved = terms.disturbed(poses, self.start_poses, undo) & self.present
-        slots = torch.arange(moved.shape[1], device=self.device)
-        return (moved & (slots != self.target_slot[:, None])).sum(dim=1)
-
-    def _undo_of(self, links: torch.Tensor) -> torch.Tensor:
-        """(N, 7) motion that brings the part that objects stand on back, from the poses of body and part (N, 2, 7)."""
-        before = Pose.create(sapien.Pose(self.model.support_motion(opened=False)), device=self.device)
-        return (Pose.create(links[:, 0]) * before * Pose.create(links[:, 1]).inv()).raw_pose
+            body, part = native(link_poses(self.scene, links)).swapaxes(0, 1)
+            undo = terms.way_back(body, part, native(self._support_shut))
+        moved = terms.disturbed(poses, native(self.start_poses), undo) & native(self.present)
+        slots = count_up(moved.shape[1], moved)
+        return (moved & (slots != native(self.target_slot)[:, None])).sum(1)
 
     def get_language_instruction(self) -> list[str]:
         """The instruction of each env."""

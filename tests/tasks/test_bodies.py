@@ -13,7 +13,6 @@ import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.robots.constants import ARM_REST
 from robocas_ms3.tasks.bodies import Bodies, link_poses
-from robocas_ms3.tasks.remembered import Remembered
 
 pytestmark = pytest.mark.slow
 
@@ -73,6 +72,21 @@ def test_a_read_is_never_out_of_date(env):
     assert torch.equal(base.bodies.read(), maniskills(base))
 
 
+def test_others_stay_the_same_while_only_the_robot_moves(env):
+    base = env.unwrapped
+    robot, before = base.agent.robot, base.bodies.read()
+    others = base.bodies.others
+    robot.set_qpos(robot.get_qpos() + 0.02)
+    robot.set_pose(sapien.Pose([0.1, 0.2, 0.3]))
+    assert not torch.equal(base.bodies.read(), before)
+    assert base.bodies.others == others
+    for _, moved in zip(range(6), set_everything(base), strict=False):
+        assert moved is None
+        base.bodies.read()
+        assert base.bodies.others != others
+        others = base.bodies.others
+
+
 def test_a_state_dict_is_maniskills(env):
     base = env.unwrapped
     ours, theirs = base.get_state_dict(), base.scene.get_sim_state()
@@ -102,15 +116,4 @@ def test_another_layout_of_packed_states_is_an_error(env, monkeypatch):
     )
     monkeypatch.setattr(scene, "px", system)
     with pytest.raises(RobocasError, match="packs states otherwise"):
-        Bodies(scene)
-
-
-def test_a_measure_is_taken_again_when_its_tensors_change_in_place_too():
-    taken = []
-    total = Remembered(lambda *of: taken.append(1) or sum(t.sum() for t in of))
-    values, more = torch.tensor([1.0, 2.0]), torch.tensor([4.0])
-    assert total(values, more) == 7 and total(values.clone(), more) == 7
-    assert len(taken) == 1
-    values[0] = 2.0
-    assert total(values, more) == 8
-    assert len(taken) == 2
+        Bodies(scene, env.unwrapped.agent.robot)

@@ -8,6 +8,7 @@ from mani_skill.utils.structs import Pose
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.errors import ConfigError
+from robocas_ms3.tasks.contacts import Contacts
 from robocas_ms3.tasks.transfer import STAGES
 
 STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}
@@ -86,8 +87,8 @@ def test_stages_are_sticky_until_the_next_reset(env):
 def test_a_reset_forgets_the_contacts_of_before(env, monkeypatch):
     """Until the first step the engine tells the contacts of the last episode, where nothing is built anew."""
     base = env.unwrapped
-    forces = torch.full((1, 3, len(base.objects), 3), 5.0)
-    monkeypatch.setattr(base, "gripper_forces", lambda: forces)
+    forces = np.full((1, 3, len(base.objects), 3), 5.0, np.float32)
+    monkeypatch.setattr(Contacts, "forces", lambda *_: forces)
     _, info = env.reset(seed=0)
     assert not any(bool(info[stage][0]) for stage in STAGES)
     assert settle(env, 1)["reached_target"]

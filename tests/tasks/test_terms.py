@@ -1,116 +1,162 @@
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
+from robocas_ms3 import arrays
 from robocas_ms3.tasks import terms
 
 YAW_90 = [math.sqrt(0.5), 0, 0, math.sqrt(0.5)]
 UPRIGHT = [1.0, 0, 0, 0]
 
 
-def test_rotate_turns_x_to_y_and_back():
-    q = torch.tensor([YAW_90, YAW_90])
-    x, y = torch.tensor([[1.0, 0, 0]] * 2), torch.tensor([[0.0, 1, 0]] * 2)
-    assert torch.allclose(terms.rotate(q, x), y, atol=1e-6)
-    assert torch.allclose(terms.rotate_inverse(q, y), x, atol=1e-6)
+@pytest.fixture(params=["torch", "numpy"])
+def make(request):
+    """Arrays of both kinds that terms take, as they lie on a GPU and on a CPU: float32, or bool, or int64."""
+
+    def as_kind(values):
+        tensor = torch.as_tensor(values)
+        return tensor if request.param == "torch" else tensor.numpy()
+
+    return as_kind
 
 
-def test_inside_box_follows_the_frame():
+def test_rotations_are_scipys(make):
+    found = Rotation.random(5, random_state=0)
+    quaternions = make(found.as_quat()[:, [3, 0, 1, 2]].astype("float32").reshape(1, 5, 4))
+    assert abs(np.asarray(terms.rotation(quaternions))[0] - found.as_matrix()).max() < 1e-6
+
+
+def test_arrays_of_a_cpu_are_numpys_and_share_memory():
+    tensor = torch.zeros(2)
+    arrays.native(tensor)[1] = 3.0
+    assert tensor.tolist() == [0, 3]
+    assert arrays.as_tensor(tensor) is tensor
+    arrays.as_tensor(arrays.native(tensor))[0] = 1.0
+    assert tensor.tolist() == [1, 3]
+
+
+def test_rotate_turns_x_to_y_and_back(make):
+    q = make([YAW_90, YAW_90])
+    x, y = make([[1.0, 0, 0]] * 2), make([[0.0, 1, 0]] * 2)
+    assert abs(terms.rotate(q, x) - y).max() < 1e-6
+    assert abs(terms.rotate_inverse(q, y) - x).max() < 1e-6
+
+
+def test_inside_box_follows_the_frame(make):
     # a box long in its own x, at (1, 0, 0); the second env has it turned by 90 degrees
-    low, high = torch.tensor([-0.2, -0.1, 0.0]), torch.tensor([0.2, 0.1, 0.3])
-    points = torch.tensor([[1.15, 0, 0.1], [1.15, 0, 0.1], [1.0, 0.15, 0.1], [1.0, 0, -0.01]])
-    position = torch.tensor([[1.0, 0, 0]] * 4)
-    quaternion = torch.tensor([UPRIGHT, YAW_90, YAW_90, UPRIGHT])
+    low, high = make([-0.2, -0.1, 0.0]), make([0.2, 0.1, 0.3])
+    points = make([[1.15, 0, 0.1], [1.15, 0, 0.1], [1.0, 0.15, 0.1], [1.0, 0, -0.01]])
+    position = make([[1.0, 0, 0]] * 4)
+    quaternion = make([UPRIGHT, YAW_90, YAW_90, UPRIGHT])
     assert terms.inside_box(points, position, quaternion, low, high).tolist() == [True, False, True, False]
 
 
-def test_inside_box_of_several_objects_an_env():
-    low, high = torch.tensor([-0.2, -0.1, 0.0]), torch.tensor([0.2, 0.1, 0.3])
-    points = torch.tensor([[[1.15, 0, 0.1], [1.0, 0.15, 0.1], [0.85, 0.05, 0.2]]] * 2)
-    position, quaternion = torch.tensor([[1.0, 0, 0]] * 2), torch.tensor([UPRIGHT, YAW_90])
+def test_inside_box_of_several_objects_an_env(make):
+    low, high = make([-0.2, -0.1, 0.0]), make([0.2, 0.1, 0.3])
+    points = make([[[1.15, 0, 0.1], [1.0, 0.15, 0.1], [0.85, 0.05, 0.2]]] * 2)
+    position, quaternion = make([[1.0, 0, 0]] * 2), make([UPRIGHT, YAW_90])
     inside = terms.inside_box(points, position, quaternion, low, high)
     assert inside.tolist() == [[True, False, True], [False, True, False]]
 
 
-def test_another_of_its_kind_is_neither_the_target_nor_of_another_kind():
-    kinds = torch.tensor([[0, 0, 2, 2], [0, 1, 0, 1], [0, 0, 2, 2]])
-    marked = torch.tensor([[True, False, True, True], [False, True, True, False], [True, False, False, True]])
-    target = torch.tensor([0, 0, 1])
+def test_another_of_its_kind_is_neither_the_target_nor_of_another_kind(make):
+    kinds = make([[0, 0, 2, 2], [0, 1, 0, 1], [0, 0, 2, 2]])
+    marked = make([[True, False, True, True], [False, True, True, False], [True, False, False, True]])
+    target = make([0, 0, 1])
     assert terms.another_of_its_kind(marked, kinds, target).tolist() == [False, True, True]
 
 
-def test_finger_grasps_needs_both_fingers_pressed_apart():
-    closing = torch.tensor([[0.0, 1, 0]])
-    left = torch.tensor([[[0, 2.0, 0], [0, 2.0, 0], [0, 0.4, 0], [0, -2.0, 0]]])
-    right = torch.tensor([[[0, -2.0, 0], [0, 0.0, 0], [0, -2.0, 0], [0, 2.0, 0]]])
+def test_finger_grasps_needs_both_fingers_pressed_apart(make):
+    closing = make([[0.0, 1, 0]])
+    left = make([[[0, 2.0, 0], [0, 2.0, 0], [0, 0.4, 0], [0, -2.0, 0]]])
+    right = make([[[0, -2.0, 0], [0, 0.0, 0], [0, -2.0, 0], [0, 2.0, 0]]])
     # held; one finger only; too weak on the left; pulled inwards
     assert terms.finger_grasps(left, right, closing).tolist() == [[True, False, False, False]]
 
 
-def test_finger_grasps_refuses_a_force_across_the_closing_axis():
-    closing = torch.tensor([[0.0, 1, 0]])
-    across = torch.tensor([[[3.0, 0.1, 0]]])  # 88 degrees off
+def test_finger_grasps_refuses_a_force_across_the_closing_axis(make):
+    closing = make([[0.0, 1, 0]])
+    across = make([[[3.0, 0.1, 0]]])  # 88 degrees off
     assert not terms.finger_grasps(across, -across, closing).any()
     assert terms.finger_grasps(across, -across, closing, max_angle_deg=89).all()
 
 
-def test_pressed_asks_for_both_fingers_but_no_direction():
-    left = torch.tensor([[[0, 2.0, 0], [0, 2.0, 0], [0, -2.0, 0]]])
-    right = torch.tensor([[[3.0, 0, 0], [0, 0.4, 0], [0, 0.0, 0]]])
+def test_pressed_asks_for_both_fingers_but_no_direction(make):
+    left = make([[[0, 2.0, 0], [0, 2.0, 0], [0, -2.0, 0]]])
+    right = make([[[3.0, 0, 0], [0, 0.4, 0], [0, 0.0, 0]]])
     assert terms.pressed(left, right).tolist() == [[True, False, False]]
 
 
 @pytest.mark.parametrize(("degrees", "shift", "expected"), [(29.0, 0.0, False), (31.0, 0.0, True), (0.0, 0.031, True)])
-def test_disturbed_is_moved_or_fallen_over(degrees, shift, expected):
+def test_disturbed_is_moved_or_fallen_over(make, degrees, shift, expected):
     half = math.radians(degrees) / 2
-    start = torch.tensor([[[1.0, 2.0, 3.0, *UPRIGHT]]])
-    now = torch.tensor([[[1.0 + shift, 2.0, 3.0, math.cos(half), 0, math.sin(half), 0]]])
+    start = make([[[1.0, 2.0, 3.0, *UPRIGHT]]])
+    now = make([[[1.0 + shift, 2.0, 3.0, math.cos(half), 0, math.sin(half), 0]]])
     assert terms.disturbed(now, start).tolist() == [[expected]]
 
 
-def test_disturbed_goes_with_what_objects_stand_on():
-    start = torch.tensor([[[1.0, 0, 0, *UPRIGHT], [1.0, 0, 0, *UPRIGHT]]])
-    now = torch.tensor([[[0.0, 1.0, 0, *YAW_90], [1.0, 0, 0, *UPRIGHT]]])  # the first went along, the second did not
-    back = torch.tensor([[0.0, 0, 0, YAW_90[0], 0, 0, -YAW_90[3]]])
+def test_disturbed_goes_with_what_objects_stand_on(make):
+    start = make([[[1.0, 0, 0, *UPRIGHT], [1.0, 0, 0, *UPRIGHT]]])
+    now = make([[[0.0, 1.0, 0, *YAW_90], [1.0, 0, 0, *UPRIGHT]]])  # the first went along, the second did not
+    back = make([[[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]]), make([[0.0, 0, 0]])
     assert terms.disturbed(now, start, back).tolist() == [[False, True]]
 
 
-def test_touched_is_any_body():
+def test_a_drawer_is_brought_back(make):
+    # a cabinet at (1, 2, 0), facing y; its drawer was 0.5 m along the cabinet's own x, and is out by another 0.2 m
+    body, part = make([[1.0, 2, 0, *YAW_90]]), make([[1.0, 2.7, 0, *YAW_90]])
+    before = make([[1.0, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    turn, shift = terms.way_back(body, part, before)
+    assert abs(turn[0] - make([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])).max() < 1e-6
+    assert abs(shift[0] - make([0.0, -0.2, 0])).max() < 1e-6
+    # a door at the origin that has turned by 90 degrees about its hinge at (1, 0, 0)
+    turn, shift = terms.way_back(make([[0.0, 0, 0, *UPRIGHT]]), make([[1.0, 0, 0, *YAW_90]]), make(hinge_at_1()))
+    on_the_door = turn[0] @ make([1.0, 0.4, 0]) + shift[0]
+    assert abs(on_the_door - make([1.4, 0, 0])).max() < 1e-6
+
+
+def hinge_at_1() -> list[list[float]]:
+    return [[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+def test_touched_is_any_body(make):
     forces = torch.zeros(2, 3, 4, 3)
     forces[0, 2, 1, 0] = 0.5
     forces[1, 0, 3, 2] = 1e-4  # noise
-    assert terms.touched(forces).tolist() == [[False, True, False, False], [False] * 4]
+    assert terms.touched(make(forces)).tolist() == [[False, True, False, False], [False] * 4]
 
 
-def test_lifted_needs_height_and_grasp():
-    height, rest = torch.tensor([[0.65, 0.65, 0.62]]), torch.tensor([[0.61, 0.61, 0.61]])
-    assert terms.lifted(height, rest, torch.tensor([[True, False, True]])).tolist() == [[True, False, False]]
+def test_lifted_needs_height_and_grasp(make):
+    height, rest = make([[0.65, 0.65, 0.62]]), make([[0.61, 0.61, 0.61]])
+    assert terms.lifted(height, rest, make([[True, False, True]])).tolist() == [[True, False, False]]
 
 
-def test_at_rest_limits_both_velocities():
-    linear = torch.tensor([[0.02, 0, 0], [0.04, 0, 0], [0, 0, 0]])
-    angular = torch.tensor([[0.1, 0, 0], [0, 0, 0], [0, 0, 0.6]])
+def test_at_rest_limits_both_velocities(make):
+    linear = make([[0.02, 0, 0], [0.04, 0, 0], [0, 0, 0]])
+    angular = make([[0.1, 0, 0], [0, 0, 0], [0, 0, 0.6]])
     assert terms.at_rest(linear, angular).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("degrees", [0.0, 19.9, 20.1, 90.0, 180.0])
-def test_basket_stands_up_to_20_degrees(degrees):
+def test_basket_stands_up_to_20_degrees(make, degrees):
     half = math.radians(degrees) / 2
-    tilted = torch.tensor([[math.cos(half), math.sin(half), 0, 0]])
-    upright, origin = torch.tensor([UPRIGHT]), torch.zeros(1, 3)
+    tilted = make([[math.cos(half), math.sin(half), 0, 0]])
+    upright, origin = make([UPRIGHT]), make([[0.0, 0, 0]])
     # tilted about x, the vertical axis leans towards -y
     lean = [0, -math.sin(2 * half), math.cos(2 * half)]
     assert terms.upward(tilted)[0].tolist() == pytest.approx(lean, abs=1e-6)
     assert terms.stands(origin, tilted, origin, upright).item() is (degrees <= 20)
 
 
-def test_basket_stands_up_to_10_cm_and_may_turn():
-    upright, turned = torch.tensor([UPRIGHT]), torch.tensor([YAW_90])
-    assert terms.stands(torch.tensor([[0.06, 0.06, 0]]), turned, torch.zeros(1, 3), upright).all()
-    assert not terms.stands(torch.tensor([[0.08, 0.08, 0]]), upright, torch.zeros(1, 3), upright).any()
+def test_basket_stands_up_to_10_cm_and_may_turn(make):
+    upright, turned = make([UPRIGHT]), make([YAW_90])
+    assert terms.stands(make([[0.06, 0.06, 0]]), turned, make([[0.0, 0, 0]]), upright).all()
+    assert not terms.stands(make([[0.08, 0.08, 0]]), upright, make([[0.0, 0, 0]]), upright).any()
 
 
-def test_of_target_picks_one_slot_per_env():
-    values = torch.arange(6).reshape(2, 3)
-    assert terms.of_target(values, torch.tensor([2, 0])).tolist() == [2, 3]
+def test_of_target_picks_one_slot_per_env(make):
+    values = make([[0, 1, 2], [3, 4, 5]])
+    assert terms.of_target(values, make([2, 0])).tolist() == [2, 3]

@@ -1,0 +1,49 @@
+"""Batched arrays: tensors on a GPU, NumPy's on a CPU, where small operations of theirs cost a third."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Array = TypeVar("Array", Tensor, NDArray[Any])
+
+
+def native(tensor: Tensor) -> Any:
+    """A tensor as the kind of array that is fast where it lies: on a CPU NumPy's, which shares its memory."""
+    return tensor if tensor.is_cuda else tensor.numpy()
+
+
+def as_tensor(array: Any) -> Tensor:
+    """An array as a tensor, which shares its memory."""
+    return array if isinstance(array, Tensor) else torch.from_numpy(array)
+
+
+def choose(condition: Array, yes: Array, no: Array) -> Array:
+    """``yes`` where the condition holds, ``no`` elsewhere."""
+    return torch.where(condition, yes, no) if isinstance(condition, Tensor) else np.where(condition, yes, no)
+
+
+def clamp(values: Array, low: Any, high: Any) -> Array:
+    """Values within limits, which are numbers or arrays of the same kind."""
+    if isinstance(values, Tensor):
+        return values.clamp(low, high)
+    return np.minimum(np.maximum(values, low), high)  # `np.clip` takes three times as long
+
+
+def join(arrays: list[Array]) -> Array:
+    """Arrays as one, along their last axis."""
+    return torch.cat(arrays, dim=-1) if isinstance(arrays[0], Tensor) else np.concatenate(arrays, axis=-1)
+
+
+def length(vectors: Array) -> Array:
+    """(...) lengths of vectors (..., D)."""
+    return (vectors * vectors).sum(-1) ** 0.5
+
+
+def count_up(count: int, like: Array) -> Array:
+    """(count,) whole numbers from 0 on, of the kind and where ``like`` is."""
+    return torch.arange(count, device=like.device) if isinstance(like, Tensor) else np.arange(count)

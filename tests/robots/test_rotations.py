@@ -1,0 +1,46 @@
+"""Rotations of NumPy's arrays are those of ManiSkill's tensors, to the last bit or two."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from robocas_ms3.robots import rotations
+
+same = partial(np.testing.assert_allclose, rtol=0, atol=2.5e-7)  # two units in the last place of 1
+
+
+def batch(seed: int, columns: int, count: int = 3000) -> np.ndarray:
+    """Numbers of many sizes, large, small and zero."""
+    rng = np.random.default_rng(seed)
+    values = rng.uniform(-1, 1, (count, columns)) * 10 ** rng.uniform(-4, 0.5, (count, 1))
+    values[: count // 10] = 0
+    return values.astype(np.float32)
+
+
+def unit(values: np.ndarray) -> np.ndarray:
+    lengths = np.linalg.norm(values, axis=1, keepdims=True)
+    return np.where(lengths > 0, values / np.maximum(lengths, 1e-12), [1, 0, 0, 0]).astype(np.float32)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.15])
+def test_quaternions_of_euler_angles_are_maniskills(scale):
+    angles = batch(0, 3) * np.float32(scale)
+    each = [rotations.from_euler(torch.from_numpy(row[None])) for row in angles]
+    same(rotations.from_euler(angles), torch.cat(each))
+
+
+def test_products_and_turned_vectors_are_maniskills():
+    first, second, vectors = unit(batch(1, 4)), unit(batch(2, 4)), batch(3, 3)
+    tensors = [torch.from_numpy(array) for array in (first, second, vectors)]
+    same(rotations.multiply(first, second), rotations.multiply(tensors[0], tensors[1]))
+    same(rotations.turn(first, vectors), rotations.turn(tensors[0], tensors[2]))
+
+
+def test_a_quarter_turn_about_x_then_the_new_z():
+    half = np.sqrt(0.5)
+    found = rotations.from_euler(np.array([[np.pi / 2, 0, np.pi / 2]], np.float32))[0]
+    assert found == pytest.approx([0.5, 0.5, -0.5, 0.5], abs=1e-6)
+    y = rotations.turn(np.array([[half, half, 0, 0]], np.float32), np.array([[0, 1, 0]], np.float32))
+    assert y[0] == pytest.approx([0, 0, 1], abs=1e-6)
