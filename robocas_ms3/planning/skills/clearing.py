@@ -79,9 +79,14 @@ class Heap:
         return hidden_share(self.arm, self.target) <= MAX_HIDDEN_SHARE
 
     @property
+    def uncovered(self) -> bool:
+        """Whether the target is free, by the paper's rule, as seen from straight above."""
+        return bool(self.clutter().cleared[0])
+
+    @property
     def cleared(self) -> bool:
-        """Whether the target is free, by the paper's rule."""
-        return bool(self.clutter().cleared[0]) and self.visible
+        """Whether it is, and the gripper's camera sees it."""
+        return self.uncovered and self.visible
 
     def moves(self) -> Iterator[Move]:
         """Ways to make room, those first that promise most: of the highest obstacles, then of what blocks grasps.

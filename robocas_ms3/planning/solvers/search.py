@@ -50,7 +50,8 @@ def attempt(arm: Arm) -> None:
                 raise
             break
         arm.executor.rehearse()
-        look_at(arm, heap.middle(slot), NEAR)
+        if heap.uncovered:
+            look_at(arm, heap.middle(slot), NEAR)
     arm.executor.rehearse()
     arm.executor.label(**subgoal("transfer object", *words))
     carry_to_basket(arm, slot)
