@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-Array = TypeVar("Array", Tensor, NDArray[Any])
+# `Tensor` or `NDArray`, all of a call of the same kind; type checkers can't follow that through operators
+Array: TypeAlias = Any
 
 
 def native(tensor: Tensor) -> Any:

@@ -129,6 +129,9 @@ class DirectDrives(PDJointPosController):
     These would take longer than the physics.
     """
 
+    action_space_low: Any
+    action_space_high: Any
+
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
         self._drives: list[PhysxArticulationJoint] = [joint._objs[0] for joint in self.joints]
