@@ -6,7 +6,6 @@ import pytest
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import load_task_config
 from robocas_ms3.errors import LayoutError
-from robocas_ms3.scenes.bank import about
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import planar_pose
 from robocas_ms3.scenes.sample import sample_layout
@@ -84,12 +83,6 @@ def test_what_nothing_moves_stays_and_draws_nothing():
     assert place_robot(scene, rng) is scene.robot_pose
     assert place_basket(scene, scene.robot_pose, rng) is scene.basket_pose
     assert rng.uniform() == np.random.default_rng(0).uniform()
-
-
-def test_only_banks_of_what_is_moved_were_wrong():
-    plain, moved = about(model()), [about(model(**{what: {}})) for what in ("robot", "basket")]
-    assert plain["layout_format"] == about(model(count=[2, 3]))["layout_format"] == 6
-    assert {one["layout_format"] for one in moved} == {7}
 
 
 def test_the_robots_body_is_low_and_wide_high_and_narrow_and_above_the_floor():
