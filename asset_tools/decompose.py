@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 GPU_LIMIT = 64  # vertices, and faces, of a hull on a GPU; PhysX cuts off what is more
 MAX_VERTICES = 34  # they make 64 triangles; more only where enough of them share flat faces
 UNFELT = 0.0007  # m: PhysX drops vertices that lie less than this outside of the hull of others
+BEVEL, THIN = 0.001, 8  # m, and a share (1 / 8) of the thickness, that what is squared may measure
+FLAT, BROAD = 0.0001, 0.5  # m, and share of the extents, that make a face one that things stand on
 MAX_HULLS = 32
 WANTED_OVERLAP = 0.9  # the fewest hulls that reach it are taken
 THRESHOLDS = (0.2, 0.12, 0.08, 0.05)  # CoACD's concavity, coarse first
@@ -97,10 +99,12 @@ def volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
 def few_vertices(points: Array) -> Array:
     """Vertices of the convex hull of points, m, thinned to what the engine keeps: same volume, most of its shape.
 
-    Beginning with a few extreme ones, the vertex farthest outside of the hull so far is added, again and again, until
-    none is felt: at most 34, or 64 where their hull has no more than 64 flat faces. What is left lies inside of the
-    hull, so that it is blown up a little to the hull's volume.
+    Bevels of up to a millimetre around broad faces across x, y or z are squared: the engine would keep a corner or two
+    of one, on which a bottle rocks. Then, beginning with a few extreme ones, the vertex farthest outside of the hull so
+    far is added, again and again, until none is felt: at most 34, or 64 where their hull has no more than 64 flat
+    faces. What is left lies inside of the hull, so that it is blown up a little to the hull's volume.
     """
+    points = _without_bevels(points)
     hull = ConvexHull(points)
     vertices = points[hull.vertices]
     if len(vertices) <= BOX:
@@ -123,6 +127,18 @@ def few_vertices(points: Array) -> Array:
     kept = vertices[chosen]
     center = kept.mean(axis=0)
     return center + (kept - center) * np.cbrt(hull.volume / ConvexHull(kept).volume)
+
+
+def _without_bevels(points: Array) -> Array:
+    """Points (P, 3) with those next to a broad face across x, y or z put into it."""
+    squared, extents = np.array(points), np.ptp(points, axis=0)
+    for axis in range(3):
+        for extreme in (points[:, axis].min(), points[:, axis].max()):
+            below = np.abs(points[:, axis] - extreme)
+            face = np.ptp(points[below <= FLAT], axis=0)
+            if np.delete(face >= BROAD * extents, axis).all():
+                squared[below <= min(BEVEL, extents[axis] / THIN), axis] = extreme
+    return squared
 
 
 def _outside(points: Array, corners: Array) -> Array:

@@ -132,11 +132,22 @@ def test_few_flat_faces_keep_their_vertices():
     assert sorted(few_vertices(column).round(9).tolist()) == sorted(column.round(9).tolist())
 
 
+def test_small_bevels_are_squared_and_large_ones_kept():
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    half = np.array([0.03, 0.04, 0.05])
+
+    def bevelled(by):
+        return np.concatenate([signs * (half - by * (np.arange(3) != axis)) for axis in range(3)])
+
+    box = few_vertices(bevelled(0.0009))
+    np.testing.assert_allclose(sorted(box.tolist()), sorted((signs * half).tolist()), atol=1e-12)
+    assert len(few_vertices(bevelled(0.004))) == 24
+
+
 def test_vertices_that_the_engine_would_drop_are_left_out():
     cube = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)])
     bumps = [[0.05, 0.05, 0.1006], [0.05, 0.05, -0.0006], [0.1006, 0.05, 0.05]]
-    kept = few_vertices(np.concatenate([cube, bumps]))
-    assert 8 <= len(kept) < 11
+    assert len(few_vertices(np.concatenate([cube, bumps]))) == 8
     higher = few_vertices(np.concatenate([cube, [[0.05, 0.05, 0.102]]]))
     assert len(higher) == 9
 
