@@ -40,6 +40,7 @@ SIMULATOR_FREE = (
     "planning.protocol",
     "language",
 )
+BARE_PHYSX = {"robocas_ms3.assets.physics", "robocas_ms3.assets.cooking"}  # without a renderer
 SIMULATORS = {"sapien", "mani_skill"}
 
 
@@ -148,7 +149,7 @@ def test_mesh_tools_know_only_the_lowest_layers():
         for name, _ in imports(module, path):
             if name.startswith("robocas_ms3"):
                 assert layer(name) in allowed, f"{module} imports {name}"
-                if layer(name) == "assets" and name != "robocas_ms3.assets.physics":  # bare PhysX, no renderer
+                if layer(name) == "assets" and name not in BARE_PHYSX:
                     assert not {n.split(".")[0] for n in reachable(name)} & SIMULATORS, f"{module} imports {name}"
 
 

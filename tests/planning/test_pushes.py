@@ -57,14 +57,12 @@ def test_extent_behind_is_the_reach_against_the_push_at_that_height():
     assert pushing.extent_behind(OBSTACLE, center, diagonal, 0.3) is None
 
 
-def test_a_swing_turns_the_first_direction_a_little():
-    angles = []
-    for seed in range(30):
-        rng = np.random.default_rng(seed)
-        first = next(pushing.candidates(rng, OBSTACLE, TARGET, NOTHING, (TABLE, HALF), NOTHING, swing_deg=20))
-        angles.append(np.rad2deg(np.arctan2(first.direction[1], first.direction[0])) - 90)  # the paper's: along y
-    assert -20 <= min(angles) < -10
-    assert 10 < max(angles) <= 20
+@pytest.mark.parametrize("turn", [30.0, -30.0, 0.0])
+def test_a_turn_is_off_the_papers_direction(turn):
+    rng = np.random.default_rng(0)
+    first = next(pushing.candidates(rng, OBSTACLE, TARGET, NOTHING, (TABLE, HALF), NOTHING, turn_deg=turn))
+    # the paper's is along y
+    assert np.rad2deg(np.arctan2(first.direction[1], first.direction[0])) == pytest.approx(90 + turn)
 
 
 def test_the_first_push_is_the_papers():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import torch
@@ -9,14 +11,16 @@ from mani_skill.utils.structs import Pose
 
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
 from robocas_ms3.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.planning.decisions import Straight
 from robocas_ms3.planning.executor import Executor
+from robocas_ms3.planning.protocol import Obstacle, Shape
 from robocas_ms3.planning.pushes import push_direction
-from robocas_ms3.planning.skills import pushing
+from robocas_ms3.planning.skills import clearing, pushing
 from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.clearing import Heap, Move
 from robocas_ms3.planning.skills.pushing import push_away
 from robocas_ms3.planning.skills.removing import remove
-from robocas_ms3.planning.solvers import search
-from robocas_ms3.planning.solvers.search import _Clearing
+from robocas_ms3.planning.solvers.search import tries
 from robocas_ms3.scenes.placement import transform
 
 pytestmark = pytest.mark.slow
@@ -33,8 +37,8 @@ def begin(generator, seed):
     """The arm at the start of an episode, and the heap's objects but the target, the highest first."""
     executor = Executor(generator.env, seed)
     executor.reset()
-    generator.planner.seed(seed)
-    arm = Arm(generator.planner, generator.reachability, executor, np.random.default_rng(seed))
+    executor.facts = {"pushes": 0, "removals": 0}
+    arm = Arm(generator.planner, generator.reachability, executor, Straight(lambda: len(executor.actions)))
     target = int(arm.env.target_slot[0])
     slots = [s for s in np.flatnonzero(arm.env.present[0].numpy()).tolist() if s != target]
     return arm, target, sorted(slots, key=lambda slot: -surface(arm, slot)[:, 2].max())
@@ -79,36 +83,65 @@ def test_a_push_moves_an_object_away_from_the_target(generator):
     assert np.abs(arm.env.gripper_forces()).max() == 0  # it has let go of everything
 
 
-def test_a_push_that_moves_nothing_is_none_but_counts_as_tried(generator, monkeypatch):
+def test_a_push_that_moves_nothing_is_none(generator, monkeypatch):
     arm, target, slots = begin(generator, 3)
-    clearing, facts = _Clearing(arm, target), arm.executor.facts
+    heap, facts = Heap(arm, target), arm.executor.facts
     pushed = arm.env.objects[slots[0]]
 
     def push(by):
-        def move(arm, slot, target):
+        def move(arm, slot, target, *, turn_deg):
+            assert turn_deg == 30
             pushed.set_pose(Pose.create_from_pq(pushed.pose.p + torch.tensor([[by, 0.0, 0.0]]), pushed.pose.q))
 
-        monkeypatch.setattr(search, "push_away", move)
-        clearing._use("pushes", slots[0])
+        monkeypatch.setattr(clearing, "push_away", move)
+        heap.make(Move("push", slots[0], 30))
 
-    push(0.015)
-    assert facts == {"pushes": 0, "pushes_in_vain": 1, "removals": 0}
+    with pytest.raises(PlanningFailed, match="in_vain"):
+        push(0.015)
+    assert facts == {"pushes": 0, "removals": 0}
     push(0.025)
-    assert facts == {"pushes": 1, "pushes_in_vain": 1, "removals": 0}
-    facts["pushes_in_vain"] = search.REMOVALS - 1
+    assert facts == {"pushes": 1, "removals": 0}
+    facts["removals"] = clearing.MOVES - 1
     with pytest.raises(EpisodeLost, match="too_many_obstacles"):
-        clearing.clear_one(slots)
+        next(heap.moves())
+
+
+def test_a_move_is_worth_what_it_leaves_to_do(generator, monkeypatch):
+    arm, target, slots = begin(generator, 3)
+    heap, work = Heap(arm, target), iter((31.0, 8.0))
+    monkeypatch.setattr(clearing, "push_away", lambda arm, slot, target, *, turn_deg: None)
+    monkeypatch.setattr(clearing, "MOVED", -1.0)
+    monkeypatch.setattr(Heap, "work_left", lambda self: next(work))
+    assert heap.make(Move("push", slots[0])) == pytest.approx(-31.0, abs=1e-6)  # nothing moved, no time was spent
+    assert heap.make(Move("push", slots[0])) == pytest.approx(-8.0, abs=1e-6)
+
+
+def test_moves_begin_with_pushes_of_what_is_highest(generator):
+    arm, target, _ = begin(generator, 3)
+    heap = Heap(arm, target)
+    moves = list(heap.moves())
+    assert target not in {move.slot for move in moves}
+    assert len(set(moves)) == len(moves)
+    in_the_way = np.flatnonzero(heap.clutter().obstacles[0].numpy()).tolist()
+    if in_the_way:
+        assert moves[0] == Move("push", max(in_the_way, key=lambda slot: surface(arm, slot)[:, 2].max()))
+
+
+def test_later_decisions_are_tried_less_often():
+    assert [tries(made) for made in range(6)] == [3, 3, 2, 2, 1, 1]
 
 
 def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, monkeypatch):
     arm, target, slots = begin(generator, 3)
     pushed = first_that_works(lambda slot: pushing.plan_push(arm, slot, target), slots)
-    fixed, width = pushing._fixed, arm.planner.finger_width
-    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0.2, 1.2, 0.005), np.arange(-0.5, 0.5, 0.005)))
+    fixed, width = pushing._fixed_bodies, arm.planner.finger_width
+    corners = np.array(list(itertools.product((0.2, 1.2), (-0.5, 0.5), (-0.005, 0.005))))
 
     def board_at(height):  # in the arm's base frame
-        board = np.stack([x, y, np.full(x.size, height)], axis=1)
-        monkeypatch.setattr(pushing, "_fixed", lambda arm: np.concatenate([fixed(arm), board]))
+        pose = np.eye(4)
+        pose[2, 3] = height
+        board = Obstacle("board", Shape((corners,)), pose)
+        monkeypatch.setattr(pushing, "_fixed_bodies", lambda arm: [*fixed(arm), board])
 
     board_at(pushing.surface_in_base(arm)[0][2, 3] + 0.3)  # across hand or wrist
     with pytest.raises(PlanningFailed, match="push"):
@@ -117,15 +150,15 @@ def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, mon
     with pytest.raises(PlanningFailed, match="push"):  # where a push was cut short
         pushing._plan_lift(arm, np.array([1.0, 0, 0]))
     assert arm.planner.finger_width == width
-    monkeypatch.setattr(pushing, "_fixed", fixed)
+    monkeypatch.setattr(pushing, "_fixed_bodies", fixed)
     pushing._plan_lift(arm, np.array([1.0, 0, 0]))
 
 
 @pytest.mark.parametrize("which", ["target", "another"])
 def test_what_lies_on_the_floor_ends_an_attempt_even_one_that_begins_after_the_fall(generator, which):
     arm, target, slots = begin(generator, 3)
-    _Clearing(arm, target).check_surface()
+    Heap(arm, target).check_surface()
     fallen = arm.env.objects[target if which == "target" else slots[0]]
     fallen.set_pose(Pose.create_from_pq(torch.tensor([[-1.0, -1.0, 0.1]]), fallen.pose.q))
     with pytest.raises(EpisodeLost, match="fell_off_table"):
-        _Clearing(arm, target).check_surface()
+        Heap(arm, target).check_surface()
