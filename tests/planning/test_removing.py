@@ -59,7 +59,7 @@ def first_that_works(skill, slots):
 
 
 def test_a_removed_object_stands_on_a_free_place_of_the_table(generator):
-    arm, target, slots = begin(generator, 1)
+    arm, target, slots = begin(generator, 4)
     before = {slot: surface(arm, slot) for slot in [*slots, target]}
     moved = first_that_works(lambda slot: remove(arm, slot), slots)
     after = surface(arm, moved)
@@ -74,7 +74,7 @@ def test_a_removed_object_stands_on_a_free_place_of_the_table(generator):
 
 
 def test_a_push_moves_an_object_away_from_the_target(generator):
-    arm, target, slots = begin(generator, 3)
+    arm, target, slots = begin(generator, 4)
     starts = {slot: surface(arm, slot).mean(axis=0) for slot in [*slots, target]}
     pushed = first_that_works(lambda slot: push_away(arm, slot, target), slots)
     ahead = push_direction(np.random.default_rng(0), starts[pushed], starts[target])
