@@ -145,3 +145,20 @@ def changed(**changes) -> dict:
     from robocas_ms3.config import load_task_config
 
     return {**load_task_config("pick_table_scattered").model_dump(mode="json"), **changes}
+
+
+def test_only_what_moved_is_evaluated_anew(env, monkeypatch):
+    env.reset(seed=0)
+    base, evaluated = env.unwrapped, []
+    settle(env, 60)  # what was laid out comes to rest
+    known = base._evaluated
+    monkeypatch.setattr(base, "_evaluated", lambda *of: evaluated.append(1) or known(*of))
+    flags = settle(env, 10)
+    assert not evaluated
+    target = base.objects[int(base.target_slot[0])]
+    target.set_pose(Pose.create_from_pq(target.pose.p + torch.tensor([[0, 0, 0.5]]), target.pose.q))
+    base.evaluate()
+    assert len(evaluated) == 1
+    base._stages["target_lifted"][:] = True  # what was reached counts too
+    assert bool(base.evaluate()["target_lifted"][0])
+    assert not flags["target_lifted"]
