@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import cache
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from typing import Any, NoReturn, Protocol, TypeVar
+from typing import Any, NoReturn, Protocol, TypeVar, cast
 
 import torch
 
@@ -171,7 +171,7 @@ class ForkedBranches:
 
     def _fork(self) -> _Child | None:
         """A new child; None in the child itself."""
-        here, there = Pipe()
+        here, there = cast("tuple[Connection, Connection]", Pipe())
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         parent = os.getpid()
