@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from asset_tools.solids import to_mesh, to_solid
+from robocas_ms3.assets.hulls import center_of
 from robocas_ms3.errors import AssetError, MissingExtraError
 
 Array = NDArray[np.float64]
@@ -96,15 +97,19 @@ def volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
     return float(shared / (solid.volume() + union.volume() - shared))
 
 
-def few_vertices(points: Array) -> Array:
+def few_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
     """Vertices of the convex hull of points, m, thinned to what the engine keeps: same volume, most of its shape.
 
-    Bevels of up to a millimetre around broad faces across x, y or z are squared: the engine would keep a corner or two
-    of one, on which a bottle rocks. Then, beginning with a few extreme ones, the vertex farthest outside of the hull so
-    far is added, again and again, until none is felt: at most 34, or 64 where their hull has no more than 64 flat
-    faces. What is left lies inside of the hull, so that it is blown up a little to the hull's volume.
+    Small bevels around broad faces across x, y or z are squared: the engine would keep a corner or two of one, on which
+    a bottle rocks. Then, beginning with a few extreme ones, the vertex farthest outside of the hull so far is added,
+    again and again, until none is felt: at most 34, or 64 where their hull has no more than 64 flat faces. What is left
+    lies inside of the hull, so that it is blown up a little, about its centre, to the hull's volume.
+
+    Args:
+        points: (P, 3) m.
+        bevel: the largest that is squared, m; 0 for parts that fit each other.
     """
-    points = _without_bevels(points)
+    points = _without_bevels(points, bevel)
     hull = ConvexHull(points)
     vertices = points[hull.vertices]
     if len(vertices) <= BOX:
@@ -125,11 +130,11 @@ def few_vertices(points: Array) -> Array:
     if len(chosen) > MAX_VERTICES and flat_faces(vertices[chosen]) > GPU_LIMIT:
         chosen = chosen[:MAX_VERTICES]
     kept = vertices[chosen]
-    center = kept.mean(axis=0)
+    center = center_of(kept)
     return center + (kept - center) * np.cbrt(hull.volume / ConvexHull(kept).volume)
 
 
-def _without_bevels(points: Array) -> Array:
+def _without_bevels(points: Array, bevel: float) -> Array:
     """Points (P, 3) with those next to a broad face across x, y or z put into it."""
     squared, extents = np.array(points), np.ptp(points, axis=0)
     for axis in range(3):
@@ -137,7 +142,7 @@ def _without_bevels(points: Array) -> Array:
             below = np.abs(points[:, axis] - extreme)
             face = np.ptp(points[below <= FLAT], axis=0)
             if np.delete(face >= BROAD * extents, axis).all():
-                squared[below <= min(BEVEL, extents[axis] / THIN), axis] = extreme
+                squared[below <= min(bevel, extents[axis] / THIN), axis] = extreme
     return squared
 
 

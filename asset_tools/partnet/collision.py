@@ -68,7 +68,7 @@ def pieces_of(parts: Sequence[Part], middle: Array) -> list[Array]:
         fine = "handle" in part.name or "knob" in part.name
         # of what else than handles is that slender nothing leans on
         found += [piece for piece in _split(part.meshes, fine, middle) if _size(piece, 0 if fine else 1) >= TINY]
-    hulls = [few_vertices(piece) for piece in found]
+    hulls = [few_vertices(piece, bevel=0) for piece in found]
     hulls = _without_hidden(hulls)
     if not hulls:
         raise AssetError("nothing to touch", found=f"{len(parts)} parts", expected="a body")
@@ -85,7 +85,7 @@ def for_gpu(hull: Array) -> list[Array]:
     axis = int(np.ptp(hull, axis=0).argmax())
     middle = float(hull[:, axis].min() + hull[:, axis].max()) / 2
     corners = hull[ConvexHull(hull).simplices]
-    halves = [few_vertices(_half(corners, axis, middle, side).reshape(-1, 3)) for side in (1.0, -1.0)]
+    halves = [few_vertices(_half(corners, axis, middle, side).reshape(-1, 3), bevel=0) for side in (1.0, -1.0)]
     if all(_sturdy(half) for half in halves):
         return halves
     to_middle, extents = trimesh.bounds.oriented_bounds(hull)

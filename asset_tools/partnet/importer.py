@@ -57,12 +57,11 @@ def read_partnet(folder: Path, annotation: Annotation) -> FurnitureSource:
         fix = "Leave `mass` out; that of moving parts goes under `joints`."
         raise AssetError("furniture with moving parts stands fixed", where=folder.name, found="a mass", fix=fix)
     middle = bounds.mean(axis=0)
-    pieces = {name: pieces_of(_parts(group), middle) for name, group in looks.items()}
+    pieces = {name: _for_gpu(pieces_of(_parts(group), middle)) for name, group in looks.items()}
     joints = {link.name: _joint(link, notes.get(link.joint, JointNote())) for link in model.links}
     for link in model.links:
         others = [piece for name, group in pieces.items() if name not in _carried(model, link.name) for piece in group]
-        pieces[link.name] = trimmed(pieces[link.name], others, joints[link.name])
-    pieces = {name: [part for piece in group for part in for_gpu(piece)] for name, group in pieces.items()}
+        pieces[link.name] = _for_gpu(trimmed(pieces[link.name], others, joints[link.name]))
     links = []
     for link in model.links:
         note = notes.get(link.joint, JointNote())
@@ -89,6 +88,10 @@ def read_partnet(folder: Path, annotation: Annotation) -> FurnitureSource:
         licence=LICENCE,
         attribution=ATTRIBUTION,
     )
+
+
+def _for_gpu(pieces: Sequence[np.ndarray]) -> list[np.ndarray]:
+    return [part for piece in pieces for part in for_gpu(piece)]
 
 
 def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> list[Job]:

@@ -34,7 +34,6 @@ ONE_WAY = 0.8  # of its path is what a rolling object gets ahead; what rocks com
 LEAST_PATH = 0.01  # m
 # An even roll has a kinetic energy of 0.7 m v^2 (a ball) to m v^2 (a pipe); in nine of ten steps, for facets bump.
 CARRIED, MOSTLY = 0.5, 0.9
-GRAVITY = 9.81  # m/s2
 LOOK_EVERY = 10  # time steps between the poses in which a rolling object is looked at
 
 
@@ -47,7 +46,7 @@ class DropReport:
         rest_times: (N,) s from letting go until it moved no more, or only rolled on; 3 s: it still moves.
         matches: (N,) which resting pose it lies in; -1: none that is listed.
         penetrations: (N,) m, deepest at the end: of corners below the plane, and of contacts as the engine sees them.
-        jitters: (N,) J, see `jitter`, in the last of the 3 s.
+        jitters: (N,) J, largest kinetic energy in the last of the 3 s.
         rolling: (N,) bool: it wasn't at rest in time but for rolling on.
         good: (N,) bool: at rest in time, in a listed pose.
     """
@@ -97,22 +96,7 @@ def drop_test(solid: Solid, resting_poses: Array, *, seed: int = 0, drops: int =
             if rolling[i]:
                 rest_times[i] = TIME_STEP * max(len(energies) - since, 0)
     good = (rest_times <= TIME_LIMIT) & (matches >= 0)
-    heights = poses[-last:, :, 2, :3] @ solid.center_of_mass + poses[-last:, :, 2, 3]
-    jitters = jitter(energies[-last:], heights, solid.mass)
-    return DropReport(poses[-1], rest_times, matches, sunk, jitters, rolling, good)
-
-
-def jitter(energies: Array, heights: Array, mass: float) -> Array:
-    """Largest kinetic energy (N,) of N bodies that doesn't come from falling, J.
-
-    What tips over late is not at rest in time, but doesn't jump either: it has no more energy than it had standing.
-
-    Args:
-        energies: (T, N) kinetic, J.
-        heights: (T, N) of the centres of mass, m.
-        mass: kg.
-    """
-    return (energies + mass * GRAVITY * (heights - heights[0])).max(axis=0)
+    return DropReport(poses[-1], rest_times, matches, sunk, energies[-last:].max(axis=0), rolling, good)
 
 
 def _advances(velocities: Array) -> bool:

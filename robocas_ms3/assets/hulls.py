@@ -163,13 +163,17 @@ def slenderness(points: Array) -> float:
 
     A cube has 1, as seen from its middle.
     """
-    hull = ConvexHull(points)
-    inside = points.mean(axis=0)
-    corners = points[hull.simplices] - inside
-    volumes = np.abs(np.linalg.det(corners))
-    center = inside + volumes @ corners.sum(axis=1) / 4 / volumes.sum()
-    depth = -(hull.equations @ np.append(center, 1.0)).max()
+    center = center_of(points)
+    depth = -(ConvexHull(points).equations @ np.append(center, 1.0)).max()
     return float(np.abs(points - center).max() / depth)
+
+
+def center_of(points: Array) -> Array:
+    """Centre of mass (3,) of the convex hull of points (V, 3)."""
+    inside = points.mean(axis=0)
+    corners = points[ConvexHull(points).simplices] - inside
+    volumes = np.abs(np.linalg.det(corners))
+    return inside + volumes @ corners.sum(axis=1) / 4 / volumes.sum()
 
 
 def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:

@@ -151,9 +151,7 @@ class ObjectQuality(StrictModel):
     rolling_share: Share = Field(default=0, description="of drops that count as at rest only because they roll evenly")
     rest_time: NotNegative = Field(description="median time until at rest after the drop, s")
     penetration: NotNegative = Field(description="deepest into the plane at rest, m")
-    jitter: NotNegative = Field(
-        description="kinetic energy from 2 s to 3 s of drops that don't roll, nor from tipping, J/kg"
-    )
+    jitter: NotNegative = Field(description="largest kinetic energy from 2 s to 3 s of drops that don't roll, J per kg")
     grasps_tried: int = Field(ge=0)
     grasps_held: Share = Field(description="of those tried: still in the hand after lifting and shaking")
 

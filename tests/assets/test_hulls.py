@@ -5,6 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.hulls import (
     box_of,
+    center_of,
     convex_faces,
     read_hulls,
     sample_surface,
@@ -97,4 +98,5 @@ def test_slenderness_is_reach_over_depth_from_the_centre_of_mass():
     assert slenderness(CUBE * [1, 1, 12]) == pytest.approx(12)
     # a right tetrahedron: its centre of mass is a quarter up each leg, so 3/4 from its tips and 1/4 / sqrt(3) deep
     legs = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
+    np.testing.assert_allclose(center_of(legs), 0.25)
     assert slenderness(legs) == pytest.approx(0.75 / (0.25 / np.sqrt(3)))

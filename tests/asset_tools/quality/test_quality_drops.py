@@ -4,7 +4,7 @@ import trimesh
 from sapien import physx
 
 from asset_tools.quality import drops
-from asset_tools.quality.drops import drop_test, jitter
+from asset_tools.quality.drops import drop_test
 from asset_tools.resting import resting_poses
 from robocas_ms3.assets.physics import Solid
 
@@ -108,12 +108,3 @@ def test_the_same_again_and_the_engine_left_as_it_was(block):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
     other = drop_test(solid, listed(solid), seed=1)
     assert np.abs(other.ends - first.ends).max() > 0.01
-
-
-def test_jitter_is_energy_that_does_not_come_from_falling():
-    fall = np.linspace(0.1, 0.0, 6)  # m: what falls freely has the energy it lost in height
-    energies = np.stack([0.5 * 9.81 * (0.1 - fall), np.full(6, 0.02), 0.003 + 0.5 * 9.81 * (0.1 - fall)], axis=1)
-    heights = np.stack([fall, np.full(6, 0.1), fall], axis=1)
-    assert jitter(energies, heights, 0.5) == pytest.approx([0.0, 0.02, 0.003], abs=1e-12)
-    # thrown up by 1 cm it has risen that much too
-    assert jitter(np.zeros((2, 1)), np.array([[0.1], [0.11]]), 0.5) == pytest.approx([0.5 * 9.81 * 0.01])
