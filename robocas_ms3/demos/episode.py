@@ -244,7 +244,25 @@ class EpisodeGenerator:
     def _finish(
         self, executor: Executor, recorder: EpisodeRecorder, result: EpisodeResult, recoveries: list[dict[str, Any]]
     ) -> None:
-        """See that what a policy says it has done is a demonstration, and write it.
+        """Write what a policy says it has done, if it is a demonstration.
+
+        Raises:
+            PlanningFailed: it is none.
+        """
+        self._check(executor, recorder, result)
+        result.success, result.steps = True, len(executor.actions)
+        noisy = self.settings.noisy_trials if result.noisy_failures < self.settings.noisy_failures else 0
+        recorder.finish(
+            {
+                **self._describe(executor),
+                "attempts": len(result.failures) + 1,
+                "noisy_trials": noisy if self.trials is not None else None,
+                "recoveries": recoveries,
+            }
+        )
+
+    def _check(self, executor: Executor, recorder: EpisodeRecorder, result: EpisodeResult) -> None:
+        """See that what a policy says it has done is a demonstration.
 
         Raises:
             PlanningFailed: the task has not succeeded.
@@ -256,16 +274,6 @@ class EpisodeGenerator:
         if not executor.flag("success"):
             raise PlanningFailed("episode", "no_success")
         self._rehearse(executor, recorder, result, finished=True)
-        result.success, result.steps = True, len(executor.actions)
-        noisy = self.settings.noisy_trials if result.noisy_failures < self.settings.noisy_failures else 0
-        recorder.finish(
-            {
-                **self._describe(executor),
-                "attempts": len(result.failures) + 1,
-                "noisy_trials": noisy if self.trials is not None else None,
-                "recoveries": recoveries,
-            }
-        )
 
     def _describe(self, executor: Executor) -> dict[str, Any]:
         env = executor.base_env

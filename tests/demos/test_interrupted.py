@@ -37,7 +37,7 @@ def made(monkeypatch):
     """Seeds that were generated, in the order in which they were."""
     seeds_made = []
 
-    def make(settings, seeds, folder, jobs):
+    def make(settings, seeds, folder, jobs, *, fork):
         for seed in seeds:
             seeds_made.append(seed)
             if seed == HOPELESS:

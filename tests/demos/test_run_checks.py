@@ -67,7 +67,7 @@ def begun(out, *, ledger=""):
 def hopeless(monkeypatch):
     """Every seed is given up."""
 
-    def give_up(settings, seeds, folder, jobs):
+    def give_up(settings, seeds, folder, jobs, *, fork):
         for seed in seeds:
             yield EpisodeResult(seed, success=False, failures=[Failure(seed, 0, "reach", "far", 0.0)])
 

@@ -47,7 +47,7 @@ def test_it_is_opened_from_the_configured_share_on(name):
     env.close()
 
 
-def done_early(executor, recorder) -> None:
+def done_early(executor, recorder, result) -> None:
     """In place of the generator's check: what is tested here ends before the task has succeeded."""
 
 
