@@ -11,7 +11,7 @@ import sapien
 import trimesh
 from sapien import physx
 
-from asset_tools.decompose import MAX_VERTICES, decompose, few_vertices, flat_faces, is_hollow, volume_iou
+from asset_tools.decompose import GPU_LIMIT, MAX_VERTICES, decompose, few_vertices, flat_faces, is_hollow, volume_iou
 from asset_tools.prepare import prepare
 from asset_tools.quality.hulls import hull_quality
 from asset_tools.repair import close
@@ -71,7 +71,7 @@ def test_a_scanned_cup_stays_hollow(tmp_path):
     found = decompose(closed)
     quality = hull_quality(closed, found.hulls, hollow=True)
     assert quality.surface_p95 <= 0.004
-    assert quality.hull_count <= 32 and quality.hull_vertices <= MAX_VERTICES
+    assert quality.hull_count <= 32 and quality.hull_vertices <= GPU_LIMIT
     for x, y in ((0, 0), (0.02, 0), (-0.012, 0.012)):
         end = ball_dropped_into(found.hulls, [x, y, 0.13])
         assert end[2] == pytest.approx(0.004 + BALL, abs=2e-3)

@@ -111,8 +111,10 @@ def test_shares_are_shares_and_more_cover_shows_no_more(poses):
     camera = top_down_camera(np.zeros(2), 0.0, size=128)
     few = visible_shares(camera, [PLATE] * 4, poses[:4])
     more = visible_shares(camera, [PLATE] * 4, poses[:4], occluders=[(PLATE, poses[4])])
-    assert ((few >= 0) & (few <= 1)).all()
-    assert (more <= few).all()
+    seen = ~np.isnan(few)  # a plate on edge is not seen at all
+    np.testing.assert_array_equal(seen, ~np.isnan(more))
+    assert ((few[seen] >= 0) & (few[seen] <= 1)).all()
+    assert (more[seen] <= few[seen]).all()
 
 
 @settings(max_examples=20, deadline=None)

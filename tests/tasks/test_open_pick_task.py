@@ -218,7 +218,7 @@ def test_it_drives_to_a_handle_that_is_out_of_reach(tmp_path):
 
 
 def test_pick_drives_to_a_target_that_is_out_of_reach(tmp_path):
-    config = farther_back("pick_table_scattered", 0.3)
+    config = farther_back("pick_table_scattered", 0.4)
     settings = EpisodeSettings("pick", config, "builtin", max_attempts=4)
     generator = EpisodeGenerator(settings)
     pick = generator.policy
