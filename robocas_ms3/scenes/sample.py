@@ -96,7 +96,7 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
             basket_pose = place_basket(model, robot_pose, basket_rng)
             unsettled += 1
             continue
-        settled = settle(used, placed, model, basket_pose, may_tip=isinstance(config.layout, StackedLayout))
+        settled = settle(used, placed, model, basket_pose, heap=isinstance(config.layout, StackedLayout))
         if not settled.stable:
             unsettled += 1
             continue

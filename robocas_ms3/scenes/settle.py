@@ -18,7 +18,7 @@ SETTLE_SECONDS, CHECK_SECONDS = 1.0, 1.0
 CHECKS = 3  # at most; what moved in one is checked again from where it came to
 MAX_MOVE, MAX_TILT_DEG = 0.05, 5.0  # while settling: what goes farther has fallen, tipped over or rolled off
 MAX_SHIFT, MAX_TURN_DEG = 0.003, 2.0  # in CHECK_SECONDS, of an object that stays
-MAX_LINEAR, MAX_ANGULAR = 0.02, 0.2  # m/s, rad/s, of an object at rest
+MAX_LINEAR, MAX_ANGULAR = 0.01, 0.1  # m/s, rad/s, of an object at rest
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Settled:
         as_put: (K,) whether it settled about where it was put.
         shift: (K,) m, how far each moves within ``CHECK_SECONDS`` when it is put where it settled.
         turn: (K,) rad, how far it turns then.
-        at_rest: (K,) whether it is at rest at the end.
+        at_rest: (K,) whether it is at rest then, half-way and at the end.
     """
 
     poses: Array
@@ -51,7 +51,7 @@ class Settled:
 
 
 def settle(
-    assets: Sequence[LoadedObject], poses: Array, model: SceneModel, basket_pose: Array, *, may_tip: bool = False
+    assets: Sequence[LoadedObject], poses: Array, model: SceneModel, basket_pose: Array, *, heap: bool = False
 ) -> Settled:
     """Simulate objects among furniture and basket: first so that they settle, then to see whether they stay.
 
@@ -59,19 +59,26 @@ def settle(
     object a kick that it would not get where it has long been standing. Where objects move then, they have settled a
     little more, and are put into another new scene; a heap creeps for a while.
 
+    Which contact the engine solves first depends on the order in which bodies were made, and on all else that is in a
+    scene. So a heap has to stay with its objects made in either order.
+
     Args:
         assets: K objects.
         poses: (K, 4, 4) in the world.
         model: where the furniture stands; doors and drawers stay as at first.
         basket_pose: 4x4 in the world.
-        may_tip: whether objects count as put where they tipped over meanwhile, as they may in a heap.
+        heap: whether objects lie on each other; then they may tip over meanwhile.
     """
     with engine_settings():
         settled = _simulate(assets, poses, model, basket_pose, SETTLE_SECONDS)[0]
         for _ in range(CHECKS):
-            after, speed, spin = _simulate(assets, settled, model, basket_pose, CHECK_SECONDS)
-            at_rest = (speed <= MAX_LINEAR) & (spin <= MAX_ANGULAR)
-            found = _compare(poses, settled, after, at_rest, np.inf if may_tip else np.deg2rad(MAX_TILT_DEG))
+            max_tilt = np.inf if heap else np.deg2rad(MAX_TILT_DEG)
+            for backwards in (False, True) if heap else (False,):
+                after, speed, spin = _simulate(assets, settled, model, basket_pose, CHECK_SECONDS, backwards=backwards)
+                at_rest = (speed <= MAX_LINEAR) & (spin <= MAX_ANGULAR)
+                found = _compare(poses, settled, after, at_rest, max_tilt)
+                if not found.stable:
+                    break
             if found.stable or not found.as_put.all():
                 break
             settled = after
@@ -95,20 +102,32 @@ def _compare(poses: Array, settled: Array, after: Array, at_rest: np.ndarray, ma
 
 
 def _simulate(
-    assets: Sequence[LoadedObject], poses: Array, model: SceneModel, basket_pose: Array, seconds: float
+    assets: Sequence[LoadedObject],
+    poses: Array,
+    model: SceneModel,
+    basket_pose: Array,
+    seconds: float,
+    *,
+    backwards: bool = False,
 ) -> tuple[Array, Array, Array]:
-    """Poses (K, 4, 4), speeds (K,) m/s and (K,) rad/s after a while in a new scene."""
+    """Simulate objects in a new scene; ``backwards``: the last one is made first.
+
+    Returns:
+        Poses (K, 4, 4) at the end; the greater of the speeds half-way and then, (K,) m/s and (K,) rad/s.
+    """
     scene = new_scene()
     add_furniture(scene, model)
     add_fixed(scene, model.basket.hulls, basket_pose, model.basket.asset.friction)
-    bodies = [add_body(scene, solid_of(asset), pose) for asset, pose in zip(assets, poses, strict=True)]
-    for _ in range(round(seconds / TIME_STEP)):
-        scene.step()
-    return (
-        np.stack([pose_matrix(body) for body in bodies]),
-        np.array([np.linalg.norm(body.linear_velocity) for body in bodies]),
-        np.array([np.linalg.norm(body.angular_velocity) for body in bodies]),
-    )
+    order = -1 if backwards else 1
+    placed = list(zip(assets, poses, strict=True))[::order]
+    bodies = [add_body(scene, solid_of(asset), pose) for asset, pose in placed][::order]
+    speed, spin = np.zeros((2, len(bodies)))
+    for _ in range(2):
+        for _ in range(round(seconds / TIME_STEP / 2)):
+            scene.step()
+        speed = np.maximum(speed, [np.linalg.norm(body.linear_velocity) for body in bodies])
+        spin = np.maximum(spin, [np.linalg.norm(body.angular_velocity) for body in bodies])
+    return np.stack([pose_matrix(body) for body in bodies]), speed, spin
 
 
 def add_furniture(scene: sapien.Scene, model: SceneModel) -> None:

@@ -71,22 +71,22 @@ def test_an_object_that_tips_over_did_not_stay(model):
     assert not settled.stable
 
 
-@pytest.mark.parametrize("may_tip", [False, True])
-def test_what_tips_in_a_heap_and_stays_is_as_put(model, monkeypatch, may_tip):
+@pytest.mark.parametrize("heap", [False, True])
+def test_what_tips_in_a_heap_and_stays_is_as_put(model, monkeypatch, heap):
     tipped = planar_pose(0, 0, 0, 0)[None]
     tipped[0, 1:3, 1:3] = [[0.8, -0.6], [0.6, 0.8]]  # by 37 deg
-    monkeypatch.setattr(settle_module, "_simulate", lambda *args: (tipped, np.zeros(1), np.zeros(1)))
+    monkeypatch.setattr(settle_module, "_simulate", lambda *args, **how: (tipped, np.zeros(1), np.zeros(1)))
     mug = [model.object_pack.objects["mug"]]
-    settled = settle(mug, np.eye(4)[None], model, model.basket_pose, may_tip=may_tip)
+    settled = settle(mug, np.eye(4)[None], model, model.basket_pose, heap=heap)
     assert settled.tilted[0] == pytest.approx(np.arccos(0.8))
-    assert settled.stable == may_tip
+    assert settled.stable == heap
 
 
 def test_what_moves_in_a_check_is_checked_again_from_where_it_came_to(model, monkeypatch):
     start = planar_pose(0, 0, 0, 0)[None]
     places = iter([0.0, 0.01, 0.012, 0.0])  # x, m, at the end of each simulation
 
-    def simulate(assets, poses, *args):
+    def simulate(assets, poses, *args, **how):
         pose = start.copy()
         pose[:, 0, 3] = next(places)
         return pose, np.zeros(1), np.zeros(1)
