@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,13 +18,15 @@ from robocas_ms3.planning.kinematics import ArmKinematics
 from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle, Trajectory
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.rrt import PathSearch
-from robocas_ms3.planning.timing import JointPath, rounded, stopping, through, timed
+from robocas_ms3.planning.timing import JointPath, blended, rounded, stopping, thinned, through, timed
 
 CHECKS_PER_SECOND = 10_000  # turns a planning time into a budget of collision checks, which load can't change
 SPACING = 0.03  # rad between checks while searching
 FINE_SPACING = 0.01  # rad between checks of the final path
 CORNER_RADII = (0.3, 0.1, 0.03)  # rad; smaller ones are tried when a rounded corner touches something
 DETOUR = 1.5  # a straight motion to another goal is taken when not longer than this times the nearest (+ 0.5 rad)
+BLENDS = (0.9, 0.5)  # s by which the end of a motion and the beginning of the next overlap
+BLEND_SPACING = 0.05  # rad between the points that a blended motion's spline goes through
 SHORTCUTS = 40
 STILL = 1e-6  # rad; a shorter motion is none
 TCP_SPEED_LIMIT = 0.45  # m/s: at 5 Hz pd_ee_delta_pose moves 0.1 m a step at most, with some lag to catch up
@@ -203,6 +206,22 @@ class MplibPlanner:
             raise PlanningFailed(stage, "timing_failed")
         return trajectory
 
+    def join(self, start: Array, first: Trajectory, second: Trajectory) -> Trajectory:
+        """Run one motion on into the next without a stop; see the protocol."""
+        a, b = np.concatenate([np.asarray(start)[None], first.qpos]), second.qpos
+        best = Trajectory(np.concatenate([first.qpos, b]), self._dt)
+        for seconds in BLENDS:
+            rows = min(round(seconds / self._dt), len(a) - 1, len(b) - 1)
+            points = blended(a, b, rows)
+            between = points[len(a) - rows - 1 : len(a) + 1]
+            if rows < 1 or not self._world.all_free(_dense(between)):
+                continue
+            path = through(thinned(points, BLEND_SPACING))
+            trajectory = self._timed(partial(timed, path))
+            if trajectory is not None and len(trajectory.qpos) < len(best.qpos):
+                return trajectory
+        return best
+
     def _checked_start(self, start: Array, stage: str, *, obstacles: bool = True) -> Array:
         start = np.asarray(start, dtype=np.float64)
         lower, upper = self._world.limits.T
@@ -232,9 +251,7 @@ class MplibPlanner:
                 trajectory = self._timed(partial(timed, path))
                 if trajectory is not None:
                     return trajectory
-        legs = zip(corners[:-1], corners[1:], strict=True)
-        polyline = np.concatenate([a + (b - a) * _fractions(a, b)[:, None] for a, b in legs])
-        return self._timed(partial(stopping, corners)) if self._world.all_free(polyline) else None
+        return self._timed(partial(stopping, corners)) if self._world.all_free(_dense(corners)) else None
 
     def _timed(self, time: Callable[..., Timed], speed: float = 1.0) -> Timed:
         """Time a motion within a fraction of the limits, and slower where the TCP would be faster than its limit."""
@@ -249,6 +266,11 @@ class MplibPlanner:
                 limits = {"velocity": limits["velocity"] * slower, "acceleration": limits["acceleration"] * slower**2}
                 trajectory = time(**limits, dt=self._dt)
         return trajectory
+
+
+def _dense(points: Array) -> Array:
+    """Configurations (M, 7) on a polyline (m, 7), near enough to each other for checks."""
+    return np.concatenate([a + (b - a) * _fractions(a, b)[:, None] for a, b in pairwise(points)])
 
 
 def _fractions(a: Array, b: Array) -> Array:

@@ -152,3 +152,15 @@ class Planner(Protocol):
             speed: fraction of the velocity and acceleration limits.
         """
         ...
+
+    def join(self, start: Array, first: Trajectory, second: Trajectory) -> Trajectory:
+        """Run one motion on into the next without a stop where nothing of the scene is in the way of that.
+
+        The corner between them is cut within the last and the first second of theirs.
+
+        Args:
+            start: (7,) where the first begins.
+            first: ends where the second begins.
+            second: the next one.
+        """
+        ...

@@ -119,16 +119,17 @@ class PlanningScene:
         *,
         without: int | Collection[int] = (),
         without_link: tuple[str, str] | None = None,
-        room_at_basket: float = 0.0,
+        room: float = 0.0,
     ) -> list[Obstacle]:
         """Furniture, basket and the objects that are there, as bodies for a planner.
 
         Args:
             without, without_link: as below.
-            room_at_basket: to keep to it, m.
+            room: to keep to furniture and basket, m.
         """
         bodies = self.obstacles_in_world(without=without, without_link=without_link)
-        bodies = [replace(body, room=room_at_basket) if body.name == BASKET else body for body in bodies]
+        objects = {asset.asset.id for asset in self.env.object_assets[0]}
+        bodies = [body if body.name in objects else replace(body, room=room) for body in bodies]
         return seen_from(bodies, self.arm_base_in_world)
 
     def obstacles_in_world(

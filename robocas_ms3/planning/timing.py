@@ -100,6 +100,32 @@ def through(waypoints: Array) -> JointPath:
     return JointPath(CubicSpline(ends, points, bc_type="not-a-knot" if len(points) > 3 else "natural"), points[-1])
 
 
+def blended(first: Array, second: Array, rows: int) -> Array:
+    """Lay the end of a motion over the beginning of the next, which cuts the corner between them.
+
+    Args:
+        first: (T, n) configurations, evenly in time, that come to rest where the next motion begins.
+        second: (U, n) of that next motion, the same time apart.
+        rows: how many of either overlap.
+
+    Returns:
+        (T + U - rows, n): both motions' own configurations before and after.
+    """
+    if not rows:
+        return np.concatenate([first, second])
+    return np.concatenate([first[:-rows], first[-rows:] + second[:rows] - first[-1], second[rows:]])
+
+
+def thinned(points: Array, spacing: float) -> Array:
+    """Those of the configurations (T, n) that lie ``spacing`` rad apart or more, first and last included."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    count = max(2, int(along[-1] / spacing) + 1)
+    kept = np.unique(np.searchsorted(along, np.linspace(0, along[-1], count)))
+    kept = kept[np.concatenate([[True], np.diff(along[kept]) > spacing / 2])]
+    kept[-1] = len(points) - 1
+    return points[kept]
+
+
 def timed(path: JointPath, *, velocity: float, acceleration: float, dt: float) -> Trajectory | None:
     """Time a path as fast as the limits allow, from rest to rest; none when TOPP-RA fails.
 

@@ -37,6 +37,7 @@ GRIP_SHIFTS = ((0.0, 0.0), (0.006, 0.0), (-0.006, 0.0), (0.0, -0.006), (0.004, -
 PAD_POINTS = 10  # of a surface at 5 mm: a third of what fits
 ROOM_BESIDE = 0.006  # m between an object and each open finger
 MARGIN_WEIGHT = 1.0
+TURN_WEIGHT = 0.4  # a rad
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # of the wrist, about the approach
 
@@ -214,8 +215,8 @@ def rank_grasps(
     """Order grasps, good ones first, with some chance so that a retry tries others.
 
     The score adds quality (relative to the best), nearness of the TCP to the object's centre (falls by e every 3 cm),
-    steepness (1 straight down, 0 level; from the front the other way round), nearness in joint space (falls by e every
-    rad of the joint that turns most), and the margin.
+    steepness (1 straight down, 0 level; from the front the other way round), nearness in joint space (of the joint that
+    turns most, which sets the time), and the margin.
 
     Args:
         tcp: (N, 4, 4) in any upright frame.
@@ -238,7 +239,7 @@ def rank_grasps(
     distance = np.linalg.norm(tcp[:, :3, 3] - object_center, axis=1)
     turn = np.abs(np.asarray(qpos) - near).max(axis=1)
     steep = -tcp[:, 2, 2] if approach == "top" else np.linalg.norm(tcp[:, :2, 2], axis=1)
-    score = quality + np.exp(-distance / 0.03) + 0.7 * steep + 0.7 * np.exp(-turn)
+    score = quality + np.exp(-distance / 0.03) + 0.7 * steep - TURN_WEIGHT * turn
     if margins is not None:
         score = score + MARGIN_WEIGHT * margins
     # Gumbel noise turns scores into draws without replacement, weighted by exp(score / temperature).

@@ -126,7 +126,7 @@ def test_a_pull_is_planned_to_the_far_end(tmp_path):
         part = Part.of(arm)
         plan = plan_pull(arm, part)
         assert not part.pressed(arm)
-        held = [arm.planner.tcp(motion.qpos[-1]) for motion in (plan.approach, plan.pull)]
+        held = [arm.planner.tcp(motion.qpos[-1]) for motion in (plan.way_in, plan.pull)]
         seen.append((part, part.in_base(arm, np.array([0.0, 0.95 * part.end])), held))
         raise Planned
 

@@ -102,7 +102,7 @@ class TestOnAShelf:
         slot = int(arm.env.target_slot[0])
         plan = plan_grasp(arm, slot, 0.1, "front")
         lift, withdraw = plan.retreat
-        grasp = arm.planner.tcp(plan.approach.qpos[-1])
+        grasp = arm.planner.tcp(plan.way_in.qpos[-1])
         lifted, out = arm.planner.tcp(lift.qpos[-1]), arm.planner.tcp(withdraw.qpos[-1])
         np.testing.assert_allclose((lifted - grasp)[:2], 0, atol=1e-3)  # turned nowhere, moved up
         assert 0.03 < lifted[2, 3] - grasp[2, 3] < 0.21

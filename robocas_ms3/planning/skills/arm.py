@@ -20,6 +20,7 @@ from robocas_ms3.tasks.transfer import TransferEnv
 
 T = TypeVar("T")
 OPEN_SECONDS, CLOSE_SECONDS = 0.50, 0.50  # a dataset at 5 Hz may give either command 0.2 s later
+ROOM = 0.012  # m kept to furniture and basket where there is a way that does: by so much a robot may be off
 RISE, RISES = 0.04, 4  # m a step, steps
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import SPACING, inverse
-from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
+from robocas_ms3.planning.skills.arm import ROOM, Arm, moved_back, raised
 from robocas_ms3.scenes.grasping import (
     NEIGHBOURHOOD,
     PREGRASP_DISTANCE,
@@ -44,8 +44,7 @@ _Way = tuple[Array, Trajectory, tuple[Trajectory, ...]]  # pre-grasp configurati
 class GraspPlan:
     """Motions from where the arm is to a grasped object that is clear of its surroundings."""
 
-    reach: Trajectory
-    approach: Trajectory
+    way_in: Trajectory
     retreat: tuple[Trajectory, ...]
 
 
@@ -66,7 +65,7 @@ def grasp(
     """
     with arm.planning():
         plan = plan_grasp(arm, slot, lift_height, approach or arm.env.task_config.target.approach, other_than)
-    arm.follow(plan.reach, plan.approach)
+    arm.follow(plan.way_in)
     arm.close_gripper()
     if not arm.holds(slot):
         raise PlanningFailed("grasp", "missed")
@@ -83,13 +82,18 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "to
     """
     planner, failure = arm.planner, PlanningFailed("grasp_sampling", "no_feasible_grasp")
     everything, others = arm.scene.obstacles(), arm.scene.obstacles(without=slot)
+    with_room = arm.scene.obstacles(room=ROOM)
     ways: list[_Way] = []
+
+    def finished(reach: Trajectory, inward: Trajectory, out: tuple[Trajectory, ...]) -> GraspPlan:
+        planner.set_scene(everything)
+        return GraspPlan(planner.join(arm.at, reach, inward), out)
 
     def searched() -> GraspPlan:
         planner.set_scene(everything)
         reach = planner.plan_to_qpos(arm.at, [way[0] for way in ways], stage="reach")
         _, inward, out = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
-        return GraspPlan(reach, inward, out)
+        return finished(reach, inward, out)
 
     for tcp_in_base in candidates(arm, slot, approach, other_than):
         # in and out of the target's surroundings, where the target itself is no obstacle; it is one on the way there
@@ -98,7 +102,7 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "to
         failure = failure if starts else PlanningFailed("approach", "no_ik")
         for start in starts:
             try:
-                planner.set_scene(everything)
+                planner.set_scene(with_room)
                 reach = planner.plan_to_qpos(arm.at, [start], stage="reach", search=False)
             except PlanningFailed:
                 reach = None
@@ -109,7 +113,7 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, approach: Approach = "to
                 failure = error
                 continue
             if reach is not None:
-                return GraspPlan(reach, inward, out)
+                return finished(reach, inward, out)
             ways.append((start, inward, out))
         # a search for a way round costs as much as all else, and takes several goals at once
         if len(ways) >= WAYS:

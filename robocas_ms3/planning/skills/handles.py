@@ -27,8 +27,10 @@ COMFORT = 0.15  # of the way from where it counts as opened to where a pull ends
 NEAR = 0.15  # m around the handle, in which what the fingers take hold of is looked for
 BETWEEN = (0.008, MAX_WIDTH / 2, 0.01)  # m from the TCP along its axes: what is between the pads
 JUDGED = 4  # ways to hold the handle that are checked for collisions where only reach is judged
+DEEPER = 0.012  # m by which the bar is farther in than the TCP, where it fits: the pads end 8 mm before the TCP
 SHIFTS = (0.0, -0.03, 0.03)  # m along the bar
 TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
+TURN_WEIGHT = 1.0  # rad of a joint that a rad about the bar is worth: pads that lean push a bar aside as they close
 STANDOFF = 0.08  # m that the gripper comes in straight
 RETREATS = (0.15, 0.10, 0.06)  # m straight back; the first one that can be reached
 CUT = 0.06  # m around the place held, within which the gripper may be near the part it pulls
@@ -41,8 +43,7 @@ SPEED = 0.8  # share of the arm's limits
 class PullPlan:
     """Motions from where the arm is to an opened part."""
 
-    reach: Trajectory
-    approach: Trajectory
+    way_in: Trajectory
     pull: Trajectory
 
 
@@ -69,7 +70,7 @@ def pull(arm: Arm, part: Part) -> None:
     with arm.planning():
         plan = plan_pull(arm, part)
         before, least = part.position(arm), 0.5 * part.least(arm)
-    arm.follow(plan.reach, plan.approach)
+    arm.follow(plan.way_in)
     arm.close_gripper()
     if not part.pressed(arm):
         raise PlanningFailed("handle", "missed")
@@ -85,23 +86,31 @@ def pull(arm: Arm, part: Part) -> None:
 
 
 def plan_pull(arm: Arm, part: Part) -> PullPlan:
-    """Plan the hold that leads furthest.
+    """Plan the hold that leads furthest, with the bar deep between the fingers where it fits.
 
     Raises:
         PlanningFailed: of the hold that came last.
     """
+    try:
+        return _plan_pull(arm, part, DEEPER)
+    except PlanningFailed:
+        return _plan_pull(arm, part, 0.0)
+
+
+def _plan_pull(arm: Arm, part: Part, deeper: float) -> PullPlan:
     positions = part.way(arm)
     frames = part.in_base(arm, positions)
-    paths, ends = _paths(arm, part, frames)
+    paths, ends, turned = _paths(arm, part, frames, deeper)
     least = part.least(arm) / abs(positions[-1] - positions[0]) * len(positions)
-    # the furthest first, in coarse steps; of those the nearest to where the arm is
-    order = np.lexsort((np.abs(paths[0] - arm.at).max(axis=1) + arm.rng.uniform(0, 0.5, len(ends)), -ends // 5))
+    # the furthest first, in coarse steps; of those the squarest, and nearest to where the arm is
+    cost = np.abs(paths[0] - arm.at).max(axis=1) + TURN_WEIGHT * turned + arm.rng.uniform(0, 0.3, len(ends))
+    order = np.lexsort((cost, -ends // 5))
     order = [i for i in order if ends[i] >= least]
     if not order:
         raise PlanningFailed("pull", "unreachable")
     everything = arm.scene.obstacles()
     others = arm.scene.obstacles(without_link=(part.furniture, part.handle.link))
-    order = _fitting(arm, part, paths[0], order, frames, others)
+    order = _fitting(arm, part, paths[0], order, frames, others, deeper)
     if not order:
         raise PlanningFailed("handle", "blocked")
     failure = PlanningFailed("pull", "no_plan")
@@ -115,7 +124,8 @@ def plan_pull(arm: Arm, part: Part) -> PullPlan:
             arm.planner.set_scene(everything)
             away = arm.planner.plan_straight(path[0], moved_back(arm.planner.tcp(path[0]), STANDOFF), stage="approach")
             reach = arm.planner.plan_to_qpos(arm.at, [away.qpos[-1]], stage="reach")
-            return PullPlan(reach, _reversed(away, path[0]), _timed(path[:free], away.dt))
+            way_in = arm.planner.join(arm.at, reach, _reversed(away, path[0]))
+            return PullPlan(way_in, _timed(path[:free], away.dt))
         except PlanningFailed as error:
             failure = error
     raise failure
@@ -135,7 +145,7 @@ def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: list[Obst
     enough = 1 + int(np.sum(np.abs(positions) < abs(opened + COMFORT * (positions[-1] - opened))))
     frames = inverse(arm_base_in_world) @ part.in_world(arm, positions)
     try:
-        paths, ends = _paths(arm, part, frames)
+        paths, ends, _ = _paths(arm, part, frames)
     except PlanningFailed:
         return 0.0
     share = 0.0
@@ -147,13 +157,17 @@ def pull_share(arm: Arm, part: Part, arm_base_in_world: Array, others: list[Obst
     return share
 
 
-def _paths(arm: Arm, part: Part, frames: Array) -> tuple[Array, NDArray[np.int_]]:
-    """Configurations (T, N, 7) for many ways to hold the handle; how many of the part's T poses (N,) each reaches."""
+def _paths(arm: Arm, part: Part, frames: Array, deeper: float = 0.0) -> tuple[Array, NDArray[np.int_], Array]:
+    """Many ways to hold the handle and go with it.
+
+    Returns:
+        Configurations (T, N, 7); how many of the part's T poses (N,) each reaches; rad (N,) turned about the bar.
+    """
     goals, starts = [], []
     for shift in SHIFTS:
         for half_turn in (False, True):
             hold = part.hold @ HALF_TURN if half_turn else part.hold
-            hold[:3, 3] += shift * part.hold[:3, 0]
+            hold[:3, 3] += shift * part.hold[:3, 0] + deeper * part.hold[:3, 2]
             for turn in TURNS:
                 goals.append(frames @ hold)
                 starts.append(turned_about_bar(goals[-1][0], turn))
@@ -162,10 +176,19 @@ def _paths(arm: Arm, part: Part, frames: Array) -> tuple[Array, NDArray[np.int_]
     if not solved.any():
         raise PlanningFailed("handle", "unreachable")
     path = track(arm.reachability.chain, qpos[solved], held[:, solved])
-    return path, reached(path)
+    turned = np.tile(np.abs(TURNS), len(goals) // len(TURNS))[solved]
+    return path, reached(path), turned
 
 
-def _fitting(arm: Arm, part: Part, starts: Array, order: list[int], frames: Array, others: list[Obstacle]) -> list[int]:
+def _fitting(
+    arm: Arm,
+    part: Part,
+    starts: Array,
+    order: list[int],
+    frames: Array,
+    others: list[Obstacle],
+    deeper: float = 0.0,
+) -> list[int]:
     """Those of the ways to hold the handle in which it is between the open fingers, which touch nothing.
 
     Args:
@@ -175,13 +198,15 @@ def _fitting(arm: Arm, part: Part, starts: Array, order: list[int], frames: Arra
         order: of ways.
         frames: (T, 4, 4) of the part during the pull.
         others: all but the part.
+        deeper: m by which the bar is farther in than the TCP.
     """
     surface = transform(frames[0], part.surface(arm))
     near = surface[np.linalg.norm(surface - (frames[0] @ part.hold)[:3, 3], axis=1) < NEAR]
     arm.planner.set_scene([*others, part.obstacle(arm, frames[0])])
 
     def holds(start: Array) -> bool:
-        between = np.abs(transform(inverse(arm.planner.tcp(start)), near)) < BETWEEN
+        bar = transform(inverse(arm.planner.tcp(start)), near) + (0, 0, deeper)
+        between = np.abs(bar) < BETWEEN
         return bool(between.all(axis=1).any())
 
     order = [i for i in order if holds(starts[i])]

@@ -10,14 +10,13 @@ from robocas_ms3.planning.chain import turn_between
 from robocas_ms3.planning.drops import overhangs, sample_drops
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import inverse, matrix
-from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
+from robocas_ms3.planning.skills.arm import ROOM, Arm, moved_back, raised
 from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.scenes.placement import transform
 
 DROPS_SAMPLED, DROPS_CHECKED, DROPS_PLANNED = 192, 64, 10
-DROP_MARGIN = 0.025  # m
+DROP_MARGIN = 0.045  # m, as far as a robot may be off by then
 LEAN_WEIGHT = 0.7  # rad of a joint that a rad of the gripper's is worth
-ROOM_AT_BASKET = 0.025  # m
 ELBOW, STRETCHED, STRETCH_WEIGHT = 3, -0.7, 5.0  # joint; rad from which on the arm is nearly straight
 RETREAT_HEIGHT = 0.05  # m, upstream's
 
@@ -57,7 +56,7 @@ def release_into_basket(arm: Arm, slot: int) -> None:
 def plan_carry(arm: Arm, slot: int) -> Trajectory:
     """Plan from where the arm is to a pose above the basket from which it can also step back.
 
-    Where there is such a way, it keeps off the basket by what a robot may miss it, which would push it away.
+    Where there is such a way, it keeps off basket and furniture by what a robot may miss them: both may be pushed away.
 
     Raises:
         PlanningFailed: of the pose that came last.
@@ -70,8 +69,8 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
     drops, qpos = drops[solved][order], qpos[solved][order]
     attach_held(arm, slot)
     failure = PlanningFailed("transfer", "no_plan")
-    for room in (ROOM_AT_BASKET, 0.0):
-        arm.planner.set_scene(arm.scene.obstacles(without=slot, room_at_basket=room))
+    for room in (2 * ROOM, 0.0):
+        arm.planner.set_scene(arm.scene.obstacles(without=slot, room=room))
         try:
             return _plan_to_one_of(arm, drops, qpos)
         except PlanningFailed as error:

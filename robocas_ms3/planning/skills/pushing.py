@@ -29,8 +29,7 @@ SETTLE_SECONDS = 0.3
 class PushPlan:
     """Motions from where the arm is to clear of the pushed object."""
 
-    reach: Trajectory
-    down: Trajectory
+    way_in: Trajectory
     push: Trajectory
     lift: Trajectory
     direction: Array
@@ -52,7 +51,7 @@ def push_away(arm: Arm, slot: int, target: int, *, turn_deg: float = 0.0) -> Non
     with arm.planning():
         plan = plan_push(arm, slot, target, turn_deg)
     arm.executor.gripper = CLOSED  # it closes on the way
-    arm.follow(plan.reach, plan.down)
+    arm.follow(plan.way_in)
     lift = plan.lift if _push_on(arm, plan.push, plan.direction) else _plan_lift(arm, plan.direction)
     arm.follow(lift)
     arm.executor.move_gripper(CLOSED, arm.at, seconds=SETTLE_SECONDS)
@@ -171,8 +170,8 @@ def _plan_along(arm: Arm, begun: list[tuple[Push, Array, Trajectory]], movable: 
     planner.set_scene(arm.scene.obstacles())
     # one direction, several turns of the tool: the one that is nearest
     reach = planner.plan_to_qpos(arm.at, [way[0] for way in ways], stage="push")
-    _, *way = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
-    return PushPlan(reach, *way, direction=first)
+    _, down, along, lift = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
+    return PushPlan(planner.join(arm.at, reach, down), along, lift, direction=first)
 
 
 def reachable_pushes(

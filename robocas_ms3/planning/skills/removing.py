@@ -39,11 +39,8 @@ def remove(arm: Arm, slot: int) -> None:
     grasp(arm, slot, lift_height=lift_height(arm, slot))
     hang_clear(arm, slot)
     with arm.planning():
-        carry, down = plan_place(arm, slot)
-    arm.follow(carry)
-    if not arm.holds(slot):
-        raise PlanningFailed("remove", "dropped")
-    arm.follow(down)
+        way = plan_place(arm, slot)
+    arm.follow(way)
     if not arm.holds(slot):
         raise PlanningFailed("remove", "dropped")
     arm.open_gripper()
@@ -102,7 +99,7 @@ def _grasps_from_above(arm: Arm, slot: int) -> Array:
     return grasps[arm.rng.permutation(len(grasps))[:GRASPS_LOOKED_AT]]
 
 
-def plan_place(arm: Arm, slot: int) -> tuple[Trajectory, Trajectory]:
+def plan_place(arm: Arm, slot: int) -> Trajectory:
     """Plan to above a free place and down to it.
 
     Raises:
@@ -133,7 +130,8 @@ def plan_place(arm: Arm, slot: int) -> tuple[Trajectory, Trajectory]:
     for index in np.argsort(np.abs(qpos - start).max(axis=1), kind="stable")[:PLACES_PLANNED]:
         try:
             carry = arm.planner.plan_to_pose(start, above[index], stage="remove")
-            return carry, arm.planner.plan_straight(carry.qpos[-1], places[index], stage="remove", speed=0.6)
+            down = arm.planner.plan_straight(carry.qpos[-1], places[index], stage="remove")
+            return arm.planner.join(start, carry, down)
         except PlanningFailed as error:
             failure = error
     raise failure

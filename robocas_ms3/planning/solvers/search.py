@@ -50,7 +50,7 @@ def attempt(arm: Arm) -> None:
                 raise
             break
         arm.executor.rehearse()
-        if heap.uncovered:
+        if heap.uncovered and not heap.visible:
             look_at(arm, heap.middle(slot), NEAR)
     arm.executor.rehearse()
     arm.executor.label(**subgoal("transfer object", *words))
