@@ -28,7 +28,7 @@ from typing import Any, NoReturn, Protocol, TypeVar, cast
 import torch
 
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.decisions import TRIES, Decisions
+from robocas_ms3.planning.decisions import ONE_BY_ONE, Decisions, Effort
 
 T = TypeVar("T")
 
@@ -124,19 +124,11 @@ class ForkedBranches:
             self._say_and_leave("done" if ended_well else _Failed())
         return ended_well
 
-    def choose(
-        self,
-        candidates: Iterable[T],
-        play: Callable[[T], float],
-        *,
-        ahead: int = 1,
-        tries: int = TRIES,
-        enough: float = math.inf,
-    ) -> T:
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
         """Choose; see `Decisions`. Returns in the child that goes on."""
         failure, gone_on, left = PlanningFailed("decision", "no_candidate"), 0, iter(candidates)
         try:
-            while gone_on < tries and not self._tally.exhausted:
+            while gone_on < effort.tries and not self._tally.exhausted:
                 for candidate in left:
                     child = self._fork()
                     if child is None:
@@ -151,14 +143,14 @@ class ForkedBranches:
                         self._end(child)
                         continue
                     child.score = answer
-                    if len(self._children) == ahead or child.score >= enough:
+                    if len(self._children) == effort.ahead or child.score >= effort.enough:
                         break
                 if not self._children:
                     break
                 for child in sorted(self._children, key=lambda child: -child.score):
                     self._go_on_as(child)
                     gone_on += 1
-                    if gone_on == tries or self._tally.exhausted:
+                    if gone_on == effort.tries or self._tally.exhausted:
                         break
                 self._end_all()
         finally:
