@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.demos import branches
-from robocas_ms3.demos.branches import ForkedBranches, why_not_fork
+from robocas_ms3.demos.branches import BranchTraceback, ForkedBranches, why_not_fork
 from robocas_ms3.demos.resimulation import Resimulation
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort, Straight
@@ -243,6 +243,71 @@ def test_an_error_of_ours_is_raised_here():
 
     with pytest.raises(KeyError, match="later"):
         forked(later)
+
+
+def test_an_error_says_where_in_a_child_it_came_from():
+    def divide(letter):
+        return 1 / 0
+
+    def decide(runner):
+        runner.choose("a", lambda letter: 0.0)
+        runner.choose("a", lambda letter: 0.0)
+        runner.choose("b", divide)  # three processes down
+
+    with pytest.raises(ZeroDivisionError) as caught:
+        forked(decide)
+    assert isinstance(caught.value.__cause__, BranchTraceback)
+    text = str(caught.value.__cause__)
+    assert text.count("in divide") == 1
+    assert text.count("Traceback") == 1
+
+
+def test_an_error_that_can_not_be_sent_is_told_of():
+    class Local(Exception):  # pickle can't find it
+        pass
+
+    for error in (Local("odd"), TwoWords("very", "odd")):
+
+        def decide(runner, error=error):
+            def play(letter):
+                raise error
+
+            runner.choose("a", play)
+
+        with pytest.raises(RuntimeError, match=f"{type(error).__name__}: .*odd") as caught:
+            forked(decide)
+        assert "in play" in str(caught.value.__cause__)
+
+
+class TwoWords(Exception):
+    """Pickles, but takes another number of arguments when it is made again."""
+
+    def __init__(self, one: str, two: str) -> None:
+        super().__init__(f"{one} {two}")
+
+
+def test_an_interrupt_in_a_new_child_ends_the_run_not_its_siblings(monkeypatch):
+    die_with, me = branches._die_with, os.getpid()
+
+    def interrupted(parent):
+        die_with(parent)
+        raise KeyboardInterrupt
+
+    def candidates():
+        yield "a"
+        monkeypatch.setattr(branches, "_die_with", interrupted)
+        yield "b"
+
+    def decide(runner):
+        runner.choose(candidates(), lambda letter: 0.0, Effort(ahead=2))
+
+    try:
+        with pytest.raises(KeyboardInterrupt) as caught:
+            forked(decide)
+        assert isinstance(caught.value.__cause__, BranchTraceback)
+    finally:
+        if os.getpid() != me:  # a child that takes itself for the root
+            os._exit(1)
 
 
 def test_what_children_print_comes_once(capfd):
