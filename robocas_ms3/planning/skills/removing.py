@@ -99,7 +99,8 @@ def _grasps_from_above(arm: Arm, slot: int) -> Array:
     grasps = frame @ notes.grasps_tcp_in_object
     passed = np.logical_and.reduce(list(directions_ok(grasps, frame[:3, 3]).values()))
     grasps = grasps[passed & (notes.grasp_widths <= MAX_WIDTH)]
-    return grasps[arm.rng.permutation(len(grasps))[:GRASPS_LOOKED_AT]]
+    # evenly spread, not drawn: a look must not change what comes after it
+    return grasps[np.linspace(0, len(grasps) - 1, min(len(grasps), GRASPS_LOOKED_AT)).astype(int)]
 
 
 def plan_place(arm: Arm, slot: int) -> tuple[Trajectory, Trajectory]:
