@@ -9,9 +9,9 @@ from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.collision import convex_hull
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.scene import SPACING
+from robocas_ms3.planning.shapes import convex_hull
 from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
 from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.placing import attach_held
