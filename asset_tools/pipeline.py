@@ -162,7 +162,7 @@ def _run(todo: list[tuple[Job, Path]], processes: int) -> Iterator[tuple[Made, P
 
 
 def _pool(processes: int) -> ProcessPoolExecutor:
-    # physics and rendering libraries don't survive a fork
+    # spawned: a renderer, and locks that threads of this process hold, don't survive a fork
     return ProcessPoolExecutor(processes, get_context("spawn"), _die_with_parent, (os.getpid(),))
 
 

@@ -20,7 +20,7 @@ def remeasure_pack(pack: Pack, processes: int = 1) -> Iterator[tuple[str, Qualit
     if processes <= 1:
         yield from ((name, _measure(asset)) for name, asset in assets.items())
         return
-    # physics engines don't survive a fork
+    # spawned: locks that threads of this process hold would stay locked in a fork
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         yield from zip(assets, pool.map(_measure, assets.values()), strict=True)
 

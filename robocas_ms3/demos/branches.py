@@ -16,8 +16,10 @@ import gc
 import logging
 import math
 import os
+import pickle
 import signal
 import sys
+import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -28,7 +30,7 @@ from typing import Any, NoReturn, Protocol, TypeVar, cast
 import torch
 
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.decisions import TRIES, Decisions
+from robocas_ms3.planning.decisions import ONE_BY_ONE, Decisions, Effort
 
 T = TypeVar("T")
 
@@ -92,6 +94,21 @@ class _Failed:
     error: PlanningFailed | None = None
 
 
+@dataclass(frozen=True)
+class _Raised:
+    """Message of a child: an error that is no failure of its candidate, and where it came from."""
+
+    error: BaseException
+    traceback: str
+
+
+class BranchTraceback(Exception):  # noqa: N818  (shown as the cause of an error, as `concurrent.futures` does)
+    """Where in a child an error came from, as text: tracebacks can't be sent."""
+
+    def __str__(self) -> str:
+        return f"in a branch\n\n{self.args[0]}"
+
+
 class ForkedBranches:
     """Makes decisions by forking; see the module.
 
@@ -118,25 +135,17 @@ class ForkedBranches:
             self._tally.failed(error)
         except BaseException as error:
             if self._pipe is not None:
-                self._say_and_leave(error)
+                self._say_and_leave(_raised(error))
             raise
         if self._pipe is not None:
             self._say_and_leave("done" if ended_well else _Failed())
         return ended_well
 
-    def choose(
-        self,
-        candidates: Iterable[T],
-        play: Callable[[T], float],
-        *,
-        ahead: int = 1,
-        tries: int = TRIES,
-        enough: float = math.inf,
-    ) -> T:
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
         """Choose; see `Decisions`. Returns in the child that goes on."""
         failure, gone_on, left = PlanningFailed("decision", "no_candidate"), 0, iter(candidates)
         try:
-            while gone_on < tries and not self._tally.exhausted:
+            while gone_on < effort.tries and not self._tally.exhausted:
                 for candidate in left:
                     child = self._fork()
                     if child is None:
@@ -151,14 +160,14 @@ class ForkedBranches:
                         self._end(child)
                         continue
                     child.score = answer
-                    if len(self._children) == ahead or child.score >= enough:
+                    if len(self._children) == effort.ahead or child.score >= effort.enough:
                         break
                 if not self._children:
                     break
                 for child in sorted(self._children, key=lambda child: -child.score):
                     self._go_on_as(child)
                     gone_on += 1
-                    if gone_on == tries or self._tally.exhausted:
+                    if gone_on == effort.tries or self._tally.exhausted:
                         break
                 self._end_all()
         finally:
@@ -175,23 +184,26 @@ class ForkedBranches:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         parent = os.getpid()
-        pid = os.fork()
-        if pid:
-            there.close()
-            child = _Child(pid, here)
-            self._children.append(child)
-            return child
-        _die_with(parent)
-        gc.freeze()  # a collection that walks all objects would copy all of the parent's memory
-        # locks of the parent's streams may be held by threads that are not here
-        sys.stdout, sys.stderr = (os.fdopen(os.dup(fd), "w") for fd in (1, 2))
-        for other in self._children:
-            other.pipe.close()
-        if self._pipe is not None:
-            self._pipe.close()
-        here.close()
-        self._pipe, self._children = there, []
-        return None
+        # an interrupt in between would find a child without a parent, or a child that takes itself for the root
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            pid = os.fork()
+            if pid:
+                child = _Child(pid, here)
+                self._children.append(child)
+                there.close()
+                return child
+            not_ours = [here, *(other.pipe for other in self._children), *([self._pipe] if self._pipe else [])]
+            self._pipe, self._children = there, []
+            _die_with(parent)
+            gc.freeze()  # a collection that walks all objects would copy all of the parent's memory
+            # locks of the parent's streams may be held by threads that are not here
+            sys.stdout, sys.stderr = (os.fdopen(os.dup(fd), "w") for fd in (1, 2))
+            for pipe in not_ours:
+                pipe.close()
+            return None
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def _go_on_as(self, child: _Child) -> None:
         """Let a child be the episode; comes back where that fails.
@@ -215,6 +227,7 @@ class ForkedBranches:
 
         Raises:
             _Crashed: it is gone, or says nothing.
+            BaseException: what it ended with, caused by a `BranchTraceback`.
         """
         try:
             if not child.pipe.poll(limit):
@@ -222,8 +235,8 @@ class ForkedBranches:
             answer, tally = child.pipe.recv()
         except (EOFError, ConnectionError) as error:
             raise _Crashed("crashed") from error
-        if isinstance(answer, BaseException):
-            raise answer
+        if isinstance(answer, _Raised):
+            raise answer.error from BranchTraceback(answer.traceback)
         self._tally.adopt(tally)
         return answer
 
@@ -246,7 +259,7 @@ class ForkedBranches:
         except PlanningFailed as error:
             self._say_and_leave(_Failed(error))
         except BaseException as error:
-            self._say_and_leave(error)
+            self._say_and_leave(_raised(error))
         assert self._pipe is not None
         try:
             self._pipe.send((answer, self._tally))
@@ -259,10 +272,21 @@ class ForkedBranches:
         self._end_all()
         try:
             self._pipe.send((answer, self._tally))
-        except Exception:  # noqa: BLE001  (an error that can't be pickled, or nobody listens)
-            if isinstance(answer, BaseException):
-                _log.exception("a branch failed", exc_info=answer)
+        except Exception:  # noqa: BLE001  (nobody listens)
+            if isinstance(answer, _Raised):
+                _log.error("a branch failed\n%s", answer.traceback)
         os._exit(0)
+
+
+def _raised(error: BaseException) -> _Raised:
+    """An error as it can be sent; its traceback is that of the process where it was raised first."""
+    cause = error.__cause__
+    text = cause.args[0] if isinstance(cause, BranchTraceback) else "".join(traceback.format_exception(error))
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:  # noqa: BLE001  (its class decides what that raises)
+        return _Raised(RuntimeError(f"{type(error).__name__}: {error}"), text)
+    return _Raised(error, text)
 
 
 def _die_with(parent: int) -> None:

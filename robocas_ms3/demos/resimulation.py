@@ -5,14 +5,13 @@ The same candidates are played as in `branches`, in the same order, so that the 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
 from robocas_ms3.demos.branches import Tally, Undone
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.decisions import TRIES
+from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort
 
 T = TypeVar("T")
 
@@ -86,31 +85,23 @@ class Resimulation:
                 return False
             self._made[-1].on = None
 
-    def choose(
-        self,
-        candidates: Iterable[T],
-        play: Callable[[T], float],
-        *,
-        ahead: int = 1,
-        tries: int = TRIES,
-        enough: float = math.inf,
-    ) -> T:
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
         """Choose; see `planning.decisions`."""
         if self._depth == len(self._made):
             self._made.append(_Decision())
         decision, items = self._made[self._depth], list(candidates)
         self._depth += 1
         if decision.on is None:
-            if decision.gone_on == tries or (decision.gone_on and self._tally.exhausted):
+            if decision.gone_on == effort.tries or (decision.gone_on and self._tally.exhausted):
                 raise Undone
-            if not decision.ranked and self._look(decision, items, play, ahead, enough):
+            if not decision.ranked and self._look(decision, items, play, effort):
                 return items[decision.go_on()]
             decision.go_on()
         assert decision.on is not None
         play(items[decision.on])
         return items[decision.on]
 
-    def _look(self, decision: _Decision, items: list[T], play: Callable[[T], float], ahead: int, enough: float) -> bool:
+    def _look(self, decision: _Decision, items: list[T], play: Callable[[T], float], effort: Effort) -> bool:
         """Play the next candidate; say whether it is the best of a comparison that ends with it, so that it stands.
 
         Returns False, with nothing played, where there is no next one and the comparison ends.
@@ -127,7 +118,7 @@ class Resimulation:
         except PlanningFailed as error:
             decision.failure = error
             raise _Again from error
-        if len(decision.played) == ahead or decision.played[-1][0] >= enough:
+        if len(decision.played) == effort.ahead or decision.played[-1][0] >= effort.enough:
             decision.rank()
             if decision.ranked[0] == index:
                 return True

@@ -11,22 +11,18 @@ obstacles, the links and what carries the arm.
 
 from __future__ import annotations
 
-import hashlib
-import itertools
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.planning.chain import ARM_JOINTS, BASE_LINK, TCP_LINK, ArmChain
-from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle, Shape
+from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle
+from robocas_ms3.planning.shapes import CollisionShapes, Pieces, bounds, matrix_to_pose
 
 FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
 WIDEST = 0.08  # m, the gripper's opening
@@ -35,8 +31,6 @@ CLOUD, ATTACHED = "cloud", "attached"
 HITTABLE = (*STATIC_LINKS, *(f"panda_link{i}" for i in range(1, 7)))  # by a held object
 REACH = 1.5  # m; obstacle points further from the arm's base never matter
 BASE_MARGIN = 0.015  # m around the parts that never move within which points of the cloud are cut out
-MARGIN = 0.0025  # m that obstacles are larger than they are: about what voxels of 5 mm add on average
-KEPT = 16  # trees of the last clouds and hulls of the last held objects
 SPARSE = 12  # every so manieth configuration of a path is checked before all others
 CHUNK = 128  # configurations of a path checked at once
 
@@ -55,50 +49,6 @@ def require_numpy_1() -> None:
             found=np.__version__,
             fix="Run: pip install 'numpy>=1.26,<2'.",
         )
-
-
-def pose_to_matrix(pose: Array) -> Array:
-    """Turn (7,) x, y, z, qw, qx, qy, qz into a 4x4 matrix."""
-    w, x, y, z = pose[3:] / np.linalg.norm(pose[3:])
-    matrix = np.eye(4)
-    matrix[:3, :3] = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-    matrix[:3, 3] = pose[:3]
-    return matrix
-
-
-def matrix_to_pose(matrix: Array) -> Array:
-    """Turn a 4x4 matrix into (7,) x, y, z, qw, qx, qy, qz."""
-    m = matrix[:3, :3]
-    trace = m[0, 0] + m[1, 1] + m[2, 2]
-    # Bar-Itzhack's symmetric form, one row of 4 q q^T, chosen by its largest diagonal element: stable everywhere.
-    diagonal = np.array([1 + trace, *(1 - trace + 2 * np.diag(m))])
-    row = int(np.argmax(diagonal))
-    wx, wy, wz = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
-    xy, xz, yz = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
-    wxyz = np.array(
-        ((diagonal[0], wx, wy, wz), (wx, diagonal[1], xy, xz), (wy, xy, diagonal[2], yz), (wz, xz, yz, diagonal[3]))
-    )
-    quaternion = wxyz[row] / np.linalg.norm(wxyz[row])
-    return np.concatenate([matrix[:3, 3], quaternion])
-
-
-@dataclass(frozen=True)
-class _Pieces:
-    """What FCL checks of a shape.
-
-    Attributes:
-        geometries: of FCL, one a piece.
-        vertices: (V, 3) of all pieces, in the shape's frame, m.
-        first: (H,) index of each piece's first vertex.
-    """
-
-    geometries: list[Any]
-    vertices: Array
-    first: NDArray[np.int_]
 
 
 @dataclass(frozen=True)
@@ -140,7 +90,7 @@ class ArmWorld:
         from mplib.pymp import ArticulatedModel
         from mplib.pymp.collision_detection import fcl
 
-        self._fcl, self._voxel = fcl, voxel
+        self._fcl, self._shapes = fcl, CollisionShapes(fcl, voxel)
         try:
             self._robot = ArticulatedModel(
                 str(urdf), str(srdf), np.array([0, 0, -9.81]), [], [], convex=True, verbose=False
@@ -164,8 +114,6 @@ class ArmWorld:
         self.checks = 0  # configurations checked so far
         self.finger_width = WIDEST
         self._request = fcl.CollisionRequest()
-        self._shapes: WeakKeyDictionary[Shape, dict[float, _Pieces]] = WeakKeyDictionary()
-        self._recent: OrderedDict[bytes, _Pieces] = OrderedDict()
         self._object_in_tcp = np.eye(4)
         self._body: Any = None
         self._read_parts()
@@ -184,7 +132,7 @@ class ArmWorld:
         boxes = []
         for width in (0.0, WIDEST):
             self._robot.set_qpos(self._full(np.zeros(7), width), True)
-            boxes.append([_bounds(part, *frames[c]) for part, c in zip(self._parts[:-1], self._carrier, strict=False)])
+            boxes.append([bounds(part, *frames[c]) for part, c in zip(self._parts[:-1], self._carrier, strict=False)])
             boxes[-1].append(np.zeros((2, 3)))
         self._box, self._box_opened = np.array(boxes[0]), np.array(boxes[1])  # (parts, 2, 3) closed, open
         self._moving = np.flatnonzero(self._carrier >= 0)
@@ -221,20 +169,13 @@ class ArmWorld:
         if len(points) == 0:
             self.set_obstacles([])
             return
-        pieces = self._remember(points, self._tree)
-        self._place([(CLOUD, pieces, np.eye(4))])
+        self._place([(CLOUD, self._shapes.cloud(points), np.eye(4))])
 
     def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Replace the obstacles by rigid bodies; they don't count against the robot's own base."""
-        known = []
-        for obstacle in obstacles:
-            sizes = self._shapes.setdefault(obstacle.shape, {})
-            if obstacle.room not in sizes:
-                sizes[obstacle.room] = self._pieces(obstacle.shape, obstacle.room)
-            known.append((obstacle.name, sizes[obstacle.room], obstacle.pose_in_base))
-        self._place(known)
+        self._place([(o.name, self._shapes.obstacle(o.shape, o.room), o.pose_in_base) for o in obstacles])
 
-    def _place(self, bodies: list[tuple[str, _Pieces, Array]]) -> None:
+    def _place(self, bodies: list[tuple[str, Pieces, Array]]) -> None:
         self._obstacle_names = [name for name, pieces, _ in bodies for _ in pieces.geometries]
         self._geometries = [(geometry, pose) for _, pieces, pose in bodies for geometry in pieces.geometries]
         self._objects: list[Any] = [None] * len(self._geometries)  # made when first asked for
@@ -247,36 +188,8 @@ class ArmWorld:
 
     def _obstacle(self, index: int) -> Any:
         if self._objects[index] is None:
-            geometry, pose = self._geometries[index]
-            place = matrix_to_pose(pose)
-            self._objects[index] = self._fcl.CollisionObject(geometry, place[:3], place[3:])
+            self._objects[index] = self._shapes.object(*self._geometries[index])
         return self._objects[index]
-
-    def _pieces(self, shape: Shape, room: float) -> _Pieces:
-        if shape.points is not None:
-            return self._tree(np.ascontiguousarray(shape.points))
-        hulls = [inflated(np.asarray(vertices, dtype=np.float64), MARGIN + room) for vertices in shape.hulls]
-        first = np.cumsum([0, *(len(vertices) for vertices, _ in hulls[:-1])])
-        geometries = [self._fcl.Convex(vertices, faces) for vertices, faces in hulls]
-        return _Pieces(geometries, np.concatenate([vertices for vertices, _ in hulls]), first)
-
-    def _tree(self, points: Array) -> _Pieces:
-        bounds = np.array([points.min(axis=0) - self._voxel, points.max(axis=0) + self._voxel])
-        corners = np.array(list(itertools.product(*bounds.T)))
-        return _Pieces([self._fcl.OcTree(points, self._voxel)], corners, np.zeros(1, dtype=int))
-
-    def _hull(self, vertices: Array) -> _Pieces:
-        corners, faces, _ = convex_hull(vertices)
-        return _Pieces([self._fcl.Convex(corners, faces)], corners, np.zeros(1, dtype=int))
-
-    def _remember(self, points: Array, make: Any) -> _Pieces:
-        """Make something of points, or find what was made of them recently."""
-        key = hashlib.blake2b(points.data).digest() + make.__name__.encode()
-        made = self._recent.pop(key, None) or make(points)
-        self._recent[key] = made
-        if len(self._recent) > KEPT:
-            self._recent.popitem(last=False)
-        return made
 
     def keeps(self, points: Array) -> NDArray[np.bool_]:
         """Say which points (P, 3) count as obstacles: in reach, and not where the robot's own base stands."""
@@ -290,9 +203,9 @@ class ArmWorld:
         self._body = None
         if body is None:
             return
-        pieces = self._remember(np.ascontiguousarray(body.vertices, dtype=np.float64), self._hull)
+        pieces = self._shapes.hull(body.vertices)
         self._object_in_tcp = np.asarray(body.object_in_tcp, dtype=np.float64)
-        self._body = self._parts[-1] = self._fcl.CollisionObject(pieces.geometries[0])
+        self._body = self._parts[-1] = self._shapes.object(pieces.geometries[0])
         vertices = pieces.vertices @ self._object_in_tcp[:3, :3].T + self._object_in_tcp[:3, 3]
         self._box[-1] = self._box_opened[-1] = vertices.min(axis=0), vertices.max(axis=0)
 
@@ -382,42 +295,3 @@ class ArmWorld:
         found = np.argwhere(overlap)
         found[:, 1], found[:, 2] = moving[found[:, 1]], pieces[found[:, 2]]
         return _Pairs(links, found)
-
-
-def convex_hull(vertices: Array) -> tuple[Array, NDArray[np.int32], Array]:
-    """Corners (V, 3) of the convex hull of points, its triangles (F, 3) seen from outside, and their normals (F, 3)."""
-    hull = ConvexHull(vertices)
-    outward = np.einsum("ij,ij->i", _normals(vertices, hull.simplices), hull.equations[:, :3]) > 0
-    faces = np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1])
-    used, faces = np.unique(faces, return_inverse=True)
-    return vertices[used], faces.reshape(-1, 3).astype(np.int32), hull.equations[:, :3]
-
-
-def inflated(vertices: Array, margin: float) -> tuple[Array, NDArray[np.int32]]:
-    """Corners and triangles of a convex hull whose faces are moved out by ``margin``, its sharp edges a little less."""
-    corners, faces, normals = convex_hull(vertices)
-    square, total = np.tile(1e-3 * np.eye(3), (len(corners), 1, 1)), np.zeros((len(corners), 3))
-    for corner in faces.T:  # all faces that meet in a corner move out; all but parallel ones along themselves
-        np.add.at(square, corner, normals[:, :, None] * normals[:, None, :])
-        np.add.at(total, corner, normals)
-    out = margin * np.linalg.solve(square, total[:, :, None])[:, :, 0]
-    out *= np.minimum(1.0, 2 * margin / np.linalg.norm(out, axis=1, keepdims=True))
-    hull, faces, _ = convex_hull(corners + out)
-    return hull, faces
-
-
-def _normals(vertices: Array, faces: NDArray[np.int_]) -> Array:
-    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
-    return np.cross(b - a, c - a)
-
-
-def _bounds(part: Any, rotation: Array, position: Array) -> Array:
-    """Give the box (2, 3) around a collision object, low and high corner, in a frame given in the base frame, m."""
-    geometry = part.get_collision_geometry()
-    if hasattr(geometry, "get_vertices"):
-        vertices = np.array(geometry.get_vertices())
-    else:
-        vertices = np.array(geometry.side) / 2 * np.array(list(itertools.product((-1, 1), repeat=3)))
-    points = vertices @ np.array(part.get_rotation()).T + np.array(part.get_translation())
-    local = (points - position) @ rotation
-    return np.array([local.min(axis=0), local.max(axis=0)])

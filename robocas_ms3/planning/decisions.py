@@ -17,18 +17,28 @@ T = TypeVar("T")
 TRIES = 3  # candidates of one decision that are gone on from before the decision before it is made otherwise
 
 
+@dataclass(frozen=True)
+class Effort:
+    """How much is tried before a decision is made, and before it is given up.
+
+    Attributes:
+        ahead: how many candidates that can be done are compared before the best is gone on from.
+        tries: how many are gone on from.
+        enough: a score at which no other candidate is looked at.
+    """
+
+    ahead: int = 1
+    tries: int = TRIES
+    enough: float = math.inf
+
+
+ONE_BY_ONE = Effort()  # the first that can be done, then the next
+
+
 class Decisions(Protocol):
     """Plays candidates and goes on from one of them."""
 
-    def choose(
-        self,
-        candidates: Iterable[T],
-        play: Callable[[T], float],
-        *,
-        ahead: int = 1,
-        tries: int = TRIES,
-        enough: float = math.inf,
-    ) -> T:
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
         """Play candidates from this moment on and go on from the one with the greatest score.
 
         When what comes after it fails, the policy is back here, and goes on from the next best one, as if the first
@@ -37,9 +47,7 @@ class Decisions(Protocol):
         Args:
             candidates: ways to go on, those tried first that promise most.
             play: makes a candidate's motions and gives its score; raises ``PlanningFailed`` where it can't be done.
-            ahead: how many that can be done are compared before the best is gone on from.
-            tries: how many are gone on from.
-            enough: a score at which no other candidate is looked at.
+            effort: how many are compared, and gone on from.
 
         Returns:
             The candidate that was played, its motions done.
@@ -60,15 +68,7 @@ class Straight:
 
     done: Callable[[], int]
 
-    def choose(
-        self,
-        candidates: Iterable[T],
-        play: Callable[[T], float],
-        *,
-        ahead: int = 1,
-        tries: int = TRIES,
-        enough: float = math.inf,
-    ) -> T:
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
         """Choose; see `Decisions`."""
         failure = PlanningFailed("decision", "no_candidate")
         for candidate in candidates:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.collision import ArmWorld, matrix_to_pose
+from robocas_ms3.planning.collision import ArmWorld
 from robocas_ms3.planning.protocol import Array
+from robocas_ms3.planning.shapes import matrix_to_pose
 
 LINE_STEP = 0.01  # m between two poses of a straight line
 LINE_TURN = np.deg2rad(3)

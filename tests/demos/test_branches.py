@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.demos import branches
-from robocas_ms3.demos.branches import ForkedBranches, why_not_fork
+from robocas_ms3.demos.branches import BranchTraceback, ForkedBranches, why_not_fork
 from robocas_ms3.demos.resimulation import Resimulation
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.decisions import Straight
+from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort, Straight
 
 RUNNERS = [ForkedBranches, Resimulation]
 
@@ -71,9 +71,9 @@ def search(decide, good, *, most=100, **how):
     return found[0]
 
 
-def two_letters(world, runner, score=lambda letters: 0.0, **how):
+def two_letters(world, runner, score=lambda letters: 0.0, effort=ONE_BY_ONE):
     for _ in range(2):
-        runner.choose("abc", lambda letter: (world.act(letter), score(world.done))[1], **how)
+        runner.choose("abc", lambda letter: (world.act(letter), score(world.done))[1], effort)
 
 
 def test_the_first_way_that_ends_well_is_taken_and_what_failed_leaves_no_trace():
@@ -93,23 +93,27 @@ def test_attempts_are_counted():
 
 
 def test_a_decision_gives_up_after_some_tries():
-    ended, outcome, failures = search(two_letters, {"ba"}, tries=2)
+    ended, outcome, failures = search(two_letters, {"ba"}, effort=Effort(tries=2))
     assert (ended, outcome, failures) == (True, "ba", ["end: aa", "end: ab"])
 
 
 def test_the_best_of_those_compared_is_gone_on_from_first():
     score = {"a": 1.0, "b": 3.0, "c": 2.0}
-    ended, outcome, failures = search(two_letters, {"cb", "bc"}, score=lambda letters: score[letters[-1]], ahead=3)
+    ended, outcome, failures = search(
+        two_letters, {"cb", "bc"}, score=lambda letters: score[letters[-1]], effort=Effort(ahead=3)
+    )
     assert (ended, outcome, failures) == (True, "bc", ["end: bb"])
 
 
 def test_equal_scores_keep_the_order_of_the_candidates():
-    assert search(two_letters, {"aa"}, ahead=3) == (True, "aa", [])
+    assert search(two_letters, {"aa"}, effort=Effort(ahead=3)) == (True, "aa", [])
 
 
 def test_others_are_compared_when_the_first_few_lead_nowhere():
     score = {"a": 1.0, "b": 2.0, "c": 3.0}
-    ended, outcome, failures = search(two_letters, {"cc"}, score=lambda letters: score[letters[-1]], ahead=2, tries=9)
+    ended, outcome, failures = search(
+        two_letters, {"cc"}, score=lambda letters: score[letters[-1]], effort=Effort(ahead=2, tries=9)
+    )
     assert (ended, outcome) == (True, "cc")
     assert failures == ["end: bb", "end: ba", "end: bc", "end: ab", "end: aa", "end: ac", "end: cb", "end: ca"]
 
@@ -118,7 +122,7 @@ def test_enough_ends_the_comparison():
     scores = {"a": 1.0, "b": 5.0, "c": 9.0}
 
     def decide(world, runner):
-        runner.choose("abc", lambda letter: (world.act(letter), scores[letter])[1], ahead=3, enough=4)
+        runner.choose("abc", lambda letter: (world.act(letter), scores[letter])[1], Effort(ahead=3, enough=4))
 
     assert search(decide, {"b"}) == (True, "b", [])
 
@@ -131,7 +135,7 @@ def test_a_candidate_that_can_not_be_played_is_passed_over():
                 raise PlanningFailed("play", letter)
             return 0.0
 
-        runner.choose("abcd", play, ahead=2)
+        runner.choose("abcd", play, Effort(ahead=2))
         world.act("!")
 
     assert search(decide, {"c!"}) == (True, "c!", [])
@@ -241,6 +245,71 @@ def test_an_error_of_ours_is_raised_here():
         forked(later)
 
 
+def test_an_error_says_where_in_a_child_it_came_from():
+    def divide(letter):
+        return 1 / 0
+
+    def decide(runner):
+        runner.choose("a", lambda letter: 0.0)
+        runner.choose("a", lambda letter: 0.0)
+        runner.choose("b", divide)  # three processes down
+
+    with pytest.raises(ZeroDivisionError) as caught:
+        forked(decide)
+    assert isinstance(caught.value.__cause__, BranchTraceback)
+    text = str(caught.value.__cause__)
+    assert text.count("in divide") == 1
+    assert text.count("Traceback") == 1
+
+
+def test_an_error_that_can_not_be_sent_is_told_of():
+    class Local(Exception):  # pickle can't find it
+        pass
+
+    for error in (Local("odd"), TwoWords("very", "odd")):
+
+        def decide(runner, error=error):
+            def play(letter):
+                raise error
+
+            runner.choose("a", play)
+
+        with pytest.raises(RuntimeError, match=f"{type(error).__name__}: .*odd") as caught:
+            forked(decide)
+        assert "in play" in str(caught.value.__cause__)
+
+
+class TwoWords(Exception):
+    """Pickles, but takes another number of arguments when it is made again."""
+
+    def __init__(self, one: str, two: str) -> None:
+        super().__init__(f"{one} {two}")
+
+
+def test_an_interrupt_in_a_new_child_ends_the_run_not_its_siblings(monkeypatch):
+    die_with, me = branches._die_with, os.getpid()
+
+    def interrupted(parent):
+        die_with(parent)
+        raise KeyboardInterrupt
+
+    def candidates():
+        yield "a"
+        monkeypatch.setattr(branches, "_die_with", interrupted)
+        yield "b"
+
+    def decide(runner):
+        runner.choose(candidates(), lambda letter: 0.0, Effort(ahead=2))
+
+    try:
+        with pytest.raises(KeyboardInterrupt) as caught:
+            forked(decide)
+        assert isinstance(caught.value.__cause__, BranchTraceback)
+    finally:
+        if os.getpid() != me:  # a child that takes itself for the root
+            os._exit(1)
+
+
 def test_what_children_print_comes_once(capfd):
     def decide(runner):
         print("before", end="")
@@ -253,13 +322,14 @@ def test_what_children_print_comes_once(capfd):
 SLEEPER = """
 import os, sys, time
 from robocas_ms3.demos.branches import ForkedBranches
+from robocas_ms3.planning.decisions import Effort
 class Notes:
     exhausted = False
     def failed(self, error): pass
     def adopt(self, other): pass
 def attempt():
     for _ in range(2):
-        runner.choose("ab", lambda letter: 0.0, ahead=2)
+        runner.choose("ab", lambda letter: 0.0, Effort(ahead=2))
     print(os.getpid(), flush=True)
     time.sleep(120)
 runner = ForkedBranches(Notes())

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.decisions import TRIES, Decisions
+from robocas_ms3.planning.decisions import ONE_BY_ONE, TRIES, Decisions, Effort
 from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.reachability import Reachability
@@ -57,8 +57,8 @@ class Arm:
         self.planner.seed(int(entropy.generate_state(1)[0]))
         self.rng = np.random.default_rng(entropy)
 
-    def choose(self, candidates: Iterable[T], play: Callable[[T], float], **how: Any) -> T:
-        """Decide between candidates; see ``Decisions.choose``, which takes the other arguments."""
+    def choose(self, candidates: Iterable[T], play: Callable[[T], float], effort: Effort = ONE_BY_ONE) -> T:
+        """Decide between candidates; see ``Decisions.choose``."""
         path = self.path
 
         def play_one(numbered: tuple[int, T]) -> float:
@@ -67,11 +67,11 @@ class Arm:
             self._seed()
             return play(candidate)
 
-        return self.decisions.choose(enumerate(candidates), play_one, **how)[1]
+        return self.decisions.choose(enumerate(candidates), play_one, effort)[1]
 
-    def come_back_here(self, *, tries: int = TRIES) -> None:
+    def come_back_here(self) -> None:
         """Let what comes next begin again from here when it fails, with other random numbers."""
-        self.choose(range(tries), lambda _: 0.0, tries=tries)
+        self.choose(range(TRIES), lambda _: 0.0)
 
     @property
     def env(self) -> TransferEnv:

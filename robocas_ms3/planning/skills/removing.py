@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
@@ -9,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.scene import SPACING
+from robocas_ms3.planning.shapes import convex_hull
 from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
 from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.placing import attach_held
@@ -96,37 +99,53 @@ def _grasps_from_above(arm: Arm, slot: int) -> Array:
     grasps = frame @ notes.grasps_tcp_in_object
     passed = np.logical_and.reduce(list(directions_ok(grasps, frame[:3, 3]).values()))
     grasps = grasps[passed & (notes.grasp_widths <= MAX_WIDTH)]
-    return grasps[arm.rng.permutation(len(grasps))[:GRASPS_LOOKED_AT]]
+    # evenly spread, not drawn: a look must not change what comes after it
+    return grasps[np.linspace(0, len(grasps) - 1, min(len(grasps), GRASPS_LOOKED_AT)).astype(int)]
 
 
 def plan_place(arm: Arm, slot: int) -> Trajectory:
     """Plan to above a free place and down to it.
 
+    In a heap an object leans; let go of as it leant, it would fall over, off its place. So it is turned as little as
+    makes it stand, and put down as it is held only where that can't be done.
+
     Raises:
         PlanningFailed: of the place that came last.
     """
-    scene, start = arm.scene, arm.at
-    vertices = transform(scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
-    tcp = scene.tcp_in_base
+    scene, asset, held = arm.scene, arm.env.object_assets[0][slot], arm.scene.object_in_base(slot)
+    vertices = transform(held, np.concatenate(asset.hulls))
+    standing = turn_to_stand(vertices, transform(held, np.array([asset.asset.center_of_mass]))[0])
     others = scene.obstacles_in_base(without=slot)
-    failure = PlanningFailed("remove", "no_free_place")
-    for margin in EDGE_MARGINS:
-        places = free_places(vertices, others, *surface_in_base(arm), margin) @ tcp
-        nearest = np.argsort(np.linalg.norm(places[:, :2, 3] - tcp[:2, 3], axis=1), kind="stable")
-        # near and far ones: all of them would take inverse kinematics seconds
-        places = places[nearest[:: max(1, len(places) // PLACES_SOLVED)]]
-        above = places.copy()
-        above[:, 2, 3] += COME_DOWN
-        solved, qpos = arm.reachability.reachable(above, start)
-        solved[solved] = arm.reachability.reachable(places[solved], start)[0]
-        if solved.any():
-            break
-        failure = PlanningFailed("remove", "unreachable") if len(places) else failure
-    else:
-        raise failure
-    places, above, qpos = places[solved], above[solved], qpos[solved]
     arm.planner.set_scene(scene.obstacles(without=slot))
     attach_held(arm, slot)
+    failure = PlanningFailed("remove", "no_free_place")
+    for turn, margin in itertools.product((standing, np.eye(4)), EDGE_MARGINS):
+        motions = free_places(transform(turn, vertices), others, *surface_in_base(arm), margin) @ turn
+        if not len(motions):
+            continue
+        try:
+            return _plan_to_one_of(arm, motions @ scene.tcp_in_base)
+        except PlanningFailed as error:
+            failure = error
+    raise failure
+
+
+def _plan_to_one_of(arm: Arm, places: Array) -> tuple[Trajectory, Trajectory]:
+    """Plan to above one of several TCP poses (N, 4, 4), in the arm's base frame, and down to it.
+
+    Raises:
+        PlanningFailed: of the place that came last.
+    """
+    start = arm.at
+    nearest = np.argsort(np.linalg.norm(places[:, :2, 3] - arm.scene.tcp_in_base[:2, 3], axis=1), kind="stable")
+    # near and far ones: all of them would take inverse kinematics seconds
+    places = places[nearest[:: max(1, len(places) // PLACES_SOLVED)]]
+    above = places.copy()
+    above[:, 2, 3] += COME_DOWN
+    solved, qpos = arm.reachability.reachable(above, start)
+    solved[solved] = arm.reachability.reachable(places[solved], start)[0]
+    places, above, qpos = places[solved], above[solved], qpos[solved]
+    failure = PlanningFailed("remove", "unreachable")
     for index in np.argsort(np.abs(qpos - start).max(axis=1), kind="stable")[:PLACES_PLANNED]:
         try:
             carry = arm.planner.plan_to_pose(start, above[index], stage="remove")
@@ -135,6 +154,27 @@ def plan_place(arm: Arm, slot: int) -> Trajectory:
         except PlanningFailed as error:
             failure = error
     raise failure
+
+
+def turn_to_stand(vertices: Array, center_of_mass: Array) -> Array:
+    """The least turn (4x4) of a body after which it stands on level ground and stays as it stands.
+
+    Args:
+        vertices: (V, 3), in a frame whose z points up, m.
+        center_of_mass: (3,) in that frame.
+    """
+    corners, faces, normals = convex_hull(vertices)
+    a, b, c = corners[faces.T]
+    # it stays on a face that its centre of mass lies above
+    above = [np.einsum("ij,ij->i", np.cross(q - p, center_of_mass - p), normals) for p, q in ((a, b), (b, c), (c, a))]
+    stable = normals[np.all(np.array(above) >= -1e-9, axis=0)]
+    down = stable[np.argmin(stable[:, 2])]
+    axis = np.cross(down, (0, 0, -1))
+    sine = np.linalg.norm(axis)
+    turn = np.eye(4)
+    if sine > 0:
+        turn[:3, :3] = Rotation.from_rotvec(axis / sine * np.arctan2(sine, -down[2])).as_matrix()
+    return turn
 
 
 def free_places(vertices: Array, others: Array, frame: Array, half: Array, margin: float = EDGE_MARGINS[-1]) -> Array:

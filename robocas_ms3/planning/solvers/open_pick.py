@@ -1,11 +1,11 @@
-"""Scripted policy of open-pick: open the door or drawer, take the target out, carry it above the basket, let go."""
+"""Scripted policy of open-pick: open the door or drawer, then as pick."""
 
 from __future__ import annotations
 
 from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
-from robocas_ms3.planning.skills.stance import drive_to_basket, grasp_from_reach, open_from_reach
+from robocas_ms3.planning.skills.stance import open_from_reach
+from robocas_ms3.planning.solvers import pick
 
 
 def attempt(arm: Arm) -> None:
@@ -14,17 +14,10 @@ def attempt(arm: Arm) -> None:
     Raises:
         PlanningFailed: with the stage that could not be done.
     """
-    slot = int(arm.env.target_slot[0])
-    words = arm.env.target_asset().asset.name, arm.env.task_config.support
     if not arm.env.task_stages()["furniture_opened"][0]:
+        words = arm.env.target_asset().asset.name, arm.env.task_config.support
         arm.executor.label(**subgoal("operate the target", *words))
         open_from_reach(arm)
         arm.executor.rehearse()
         arm.come_back_here()
-    arm.executor.label(**subgoal("move and grasp", *words))
-    grasp_from_reach(arm, slot)
-    arm.executor.rehearse()
-    arm.executor.label(**subgoal("transfer object", *words))
-    drive_to_basket(arm, slot)
-    carry_to_basket(arm, slot)
-    release_into_basket(arm, slot)
+    pick.attempt(arm)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.language.templates import subgoal
+from robocas_ms3.planning.decisions import Effort
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.clearing import FACTS, Heap
@@ -42,7 +43,7 @@ def attempt(arm: Arm) -> None:
                 break
             arm.executor.label(**find)
         try:
-            arm.choose(heap.moves(), heap.make, ahead=AHEAD, tries=tries(heap.moves_made), enough=ENOUGH)
+            arm.choose(heap.moves(), heap.make, Effort(AHEAD, tries(heap.moves_made), ENOUGH))
         except PlanningFailed:
             # nothing can be moved: perhaps it can be grasped as things stand
             arm.executor.label(**take)
