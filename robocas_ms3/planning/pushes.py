@@ -16,10 +16,7 @@ TOOL_RADIUS = 0.012  # m, half the width of the closed fingers
 TIP_BELOW_TCP = 0.0085  # m, by which the pads reach beyond the TCP
 TIP_CLEARANCE = 0.012  # m kept between the finger tips and the surface
 BELOW_TOP = 0.02  # m; nearer to an object's top the tool would slide over it
-PUSH_LENGTH = (
-    0.12,
-    0.18,
-)  # m, least and greatest way of the tool once it touches; upstream goes 0.1 on from the middle
+PAST_MIDDLE = 0.1  # m that the tool goes past where the object's middle was (upstream's; the paper: 2 d_ext in all)
 EDGE_MARGIN = 0.08  # m that a pushed object keeps from the surface's edge
 WALL_MARGIN = 0.02  # m that it keeps from furniture and basket
 PUSHED_THINNED = 5  # every fifth point of an object will do for that: they are 5 mm apart
@@ -95,7 +92,7 @@ def candidates(
             tool = np.array([*center[:2], height]) - (extent + STAND_OFF + TOOL_RADIUS) * direction
             if not _tool_fits(tool, near):
                 continue
-            length = STAND_OFF + float(np.clip(2 * extent, *PUSH_LENGTH))
+            length = STAND_OFF + extent + PAST_MIDDLE
             shift = (length - STAND_OFF) * direction
             if not _ends_on(points + shift, frame, half) or _hits(tree, points, shift):
                 continue

@@ -117,13 +117,10 @@ def blended(first: Array, second: Array, rows: int) -> Array:
 
 
 def thinned(points: Array, spacing: float) -> Array:
-    """Those of the configurations (T, n) that lie ``spacing`` rad apart or more, first and last included."""
+    """Those of the configurations (T, n) that lie about ``spacing`` rad apart, first and last included."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    count = max(2, int(along[-1] / spacing) + 1)
-    kept = np.unique(np.searchsorted(along, np.linspace(0, along[-1], count)))
-    kept = kept[np.concatenate([[True], np.diff(along[kept]) > spacing / 2])]
-    kept[-1] = len(points) - 1
-    return points[kept]
+    kept = np.unique(np.searchsorted(along, np.arange(0, max(along[-1] - spacing / 2, spacing / 2), spacing)))
+    return points[[*kept, len(points) - 1]]
 
 
 def timed(path: JointPath, *, velocity: float, acceleration: float, dt: float) -> Trajectory | None:

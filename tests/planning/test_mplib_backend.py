@@ -124,6 +124,39 @@ def test_the_nearest_reachable_goal_is_taken(planner):
     np.testing.assert_array_equal(trajectory.qpos[-1], far)
 
 
+def test_joined_motions_do_not_stop_and_end_as_the_second(planner):
+    planner.set_scene([])
+    goal = top_down(0.5, 0.2, 0.3)
+    reach = planner.plan_to_pose(REST, goal, stage="reach")
+    lower = goal.copy()
+    lower[2, 3] -= 0.1
+    down = planner.plan_straight(reach.qpos[-1], lower, stage="approach")
+    joined = planner.join(REST, reach, down)
+    saved = reach.duration + down.duration - joined.duration
+    assert 0.5 <= saved <= 1.0
+    assert joined.qpos[-1].tolist() == down.qpos[-1].tolist()
+    rows = np.concatenate([[REST], joined.qpos])
+    speed = np.diff(rows, axis=0) / joined.dt
+    assert np.abs(speed).max() <= 0.5 and np.abs(np.diff(speed, axis=0) / joined.dt).max() <= 0.5
+    assert np.abs(speed[1:-1]).max(axis=1).min() > 0.02  # nowhere at rest in between
+    # the last 5 cm go straight down, as planned
+    low = np.array([planner.tcp(qpos)[:3, 3] for qpos in joined.qpos])
+    low = low[low[:, 2] < 0.25]
+    assert len(low) > 3 and np.abs(low[:, :2] - goal[:2, 3]).max() < 0.004
+
+
+def test_where_the_corner_is_blocked_motions_are_joined_with_a_stop(planner):
+    planner.set_scene([])
+    goal = top_down(0.5, 0.2, 0.3)
+    reach = planner.plan_to_pose(REST, goal, stage="reach")
+    lower = goal.copy()
+    lower[2, 3] -= 0.1
+    down = planner.plan_straight(reach.qpos[-1], lower, stage="approach")
+    everywhere = cloud([Box((0.5, 0.2, 0.25), (0.2, 0.2, 0.2))])
+    planner.set_scene(everywhere)
+    assert planner.join(REST, reach, down).qpos.tolist() == [*reach.qpos.tolist(), *down.qpos.tolist()]
+
+
 def test_failures_have_reasons(make_planner):
     planner = make_planner()
     assert reason_of(planner.plan_to_pose, REST, top_down(1.3, 0, 0.3)) == "no_ik"

@@ -130,7 +130,7 @@ def plan_place(arm: Arm, slot: int) -> Trajectory:
     raise failure
 
 
-def _plan_to_one_of(arm: Arm, places: Array) -> tuple[Trajectory, Trajectory]:
+def _plan_to_one_of(arm: Arm, places: Array) -> Trajectory:
     """Plan to above one of several TCP poses (N, 4, 4), in the arm's base frame, and down to it.
 
     Raises:
