@@ -119,8 +119,8 @@ def clutter(points: Tensor, present: Tensor, target: Tensor) -> Clutter:
 def _cells(points: Tensor, middle: Tensor) -> Tensor:
     """Number of the cell around ``middle`` (N, 2) that each of points (N, K, 2, P) lies in, (N, K, P)."""
     cell = torch.floor((points - middle[:, None, :, None]) / CELL).long() + CELLS // 2
-    inside = ((cell >= 0) & (cell < CELLS)).all(dim=2)
-    return torch.where(inside, cell[:, :, 0] * CELLS + cell[:, :, 1], _OUTSIDE)
+    inside = (cell >= 0) & (cell < CELLS)
+    return torch.where(inside[:, :, 0] & inside[:, :, 1], cell[:, :, 0] * CELLS + cell[:, :, 1], _OUTSIDE)
 
 
 def _height_map(cells: Tensor, heights: Tensor) -> Tensor:
