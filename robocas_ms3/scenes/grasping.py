@@ -7,13 +7,14 @@ with another turn of the wrist, so both are candidates.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.assets.gripper import GRIPPER_BOXES, GRIPPER_RADIUS
+from robocas_ms3.assets.gripper import GRIPPER_BOXES
 from robocas_ms3.assets.pack import LoadedObject
 
 Array = NDArray[np.float64]
@@ -38,6 +39,9 @@ PAD_POINTS = 10  # of a surface at 5 mm: a third of what fits
 ROOM_BESIDE = 0.006  # m between an object and each open finger
 MARGIN_WEIGHT = 1.0
 TURN_WEIGHT = 0.4  # a rad
+
+SPARSE = 16  # every so manieth point is tested against the gripper before all of them
+TESTED_AT_ONCE = 1 << 16  # pairs of grasp and point
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # of the wrist, about the approach
 
@@ -113,24 +117,48 @@ def gripper_is_clear(
     low, high = GRIPPER_BOXES[:, 0].copy(), GRIPPER_BOXES[:, 1].copy()
     low -= (side_clearance, side_clearance, sweep)
     high += (side_clearance, side_clearance, 0.0)
-    centers = tcp_in_world[:, :3, 3]
-    reach = GRIPPER_RADIUS + sweep
-    near = np.all((points_in_world >= centers.min(0) - reach) & (points_in_world <= centers.max(0) + reach), axis=1)
+    first, last = _bounds_around(tcp_in_world, low.min(axis=0), high.max(axis=0))
+    near = np.all((points_in_world >= first.min(0)) & (points_in_world <= last.max(0)), axis=1)
     points = points_in_world[near]
-    columns = np.ascontiguousarray(points.T)
-    least, most = low.min(axis=0), high.max(axis=0)  # of the half at positive y
-    middle, half = (least + most) / 2 * (1, 0, 1), np.array([(most - least)[0] / 2, most[1], (most - least)[2] / 2])
-    for i, pose in enumerate(tcp_in_world):
-        # Most points are outside a box along the axes around it all; the rest is tested against the three boxes, both
-        # halves at once.
-        center, extent = pose[:3, :3] @ middle + pose[:3, 3], np.abs(pose[:3, :3]) @ half
-        inside = np.arange(len(points))
-        for axis in range(3):
-            inside = inside[np.abs(columns[axis][inside] - center[axis]) <= extent[axis] + 1e-9]
-        local = (points[inside] - pose[:3, 3]) @ pose[:3, :3]
-        local[:, 1] = np.abs(local[:, 1])
-        clear[i] = not any(np.any(np.all((local >= a) & (local <= b), axis=1)) for a, b in zip(low, high, strict=True))
+    if len(points) == 0:
+        return clear
+    left = np.flatnonzero(np.all((first <= points.max(0)) & (last >= points.min(0)), axis=1))
+    for some in (points[::SPARSE], points):  # few points tell of most of the grasps that are not clear
+        batch = max(1, TESTED_AT_ONCE // len(some))
+        for start in range(0, len(left), batch):
+            part = left[start : start + batch]
+            clear[part] = ~_any_inside(tcp_in_world[part], some, low, high)
+        left = left[clear[left]]
     return clear
+
+
+def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Low and high corners (G, 3) of what is between ``low`` and ``high`` (3,) and, mirrored at y = 0, at each TCP."""
+    low = np.array([low[0], -high[1], low[2]])
+    rotations = tcp_in_world[:, :3, :3]
+    centers = rotations @ ((low + high) / 2) + tcp_in_world[:, :3, 3]
+    extents = np.abs(rotations) @ ((high - low) / 2) + 1e-9
+    return centers - extents, centers + extents
+
+
+def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+    """Say for each TCP (G, 4, 4) whether a point (P, 3) is in one of the boxes (B, 3), or in their mirror image."""
+    x, y, z = _seen_from(tcp, points)
+    y = np.abs(y)
+    inside = np.zeros(len(tcp), dtype=bool)
+    for (x0, y0, z0), (x1, y1, z1) in zip(low, high, strict=True):
+        inside |= ((x >= x0) & (x <= x1) & (y <= y1) & (y >= y0) & (z >= z0) & (z <= z1)).any(axis=1)
+    return inside
+
+
+def _seen_from(tcp: Array, points: Array) -> Iterator[Array]:
+    """Coordinates x, y, z, (G, P) each, of points (P, 3) in the frames of TCPs (G, 4, 4).
+
+    No BLAS, whose threads may change the last bits.
+    """
+    a, b, c = (points[:, i] - tcp[:, i, 3, None] for i in range(3))
+    for axis in range(3):
+        yield tcp[:, 0, axis, None] * a + tcp[:, 1, axis, None] * b + tcp[:, 2, axis, None] * c
 
 
 def filter_grasps(
@@ -190,13 +218,20 @@ def grip_margins(tcp: Array, widths: Array, surface: Array) -> Array:
         ``ROOM_BESIDE`` beside the object while the gripper is open.
     """
     tcp = np.asarray(tcp, dtype=np.float64)
-    local = np.einsum("nij,npi->npj", tcp[:, :3, :3], surface[None] - tcp[:, None, :3, 3])
-    between = np.abs(local[..., 1]) <= MAX_WIDTH / 2
     margin = np.clip((MAX_WIDTH - np.asarray(widths)) / 2 / ROOM_BESIDE, 0, 1)
-    for across, deeper in GRIP_SHIFTS:
-        inside = between & (np.abs(local[..., 0] - across) <= PAD_HALF_WIDTH)
-        inside &= (local[..., 2] >= PAD_BEHIND_TCP + deeper) & (local[..., 2] <= PAD_BEFORE_TCP + deeper)
-        margin = np.minimum(margin, inside.sum(axis=1) / PAD_POINTS)
+    widest, deepest = np.abs(GRIP_SHIFTS).max(axis=0)
+    batch = max(1, TESTED_AT_ONCE // len(surface))
+    for start in range(0, len(tcp), batch):
+        x, y, z = _seen_from(tcp[start : start + batch], surface)
+        near = (np.abs(y) <= MAX_WIDTH / 2) & (np.abs(x) <= PAD_HALF_WIDTH + widest)
+        near &= (z >= PAD_BEHIND_TCP - deepest) & (z <= PAD_BEFORE_TCP + deepest)
+        grasp, _ = np.nonzero(near)
+        x, z = x[near], z[near]
+        some = margin[start : start + batch]
+        for across, deeper in GRIP_SHIFTS:
+            inside = np.abs(x - across) <= PAD_HALF_WIDTH
+            inside &= (z >= PAD_BEHIND_TCP + deeper) & (z <= PAD_BEFORE_TCP + deeper)
+            np.minimum(some, np.bincount(grasp[inside], minlength=len(some)) / PAD_POINTS, out=some)
     return margin
 
 

@@ -74,11 +74,11 @@ def moved_near(poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, *, 
         (N,) bool.
     """
     env = torch.arange(len(target), device=poses.device)
-    reach = CELL * CELLS / 2**0.5 + radii + radii[env, target][:, None]
-    middle = poses[env, target, None, :2]
+    # the target's outline, the cells around it, and one for where in its cell a point lies
+    reach = radii + radii[env, target][:, None] + (REACH + 1) * CELL
     near = torch.zeros_like(radii, dtype=torch.bool)
     for at in (poses, before):
-        near |= torch.linalg.vector_norm(at[..., :2] - middle, dim=-1) <= reach
+        near |= ((at[..., :2] - at[env, target, None, :2]).abs() <= reach[..., None]).all(dim=-1)
     return (((poses - before).abs() > least).any(dim=-1) & near).any(dim=-1)
 
 
@@ -119,8 +119,8 @@ def clutter(points: Tensor, present: Tensor, target: Tensor) -> Clutter:
 def _cells(points: Tensor, middle: Tensor) -> Tensor:
     """Number of the cell around ``middle`` (N, 2) that each of points (N, K, 2, P) lies in, (N, K, P)."""
     cell = torch.floor((points - middle[:, None, :, None]) / CELL).long() + CELLS // 2
-    inside = ((cell >= 0) & (cell < CELLS)).all(dim=2)
-    return torch.where(inside, cell[:, :, 0] * CELLS + cell[:, :, 1], _OUTSIDE)
+    inside = (cell >= 0) & (cell < CELLS)
+    return torch.where(inside[:, :, 0] & inside[:, :, 1], cell[:, :, 0] * CELLS + cell[:, :, 1], _OUTSIDE)
 
 
 def _height_map(cells: Tensor, heights: Tensor) -> Tensor:

@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from robocas_ms3.planning.scene import PlanningScene, seen_from
+from robocas_ms3.planning.scene import PlanningScene, matrix, seen_from
 
 
 class Parked(PlanningScene):
@@ -24,10 +25,6 @@ def at(x, y, z):
     return pose
 
 
-def actor(x, y, z):
-    return SimpleNamespace(pose=SimpleNamespace(raw_pose=torch.tensor([[x, y, z, 1.0, 0, 0, 0]])))
-
-
 def part(name):
     return SimpleNamespace(
         surface_points=lambda spacing: np.zeros((1, 3)),
@@ -41,8 +38,8 @@ def environment(present):
     return SimpleNamespace(
         present=torch.tensor([present], dtype=torch.bool),
         object_assets=[[part(f"object {slot}") for slot in range(3)]],
-        objects=[actor(0, 0, 1.0 + slot) for slot in range(3)],
-        fixtures=SimpleNamespace(basket=actor(0, 0, 0)),
+        object_states=torch.tensor([[[0, 0, 1.0 + slot, 1, 0, 0, 0, *6 * [0]] for slot in range(3)]]),
+        basket_pose=torch.tensor([[0, 0, 0, 1.0, 0, 0, 0]]),
         model=SimpleNamespace(
             basket=part("basket"), furniture={"table": part("table")}, furniture_poses={"table": at(9, 0, 0)}
         ),
@@ -59,6 +56,15 @@ def test_objects_that_wait_elsewhere_are_no_obstacles(present, without, heights)
     bodies = scene.obstacles(without=without)
     assert [body.name for body in bodies[:2]] == ["table", "basket"]
     assert [body.pose_in_base[2, 3] for body in bodies[2:]] == heights
+
+
+def test_a_pose_becomes_the_matrix_that_scipy_gives():
+    raw = torch.tensor([0.1, -0.2, 0.3, 0.5, -0.1, 0.7, 0.2])  # not quite a unit quaternion
+    pose = matrix(raw)
+    values = raw.numpy().astype(float)
+    assert np.array_equal(pose[:3, :3], Rotation.from_quat(values[[4, 5, 6, 3]]).as_matrix())
+    assert np.array_equal(pose[:, 3], [*values[:3], 1])
+    assert np.array_equal(pose[3], [0, 0, 0, 1])
 
 
 def test_only_what_is_near_a_place_is_sampled():

@@ -127,6 +127,22 @@ def test_points_in_the_open_gripper(point, clear):
         assert gripper_is_clear(pose[None], inside[None])[0] == clear
 
 
+def test_many_grasps_among_many_points_are_judged_as_each_alone():
+    rng = np.random.default_rng(0)
+    grasps = np.stack([grasp(*rng.uniform(-60, 60, 3)) for _ in range(40)])
+    grasps[:, :3, 3] += rng.uniform(-0.3, 0.3, (40, 3))
+    points = rng.uniform(-0.6, 0.6, (300, 3)) + grasp()[:3, 3]
+    expected = []
+    for pose in grasps:
+        x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
+        in_tip = (abs(x) <= 0.01) & (abs(abs(y) - 0.043) <= 0.003) & (z >= -0.14) & (z <= 0.0085)
+        in_knuckle = (abs(x) <= 0.012) & (abs(abs(y) - 0.0535) <= 0.0135) & (z >= -0.175) & (z <= -0.02)
+        in_palm = (abs(x) <= 0.033) & (abs(y) <= 0.104) & (z >= -0.28) & (z <= -0.067)
+        expected.append(not (in_tip | in_knuckle | in_palm).any())
+    assert 0 < sum(expected) < 40
+    assert gripper_is_clear(grasps, points).tolist() == expected
+
+
 def test_without_a_sweep_only_the_grasp_itself_counts():
     above = grasp()[:3, 3] + [0, 0.042, 0.2]  # 0.2 m above the pad
     assert not gripper_is_clear(grasp()[None], above[None], sweep=0.1)[0]

@@ -94,6 +94,22 @@ def test_points_follow_their_object():
     assert torch.allclose(moved[..., 0], torch.tensor([[[1.0, 2.1, 3], [0, 0, 0.1]]]), atol=1e-6)
 
 
+def test_what_is_too_far_to_count_as_motion_changes_nothing():
+    side = torch.linspace(-0.05, 0.05, 21)
+    ball = torch.stack([x.flatten() for x in torch.meshgrid(side, side, indexing="ij")] + [torch.zeros(441)])
+    ball = ball[:, torch.linalg.vector_norm(ball, dim=0) <= 0.05 + 1e-6]
+
+    def counted(x: float) -> bool:
+        poses = torch.tensor([[[0.0, 0, 0.7, 1, 0, 0, 0], [x, 0, 0.8, 1, 0, 0, 0]]])
+        found = clutter(
+            surface_points(poses, ball.expand(1, 2, 3, -1)), torch.ones(1, 2, dtype=torch.bool), torch.tensor([0])
+        )
+        return bool(found.obstacles[0, 1])
+
+    assert counted(0.108)
+    assert not counted(0.1151)
+
+
 def test_what_moves_far_away_does_not_count_as_motion():
     def at(*places: tuple[float, float]) -> torch.Tensor:
         return torch.tensor([[[x, y, 0.7, 1, 0, 0, 0] for x, y in places]])
@@ -101,10 +117,11 @@ def test_what_moves_far_away_does_not_count_as_motion():
     def moved(before: torch.Tensor, now: torch.Tensor) -> bool:
         return bool(moved_near(now, before, torch.full((1, 2), 0.05), torch.tensor([0])))
 
-    still = at((0, 0), (0.3, 0))  # within 0.226 + 0.1 m
+    still = at((0, 0), (0.11, 0))  # within two radii and three cells, along x and along y: 0.115 m
     assert not moved(still, still + 5e-5)
-    assert moved(still, at((0, 0), (0.3002, 0)))
-    assert moved(still, at((0.0002, 0), (0.3, 0)))  # the target
-    assert not moved(at((0, 0), (0.4, 0)), at((0, 0), (0.5, 0)))
-    assert moved(at((0, 0), (0.4, 0)), at((0, 0), (0.3, 0)))  # comes near
-    assert moved(at((0, 0), (0.3, 0)), at((0, 0), (0.4, 0)))  # leaves
+    assert moved(still, at((0, 0), (0.1102, 0)))
+    assert moved(at((0, 0), (0.11, 0.11)), at((0, 0), (0.11, 0.1102)))
+    assert moved(still, at((0.0002, 0), (0.11, 0)))  # the target
+    assert not moved(at((0, 0), (0.12, 0)), at((0, 0), (0.2, 0)))
+    assert moved(at((0, 0), (0.2, 0)), at((0, 0), (0.11, 0)))  # comes near
+    assert moved(at((0, 0), (0.11, 0)), at((0, 0), (0.2, 0)))  # leaves
