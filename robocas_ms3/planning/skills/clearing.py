@@ -27,7 +27,8 @@ TURNS_DEG = (30.0, -30.0)  # off the paper's direction of a push, where that one
 AT_EDGE = 0.01  # m from the surface's edge, nearer than which no object may come
 
 # What a move is worth, in seconds of the demonstration that it makes needless or costs
-PER_OBSTACLE, PER_HIDDEN_SHARE, NO_GRASP, PER_METRE_OF_TARGET = 10.0, 30.0, 8.0, 120.0
+PER_OBSTACLE, PER_HIDDEN_SHARE, NO_GRASP, PER_METRE_OF_TARGET = 10.0, 30.0, 8.0, 400.0
+PUSHED = 8.0  # what is pushed comes to lie elsewhere each time, and so may all that it meets
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,7 @@ class Heap:
         order = dict.fromkeys(obstacles[:LOOKED_AT])
         order |= dict.fromkeys(slot for slot in blockers(self.arm, self.target)[:LOOKED_AT] if slot not in order)
         slots = [slot for slot in order if slot != self.target][:LOOKED_AT]
-        yield from (Move("push", slot) for slot in slots[:2])
-        yield from (Move("lift", slot) for slot in slots[:2])
+        yield from (Move(skill, slot) for slot in slots[:2] for skill in ("push", "lift"))
         yield from (Move("push", slot) for slot in slots[2:])
         yield from (Move("push", slot, turn) for slot in slots[:2] for turn in TURNS_DEG)
         yield from (Move("lift", slot) for slot in slots[2:])
@@ -131,7 +131,7 @@ class Heap:
             remove(arm, move.slot)
             facts["removals"] += 1
         self.check_surface()
-        seconds = (len(arm.executor.actions) - begun) * arm.executor.dt
+        seconds = PUSHED * (move.skill == "push") + (len(arm.executor.actions) - begun) * arm.executor.dt
         return (
             -seconds - self.work_left() - PER_METRE_OF_TARGET * float(np.linalg.norm(self.middle(self.target) - target))
         )

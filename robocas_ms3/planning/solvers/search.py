@@ -18,7 +18,7 @@ from robocas_ms3.planning.skills.removing import hang_clear
 
 LIFT_HEIGHT = 0.15  # m, upstream's
 AHEAD = 3  # moves that are compared
-ENOUGH = -10.0  # s; a move after which nothing is left to do, and which took no longer, is not compared with others
+ENOUGH = -18.0  # s; a move after which nothing is left to do, and which took no longer, is not compared with others
 GRASPS = 3  # kinds of grasps of the target that are tried
 
 
