@@ -5,6 +5,7 @@ No BLAS: its threads take longer to start than 3 x 3 matrices take, and the last
 
 from __future__ import annotations
 
+from copy import copy
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -68,6 +69,13 @@ class ArmChain:
             [[float(e.attrib[key]) for key in ("lower", "upper")] for joint in turning for e in joint.findall("limit")]
         )
         self.lower, self.upper = limits[:, 0] + LIMIT_MARGIN, limits[:, 1] - LIMIT_MARGIN
+
+    def ending_behind(self, distance: float) -> ArmChain:
+        """The same arm, whose end is a point this far (m) behind the TCP, against the approach."""
+        chain, back = copy(self), np.eye(4)
+        back[2, 3] = -distance
+        chain.links = [*self.links[:-1], self.links[-1] @ back]
+        return chain
 
     def frames(self, qpos: Array) -> tuple[Array, Array]:
         """Give rotations (8, M, 3, 3) and positions (8, M, 3) of links 1 to 7 and the TCP in the base at (M, 7)."""

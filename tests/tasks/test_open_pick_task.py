@@ -18,7 +18,7 @@ from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.skills.driving import base_at, drive
 from robocas_ms3.planning.skills.grasping import plan_grasp
-from robocas_ms3.planning.skills.handles import open_part, plan_pull, pull_share
+from robocas_ms3.planning.skills.handles import DEEPER, open_part, plan_pull, pull_share
 from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.stance import drive_to_handle
 
@@ -126,7 +126,8 @@ def test_a_pull_is_planned_to_the_far_end(tmp_path):
         part = Part.of(arm)
         plan = plan_pull(arm, part)
         assert not part.pressed(arm)
-        held = [arm.planner.tcp(motion.qpos[-1]) for motion in (plan.way_in, plan.pull)]
+        at_bar = arm.reachability.chain.ending_behind(DEEPER)
+        held = at_bar.tcp(np.stack([motion.qpos[-1] for motion in (plan.way_in, plan.pull)]))
         seen.append((part, part.in_base(arm, np.array([0.0, 0.95 * part.end])), held))
         raise Planned
 

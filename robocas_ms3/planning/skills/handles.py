@@ -163,19 +163,20 @@ def _paths(arm: Arm, part: Part, frames: Array, deeper: float = 0.0) -> tuple[Ar
     Returns:
         Configurations (T, N, 7); how many of the part's T poses (N,) each reaches; rad (N,) turned about the bar.
     """
-    goals, starts = [], []
+    goals, starts, beyond = [], [], np.eye(4)
+    beyond[2, 3] = deeper
     for shift in SHIFTS:
         for half_turn in (False, True):
             hold = part.hold @ HALF_TURN if half_turn else part.hold
-            hold[:3, 3] += shift * part.hold[:3, 0] + deeper * part.hold[:3, 2]
+            hold[:3, 3] += shift * part.hold[:3, 0]
             for turn in TURNS:
                 goals.append(frames @ hold)
-                starts.append(turned_about_bar(goals[-1][0], turn))
+                starts.append(turned_about_bar(goals[-1][0], turn) @ beyond)
     held = np.stack(goals, axis=1)
     solved, qpos = arm.reachability.reachable(np.array(starts), arm.at)
     if not solved.any():
         raise PlanningFailed("handle", "unreachable")
-    path = track(arm.reachability.chain, qpos[solved], held[:, solved])
+    path = track(arm.reachability.chain.ending_behind(deeper), qpos[solved], held[:, solved])
     turned = np.tile(np.abs(TURNS), len(goals) // len(TURNS))[solved]
     return path, reached(path), turned
 
