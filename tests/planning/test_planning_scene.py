@@ -58,6 +58,11 @@ def test_objects_that_wait_elsewhere_are_no_obstacles(present, without, heights)
     assert [body.pose_in_base[2, 3] for body in bodies[2:]] == heights
 
 
+def test_room_is_kept_to_furniture_and_basket_not_to_objects():
+    bodies = Parked(environment([1, 1, 1])).obstacles(room=0.02)
+    assert [(body.name, body.room) for body in bodies[:3]] == [("table", 0.02), ("basket", 0.02), ("object 0", 0.0)]
+
+
 def test_a_pose_becomes_the_matrix_that_scipy_gives():
     raw = torch.tensor([0.1, -0.2, 0.3, 0.5, -0.1, 0.7, 0.2])  # not quite a unit quaternion
     pose = matrix(raw)
