@@ -214,7 +214,8 @@ class MplibPlanner:
             rows = min(round(seconds / self._dt), len(a) - 1, len(b) - 1)
             points = blended(a, b, rows)
             between = points[len(a) - rows - 1 : len(a) + 1]
-            if rows < 1 or not self._world.all_free(_dense(between)):
+            lower, upper = self._world.limits.T  # the sum of two motions may leave what either keeps to
+            if rows < 1 or np.any((between < lower) | (between > upper)) or not self._world.all_free(_dense(between)):
                 continue
             path = through(thinned(points, BLEND_SPACING))
             trajectory = self._timed(partial(timed, path))

@@ -9,7 +9,7 @@ from planning_scenes import REST, Box, cloud, corners, table_scene, top_down
 from robocas_ms3.errors import PlanningFailed, RobocasError
 from robocas_ms3.planning.kinematics import pose_error
 from robocas_ms3.planning.mplib_backend import TCP_SPEED_LIMIT, MplibPlanner
-from robocas_ms3.planning.protocol import AttachedBody, Planner
+from robocas_ms3.planning.protocol import AttachedBody, Planner, Trajectory
 
 WALL = Box((0.55, 0.0, 0.15), (0.4, 0.03, 0.4))
 
@@ -124,13 +124,18 @@ def test_the_nearest_reachable_goal_is_taken(planner):
     np.testing.assert_array_equal(trajectory.qpos[-1], far)
 
 
-def test_joined_motions_do_not_stop_and_end_as_the_second(planner):
+def reach_and_down(planner):
+    """A motion to above a place on a free table, and 10 cm straight down from there."""
     planner.set_scene([])
     goal = top_down(0.5, 0.2, 0.3)
     reach = planner.plan_to_pose(REST, goal, stage="reach")
     lower = goal.copy()
     lower[2, 3] -= 0.1
-    down = planner.plan_straight(reach.qpos[-1], lower, stage="approach")
+    return reach, planner.plan_straight(reach.qpos[-1], lower, stage="approach")
+
+
+def test_joined_motions_do_not_stop_and_end_as_the_second(planner):
+    reach, down = reach_and_down(planner)
     joined = planner.join(REST, reach, down)
     saved = reach.duration + down.duration - joined.duration
     assert 0.5 <= saved <= 1.0
@@ -142,19 +147,22 @@ def test_joined_motions_do_not_stop_and_end_as_the_second(planner):
     # the last 5 cm go straight down, as planned
     low = np.array([planner.tcp(qpos)[:3, 3] for qpos in joined.qpos])
     low = low[low[:, 2] < 0.25]
-    assert len(low) > 3 and np.abs(low[:, :2] - goal[:2, 3]).max() < 0.004
+    assert len(low) > 3 and np.abs(low[:, :2] - (0.5, 0.2)).max() < 0.004
 
 
 def test_where_the_corner_is_blocked_motions_are_joined_with_a_stop(planner):
-    planner.set_scene([])
-    goal = top_down(0.5, 0.2, 0.3)
-    reach = planner.plan_to_pose(REST, goal, stage="reach")
-    lower = goal.copy()
-    lower[2, 3] -= 0.1
-    down = planner.plan_straight(reach.qpos[-1], lower, stage="approach")
-    everywhere = cloud([Box((0.5, 0.2, 0.25), (0.2, 0.2, 0.2))])
-    planner.set_scene(everywhere)
+    reach, down = reach_and_down(planner)
+    planner.set_scene(cloud([Box((0.5, 0.2, 0.25), (0.2, 0.2, 0.2))]))
     assert planner.join(REST, reach, down).qpos.tolist() == [*reach.qpos.tolist(), *down.qpos.tolist()]
+
+
+def test_joined_motions_keep_to_joint_limits(planner):
+    planner.set_scene([])
+    limit = planner._world.limits[5, 0]  # of joint 6; both motions keep to it, their sum would not
+    start, rise, fall = REST.copy(), np.tile(REST, (20, 1)), np.tile(REST, (20, 1))
+    start[5], rise[:, 5], fall[:, 5] = limit + 0.02, np.linspace(limit + 0.024, limit + 0.1, 20), limit + 0.02
+    first, second = Trajectory(rise, 0.05), Trajectory(fall, 0.05)
+    assert planner.join(start, first, second).qpos.tolist() == [*rise.tolist(), *fall.tolist()]
 
 
 def test_failures_have_reasons(make_planner):

@@ -83,12 +83,15 @@ def test_layouts_are_settled_and_as_their_kind_says(env, seed):
     base = env.unwrapped
     kind = base.task_config.layout.kind
     before = base.object_poses[0, :, :3].clone()
-    for _ in range(20):  # 1 s: what was checked when the layout was made
-        env.step(hold(env))
-    moved = (base.object_poses[0, :, :3] - before).norm(dim=1)
-    # rows stand and heaps lie as they did in a bare scene; with a robot in it, a bottle may tip onto its next facet
-    assert moved.max() < (0.002 if kind == "scattered" else 0.005)
-    assert torch.stack([actor.linear_velocity for actor in base.objects]).norm(dim=-1).max() < 0.02
+    for second in (0.5, 1.0):
+        for _ in range(10):
+            env.step(hold(env))
+        moved = (base.object_poses[0, :, :3] - before).norm(dim=1)
+        # rows stand and heaps lie as they did in a bare scene; with a robot in it, a bottle may tip onto its next facet
+        assert moved.max() < (0.002 if kind == "scattered" else 0.005)
+        # in a heap something may rock for half a second, since the engine solves contacts in another order here
+        if kind != "stacked" or second == 1.0:
+            assert torch.stack([actor.linear_velocity for actor in base.objects]).norm(dim=-1).max() < 0.02
     ids = {o._bodies[0].entity.per_scene_id: i for i, o in enumerate(base.objects)}
     for contact in base.scene.px.get_contacts():
         pair = [body.entity.per_scene_id for body in contact.bodies]
