@@ -6,7 +6,8 @@ fails, this process, still at the decision, tells the next best. So processes st
 made, and the last one writes the episode. Nothing is simulated twice, and the actions since the reset remain all there
 is.
 
-Children die with their parents, leave no zombies, and have a time limit; one that crashes has failed.
+Children die with their parents, leave no zombies, and have a time limit. One that is gone is played once more: if it
+was killed from outside, the episode stays what it would have been; if it crashes again, it has failed.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import logging
-import math
 import os
 import pickle
 import signal
@@ -77,14 +77,19 @@ class _Done(Exception):  # noqa: N818
 
 
 class _Crashed(Exception):  # noqa: N818
-    """A child is gone, or took too long."""
+    """A child took too long, or is gone."""
+
+
+class _Gone(_Crashed):
+    """A child has ended without a word."""
 
 
 @dataclass
 class _Child:
     pid: int
     pipe: Connection
-    score: float = -math.inf
+    candidate: Any
+    answer: Any = None
 
 
 @dataclass(frozen=True)
@@ -147,25 +152,23 @@ class ForkedBranches:
         try:
             while gone_on < effort.tries and not self._tally.exhausted:
                 for candidate in left:
-                    child = self._fork()
+                    child = self._look(play, candidate)
                     if child is None:
-                        self._play(play, candidate)
                         return candidate
-                    try:
-                        answer = self._hear(child, PLAY_LIMIT)
-                    except _Crashed as error:
-                        answer = _Failed(PlanningFailed("branch", str(error)))
-                    if isinstance(answer, _Failed):
-                        failure = answer.error or failure
-                        self._end(child)
+                    if isinstance(child.answer, _Failed):
+                        failure = child.answer.error or failure
                         continue
-                    child.score = answer
-                    if len(self._children) == effort.ahead or child.score >= effort.enough:
+                    if len(self._children) == effort.ahead or child.answer >= effort.enough:
                         break
                 if not self._children:
                     break
-                for child in sorted(self._children, key=lambda child: -child.score):
-                    self._go_on_as(child)
+                for child in sorted(self._children, key=lambda child: -child.answer):
+                    if not self._go_on_as(child):
+                        again = self._look(play, child.candidate)
+                        if again is None:
+                            return child.candidate
+                        if isinstance(again.answer, _Failed) or not self._go_on_as(again):
+                            self._tally.failed(PlanningFailed("branch", "crashed"))
                     gone_on += 1
                     if gone_on == effort.tries or self._tally.exhausted:
                         break
@@ -178,8 +181,30 @@ class ForkedBranches:
 
     # ------------------------------------------------------------------ this process
 
-    def _fork(self) -> _Child | None:
-        """A new child; None in the child itself."""
+    def _look(self, play: Callable[[T], float], candidate: T) -> _Child | None:
+        """A child that has played a candidate, with what it said; None in the child itself, where it shall go on.
+
+        The child has ended where it, or its second try, failed.
+        """
+        for last in (False, True):
+            child = self._fork(candidate)
+            if child is None:
+                self._play(play, candidate)
+                return None
+            try:
+                child.answer = self._hear(child, PLAY_LIMIT)
+            except _Crashed as error:
+                child.answer = _Failed(PlanningFailed("branch", str(error)))
+                if isinstance(error, _Gone) and not last:
+                    self._end(child)
+                    continue
+            break
+        if isinstance(child.answer, _Failed):
+            self._end(child)
+        return child
+
+    def _fork(self, candidate: Any) -> _Child | None:
+        """A new child for a candidate; None in the child itself."""
         here, there = cast("tuple[Connection, Connection]", Pipe())
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
@@ -189,7 +214,7 @@ class ForkedBranches:
         try:
             pid = os.fork()
             if pid:
-                child = _Child(pid, here)
+                child = _Child(pid, here, candidate)
                 self._children.append(child)
                 there.close()
                 return child
@@ -205,28 +230,31 @@ class ForkedBranches:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def _go_on_as(self, child: _Child) -> None:
-        """Let a child be the episode; comes back where that fails.
+    def _go_on_as(self, child: _Child) -> bool:
+        """Let a child be the episode; comes back where that fails, or, with False, where the child is gone.
 
         Raises:
             _Done: it ended well.
         """
-        child.pipe.send(self._tally)
         try:
+            child.pipe.send(self._tally)
             answer = self._hear(child, GO_ON_LIMIT)
+        except (_Gone, ConnectionError):
+            return False
         except _Crashed as error:
             self._tally.failed(PlanningFailed("branch", str(error)))
+            return True
+        finally:
             self._end(child)
-            return
-        self._end(child)
         if answer == "done":
             raise _Done
+        return True
 
     def _hear(self, child: _Child, limit: float) -> Any:
         """What a child says next; its tally is ours then.
 
         Raises:
-            _Crashed: it is gone, or says nothing.
+            _Crashed: it is gone (`_Gone`), or says nothing.
             BaseException: what it ended with, caused by a `BranchTraceback`.
         """
         try:
@@ -234,7 +262,7 @@ class ForkedBranches:
                 raise _Crashed("timed_out")
             answer, tally = child.pipe.recv()
         except (EOFError, ConnectionError) as error:
-            raise _Crashed("crashed") from error
+            raise _Gone("crashed") from error
         if isinstance(answer, _Raised):
             raise answer.error from BranchTraceback(answer.traceback)
         self._tally.adopt(tally)

@@ -214,6 +214,43 @@ def test_a_crash_further_on_is_a_failed_attempt():
     assert notes.failures == ["branch: crashed"]
 
 
+@pytest.mark.parametrize("moment", ["it plays", "it goes on", "it waits"])
+def test_a_child_that_is_killed_once_changes_nothing(tmp_path, moment):
+    """Three candidates are compared; b is the best. It, or a later decision's, is killed from outside, once."""
+
+    def kill_once(when):
+        if when == moment and not (tmp_path / "killed").exists():
+            (tmp_path / "killed").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def kill_waiting(letter):
+        if moment == "it waits" and letter == "c" and not (tmp_path / "killed").exists():
+            (tmp_path / "killed").touch()
+            os.kill(int((tmp_path / "b").read_text()), signal.SIGKILL)
+
+    def play(letter):
+        (tmp_path / letter).write_text(str(os.getpid()))
+        if letter == "b":
+            kill_once("it plays")
+        kill_waiting(letter)
+        return {"a": 1.0, "b": 3.0, "c": 2.0}[letter]
+
+    def decide(runner):
+        first = runner.choose("abc", play, Effort(ahead=3))
+        second = runner.choose("abc", lambda letter: 0.0)
+        if second == "b":
+            kill_once("it goes on")
+        if (first, second) != ("b", "c"):
+            raise PlanningFailed("end", first + second)
+        (tmp_path / "outcome").write_text(first + second)
+
+    ended, notes = forked(decide)
+    assert ended
+    assert (tmp_path / "killed").exists()
+    assert (tmp_path / "outcome").read_text() == "bc"
+    assert notes.failures == ["end: ba", "end: bb"]
+
+
 def test_a_child_that_takes_too_long_is_ended(monkeypatch):
     monkeypatch.setattr(branches, "PLAY_LIMIT", 0.2)
 
