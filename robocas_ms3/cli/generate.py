@@ -41,7 +41,7 @@ class Generate:
     """How often they are tried with a robot's noise as well. 0: not at all."""
     noise: tuple[float, float] = (0.5, 0.2)
     """That noise: standard deviations in mm and degrees, of each component of each action."""
-    noisy_failures: int = 5
+    noisy_failures: int = 1
     """Attempts that may fail for noise alone; after so many an episode counts without, and its record says so."""
     fork: bool = True
     """Undo what fails by forking the process, where that is safe. The episodes are the same without, only slower."""

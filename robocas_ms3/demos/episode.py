@@ -65,7 +65,7 @@ class EpisodeSettings:
     keep_recoveries: bool = False
     replay_rate: int = 5
     noisy_trials: int = 1
-    noisy_failures: int = 5
+    noisy_failures: int = 1
     noise_mm: float = 0.5
     noise_deg: float = 0.2
 

@@ -33,8 +33,8 @@ from robocas_ms3.tasks.contacts import Contacts
 from robocas_ms3.tasks.seeds import SeededEnv
 from robocas_ms3.tasks.spec import TaskSpec
 
-# with a renderer what is left of a scene holds 8 MB until it is collected, without one next to nothing
-_RESETS_PER_COLLECTION, _RESETS_PER_COLLECTION_STATE_ONLY = 20, 200
+# with a renderer what is left of a scene holds 8 MB until it is collected, without one 0.5 MB
+_RESETS_PER_COLLECTION, _RESETS_PER_COLLECTION_STATE_ONLY = 20, 30
 _STATIC_CAMERA_SHARE = 0.75  # of the render camera's distance, as it sees 90 deg instead of 60
 
 

@@ -310,7 +310,7 @@ def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("reason", ["no_success", "clipped", "parted"])
 def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_path, monkeypatch, reason):
-    generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin"))
+    generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin", noisy_failures=2))
     world, spoilt = generator.worlds[-1], []
     step, settle = world.step, world.settle
 
