@@ -95,6 +95,11 @@ class PlanningScene:
             if present[slot] and slot not in left_out:
                 yield asset.asset.id, asset, SPACING, matrix(poses[slot])
 
+    def sample_surfaces(self) -> None:
+        """Sample now, once for each asset of a process, what clouds are made of; a branch would lose its samples."""
+        for _, part, spacing, _ in self._bodies((), None):
+            part.surface_points(spacing)
+
     def joint_positions(self, furniture: str) -> dict[str, float]:
         """Positions of a piece of furniture's joints by name, m or rad."""
         built = self.env.fixtures.furniture[furniture]

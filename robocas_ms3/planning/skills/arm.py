@@ -51,6 +51,14 @@ class Arm:
         self.at = self.scene.arm_qpos
         self.hold_nothing()
         self._seed()
+        with self.planning():
+            self._prepare()
+
+    def _prepare(self) -> None:
+        """Work out before the first decision what is kept for as long as the process runs."""
+        self.scene.sample_surfaces()
+        for room in (ROOM, 0.0):
+            self.planner.set_scene(self.scene.obstacles(room=room))
 
     def _seed(self) -> None:
         entropy = np.random.SeedSequence([self.executor.seed, *self.path])
