@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
@@ -44,6 +45,7 @@ class EpisodeRecorder(gym.Wrapper):
         self._base_env, self._trajectory = base_env, folder / f"{name}.h5"
         self._steps = _Steps()
         self._reset_kwargs: dict[str, Any] = {}
+        versions()  # here, where it is kept, and not in each branch
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Reset the environment and begin anew."""
@@ -164,6 +166,7 @@ def _write(group: h5py.Group, key: str, data: Any) -> None:
     group.create_dataset(key, data=data, dtype=data.dtype, **packing)
 
 
+@cache  # it reads the packages' descriptions
 def versions() -> dict[str, str]:
     """Versions an episode depends on."""
     return {name: version(name) for name in ("robocas-ms3", "mani_skill", "sapien", "mplib", "torch", "numpy")}

@@ -11,7 +11,7 @@ from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.scene import inverse, matrix
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.scenes.randomise import draw_camera_shift
-from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh
+from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, prepare
 
 CAMERA = "gripper_camera"
 FAR, NEAR = (0.4, 0.5), (0.2, 0.3)  # m from the camera to what it looks at: at first; between two removals (upstream's)
@@ -56,6 +56,13 @@ def plan_look(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> 
     near = near[: 4 * VIEWS_PLANNED]
     goals = near[arm.planner.free(near, arm.planner.finger_width)][:VIEWS_PLANNED]
     return arm.planner.plan_to_qpos(arm.at, list(goals), stage="look")
+
+
+def prepare_looks(arm: Arm) -> None:
+    """Read the objects' meshes before the first decision: each branch that looks would read them again."""
+    for asset, present in zip(arm.env.object_assets[0], arm.env.present[0].tolist(), strict=True):
+        if present:
+            prepare(object_mesh(asset))
 
 
 def hidden_share(arm: Arm, slot: int) -> float:

@@ -12,7 +12,7 @@ from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.clearing import FACTS, Heap
 from robocas_ms3.planning.skills.grasping import grasp
-from robocas_ms3.planning.skills.looking import FAR, NEAR, look_at
+from robocas_ms3.planning.skills.looking import FAR, NEAR, look_at, prepare_looks
 from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
 from robocas_ms3.planning.skills.removing import hang_clear
 
@@ -34,6 +34,7 @@ def attempt(arm: Arm) -> None:
     heap = Heap(arm, slot)
     for fact in FACTS:
         arm.executor.facts.setdefault(fact, 0)
+    prepare_looks(arm)
     arm.executor.label(**find)
     look_at(arm, heap.middle(slot), FAR)
     while True:
