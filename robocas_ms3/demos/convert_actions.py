@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.robots import constants as c
-from robocas_ms3.robots.controllers import RoboCASEEPoseController, to_ee_delta_action
+from robocas_ms3.robots.ee_controller import RoboCASEEPoseController
+from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.robots.urdf import robot_files
 from robocas_ms3.tasks.base import RoboCASEnv
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.demos.sampling import Array
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.robots.controllers import to_ee_delta_action
+from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.tasks.transfer import TransferEnv
 

@@ -18,19 +18,20 @@ from mani_skill.utils import common
 from mani_skill.utils.structs import Actor, Link, Pose
 
 from robocas_ms3.robots import constants as c
-from robocas_ms3.robots.controllers import (
-    BASE_SCALE,
+from robocas_ms3.robots.drives import EvenDrives
+from robocas_ms3.robots.ee_controller import (
     BODY_FRAME,
-    JOINT_SCALE,
-    POSITION_SCALE,
-    ROTATION_SCALE,
-    EvenDrives,
-    FingersControllerConfig,
-    HeldJointsControllerConfig,
     RoboCASEEPoseController,
     RoboCASEEPoseControllerConfig,
-    SmoothJointPosControllerConfig,
     relative_pose,
+)
+from robocas_ms3.robots.ee_deltas import POSITION_SCALE, ROTATION_SCALE
+from robocas_ms3.robots.joint_controllers import (
+    BASE_SCALE,
+    JOINT_SCALE,
+    FingersControllerConfig,
+    HeldJointsControllerConfig,
+    SmoothJointPosControllerConfig,
 )
 from robocas_ms3.robots.urdf import robot_files
 

@@ -9,7 +9,8 @@ from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.robots import constants as c
-from robocas_ms3.robots.controllers import batched_ik, ee_delta_target, to_ee_delta_action
+from robocas_ms3.robots.ee_controller import batched_ik
+from robocas_ms3.robots.ee_deltas import ee_delta_target, to_ee_delta_action
 
 MODES = {"pd_joint_pos": 8, "pd_joint_delta_pos": 8, "pd_ee_delta_pose": 7, "pd_ee_pose": 7}
 ALL_MODES = {**MODES, **{f"{mode}_base": size + 3 for mode, size in MODES.items()}}
