@@ -139,6 +139,10 @@ class TargetConfig(StrictModel):
     max_visible_share: Annotated[float, Field(gt=0, le=1)] = Field(
         default=0.9, description="search: the target's p_vis from above is lower"
     )
+    min_uncovered_grasps: Annotated[int, Field(ge=0)] = Field(
+        default=6,
+        description="search: fewer of its grasps, as it lies, clear of furniture and basket: not the target",
+    )
 
 
 class OpeningConfig(StrictModel):

@@ -3,11 +3,12 @@
 A decision (`planning.decisions`) forks a child for each candidate. The child plays it, says how well it went, and
 waits. The best one is told to go on: it *is* the episode from then on, while this process waits for its end. Where it
 fails, this process, still at the decision, tells the next best. So processes stand in a row, one for each decision
-made, and the last one writes the episode. Nothing is simulated twice, and the actions since the reset remain all there
+made, and the last one writes the episode. No way is simulated twice, and the actions since the reset remain all there
 is.
 
 Children die with their parents, leave no zombies, and have a time limit. One that is gone is played once more: if it
-was killed from outside, the episode stays what it would have been; if it crashes again, it has failed.
+was killed from outside, the episode stays what it would have been; if it crashes again, it is passed over, or, where it
+had been told to go on, a failed attempt.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from typing import Any, NoReturn, Protocol, TypeVar, cast
 
 import torch
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.errors import PlanningFailed, RobocasError
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Decisions, Effort
 
 T = TypeVar("T")
@@ -205,14 +206,14 @@ class ForkedBranches:
 
     def _fork(self, candidate: Any) -> _Child | None:
         """A new child for a candidate; None in the child itself."""
-        here, there = cast("tuple[Connection, Connection]", Pipe())
         for stream in (sys.stdout, sys.stderr):
-            stream.flush()
+            if stream is not None:  # as in a service
+                stream.flush()
         parent = os.getpid()
         # an interrupt in between would find a child without a parent, or a child that takes itself for the root
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
-            pid = os.fork()
+            here, there, pid = _piped_fork()
             if pid:
                 child = _Child(pid, here, candidate)
                 self._children.append(child)
@@ -223,7 +224,9 @@ class ForkedBranches:
             _die_with(parent)
             gc.freeze()  # a collection that walks all objects would copy all of the parent's memory
             # locks of the parent's streams may be held by threads that are not here
-            sys.stdout, sys.stderr = (os.fdopen(os.dup(fd), "w") for fd in (1, 2))
+            sys.stdout, sys.stderr = (
+                stream and os.fdopen(os.dup(fd), "w") for fd, stream in ((1, sys.stdout), (2, sys.stderr))
+            )
             for pipe in not_ours:
                 pipe.close()
             return None
@@ -237,9 +240,9 @@ class ForkedBranches:
             _Done: it ended well.
         """
         try:
-            child.pipe.send(self._tally)
+            _tell(child, self._tally)
             answer = self._hear(child, GO_ON_LIMIT)
-        except (_Gone, ConnectionError):
+        except _Gone:
             return False
         except _Crashed as error:
             self._tally.failed(PlanningFailed("branch", str(error)))
@@ -261,7 +264,7 @@ class ForkedBranches:
             if not child.pipe.poll(limit):
                 raise _Crashed("timed_out")
             answer, tally = child.pipe.recv()
-        except (EOFError, ConnectionError) as error:
+        except (EOFError, OSError) as error:  # it ended before it said anything, or in the middle of it
             raise _Gone("crashed") from error
         if isinstance(answer, _Raised):
             raise answer.error from BranchTraceback(answer.traceback)
@@ -297,13 +300,43 @@ class ForkedBranches:
 
     def _say_and_leave(self, answer: Any) -> NoReturn:
         assert self._pipe is not None
-        self._end_all()
         try:
+            self._end_all()
             self._pipe.send((answer, self._tally))
         except Exception:  # noqa: BLE001  (nobody listens)
             if isinstance(answer, _Raised):
                 _log.error("a branch failed\n%s", answer.traceback)
-        os._exit(0)
+        finally:  # not even an interrupt leads back into the code that the parent runs too
+            os._exit(0)
+
+
+def _piped_fork() -> tuple[Connection, Connection, int]:
+    """Both ends of a pipe, the parent's first, and what ``os.fork`` gives.
+
+    Raises:
+        RobocasError: the system allows no more processes, memory or open files.
+    """
+    try:
+        here, there = cast("tuple[Connection, Connection]", Pipe())
+        return here, there, os.fork()
+    except OSError as error:
+        raise RobocasError(
+            "can't start another process",
+            found=error.strerror,
+            fix="Use fewer --jobs, raise the limits (ulimit -u, -n), or --no-fork, which is slower.",
+        ) from error
+
+
+def _tell(child: _Child, tally: Tally) -> None:
+    """Let a child go on with a tally.
+
+    Raises:
+        _Gone: there is no child any more.
+    """
+    try:
+        child.pipe.send(tally)
+    except OSError as error:
+        raise _Gone("crashed") from error
 
 
 def _raised(error: BaseException) -> _Raised:

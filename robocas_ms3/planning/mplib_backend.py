@@ -212,12 +212,16 @@ class MplibPlanner:
         best = Trajectory(np.concatenate([first.qpos, b]), self._dt)
         for seconds in BLENDS:
             rows = min(round(seconds / self._dt), len(a) - 1, len(b) - 1)
-            points = blended(a, b, rows)
-            between = points[len(a) - rows - 1 : len(a) + 1]
-            lower, upper = self._world.limits.T  # the sum of two motions may leave what either keeps to
-            if rows < 1 or np.any((between < lower) | (between > upper)) or not self._world.all_free(_dense(between)):
+            if rows < 1:
                 continue
+            points = blended(a, b, rows)
             path = through(thinned(points, BLEND_SPACING))
+            driven, end = path.dense(FINE_SPACING), points[min(len(a), len(points) - 1)]
+            lower, upper = self._world.limits.T  # the sum of two motions may leave what either keeps to
+            # up to the end of the corner: what follows was planned among other obstacles
+            corner = int(np.linalg.norm(driven - end, axis=1).argmin()) + 1
+            if np.any((driven < lower) | (driven > upper)) or not self._world.all_free(driven[:corner]):
+                continue
             trajectory = self._timed(partial(timed, path))
             if trajectory is not None and len(trajectory.qpos) < len(best.qpos):
                 return trajectory

@@ -25,7 +25,7 @@ from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
 
-LAYOUT_FORMAT = 12  # raised when the same seed gives another layout, or the files change
+LAYOUT_FORMAT = 13  # raised when the same seed gives another layout, or the files change
 ABOUT = "about.json"  # in the folder of a bank: all that its layouts depend on
 _A_FOLDER = 1000  # layouts in one
 _NO_MATTER = (

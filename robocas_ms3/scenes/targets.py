@@ -88,18 +88,25 @@ class Arrangement:
 
     def has_free_grasps(self, slot: int) -> bool:
         """Whether enough of an object's grasps are clear of everything else."""
-        rules = self.model.config.target
-        points = [self.fixture_points]
-        for other in np.flatnonzero(self.present):
-            if other != slot and self._within_reach(slot, other):
-                points.append(transform(self.opened_poses[other], self.assets[other].surface_points()))
+        others = [
+            transform(self.opened_poses[other], self.assets[other].surface_points())
+            for other in np.flatnonzero(self.present)
+            if other != slot and self._within_reach(slot, other)
+        ]
+        return self._has_grasps(slot, others, self.model.config.target.min_free_grasps)
+
+    def has_uncovered_grasps(self, slot: int) -> bool:
+        """Whether enough of an object's grasps would be clear with all other objects out of the way."""
+        return self._has_grasps(slot, [], self.model.config.target.min_uncovered_grasps)
+
+    def _has_grasps(self, slot: int, others: list[Array], at_least: int) -> bool:
         return has_free_grasps(
             self.assets[slot],
             self.opened_poses[slot],
-            np.concatenate(points),
+            np.concatenate([self.fixture_points, *others]),
             self.robot_pose[:2, 3],
-            rules.approach,
-            at_least=rules.min_free_grasps,
+            self.model.config.target.approach,
+            at_least=at_least,
         )
 
     def _within_reach(self, slot: int, other: int) -> bool:
@@ -147,7 +154,10 @@ def _by_relation(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
 
 
 def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
-    """A hidden object, near ones more often: weight 1 / distance to the robot (upstream's)."""
+    """A hidden object, near ones more often: weight 1 / distance to the robot (upstream's).
+
+    One that can't be grasped as it lies is none, whatever lies on it: a can on its broad side, a screwdriver in a gap.
+    """
     model, slots = scene.model, np.flatnonzero(scene.present)
     region = model.region
     middle = np.append(np.add(region.min_xy, region.max_xy) / 2, region.z)
@@ -160,7 +170,9 @@ def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | Non
     weight = np.where(hidden, 1 / np.linalg.norm(scene.xy_in_robot, axis=1), 0)
     while weight.any():
         slot = int(rng.choice(len(weight), p=weight / weight.sum()))
-        if model.config.target.min_free_grasps == 0 or scene.has_free_grasps(slot):
+        if scene.has_uncovered_grasps(slot) and (
+            model.config.target.min_free_grasps == 0 or scene.has_free_grasps(slot)
+        ):
             return Choice(slot, visible_shares=shares)
         weight[slot] = 0
     return None

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,7 @@ import pytest
 from robocas_ms3.demos import branches
 from robocas_ms3.demos.branches import BranchTraceback, ForkedBranches, why_not_fork
 from robocas_ms3.demos.resimulation import Resimulation
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.errors import PlanningFailed, RobocasError
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort, Straight
 
 RUNNERS = [ForkedBranches, Resimulation]
@@ -190,8 +190,10 @@ def forked(decide, notes=None):
 
 
 @pytest.mark.parametrize("signal_", [signal.SIGSEGV, signal.SIGKILL])
-def test_a_child_that_crashes_has_failed(signal_):
+def test_a_child_that_crashes_is_played_once_more_and_passed_over(signal_, tmp_path):
     def play(letter):
+        with (tmp_path / "played").open("a") as file:
+            file.write(letter)
         if letter == "a":
             os.kill(os.getpid(), signal_)
         return 0.0
@@ -202,6 +204,7 @@ def test_a_child_that_crashes_has_failed(signal_):
     ended, notes = forked(decide)
     assert ended
     assert notes.failures == []  # it was never gone on from
+    assert (tmp_path / "played").read_text() == "aab"
 
 
 def test_a_crash_further_on_is_a_failed_attempt():
@@ -265,6 +268,70 @@ def test_a_child_that_takes_too_long_is_ended(monkeypatch):
     start = time.monotonic()
     assert forked(decide)[0]
     assert time.monotonic() - start < 20
+
+
+def test_a_child_that_dies_in_the_middle_of_a_message_is_gone():
+    def decide(runner):
+        def play(letter):
+            if letter == "a":
+                # a length that no message of it reaches, as `multiprocessing.Connection` writes it
+                os.write(runner._pipe.fileno(), (1 << 20).to_bytes(4, "big") + bytes(1000))
+                os.kill(os.getpid(), signal.SIGKILL)
+            return 0.0
+
+        assert runner.choose("ab", play) == "b"
+
+    ended, notes = forked(decide)
+    assert (ended, notes.failures) == (True, [])
+
+
+def test_a_broken_pipe_of_the_attempt_is_its_error_not_a_crash(tmp_path):
+    def decide(runner):
+        runner.choose("a", lambda letter: 0.0)
+        with (tmp_path / "gone_on").open("a") as file:
+            file.write("a")
+        raise BrokenPipeError("a dropped mount")
+
+    with pytest.raises(BrokenPipeError, match="a dropped mount"):
+        forked(decide)
+    assert (tmp_path / "gone_on").read_text() == "a"
+
+
+def test_where_no_process_can_be_started_the_error_says_what_to_do(monkeypatch):
+    def refuse():
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(os, "fork", refuse)
+    with pytest.raises(RobocasError, match="Resource temporarily unavailable.*--no-fork"):
+        forked(lambda runner: runner.choose("a", lambda letter: 0.0))
+
+
+def test_without_standard_streams_branches_work(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    ended, notes = forked(lambda runner: runner.choose("a", lambda letter: 0.0))
+    assert (ended, notes.failures) == (True, [])
+
+
+def test_an_interrupt_while_a_child_says_its_last_word_ends_the_child(monkeypatch, tmp_path):
+    class Interrupted(Connection):
+        def send(self, obj):
+            raise KeyboardInterrupt
+
+    def decide(runner):
+        def play(letter):
+            if letter == "a":
+                runner._pipe.__class__ = Interrupted
+                raise PlanningFailed("play", "a")
+            return 0.0
+
+        assert runner.choose("ab", play) == "b"
+
+    root = os.getpid()
+    ended, notes = forked(decide)
+    (tmp_path / str(os.getpid())).touch()  # whoever comes here
+    assert [path.name for path in tmp_path.iterdir()] == [str(root)]
+    assert ended
 
 
 def test_an_error_of_ours_is_raised_here():
@@ -398,7 +465,3 @@ def test_where_a_process_must_not_be_forked(monkeypatch):
     assert why_not_fork(renders=False) == ("" if sys.platform == "linux" else "this is not Linux")
     monkeypatch.setattr(sys, "platform", "darwin")
     assert why_not_fork(renders=False) == "this is not Linux"
-
-
-def test_scores_are_numbers():
-    assert search(two_letters, {"aa"}, score=lambda letters: -math.inf) == (True, "aa", [])

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import os
+import signal
 
 import h5py
 import numpy as np
@@ -10,6 +12,7 @@ import torch
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.structs import Pose
 
+from robocas_ms3.demos import branches
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings, horizon
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.record import merge, open_trajectory, read_json
@@ -265,7 +268,17 @@ def test_the_way_back_to_a_decision_leaves_no_trace(tmp_path, monkeypatch, fork)
     assert len(load(tmp_path / "stirred.h5")["traj_0"]["actions"]) == 18
 
 
-def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path):
+def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, monkeypatch):
+    """Even where a branch is killed from outside while it goes on."""
+    tell = branches._tell
+
+    def tell_and_kill_the_first(child, tally):
+        tell(child, tally)
+        if not (tmp_path / "killed").exists():
+            (tmp_path / "killed").touch()
+            os.kill(child.pid, signal.SIGKILL)
+
+    monkeypatch.setattr(branches, "_tell", tell_and_kill_the_first)
     episodes = []
     for fork in (True, False):
         generator = EpisodeGenerator(EpisodeSettings("search", "search_table_small_heap", "builtin"), fork=fork)
@@ -274,6 +287,7 @@ def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path):
         assert result.success
         assert result.steps > 0
         episodes.append((load(tmp_path / f"fork_{fork}.h5")["traj_0"], result))
+    assert (tmp_path / "killed").exists()
     (forked, one), (again, other) = episodes
     assert [(f.stage, f.reason) for f in one.failures] == [(f.stage, f.reason) for f in other.failures]
     np.testing.assert_array_equal(forked["actions"], again["actions"])

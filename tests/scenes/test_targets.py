@@ -13,7 +13,9 @@ def thing(name: str, grasps: int = 50):
     return SimpleNamespace(asset=SimpleNamespace(name=name, grasp_count=grasps))
 
 
-def arrangement(task: str, names: list[str], positions, *, monkeypatch, blocked=(), grasps=50, **rules) -> Arrangement:
+def arrangement(
+    task: str, names: list[str], positions, *, monkeypatch, blocked=(), flat=(), grasps=50, **rules
+) -> Arrangement:
     """Objects at (x, y) in the robot's frame, which is the world's."""
     target = SimpleNamespace(min_grasps=20, min_free_grasps=1, max_distance=0.8, relations=["nearest"], **rules)
     config = SimpleNamespace(task=task, target=target)
@@ -22,6 +24,7 @@ def arrangement(task: str, names: list[str], positions, *, monkeypatch, blocked=
     poses[:, :2, 3] = positions
     everything = np.ones(len(names), dtype=bool)
     monkeypatch.setattr(Arrangement, "has_free_grasps", lambda self, slot: slot not in blocked)
+    monkeypatch.setattr(Arrangement, "has_uncovered_grasps", lambda self, slot: slot not in flat)
     assets = [thing(name, grasps) for name in names]
     return Arrangement(model, assets, poses, everything, everything, np.eye(4), np.eye(4))
 
@@ -77,6 +80,16 @@ def test_search_wants_free_grasps_where_the_configuration_does(monkeypatch):
     everything = arrangement("search", names, places, monkeypatch=monkeypatch, blocked=[0, 1], max_visible_share=0.9)
     everything.model.region = scene.model.region
     assert drawn(everything) == {None}
+
+
+def test_search_wants_what_can_be_grasped_once_it_is_uncovered(monkeypatch):
+    names, places = ["soap", "mug"], [(0.2, 0.0), (0.6, 0.0)]
+    scene = arrangement("search", names, places, monkeypatch=monkeypatch, flat=[0], max_visible_share=0.9)
+    scene.model.config.target.min_free_grasps = 0
+    scene.model.region = SimpleNamespace(min_xy=(0.0, 0.0), max_xy=(0.2, 0.2), z=0.6)
+    monkeypatch.setattr(targets, "object_mesh", lambda asset: asset)
+    monkeypatch.setattr(targets, "visible_shares", lambda camera, meshes, poses: np.zeros(2))
+    assert drawn(scene) == {(1, "")}
 
 
 def test_search_prefers_near_objects(monkeypatch):

@@ -57,7 +57,7 @@ class Arm:
     def _prepare(self) -> None:
         """Work out before the first decision what is kept for as long as the process runs."""
         self.scene.sample_surfaces()
-        for room in (ROOM, 0.0):
+        for room in (2 * ROOM, ROOM, 0.0):  # while carrying, on the way to a grasp, at least
             self.planner.set_scene(self.scene.obstacles(room=room))
 
     def _seed(self) -> None:

@@ -43,9 +43,12 @@ def attempt(arm: Arm) -> None:
             if _grasp(arm, slot):
                 break
             arm.executor.label(**find)
+        done = len(arm.executor.actions)
         try:
             arm.choose(heap.moves(), heap.make, Effort(AHEAD, tries(heap.moves_made), ENOUGH))
         except PlanningFailed:
+            if len(arm.executor.actions) > done:
+                raise
             # nothing can be moved: perhaps it can be grasped as things stand
             arm.executor.label(**take)
             if not heap.visible or not _grasp(arm, slot):

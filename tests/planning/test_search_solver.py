@@ -1,0 +1,70 @@
+"""What the policy of search does when a move fails, on stand-ins."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from robocas_ms3.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.planning.decisions import Straight
+from robocas_ms3.planning.solvers import search
+
+
+@pytest.fixture
+def arm(monkeypatch):
+    """An arm whose actions are words; nothing is free, and the only move is to push something."""
+    asset = SimpleNamespace(asset=SimpleNamespace(name="mug"))
+    env = SimpleNamespace(target_slot=[0], target_asset=lambda: asset, task_config=SimpleNamespace(support="table"))
+    done: list[str] = []
+    executor = SimpleNamespace(actions=done, facts={}, label=lambda **words: None, rehearse=lambda: None)
+    decisions = Straight(lambda: len(done))
+    arm = SimpleNamespace(env=env, executor=executor, choose=decisions.choose)
+
+    class Heap:
+        cleared = uncovered = False
+        visible = True
+        moves_made = 0
+        make = None
+
+        def __init__(self, *_):
+            pass
+
+        def middle(self, slot):
+            return None
+
+        def moves(self):
+            return ["push"]
+
+        def check_surface(self):
+            done.append("look at the surface")
+
+    monkeypatch.setattr(search, "Heap", Heap)
+    for name in ("look_at", "prepare_looks"):
+        monkeypatch.setattr(search, name, lambda *_: None)
+    monkeypatch.setattr(search, "_grasp", lambda *_: done.append("grasp") or True)
+    monkeypatch.setattr(search, "carry_to_basket", lambda *_: done.append("carry"))
+    monkeypatch.setattr(search, "release_into_basket", lambda *_: done.append("release"))
+    return arm, Heap, done
+
+
+def test_where_nothing_can_be_moved_the_target_is_grasped_as_it_lies(arm):
+    arm, heap, done = arm
+
+    def make(self, move):
+        raise PlanningFailed("push", "no_room")
+
+    heap.make = make
+    search.attempt(arm)
+    assert done == ["grasp", "carry", "look at the surface", "release"]
+
+
+def test_a_move_that_fails_on_its_way_ends_the_attempt(arm):
+    arm, heap, done = arm
+
+    def make(self, move):
+        done.append("push")
+        raise EpisodeLost("clear", "fell_off_table")
+
+    heap.make = make
+    with pytest.raises(EpisodeLost, match="fell_off_table"):
+        search.attempt(arm)
+    assert done == ["push"]
