@@ -34,7 +34,7 @@ class Segment:
 
 @dataclass
 class Seconds:
-    """Where an episode's time went: CPU seconds of this process, or of those that went on with its episode."""
+    """Where an episode's time went: CPU seconds of this process and of all its branches that could be played."""
 
     reset: float = 0.0
     planning: float = 0.0

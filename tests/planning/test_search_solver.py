@@ -1,5 +1,6 @@
 """What the policy of search does when a move fails, on stand-ins."""
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -17,7 +18,7 @@ def arm(monkeypatch):
     done: list[str] = []
     executor = SimpleNamespace(actions=done, facts={}, label=lambda **words: None, rehearse=lambda: None)
     decisions = Straight(lambda: len(done))
-    arm = SimpleNamespace(env=env, executor=executor, choose=decisions.choose)
+    arm = SimpleNamespace(env=env, executor=executor, choose=decisions.choose, planning=nullcontext)
 
     class Heap:
         cleared = uncovered = False

@@ -77,7 +77,8 @@ class Heap:
     @property
     def visible(self) -> bool:
         """Whether the gripper's camera sees most of the target."""
-        return hidden_share(self.arm, self.target) <= MAX_HIDDEN_SHARE
+        with self.arm.planning():
+            return hidden_share(self.arm, self.target) <= MAX_HIDDEN_SHARE
 
     @property
     def uncovered(self) -> bool:
@@ -99,17 +100,22 @@ class Heap:
         """
         if self.moves_made >= MOVES:
             raise EpisodeLost("horizon", "too_many_obstacles")
-        obstacles = np.flatnonzero(self.clutter().obstacles[0].cpu().numpy()).tolist()
-        obstacles.sort(key=lambda slot: -self._points(slot)[:, 2].max())
-        order = dict.fromkeys(obstacles[:LOOKED_AT])
-        order |= dict.fromkeys(slot for slot in blockers(self.arm, self.target)[:LOOKED_AT] if slot not in order)
-        slots = [slot for slot in order if slot != self.target][:LOOKED_AT]
+        with self.arm.planning():
+            slots = self._in_the_way()
         yield from (Move(skill, slot) for slot in slots[:2] for skill in ("push", "lift"))
         yield from (Move("push", slot) for slot in slots[2:])
         yield from (Move("push", slot, turn) for slot in slots[:2] for turn in TURNS_DEG)
         yield from (Move("lift", slot) for slot in slots[2:])
         if not slots:  # no grasp comes from above as it lies: it has to lie otherwise
             yield from (Move("push", self.target, turn) for turn in (0.0, 90.0, -90.0, 180.0))
+
+    def _in_the_way(self) -> list[int]:
+        """Slots of what hides or surrounds the target, the highest first, then of what blocks its grasps."""
+        obstacles = np.flatnonzero(self.clutter().obstacles[0].cpu().numpy()).tolist()
+        obstacles.sort(key=lambda slot: -self._points(slot)[:, 2].max())
+        order = dict.fromkeys(obstacles[:LOOKED_AT])
+        order |= dict.fromkeys(slot for slot in blockers(self.arm, self.target)[:LOOKED_AT] if slot not in order)
+        return [slot for slot in order if slot != self.target][:LOOKED_AT]
 
     def make(self, move: Move) -> float:
         """Make a move; gives what it was worth, in seconds.
@@ -138,10 +144,11 @@ class Heap:
 
     def work_left(self) -> float:
         """What is still in the way, in seconds it may take."""
-        clutter = self.clutter()
-        hidden, obstacles = float(clutter.hidden_share[0]), int(clutter.obstacles[0].sum())
-        work = PER_OBSTACLE * max(0, obstacles - 1) + PER_HIDDEN_SHARE * max(0.0, hidden - MAX_HIDDEN_SHARE)
-        return work + NO_GRASP * (not clear_grasps(self.arm, self.target))
+        with self.arm.planning():
+            clutter = self.clutter()
+            hidden, obstacles = float(clutter.hidden_share[0]), int(clutter.obstacles[0].sum())
+            work = PER_OBSTACLE * max(0, obstacles - 1) + PER_HIDDEN_SHARE * max(0.0, hidden - MAX_HIDDEN_SHARE)
+            return work + NO_GRASP * (not clear_grasps(self.arm, self.target))
 
     def check_surface(self) -> None:
         """See that nothing has been moved to the edge, or over it.

@@ -34,7 +34,8 @@ def attempt(arm: Arm) -> None:
     heap = Heap(arm, slot)
     for fact in FACTS:
         arm.executor.facts.setdefault(fact, 0)
-    prepare_looks(arm)
+    with arm.planning():
+        prepare_looks(arm)
     arm.executor.label(**find)
     look_at(arm, heap.middle(slot), FAR)
     while True:
