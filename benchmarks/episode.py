@@ -11,11 +11,15 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 import resource
 import sys
 import tempfile
+import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -49,6 +53,8 @@ class Args:
     """Processes. One, on a machine that does nothing else, where times are to be compared."""
     fork: bool = True
     """Undo what fails by forking."""
+    memory: bool = False
+    """Sample the memory of the process and all its branches together (PSS), which takes time of its own."""
 
 
 @dataclass
@@ -63,6 +69,7 @@ class Seed:
     parts: dict[str, float]
     failures: list[str]
     rss_mb: int
+    all_mb: int = 0
     physx: float = 0.0
     facts: dict[str, int] = field(default_factory=dict)
     clean: bool = False
@@ -92,13 +99,15 @@ def run(args: Args, config: str, seeds: list[int]) -> list[Seed]:
         generator.generate(seeds[0] - 1, Path(folder), "warm")  # loads packs, starts planners
         for seed in seeds:
             before = cpu()
-            result = generator.generate(seed, Path(folder), str(seed))
+            with sampled_memory(args.memory) as memory:
+                result = generator.generate(seed, Path(folder), str(seed))
             spent = cpu() - before
             parts = {name: round(value, 3) for name, value in asdict(result.seconds).items()}
             failures = [f"{failure.stage}: {failure.reason}" for failure in result.failures]
             found.append(
                 Seed(seed, result.success, result.steps, result.attempts, round(spent, 3), parts, failures, rss_mb())
             )
+            found[-1].all_mb = max(memory, default=0)
             if result.success:
                 judge(found[-1], generator, Path(folder) / f"{seed}.h5", args)
             print(json.dumps(asdict(found[-1])), file=sys.stderr, flush=True)
@@ -115,6 +124,44 @@ def cpu() -> float:
 def rss_mb() -> int:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() // 2**20
+
+
+@contextmanager
+def sampled_memory(wanted: bool) -> Iterator[list[int]]:
+    """MB of this process and its branches, shared pages counted once, every half a second while inside."""
+    samples: list[int] = []
+    over = threading.Event()
+
+    def sample() -> None:
+        while not over.wait(0.5):
+            samples.append(sum(map(pss_kb, family(os.getpid()))) // 1024)
+
+    thread = threading.Thread(target=sample)
+    if wanted:
+        thread.start()
+    try:
+        yield samples
+    finally:
+        over.set()
+        if wanted:
+            thread.join()
+
+
+def family(pid: int) -> list[int]:
+    """A process and all that descend from it."""
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except OSError:
+        return []
+    return [pid, *(member for child in children for member in family(int(child)))]
+
+
+def pss_kb(pid: int) -> int:
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0)
 
 
 def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> None:
@@ -177,6 +224,7 @@ def summary(found: list[Seed], args: Args) -> dict[str, Any]:
         "clean_success": mean(seed.clean for seed in good),
         "noisy_success": mean(seed.noisy / max(1, args.draws) for seed in good),
         "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        "peak_mb_with_branches": max(seed.all_mb for seed in found),
         "rss_mb": {seed.seed: seed.rss_mb for seed in found[:: max(1, len(found) // 10)]},
     }
 

@@ -225,7 +225,7 @@ class ForkedBranches:
             gc.freeze()  # a collection that walks all objects would copy all of the parent's memory
             # locks of the parent's streams may be held by threads that are not here
             sys.stdout, sys.stderr = (
-                stream and os.fdopen(os.dup(fd), "w") for fd, stream in ((1, sys.stdout), (2, sys.stderr))
+                stream and os.fdopen(os.dup(fd), "w", buffering=1) for fd, stream in ((1, sys.stdout), (2, sys.stderr))
             )
             for pipe in not_ours:
                 pipe.close()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -332,6 +334,38 @@ def test_an_interrupt_while_a_child_says_its_last_word_ends_the_child(monkeypatc
     (tmp_path / str(os.getpid())).touch()  # whoever comes here
     assert [path.name for path in tmp_path.iterdir()] == [str(root)]
     assert ended
+
+
+def test_threads_that_write_do_not_hold_up_branches(capfd):
+    """As progress bars do: their locks may be held at the moment of a fork, by threads that the child has not."""
+    over = threading.Event()
+
+    def write():
+        while not over.is_set():
+            print("#" * 100, file=sys.stderr)
+
+    def play(number):
+        print("in a branch", file=sys.stderr)
+        logging.getLogger("robocas_ms3").error("in a branch")
+        raise PlanningFailed("play", str(number))
+
+    def decide(runner):
+        with pytest.raises(PlanningFailed, match="play: 39"):
+            runner.choose(range(40), play)
+
+    writers = [threading.Thread(target=write) for _ in range(2)]
+    for writer in writers:
+        writer.start()
+    start = time.monotonic()
+    try:
+        ended, notes = forked(decide)
+    finally:
+        over.set()
+        for writer in writers:
+            writer.join()
+    assert (ended, notes.failures) == (True, [])
+    assert time.monotonic() - start < 60
+    assert capfd.readouterr().err.count("in a branch\n") >= 40
 
 
 def test_an_error_of_ours_is_raised_here():
