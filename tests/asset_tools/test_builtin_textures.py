@@ -1,4 +1,3 @@
-import io
 import itertools
 from functools import cache
 
@@ -91,13 +90,10 @@ def test_skins_have_no_seam(name):
 
 
 @pytest.mark.parametrize("name", ["tomato_soup_can", "peach"])
-def test_same_bytes_twice(name):
-    def data(mesh):
-        texture = io.BytesIO()
-        mesh.visual.material.baseColorTexture.save(texture, "PNG")
-        return mesh.vertices.tobytes(), mesh.faces.tobytes(), mesh.visual.uv.tobytes(), texture.getvalue()
-
-    assert data(built(name)[1]) == data(spec(name).build()[1])
+def test_same_file_twice(name):
+    """In memory the last bit of a coordinate may differ, as NumPy's `exp` does with where an array lies; files have
+    single precision."""
+    assert built(name)[1].export(file_type="glb") == spec(name).build()[1].export(file_type="glb")
 
 
 def test_textures_are_small_jpegs():
