@@ -13,7 +13,6 @@ had been told to go on, a failed attempt.
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import logging
 import os
@@ -23,20 +22,16 @@ import sys
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cache
-from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from typing import Any, NoReturn, Protocol, TypeVar, cast
+from typing import Any, NoReturn, Protocol, TypeVar
 
-import torch
-
-from robocas_ms3.errors import PlanningFailed, RobocasError
+from robocas_ms3.demos.forking import die_with, piped_fork, streams_of_its_own
+from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Decisions, Effort
 
 T = TypeVar("T")
 
 PLAY_LIMIT, GO_ON_LIMIT = 300.0, 3600.0  # s of wall-clock time for one candidate; for the rest of the episode
-_PR_SET_PDEATHSIG = 1
 _log = logging.getLogger(__name__)
 
 
@@ -213,7 +208,7 @@ class ForkedBranches:
         # an interrupt in between would find a child without a parent, or a child that takes itself for the root
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
         try:
-            here, there, pid = _piped_fork()
+            here, there, pid = piped_fork()
             if pid:
                 child = _Child(pid, here, candidate)
                 self._children.append(child)
@@ -221,12 +216,9 @@ class ForkedBranches:
                 return child
             not_ours = [here, *(other.pipe for other in self._children), *([self._pipe] if self._pipe else [])]
             self._pipe, self._children = there, []
-            _die_with(parent)
+            die_with(parent)
             gc.freeze()  # a collection that walks all objects would copy all of the parent's memory
-            # locks of the parent's streams may be held by threads that are not here
-            sys.stdout, sys.stderr = (
-                stream and os.fdopen(os.dup(fd), "w", buffering=1) for fd, stream in ((1, sys.stdout), (2, sys.stderr))
-            )
+            streams_of_its_own()
             for pipe in not_ours:
                 pipe.close()
             return None
@@ -310,23 +302,6 @@ class ForkedBranches:
             os._exit(0)
 
 
-def _piped_fork() -> tuple[Connection, Connection, int]:
-    """Both ends of a pipe, the parent's first, and what ``os.fork`` gives.
-
-    Raises:
-        RobocasError: the system allows no more processes, memory or open files.
-    """
-    try:
-        here, there = cast("tuple[Connection, Connection]", Pipe())
-        return here, there, os.fork()
-    except OSError as error:
-        raise RobocasError(
-            "can't start another process",
-            found=error.strerror,
-            fix="Use fewer --jobs, raise the limits (ulimit -u, -n), or --no-fork, which is slower.",
-        ) from error
-
-
 def _tell(child: _Child, tally: Tally) -> None:
     """Let a child go on with a tally.
 
@@ -348,31 +323,3 @@ def _raised(error: BaseException) -> _Raised:
     except Exception:  # noqa: BLE001  (its class decides what that raises)
         return _Raised(RuntimeError(f"{type(error).__name__}: {error}"), text)
     return _Raised(error, text)
-
-
-def _die_with(parent: int) -> None:
-    """Let the system kill this process when its parent ends."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it ended before that
-        os._exit(0)
-
-
-def why_not_fork(*, renders: bool) -> str:
-    """Why this process can't be forked safely; empty where it can.
-
-    Args:
-        renders: whether a renderer is open.
-    """
-    if sys.platform != "linux":
-        return "this is not Linux"
-    if renders:
-        return "a renderer is open"
-    if torch.cuda.is_initialized():
-        return "CUDA is in use"
-    return ""
-
-
-@cache
-def say_once(reason: str) -> None:
-    """Tell the user that undoing takes longer here."""
-    _log.warning("can't fork (%s): what fails is undone by simulating everything again", reason)

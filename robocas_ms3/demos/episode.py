@@ -15,7 +15,8 @@ import torch
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.config import TaskConfig, load_task_config
-from robocas_ms3.demos.branches import ForkedBranches, say_once, why_not_fork
+from robocas_ms3.demos.branches import ForkedBranches
+from robocas_ms3.demos.forking import say_once, why_not_fork
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.demos.record import EpisodeRecorder

@@ -141,7 +141,8 @@ def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, u
     if untargeted < _SEVERAL:
         fix = "Lower objects.count, enlarge the surface, use objects that stand firmly, or move the basket less."
         return LayoutError("the objects don't come to rest", where="layout", found=found, fix=fix)
-    fix = "Raise target.max_distance, lower target.min_grasps or min_free_grasps, or use other objects."
+    lower = "min_grasps, min_uncovered_grasps" if model.config.task == "search" else "min_grasps"
+    fix = f"Raise target.max_distance, lower target.{lower} or min_free_grasps, or use other objects."
     if model.config.task == "select":
         names = ", ".join(model.config.target.relations)
         fix = f"Give other target.relations than {names}, or more layout.copies. {fix}"

@@ -186,7 +186,7 @@ def _depths(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[
     return box, np.where(depths < _FAR, depths, np.inf).reshape(shape)
 
 
-def prepare(mesh: trimesh.Trimesh) -> None:
+def prepare_rays(mesh: trimesh.Trimesh) -> None:
     """Build a mesh's search tree now, for as long as the process runs, instead of at the first ray."""
     _scene_of(mesh)
 

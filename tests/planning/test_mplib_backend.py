@@ -156,6 +156,16 @@ def test_where_the_corner_is_blocked_motions_are_joined_with_a_stop(planner):
     assert planner.join(REST, reach, down).qpos.tolist() == [*reach.qpos.tolist(), *down.qpos.tolist()]
 
 
+def test_motions_are_joined_only_where_all_of_the_first_is_free(planner):
+    reach, down = reach_and_down(planner)
+    early = reach.qpos[len(reach.qpos) // 3]
+    place = planner.tcp(early)[:3, 3]
+    assert np.linalg.norm(place - planner.tcp(reach.qpos[-1])[:3, 3]) > 0.1  # far from the corner
+    planner.set_scene(cloud([Box(tuple(place), (0.09, 0.09, 0.03))]))  # wider than the open gripper
+    assert planner.collisions(early) and not planner.collisions(reach.qpos[-1])
+    assert planner.join(REST, reach, down).qpos.tolist() == [*reach.qpos.tolist(), *down.qpos.tolist()]
+
+
 def test_joined_motions_keep_to_joint_limits(planner):
     planner.set_scene([])
     limit = planner._world.limits[5, 0]  # of joint 6; both motions keep to it, their sum would not

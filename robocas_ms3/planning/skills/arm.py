@@ -20,7 +20,8 @@ from robocas_ms3.tasks.transfer import TransferEnv
 
 T = TypeVar("T")
 OPEN_SECONDS, CLOSE_SECONDS = 0.50, 0.50  # a dataset at 5 Hz may give either command 0.2 s later
-ROOM = 0.012  # m kept to furniture and basket where there is a way that does: by so much a robot may be off
+# m kept to furniture and basket where there is a way that does, as a robot may be off: on straight ways, while carrying
+ROOM, CARRYING_ROOM = 0.012, 0.024
 RISE, RISES = 0.04, 4  # m a step, steps
 
 
@@ -57,7 +58,7 @@ class Arm:
     def _prepare(self) -> None:
         """Work out before the first decision what is kept for as long as the process runs."""
         self.scene.sample_surfaces()
-        for room in (2 * ROOM, ROOM, 0.0):  # while carrying, on the way to a grasp, at least
+        for room in (CARRYING_ROOM, ROOM, 0.0):
             self.planner.set_scene(self.scene.obstacles(room=room))
 
     def _seed(self) -> None:

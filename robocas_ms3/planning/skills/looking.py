@@ -11,7 +11,7 @@ from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.scene import inverse, matrix
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.scenes.randomise import draw_camera_shift
-from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, prepare
+from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, prepare_rays
 
 CAMERA = "gripper_camera"
 FAR, NEAR = (0.4, 0.5), (0.2, 0.3)  # m from the camera to what it looks at: at first; between two removals (upstream's)
@@ -62,7 +62,7 @@ def prepare_looks(arm: Arm) -> None:
     """Read the objects' meshes before the first decision: each branch that looks would read them again."""
     for asset, present in zip(arm.env.object_assets[0], arm.env.present[0].tolist(), strict=True):
         if present:
-            prepare(object_mesh(asset))
+            prepare_rays(object_mesh(asset))
 
 
 def hidden_share(arm: Arm, slot: int) -> float:

@@ -10,7 +10,7 @@ from robocas_ms3.planning.chain import turn_between
 from robocas_ms3.planning.drops import overhangs, sample_drops
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import inverse, matrix
-from robocas_ms3.planning.skills.arm import ROOM, Arm, moved_back, raised
+from robocas_ms3.planning.skills.arm import CARRYING_ROOM, Arm, moved_back, raised
 from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.scenes.placement import transform
 
@@ -69,7 +69,7 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
     drops, qpos = drops[solved][order], qpos[solved][order]
     attach_held(arm, slot)
     failure = PlanningFailed("transfer", "no_plan")
-    for room in (2 * ROOM, 0.0):
+    for room in (CARRYING_ROOM, 0.0):
         arm.planner.set_scene(arm.scene.obstacles(without=slot, room=room))
         try:
             return _plan_to_one_of(arm, drops, qpos)

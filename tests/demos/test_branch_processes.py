@@ -1,0 +1,350 @@
+"""Branches as processes: killed, crashing, slow, interrupted, printing, and gone with their parents."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import pytest
+from branch_notes import Notes
+
+from robocas_ms3.demos import branches
+from robocas_ms3.demos.branches import BranchTraceback, ForkedBranches
+from robocas_ms3.demos.forking import why_not_fork
+from robocas_ms3.errors import PlanningFailed, RobocasError
+from robocas_ms3.planning.decisions import Effort
+
+
+def children() -> set[int]:
+    return {int(pid) for pid in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()}
+
+
+def forked(decide, notes=None):
+    notes = notes or Notes()
+    runner = ForkedBranches(notes)
+    before = children()
+    ended = runner.run(lambda: decide(runner))
+    assert children() == before, "no child is left, and no zombie"
+    return ended, notes
+
+
+@pytest.mark.parametrize("signal_", [signal.SIGSEGV, signal.SIGKILL])
+def test_a_child_that_crashes_is_played_once_more_and_passed_over(signal_, tmp_path):
+    def play(letter):
+        with (tmp_path / "played").open("a") as file:
+            file.write(letter)
+        if letter == "a":
+            os.kill(os.getpid(), signal_)
+        return 0.0
+
+    def decide(runner):
+        assert runner.choose("ab", play) == "b"
+
+    ended, notes = forked(decide)
+    assert ended
+    assert notes.failures == []  # it was never gone on from
+    assert (tmp_path / "played").read_text() == "aab"
+
+
+def test_a_crash_further_on_is_a_failed_attempt():
+    def decide(runner):
+        if runner.choose("ab", lambda letter: 0.0) == "a":
+            os.kill(os.getpid(), signal.SIGSEGV)
+
+    ended, notes = forked(decide)
+    assert ended
+    assert notes.failures == ["branch: crashed"]
+
+
+@pytest.mark.parametrize("moment", ["it plays", "it goes on", "it waits"])
+def test_a_child_that_is_killed_once_changes_nothing(tmp_path, moment):
+    """Three candidates are compared; b is the best. It, or a later decision's, is killed from outside, once."""
+
+    def kill_once(when):
+        if when == moment and not (tmp_path / "killed").exists():
+            (tmp_path / "killed").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def kill_waiting(letter):
+        if moment == "it waits" and letter == "c" and not (tmp_path / "killed").exists():
+            (tmp_path / "killed").touch()
+            os.kill(int((tmp_path / "b").read_text()), signal.SIGKILL)
+
+    def play(letter):
+        (tmp_path / letter).write_text(str(os.getpid()))
+        if letter == "b":
+            kill_once("it plays")
+        kill_waiting(letter)
+        return {"a": 1.0, "b": 3.0, "c": 2.0}[letter]
+
+    def decide(runner):
+        first = runner.choose("abc", play, Effort(ahead=3))
+        second = runner.choose("abc", lambda letter: 0.0)
+        if second == "b":
+            kill_once("it goes on")
+        if (first, second) != ("b", "c"):
+            raise PlanningFailed("end", first + second)
+        (tmp_path / "outcome").write_text(first + second)
+
+    ended, notes = forked(decide)
+    assert ended
+    assert (tmp_path / "killed").exists()
+    assert (tmp_path / "outcome").read_text() == "bc"
+    assert notes.failures == ["end: ba", "end: bb"]
+
+
+def test_a_child_that_takes_too_long_is_ended(monkeypatch):
+    monkeypatch.setattr(branches, "PLAY_LIMIT", 0.2)
+
+    def play(letter):
+        if letter == "a":
+            time.sleep(60)
+        return 0.0
+
+    def decide(runner):
+        assert runner.choose("ab", play) == "b"
+
+    start = time.monotonic()
+    assert forked(decide)[0]
+    assert time.monotonic() - start < 20
+
+
+def test_a_child_that_dies_in_the_middle_of_a_message_is_gone():
+    def decide(runner):
+        def play(letter):
+            if letter == "a":
+                # a length that no message of it reaches, as `multiprocessing.Connection` writes it
+                os.write(runner._pipe.fileno(), (1 << 20).to_bytes(4, "big") + bytes(1000))
+                os.kill(os.getpid(), signal.SIGKILL)
+            return 0.0
+
+        assert runner.choose("ab", play) == "b"
+
+    ended, notes = forked(decide)
+    assert (ended, notes.failures) == (True, [])
+
+
+def test_a_broken_pipe_of_the_attempt_is_its_error_not_a_crash(tmp_path):
+    def decide(runner):
+        runner.choose("a", lambda letter: 0.0)
+        with (tmp_path / "gone_on").open("a") as file:
+            file.write("a")
+        raise BrokenPipeError("a dropped mount")
+
+    with pytest.raises(BrokenPipeError, match="a dropped mount"):
+        forked(decide)
+    assert (tmp_path / "gone_on").read_text() == "a"
+
+
+def test_where_no_process_can_be_started_the_error_says_what_to_do(monkeypatch):
+    def refuse():
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(os, "fork", refuse)
+    with pytest.raises(RobocasError, match="Resource temporarily unavailable.*--no-fork"):
+        forked(lambda runner: runner.choose("a", lambda letter: 0.0))
+
+
+def test_without_standard_streams_branches_work(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    ended, notes = forked(lambda runner: runner.choose("a", lambda letter: 0.0))
+    assert (ended, notes.failures) == (True, [])
+
+
+def test_an_interrupt_while_a_child_says_its_last_word_ends_the_child(monkeypatch, tmp_path):
+    class Interrupted(Connection):
+        def send(self, obj):
+            raise KeyboardInterrupt
+
+    def decide(runner):
+        def play(letter):
+            if letter == "a":
+                runner._pipe.__class__ = Interrupted
+                raise PlanningFailed("play", "a")
+            return 0.0
+
+        assert runner.choose("ab", play) == "b"
+
+    root = os.getpid()
+    try:
+        ended, notes = forked(decide)
+    except KeyboardInterrupt:
+        if os.getpid() == root:
+            raise
+        (tmp_path / "escaped").touch()
+        os._exit(0)
+    assert not (tmp_path / "escaped").exists()
+    assert (ended, notes.failures) == (True, [])
+
+
+def test_threads_that_write_do_not_hold_up_branches(capfd):
+    """As progress bars do: their locks may be held at the moment of a fork, by threads that the child has not."""
+    over = threading.Event()
+
+    def write():
+        while not over.is_set():
+            print("#" * 100, file=sys.stderr)
+
+    def play(number):
+        print("in a branch", file=sys.stderr)
+        logging.getLogger("robocas_ms3").error("in a branch")
+        raise PlanningFailed("play", str(number))
+
+    def decide(runner):
+        with pytest.raises(PlanningFailed, match="play: 39"):
+            runner.choose(range(40), play)
+
+    writers = [threading.Thread(target=write) for _ in range(2)]
+    for writer in writers:
+        writer.start()
+    start = time.monotonic()
+    try:
+        ended, notes = forked(decide)
+    finally:
+        over.set()
+        for writer in writers:
+            writer.join()
+    assert (ended, notes.failures) == (True, [])
+    assert time.monotonic() - start < 60
+    assert capfd.readouterr().err.count("in a branch\n") >= 40
+
+
+def test_an_error_of_ours_is_raised_here():
+    def decide(runner):
+        runner.choose("a", lambda letter: 1 / 0)
+
+    with pytest.raises(ZeroDivisionError):
+        forked(decide)
+
+    def later(runner):
+        runner.choose("a", lambda letter: 0.0)
+        raise KeyError("later")
+
+    with pytest.raises(KeyError, match="later"):
+        forked(later)
+
+
+def test_an_error_says_where_in_a_child_it_came_from():
+    def divide(letter):
+        return 1 / 0
+
+    def decide(runner):
+        runner.choose("a", lambda letter: 0.0)
+        runner.choose("a", lambda letter: 0.0)
+        runner.choose("b", divide)  # three processes down
+
+    with pytest.raises(ZeroDivisionError) as caught:
+        forked(decide)
+    assert isinstance(caught.value.__cause__, BranchTraceback)
+    text = str(caught.value.__cause__)
+    assert text.count("in divide") == 1
+    assert text.count("Traceback") == 1
+
+
+def test_an_error_that_can_not_be_sent_is_told_of():
+    class Local(Exception):  # pickle can't find it
+        pass
+
+    for error in (Local("odd"), TwoWords("very", "odd")):
+
+        def decide(runner, error=error):
+            def play(letter):
+                raise error
+
+            runner.choose("a", play)
+
+        with pytest.raises(RuntimeError, match=f"{type(error).__name__}: .*odd") as caught:
+            forked(decide)
+        assert "in play" in str(caught.value.__cause__)
+
+
+class TwoWords(Exception):
+    """Pickles, but takes another number of arguments when it is made again."""
+
+    def __init__(self, one: str, two: str) -> None:
+        super().__init__(f"{one} {two}")
+
+
+def test_an_interrupt_in_a_new_child_ends_the_run_not_its_siblings(monkeypatch):
+    die_with, me = branches.die_with, os.getpid()
+
+    def interrupted(parent):
+        die_with(parent)
+        raise KeyboardInterrupt
+
+    def candidates():
+        yield "a"
+        monkeypatch.setattr(branches, "die_with", interrupted)
+        yield "b"
+
+    def decide(runner):
+        runner.choose(candidates(), lambda letter: 0.0, Effort(ahead=2))
+
+    try:
+        with pytest.raises(KeyboardInterrupt) as caught:
+            forked(decide)
+        assert isinstance(caught.value.__cause__, BranchTraceback)
+    finally:
+        if os.getpid() != me:  # a child that takes itself for the root
+            os._exit(1)
+
+
+def test_what_children_print_comes_once(capfd):
+    def decide(runner):
+        print("before", end="")
+        runner.choose("ab", lambda letter: 0.0)
+
+    assert forked(decide)[0]
+    assert capfd.readouterr().out == "before"
+
+
+SLEEPER = """
+import os, sys, time
+from robocas_ms3.demos.branches import ForkedBranches
+from robocas_ms3.planning.decisions import Effort
+class Notes:
+    exhausted = False
+    def failed(self, error): pass
+    def adopt(self, other): pass
+def attempt():
+    for _ in range(2):
+        runner.choose("ab", lambda letter: 0.0, Effort(ahead=2))
+    print(os.getpid(), flush=True)
+    time.sleep(120)
+runner = ForkedBranches(Notes())
+runner.run(attempt)
+"""
+
+
+def test_children_die_with_their_parent():
+    with subprocess.Popen([sys.executable, "-c", SLEEPER], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        last = int(parent.stdout.readline())
+        assert last != parent.pid
+        parent.kill()
+    deadline = time.monotonic() + 20
+    while alive(last):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_where_a_process_must_not_be_forked(monkeypatch):
+    assert why_not_fork(renders=True) == "a renderer is open"
+    assert why_not_fork(renders=False) == ("" if sys.platform == "linux" else "this is not Linux")
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert why_not_fork(renders=False) == "this is not Linux"
