@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from mani_skill.utils.registration import register_env
 
-from robocas_ms3.arrays import as_tensor, native
+from robocas_ms3.arrays import as_tensor, native, none
+from robocas_ms3.scenes.targets import selection_camera
 from robocas_ms3.tasks import occlusion, terms
 from robocas_ms3.tasks.spec import SEARCH
 from robocas_ms3.tasks.transfer import STAGES, TransferEnv
@@ -16,16 +17,21 @@ from robocas_ms3.tasks.transfer import STAGES, TransferEnv
 # of each object's surface; hidden shares are then off ray casting by 0.03 on average, 0.08 at the 95th percentile
 _POINTS = 512
 FALLEN = 0.05  # m below the surface that objects stand on, at which one counts as fallen off it
+LOOKS_PER_SECOND = 5  # at what is cleared
+ENVS_AT_ONCE = 512  # whose clutter is measured: a quarter of a GB with 15 objects each
 
 
 @register_env(SEARCH.env_id, max_episode_steps=SEARCH.max_episode_steps)
 class RoboCASSearchEnv(TransferEnv):
     """Search: the target is hidden in part (p_vis from above below ``target.max_visible_share``).
 
-    The stages add ``obstacles_cleared``: at most a fifth of the target is hidden from straight above, and fewer than
-    two other objects stick out next to it (`occlusion.clutter`). What counts is the heap while the target lies in it:
-    from the moment the gripper has held the target, nothing is cleared any more, so pulling or dragging it out from
-    under the heap does not reach this stage.
+    The stages add ``obstacles_cleared``: to the camera above that p_vis is measured with, at most a fifth of the target
+    is hidden, and fewer than two other objects stick out next to it (`occlusion.clutter`). It is looked at five times a
+    second. What counts is the heap while the target lies in it: from the moment the gripper has held the target,
+    nothing is cleared any more, so pulling or dragging it out from under the heap does not reach this stage.
+
+    ``cleared_at_reset`` (N,) bool says that the target lay clear from the beginning: then the stage says nothing of
+    what was done.
     """
 
     SPEC = SEARCH
@@ -37,42 +43,90 @@ class RoboCASSearchEnv(TransferEnv):
         columns = np.ascontiguousarray(np.array(points).swapaxes(-1, -2))
         self._surface_points = torch.as_tensor(columns, dtype=torch.float32, device=self.device)
         self._radii = torch.linalg.vector_norm(self._surface_points, dim=-2).amax(dim=-1)
+        eye = selection_camera(self.model).pose[:3, 3]
+        self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
+        self._looked: _Look | None = None
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
-        self._last_clutter: tuple[torch.Tensor, torch.Tensor] | None = None
+        if not hasattr(self, "hidden_share"):
+            self.hidden_share = torch.zeros(self.num_envs, device=self.device)
+            self._cleared_at_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._looked = None
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
         """Set the state; see `RoboCASEnv`."""
         super().set_state_dict(state, env_idx)
-        self._last_clutter = None  # else what follows would hang on what was before
+        self._looked = None  # else what follows would hang on what was before
 
-    def clutter(self) -> occlusion.Clutter:
-        """What hides and surrounds each env's target right now."""
-        points = occlusion.surface_points(self.object_states[..., :7], self._surface_points)
-        return occlusion.clutter(points, self.present, self.target_slot)
+    def clutter(self, envs: Any = slice(None)) -> occlusion.Clutter:
+        """What hides and surrounds the targets of some envs right now."""
+        points = occlusion.surface_points(self.object_states[envs, :, :7], self._surface_points[envs])
+        return occlusion.clutter(points, self.present[envs], self.target_slot[envs], self._eye)
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """See `TransferEnv`; ``cleared_at_reset`` besides."""
+        found = super().evaluate()
+        begins = self.elapsed_steps == 0
+        self._cleared_at_reset = torch.where(begins, found["obstacles_cleared"], self._cleared_at_reset)
+        return {**found, "cleared_at_reset": self._cleared_at_reset}
+
+    def _known_by(self, forces: Any) -> object:
+        known = super()._known_by(forces)
+        waits = self._looked is None or self._looked.others != self.bodies.others
+        return None if waits and not none(self._due()) else known
+
+    def _due(self) -> Any:
+        """(N,) bool, native: whose clutter is looked at in this step."""
+        every = max(1, self.control_freq // LOOKS_PER_SECOND)
+        settled = native(self._stages["target_grasped"]) | native(self._stages["obstacles_cleared"])
+        return (native(self.elapsed_steps) % every == 0) & ~settled
 
     def _task_stages(self, objects: Any, held: Any) -> dict[str, Any]:
-        """``obstacles_cleared``, (N,) bool, of this moment."""
-        taken = held | native(self._stages["target_grasped"])
-        if (taken | native(self._stages["obstacles_cleared"])).all():  # nothing can change it any more
+        """``obstacles_cleared``, (N,) bool, of this moment; nothing in steps in which no env is looked at."""
+        due = self._due() & ~held
+        if none(due):
             return {}
         surface = float(self.model.support_pose[2, 3]) + self.model.region.z
         lies = terms.of_target(objects[..., 2], native(self.target_slot)) > surface - FALLEN
-        return {"obstacles_cleared": native(self._cleared(as_tensor(objects[..., :7]))) & lies & ~taken}
+        return {"obstacles_cleared": native(self._look(as_tensor(due), as_tensor(objects[..., :7]))) & lies & due}
 
-    def _cleared(self, poses: torch.Tensor) -> torch.Tensor:
-        """(N,) bool of `clutter` at these poses (N, K, 7), as it was when something in the heap last moved."""
-        if self._last_clutter is not None:
-            before, cleared = self._last_clutter
-            if torch.equal(poses, before) or not self._moved(poses, before):
-                return cleared
-        cleared = self.clutter().cleared
-        self._last_clutter = poses, cleared
+    def _look(self, due: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
+        """(N,) bool, which of the envs that are due are cleared; keeps their hidden shares.
+
+        Args:
+            due: (N,) bool.
+            poses: (N, K, 7) of the objects.
+        """
+        others, looked = self.bodies.others, self._looked
+        if others is not None and looked is not None:  # on a CPU it is known whether anything has moved
+            still = looked.others == others or not self._moved(poses, looked.poses)
+            if still:
+                self._looked = looked._replace(others=others)
+                return looked.cleared
+        cleared = torch.zeros_like(due)
+        for envs in due.nonzero()[:, 0].split(ENVS_AT_ONCE):
+            found = self.clutter(envs)
+            cleared[envs], self.hidden_share[envs] = found.cleared, found.hidden_share
+        self._looked = _Look(others, poses, cleared)
         return cleared
 
     def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:
-        return bool(occlusion.moved_near(poses, before, self._radii, self.target_slot).any())
+        return bool(occlusion.moved_near(poses, before, self._radii, self.target_slot, self._eye).any())
+
+
+class _Look(NamedTuple):
+    """The last look at the clutter.
+
+    Attributes:
+        others: all but the robot as it was then, on a CPU.
+        poses: (N, K, 7) of the objects when it was last measured.
+        cleared: (N,) bool, what was found.
+    """
+
+    others: object
+    poses: torch.Tensor
+    cleared: torch.Tensor
 
 
 def _sample(points: np.ndarray) -> np.ndarray:

@@ -68,9 +68,17 @@ class TransferEnv(RoboCASEnv):
             synonyms=config.language.synonyms,
         )
 
+    def state_beside_bodies(self) -> dict:
+        """See `RoboCASEnv`. ``task`` holds the ``stages`` reached so far, (N, stages) bool."""
+        return {**super().state_beside_bodies(), "task": {"stages": self._reached.T.clone()}}
+
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state; see `RoboCASEnv`."""
+        """Set the state; see `RoboCASEnv`. Where it has no stages, they stay as they are."""
         super().set_state_dict(state, env_idx)
+        if "task" in state:
+            stages = torch.as_tensor(state["task"]["stages"], dtype=torch.bool, device=self.device)
+            envs = slice(None) if env_idx is None else env_idx
+            self._reached[:, envs] = stages.reshape(-1, len(self.STAGES)).T
         self._last = None
 
     def evaluate(self) -> dict[str, torch.Tensor]:
