@@ -36,6 +36,10 @@ class LayoutError(RobocasError):
     """No arrangement of the objects satisfies the configuration."""
 
 
+class SimulationError(RobocasError):
+    """The physics engine could not do what it was asked for."""
+
+
 class OutputExistsError(RobocasError):
     """The output is already there and neither ``--resume`` nor ``--overwrite`` was given."""
 

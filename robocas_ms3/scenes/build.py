@@ -8,7 +8,7 @@ from typing import Any
 
 import sapien
 from mani_skill.envs.scene import ManiSkillScene
-from mani_skill.utils.structs import Actor, Articulation
+from mani_skill.utils.structs import Actor, Articulation, Pose
 from mani_skill.utils.structs.render_camera import RenderCamera
 
 from robocas_ms3.assets.pack import LoadedObject, VisualLevel
@@ -99,28 +99,28 @@ def shift_cameras(cameras: Sequence[RenderCamera], config: TaskConfig, seeds: Se
 def build_object_slot(
     scene: ManiSkillScene, slot: int, assets: list[LoadedObject], level: VisualLevel = "fast"
 ) -> Actor:
-    """Build one slot of objects: env i gets ``assets[i]``; the actors are merged into one batched view.
+    """Build one slot of objects, env i's being ``assets[i]``, as one actor whose bodies are in the order of envs.
 
-    Until the layout puts them in place they hang apart from each other, high above the room.
+    Each asset is built once for all envs that have it. Until the layout puts them in place they hang apart from each
+    other, high above the room.
     """
-    name = f"object_{slot}"
-    waiting = sapien.Pose([slot * 0.5, 0, 20.0])
+    name, waiting = f"object_{slot}", sapien.Pose([slot * 0.5, 0, 20.0])
+    envs_of: dict[str, list[int]] = {}
+    for env, asset in enumerate(assets):
+        envs_of.setdefault(asset.asset.id, []).append(env)
+    if len(envs_of) == 1:
+        return spawn(scene, assets[0], name=name, pose=waiting, level=level)
     actors = [
-        spawn(
-            scene,
-            asset,
-            name=f"{name}-env_{i}" if len(assets) > 1 else name,
-            pose=waiting,
-            level=level,
-            scene_idxs=[i],
-        )
-        for i, asset in enumerate(assets)
+        spawn(scene, assets[envs[0]], name=f"{name}-{asset_id}", pose=waiting, level=level, scene_idxs=envs)
+        for asset_id, envs in envs_of.items()
     ]
-    if len(actors) == 1:
-        return actors[0]
     for actor in actors:
         scene.remove_from_state_dict_registry(actor)
     merged = Actor.merge(actors, name=name)
+    order = merged._scene_idxs.argsort()
+    merged._objs, merged._bodies = ([found[i] for i in order.tolist()] for found in (merged._objs, merged._bodies))
+    merged._scene_idxs = merged._scene_idxs[order]
+    merged.initial_pose = Pose.create(waiting, device=scene.device)
     scene.add_to_state_dict_registry(merged)
     return merged
 

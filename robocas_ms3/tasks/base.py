@@ -30,6 +30,8 @@ from robocas_ms3.scenes.sample import object_set
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.bodies import Bodies, link_poses
 from robocas_ms3.tasks.contacts import Contacts
+from robocas_ms3.tasks.engine_errors import EngineErrors
+from robocas_ms3.tasks.gpu_memory import gpu_memory
 from robocas_ms3.tasks.seeds import SeededEnv
 from robocas_ms3.tasks.spec import TaskSpec
 
@@ -91,6 +93,7 @@ class RoboCASEnv(SeededEnv):
         self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack))
         self._visual_level: VisualLevel = visual_level
         self._resets = 0
+        self._engine_errors: EngineErrors | None = None
         super().__init__(
             *args,
             layouts=layout_bank(self.model, layouts),
@@ -103,8 +106,10 @@ class RoboCASEnv(SeededEnv):
 
     @property
     def _default_sim_config(self) -> SimConfig:
-        contacts = SceneConfig(contact_offset=CONTACT_OFFSET)
-        return SimConfig(sim_freq=100, control_freq=20, spacing=10, scene_config=contacts)
+        contacts, random = SceneConfig(contact_offset=CONTACT_OFFSET), self.task_config.randomisation
+        objects = self.task_config.objects.count + (random.distractors.count[1] if random.distractors else 0)
+        memory = gpu_memory(self.num_envs, objects)
+        return SimConfig(sim_freq=100, control_freq=20, spacing=10, scene_config=contacts, gpu_memory_config=memory)
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
@@ -126,11 +131,11 @@ class RoboCASEnv(SeededEnv):
     # ------------------------------------------------------------------ scene
 
     def _clear(self) -> None:
-        """Forget the scene. ManiSkill collects garbage each time, 0.14 s; here only now and then."""
+        """Forget the scene. ManiSkill collects garbage each time, 0.14 s; here on a CPU only now and then."""
         self._resets += 1
         renders = can_render(self.backend.render_device)
         every = _RESETS_PER_COLLECTION if renders else _RESETS_PER_COLLECTION_STATE_ONLY
-        if self._resets % every == 0 or self.num_envs > 1:
+        if self._resets % every == 0 or self.num_envs > 1 or self._sim_device.is_cuda():
             super()._clear()
             return
         self._close_viewer()
@@ -138,9 +143,21 @@ class RoboCASEnv(SeededEnv):
         self._sensors, self._human_render_cameras, self._hidden_objects = {}, {}, []
         self.scene = None  # pyright: ignore[reportAttributeAccessIssue]
 
+    def _clear_sim_state(self) -> None:
+        """Stop everything in the envs that are being reset, on a GPU in two writes."""
+        if not self.gpu_sim_enabled:
+            super()._clear_sim_state()
+            return
+        self.bodies.stop(self.scene._reset_mask.nonzero()[:, 0])
+        self.scene._gpu_apply_all()
+        self.scene._gpu_fetch_all()
+
     def close(self) -> None:
         """Close the environment and free what it held."""
         self._resets = -1
+        if self._engine_errors is not None:
+            self._engine_errors.close()
+            self._engine_errors = None
         super().close()
 
     def _load_agent(self, options: dict, *args: Any, **kwargs: Any) -> None:
@@ -182,6 +199,8 @@ class RoboCASEnv(SeededEnv):
 
     def _after_reconfigure(self, options: dict) -> None:
         super()._after_reconfigure(options)
+        if self.gpu_sim_enabled and self._engine_errors is None:
+            self._engine_errors = EngineErrors()
         self.bodies = Bodies(self.scene, self.agent.robot)
         rows = [self.bodies.actors.index(actor.name) for actor in self.objects]
         assert rows == list(range(rows[0], rows[0] + len(rows))), "the objects are built one after the other"
@@ -219,8 +238,11 @@ class RoboCASEnv(SeededEnv):
             self.basket_at_start[env_idx] = basket.raw_pose
             raw = _raw_poses(np.concatenate([layout.object_poses for layout in layouts]))
             poses = torch.as_tensor(raw, device=self.device).reshape(count, len(self.objects), 7)
-            for slot, actor in enumerate(self.objects):
-                actor.set_pose(Pose.create(poses[:, slot]))
+            if self.gpu_sim_enabled:
+                self.bodies.put_actors(env_idx, self._object_rows, poses)
+            else:
+                for slot, actor in enumerate(self.objects):
+                    actor.set_pose(Pose.create(poses[:, slot]))
             self.start_poses[env_idx] = poses
             self.target_slot[env_idx] = torch.tensor([layout.target for layout in layouts])
             self._is_target = torch.nn.functional.one_hot(self.target_slot, len(self.objects)).bool()
@@ -251,7 +273,13 @@ class RoboCASEnv(SeededEnv):
     # ------------------------------------------------------------------ step
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict]:
-        """Step; see ``BaseEnv``, whose step takes longer on a CPU where neither observation nor reward is wanted."""
+        """Step; see ``BaseEnv``, whose step takes longer on a CPU where neither observation nor reward is wanted.
+
+        Raises:
+            SimulationError: on a GPU PhysX ran out of memory, and has dropped contacts.
+        """
+        if self._engine_errors is not None:
+            self._engine_errors.check()
         plain = self._obs_mode == "none" and self._reward_mode == "none" and isinstance(action, np.ndarray)
         if not plain or self.gpu_sim_enabled or action.shape != self._orig_single_action_space.shape:
             return super().step(action)

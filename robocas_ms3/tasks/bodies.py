@@ -110,6 +110,25 @@ class Bodies:
         start = starts[robot._objs[0]]
         return np.array(order), slice(4 * start, 4 * (start + BODY + _PACKED_PER_JOINT * robot.max_dof))
 
+    def put_actors(self, envs: torch.Tensor, actors: slice, poses: torch.Tensor) -> None:
+        """Put some actors of some envs somewhere at once, on a GPU; `ManiSkillScene._gpu_apply_all` tells PhysX.
+
+        Args:
+            envs: (E,) indices.
+            actors: which of ``actors``.
+            poses: (E, A, 7) in the world.
+        """
+        if self._scene.parallel_in_single_scene:
+            poses = poses.clone()
+            poses[..., :3] += self._scene.scene_offsets[envs, None]
+        self._px.cuda_rigid_body_data.torch()[self._rows[envs, actors], :7] = poses
+
+    def stop(self, envs: torch.Tensor) -> None:
+        """Take all velocities from some envs (E,) at once, on a GPU; see `put_actors`."""
+        self._px.cuda_rigid_body_data.torch()[self._rows[envs].flatten(), 7:BODY] = 0.0
+        for articulation in self._articulations:
+            self._px.cuda_articulation_qvel.torch()[articulation._data_index[envs], : articulation.max_dof] = 0.0
+
     def _gather(self) -> torch.Tensor:
         bodies = self._px.cuda_rigid_body_data.torch()[self._rows, :BODY]
         if self._scene.parallel_in_single_scene:

@@ -7,9 +7,11 @@ from mani_skill.utils.structs import Articulation
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.assets.spawn import spawn
 from robocas_ms3.config import TaskConfig
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.paths import task_configs_dir
+from robocas_ms3.scenes import build
 from robocas_ms3.scenes.lookup import find_objects, furniture_pose
 
 
@@ -96,3 +98,30 @@ def test_finishes_and_levels_are_seen(needs_renderer):
 def test_an_unknown_level_of_detail_is_an_error():
     with pytest.raises(ConfigError, match=r"no such visual_level \(expected one of \['fast', 'full'\], found fulll\)"):
         gym.make("RoboCASPick-v1", visual_level="fulll", render_backend="none")
+
+
+def test_an_asset_is_built_once_for_all_envs_that_have_it_and_bodies_are_in_the_order_of_envs(monkeypatch):
+    import sapien
+    from mani_skill.envs.scene import ManiSkillScene
+    from mani_skill.envs.utils.system.backend import parse_sim_and_render_backend
+
+    scenes = [sapien.Scene([sapien.physx.PhysxCpuSystem()]) for _ in range(5)]
+    backend = parse_sim_and_render_backend("cpu", "none")
+    scene = ManiSkillScene(scenes, device=torch.device("cpu"), backend=backend)
+    objects, spawned = load_pack("builtin").objects, []
+    monkeypatch.setattr(build, "spawn", lambda *args, **kw: spawned.append(kw["name"]) or spawn(*args, **kw))
+    ids = ["apple", "banana", "apple", "mug", "banana"]
+    actor = build.build_object_slot(scene, 2, [objects[i] for i in ids])
+    assert spawned == ["object_2-apple", "object_2-banana", "object_2-mug"]
+    assert actor._scene_idxs.tolist() == [0, 1, 2, 3, 4]
+    assert [entity.name for entity in actor._objs] == [f"scene-{i}_object_2-{asset}" for i, asset in enumerate(ids)]
+    assert [body.entity for body in actor._bodies] == actor._objs
+    masses = [objects[i].asset.mass for i in ids]
+    np.testing.assert_allclose([body.mass for body in actor._bodies], masses, rtol=1e-5)
+    assert list(scene.state_dict_registry.actors) == ["object_2"]
+    for i, entity in enumerate(actor._objs):
+        assert entity.scene == scenes[i]
+    alike = build.build_object_slot(scene, 3, [objects["apple"]] * 5)
+    assert alike.name == "object_3"
+    assert len(alike._objs) == 5
+    assert list(scene.state_dict_registry.actors) == ["object_2", "object_3"]
