@@ -1,0 +1,173 @@
+"""Environment steps a second of many envs at once, beside ManiSkill's PickCube-v1 and a bare scene of as many bodies.
+
+Without a GPU only one env of each runs: several are processes there (`benchmarks/vector.py`). Actions are random, time
+is wall-clock time after a warm-up, resets are not in it. Prints JSON.
+
+Run: python benchmarks/fps.py [--envs 1 16 256 1024 4096] [--modes state rgb] [--steps 100]
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import gymnasium as gym
+import torch
+import tyro
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.tasks import PickCubeEnv  # noqa: F401  (registers it)
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs import Pose
+from mani_skill.utils.structs.types import SceneConfig, SimConfig
+
+import robocas_ms3.tasks  # noqa: F401
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.assets.physics import CONTACT_OFFSET
+from robocas_ms3.config import load_task_config
+from robocas_ms3.scenes import build
+from robocas_ms3.scenes.bank import layout_bank
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.tasks.gpu_memory import gpu_memory
+from robocas_ms3.tasks.spec import TASKS
+
+SIZE = dict(width=128, height=128)
+
+
+@register_env("RoboCASBare-v1", max_episode_steps=10_000)
+class BareEnv(BaseEnv):
+    """ManiSkill's Panda above the furniture and objects of a configuration; nothing is evaluated.
+
+    Args:
+        scene_config: name of a task configuration; every env has the layout of seed 0.
+        kwargs: of ``BaseEnv``.
+    """
+
+    SUPPORTED_ROBOTS = ["panda"]  # noqa: RUF012  (ManiSkill's form)
+    SUPPORTED_REWARD_MODES = ["none"]  # noqa: RUF012
+
+    def __init__(self, *args: Any, scene_config: str, **kwargs: Any) -> None:
+        pack = load_pack("builtin")
+        self.model = SceneModel.load(load_task_config(scene_config), pack, pack)
+        super().__init__(*args, robot_uids="panda", **kwargs)
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        return SimConfig(
+            sim_freq=100,
+            control_freq=20,
+            spacing=10,
+            scene_config=SceneConfig(contact_offset=CONTACT_OFFSET),
+            gpu_memory_config=gpu_memory(self.num_envs, self.model.config.objects.count),
+        )
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        pose = sapien_utils.look_at([0.6, 0, 1.6], [-0.5, 0, 0.6])
+        return [
+            CameraConfig(f"camera_{i}", pose, fov=1.5, near=0.01, far=10, shader_pack="minimal", **SIZE)
+            for i in range(3)
+        ]
+
+    def _load_scene(self, options: dict) -> None:
+        self.layout = layout_bank(self.model)(0, 0)
+        build.build_fixtures(self.scene, self.model, "fast", [0] * self.num_envs)
+        assets = [self.model.object_pack.objects[i] for i in self.layout.object_ids]
+        self.things = [build.build_object_slot(self.scene, k, [a] * self.num_envs) for k, a in enumerate(assets)]
+
+    def _load_lighting(self, options: dict) -> None:
+        build.build_lights(self.scene, self.model.config, [0] * self.num_envs, shadow=False)
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        self.agent.reset(torch.as_tensor(self.agent.keyframes["rest"].qpos).float())
+        self.agent.robot.set_pose(Pose.create_from_pq(torch.tensor([[0.2, 0.0, 1.2]])))
+        for thing, pose in zip(self.things, self.layout.object_poses, strict=True):
+            position, turn = torch.as_tensor(pose[:3, 3]), sapien_utils.sapien.Pose(pose).q
+            thing.set_pose(Pose.create_from_pq(position[None].float(), torch.as_tensor(turn)[None]))
+
+    def evaluate(self) -> dict:
+        """Nothing."""
+        return {}
+
+
+@dataclass
+class Args:
+    envs: tuple[int, ...] = (1, 16, 64, 256, 1024, 4096)
+    """Numbers of envs."""
+    modes: tuple[Literal["state", "rgb"], ...] = ("state", "rgb")
+    """Observations: states, or three cameras of 128 x 128 (of PickCube-v1 one)."""
+    configs: tuple[str, ...] = ("pick_table_scattered", "search_table_stacked")
+    """Task configurations."""
+    steps: int = 100
+    """Control steps that are timed."""
+    seconds: float = 60.0
+    """Time after which a case stops early."""
+
+
+def main(args: Args) -> None:
+    torch.set_num_threads(1)
+    gpu = torch.cuda.is_available()
+    report: dict[str, Any] = {"device": torch.cuda.get_device_name() if gpu else "cpu", "steps_per_second": {}}
+    for mode in args.modes:
+        cases = {"pick_cube": ("PickCube-v1", {})}
+        for config in args.configs:
+            cases[config] = TASKS[load_task_config(config).task].env_id, {"config": config}
+            cases[f"{config} bare"] = "RoboCASBare-v1", {"scene_config": config}
+        rates: dict[str, dict[int, float | str]] = {name: {} for name in cases}
+        for name, (env_id, kwargs) in cases.items():
+            for count in args.envs:
+                if count == 1 or gpu:
+                    try:
+                        rates[name][count] = round(rate(env_id, count, mode, args, kwargs), 1)
+                    except Exception as error:  # one case that fails, such as for memory, leaves the others
+                        rates[name][count] = f"{type(error).__name__}: {error}"
+        report["steps_per_second"][mode] = rates
+        report.setdefault("over_bare", {})[mode] = {
+            config: {
+                count: round(own / bare, 2)
+                for count, own in rates[config].items()
+                if isinstance(own, float) and isinstance(bare := rates[f"{config} bare"].get(count), float)
+            }
+            for config in args.configs
+        }
+    if not gpu:
+        report["skipped"] = "more than one env: no CUDA device"
+    print(json.dumps(report, indent=2))
+
+
+def rate(env_id: str, count: int, mode: str, args: Args, kwargs: dict[str, Any]) -> float:
+    """Steps of all envs together, a second."""
+    kwargs = kwargs if mode == "rgb" else {**kwargs, "render_backend": "none"}
+    kwargs = {**kwargs, "obs_mode": mode, "control_mode": "pd_joint_delta_pos", "sensor_configs": SIZE}
+    env = gym.make(env_id, num_envs=count, **kwargs)
+    try:
+        env.reset(seed=0)
+        shape = env.action_space.shape
+        assert shape is not None
+        device = env.unwrapped.device  # type: ignore[attr-defined]
+        generator = torch.Generator(device).manual_seed(0)
+        steps, begun = 0, 0.0
+        for step in range(-10, args.steps):
+            if step == 0:
+                _wait(device)
+                begun = time.perf_counter()
+            env.step(0.2 * (2 * torch.rand(shape, generator=generator, device=device) - 1))
+            steps = step + 1
+            if step >= 0 and time.perf_counter() - begun > args.seconds:
+                break
+        _wait(device)
+        return count * steps / (time.perf_counter() - begun)
+    finally:
+        env.close()
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
