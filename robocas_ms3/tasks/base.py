@@ -15,7 +15,7 @@ from mani_skill.utils.structs import Actor, Articulation, Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.arrays import as_tensor, native
+from robocas_ms3.arrays import as_tensor, native, none
 from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
 from robocas_ms3.config import TaskConfig, load_task_config
@@ -333,7 +333,7 @@ class RoboCASEnv(SeededEnv):
     def _grasped_by(self, forces: Any) -> Any:
         """`grasped` from the gripper's forces, both native (`arrays`)."""
         pressed = terms.pressed(forces[:, 0], forces[:, 1])
-        if not pressed.any():  # as most of the time: no need to ask in which direction
+        if none(pressed):  # as most of the time: no need to ask in which direction
             return pressed
         finger = native(link_poses(self.scene, [self.agent.finger1_link]))[:, 0]
         # the left finger opens along its own +y
