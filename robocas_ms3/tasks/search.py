@@ -9,17 +9,17 @@ import torch
 from mani_skill.utils.registration import register_env
 
 from robocas_ms3.arrays import as_tensor, native
-from robocas_ms3.tasks import occlusion, terms
+from robocas_ms3.tasks import occlusion, rewards, terms
+from robocas_ms3.tasks.learning import LearningEnv
 from robocas_ms3.tasks.spec import SEARCH
-from robocas_ms3.tasks.transfer import STAGES, TransferEnv
+from robocas_ms3.tasks.transfer import STAGES
 
 # of each object's surface; hidden shares are then off ray casting by 0.03 on average, 0.08 at the 95th percentile
 _POINTS = 512
-FALLEN = 0.05  # m below the surface that objects stand on, at which one counts as fallen off it
 
 
 @register_env(SEARCH.env_id, max_episode_steps=SEARCH.max_episode_steps)
-class RoboCASSearchEnv(TransferEnv):
+class RoboCASSearchEnv(LearningEnv):
     """Search: the target is hidden in part (p_vis from above below ``target.max_visible_share``).
 
     The stages add ``obstacles_cleared``: at most a fifth of the target is hidden from straight above, and fewer than
@@ -30,6 +30,7 @@ class RoboCASSearchEnv(TransferEnv):
 
     SPEC = SEARCH
     STAGES = ("obstacles_cleared", *STAGES)
+    REWARDS = rewards.SEARCH
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
@@ -40,7 +41,7 @@ class RoboCASSearchEnv(TransferEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
-        self._last_clutter: tuple[torch.Tensor, torch.Tensor] | None = None
+        self._last_clutter: tuple[torch.Tensor, occlusion.Clutter] | None = None
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
         """Set the state; see `RoboCASEnv`."""
@@ -57,22 +58,43 @@ class RoboCASSearchEnv(TransferEnv):
         taken = held | native(self._stages["target_grasped"])
         if (taken | native(self._stages["obstacles_cleared"])).all():  # nothing can change it any more
             return {}
-        surface = float(self.model.support_pose[2, 3]) + self.model.region.z
-        lies = terms.of_target(objects[..., 2], native(self.target_slot)) > surface - FALLEN
-        return {"obstacles_cleared": native(self._cleared(as_tensor(objects[..., :7]))) & lies & ~taken}
+        lies = terms.of_target(objects[..., 2], native(self.target_slot)) > self._surface - terms.FALLEN
+        return {"obstacles_cleared": native(self._clutter_at(as_tensor(objects[..., :7])).cleared) & lies & ~taken}
 
-    def _cleared(self, poses: torch.Tensor) -> torch.Tensor:
-        """(N,) bool of `clutter` at these poses (N, K, 7), as it was when something in the heap last moved."""
+    def _clutter_at(self, poses: torch.Tensor) -> occlusion.Clutter:
+        """`clutter` at these poses of now (N, K, 7), as it was when something in the heap last moved."""
         if self._last_clutter is not None:
-            before, cleared = self._last_clutter
+            before, found = self._last_clutter
             if torch.equal(poses, before) or not self._moved(poses, before):
-                return cleared
-        cleared = self.clutter().cleared
-        self._last_clutter = poses, cleared
-        return cleared
+                return found
+        found = self.clutter()
+        self._last_clutter = poses, found
+        return found
 
     def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:
         return bool(occlusion.moved_near(poses, before, self._radii, self.target_slot).any())
+
+    def _progress(self) -> tuple[Any, dict[str, Any]]:
+        """As of `LearningEnv`; before the target may be grasped it has to be cleared, or must have been."""
+        stage, found = super()._progress()
+        assert self._moment is not None
+        poses = as_tensor(self._moment.objects[..., :7])
+        covered = (stage == self.REWARDS.index("grasp")) & ~native(self._stages["obstacles_cleared"])
+        if not covered.any():
+            return stage, found
+        clutter = self._clutter_at(poses)
+        points = occlusion.surface_points(poses, self._surface_points)
+        start = native(occlusion.push_point(points, clutter.obstacles, self.target_slot))
+        found["push_point"] = rewards.closeness(self._tcp()[:, :3], start)
+        found["clear"] = rewards.uncovered(native(clutter.hidden_share), native(clutter.obstacles.sum(dim=1)))
+        return rewards.furthest(stage, [(covered & ~native(clutter.cleared), self.REWARDS.index("clear"))]), found
+
+    def _privileged(self) -> dict[str, torch.Tensor]:
+        """As of `LearningEnv`, and ``hidden_share`` (N, 1), 0 from when the target was first held."""
+        share = torch.where(
+            self._stages["target_grasped"], 0.0, self._clutter_at(self.object_states[..., :7]).hidden_share
+        )
+        return {**super()._privileged(), "hidden_share": share[:, None]}
 
 
 def _sample(points: np.ndarray) -> np.ndarray:
