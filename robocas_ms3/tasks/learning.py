@@ -11,6 +11,7 @@ from robocas_ms3.tasks import rewards, terms
 from robocas_ms3.tasks.transfer import TransferEnv
 
 _DROP_HEIGHT, _LOWERING = 0.1, 0.25  # m above the basket's rim: where a carry leads; from where on lowering counts
+_FAR = 0.2  # m from there at which half of the carry is done
 _LIFT = 0.03  # m, that of `terms.lifted`
 
 
@@ -96,7 +97,7 @@ class LearningEnv(TransferEnv):
         return stage, {
             "reach": rewards.closeness(self._tcp()[:, :3], center),
             "lift": rewards.rise(target[:, 2], start, _LIFT),
-            "carry": rewards.closeness(center, basket + terms.rotate(turned, drop)),
+            "carry": rewards.closeness(center, basket + terms.rotate(turned, drop), half=_FAR),
             "place": 1 - rewards.rise(inside[:, 2], high[2], _LOWERING),
             "released": rewards.let_go(now.held, now.touched),
             "at_rest": rewards.calm(target[:, 7:10], target[:, 10:]),
@@ -118,8 +119,7 @@ class LearningEnv(TransferEnv):
         if action is None or before is None or before.shape[-1] != action.shape[-1]:
             return native(torch.zeros(self.num_envs, device=self.device))
         action = torch.as_tensor(action, device=self.device).reshape(self.num_envs, -1)
-        rate = rewards.action_rate(native(action), native(before))
-        return choose(native(before.isnan().any(dim=1)), 0 * rate, rate)
+        return rewards.action_rate(native(action), native(torch.where(before.isnan(), action, before)))
 
     def _target_center(self, objects: Any) -> Any:
         """(N, 3) the target's centre of mass in the world, from states (N, K, 13); native (`arrays`)."""
