@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from robocas_ms3.arrays import as_tensor, choose, native
+from robocas_ms3.arrays import as_tensor, choose, join, native
 from robocas_ms3.tasks import rewards, terms
 from robocas_ms3.tasks.transfer import TransferEnv
 
@@ -38,6 +38,7 @@ class LearningEnv(TransferEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
+        self._target_extents = terms.of_target(self._extents, self.target_slot)
         for last in (self._last_action, self._last_level):
             if last is not None:
                 last[env_idx] = torch.nan
@@ -133,14 +134,15 @@ class LearningEnv(TransferEnv):
         state, tcp = self.bodies.read(), self._tcp()
         center, basket = self._target_center(native(self._objects_in(state))), native(self._basket_in(state))
         drop = basket[:, :3] + terms.rotate(basket[:, 3:], native(self._drop))
+        seen = seen_from(tcp, join([center - tcp[:, :3], drop - center]).reshape(-1, 2, 3))
         return {
             **super()._privileged(),
-            "tcp_to_target": as_tensor(_seen_from(tcp, center)),
-            "target_to_drop": as_tensor(terms.rotate_inverse(tcp[:, 3:], drop - center)),
-            "target_extents": as_tensor(terms.of_target(native(self._extents), native(self.target_slot))),
+            "tcp_to_target": seen[:, 0],
+            "target_to_drop": seen[:, 1],
+            "target_extents": self._target_extents,
         }
 
 
-def _seen_from(tcp: Any, point: Any) -> Any:
-    """(N, 3) points of the world in the frames of poses (N, 7)."""
-    return terms.rotate_inverse(tcp[:, 3:], point - tcp[:, :3])
+def seen_from(tcp: Any, vectors: Any) -> torch.Tensor:
+    """(N, V, 3) vectors of the world along the axes of poses (N, 7), from native ones (`arrays`)."""
+    return as_tensor(vectors @ terms.rotation(tcp[:, 3:]))

@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Articulation
 from robocas_ms3.arrays import as_tensor, native
 from robocas_ms3.tasks import rewards, terms
 from robocas_ms3.tasks.bodies import link_poses
-from robocas_ms3.tasks.learning import LearningEnv
+from robocas_ms3.tasks.learning import LearningEnv, seen_from
 from robocas_ms3.tasks.spec import OPEN_PICK
 from robocas_ms3.tasks.transfer import STAGES
 
@@ -83,10 +83,10 @@ class RoboCASOpenPickEnv(LearningEnv):
 
     def _privileged(self) -> dict[str, torch.Tensor]:
         """As of `LearningEnv`, and how far it is open (N, 1), 1 where that is enough, and the handle from the TCP."""
-        tcp, shut = self._tcp(), native(self.opening_position())
-        opened = rewards.rise(shut, 0.0, self.model.opened_position)
+        tcp = self._tcp()
+        opened = rewards.rise(native(self.opening_position()), 0.0, self.model.opened_position)
         return {
             **super()._privileged(),
             "opened_share": as_tensor(opened)[:, None],
-            "tcp_to_handle": as_tensor(terms.rotate_inverse(tcp[:, 3:], self._handle_in_world() - tcp[:, :3])),
+            "tcp_to_handle": seen_from(tcp, (self._handle_in_world() - tcp[:, :3])[:, None])[:, 0],
         }

@@ -42,6 +42,7 @@ class RoboCASSearchEnv(LearningEnv):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
         self._last_clutter: tuple[torch.Tensor, occlusion.Clutter] | None = None
+        self._last_push: torch.Tensor | None = None  # of that clutter
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
         """Set the state; see `RoboCASEnv`."""
@@ -68,7 +69,7 @@ class RoboCASSearchEnv(LearningEnv):
             if torch.equal(poses, before) or not self._moved(poses, before):
                 return found
         found = self.clutter()
-        self._last_clutter = poses, found
+        self._last_clutter, self._last_push = (poses, found), None
         return found
 
     def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:
@@ -83,9 +84,10 @@ class RoboCASSearchEnv(LearningEnv):
         if not covered.any():
             return stage, found
         clutter = self._clutter_at(poses)
-        points = occlusion.surface_points(poses, self._surface_points)
-        start = native(occlusion.push_point(points, clutter.obstacles, self.target_slot))
-        found["push_point"] = rewards.closeness(self._tcp()[:, :3], start)
+        if self._last_push is None:
+            points = occlusion.surface_points(poses, self._surface_points)
+            self._last_push = occlusion.push_point(points, clutter.obstacles, self.target_slot)
+        found["push_point"] = rewards.closeness(self._tcp()[:, :3], native(self._last_push))
         found["clear"] = rewards.uncovered(native(clutter.hidden_share), native(clutter.obstacles.sum(dim=1)))
         return rewards.furthest(stage, [(covered & ~native(clutter.cleared), self.REWARDS.index("clear"))]), found
 
