@@ -114,7 +114,7 @@ class Agent(nn.Module):
             for start in (torch.zeros(observed), torch.ones(observed), torch.tensor(1e-4))
         )
         self.actor, self.critic = _layers(observed, acted, 0.01), _layers(observed, 1, 1.0)
-        self.log_std = nn.Parameter(torch.full((acted,), -0.5))
+        self.log_std = nn.Parameter(torch.full((acted,), -0.9))
 
     def see(self, obs: torch.Tensor) -> None:
         """Learn what observations are like."""

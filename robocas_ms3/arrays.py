@@ -49,6 +49,16 @@ def length(vectors: Array) -> Array:
     return (vectors * vectors).sum(-1) ** 0.5
 
 
+def none(conditions: Array) -> bool:
+    """Whether none of some conditions holds; on a GPU that is not asked, since it would have to be waited for."""
+    return not isinstance(conditions, Tensor) and not conditions.any()
+
+
+def every(conditions: Array) -> bool:
+    """Whether all of some conditions hold; on a GPU that is not asked, since it would have to be waited for."""
+    return not isinstance(conditions, Tensor) and bool(conditions.all())
+
+
 def count_up(count: int, like: Array) -> Array:
     """(count,) whole numbers from 0 on, of the kind and where ``like`` is."""
     return torch.arange(count, device=like.device) if isinstance(like, Tensor) else np.arange(count)

@@ -66,7 +66,7 @@ class EpisodeRecorder(gym.Wrapper):
     def _keep(self, observation: Any) -> None:
         steps = self._steps
         steps.states.append(self._base_env.bodies.read()[0].cpu().numpy())
-        steps.controllers.append(_of_one_env(self._base_env.agent.get_controller_state()))
+        steps.beside_bodies.append(_of_one_env(self._base_env.state_beside_bodies()))
         steps.observations.append(_of_one_env(observation))
 
     @property
@@ -90,8 +90,7 @@ class EpisodeRecorder(gym.Wrapper):
                 flags = {"terminated": terminated, "truncated": truncated, "success": success}
                 for name, values in flags.items():
                     group.create_dataset(name, data=values, dtype=bool)
-                controllers = _stacked(steps.controllers)
-                _write(group, "env_states", {**self.states, **({"controller": controllers} if controllers else {})})
+                _write(group, "env_states", {**self.states, **_stacked(steps.beside_bodies)})
             # the JSON first: an HDF5 file that is there always has its JSON
             write_json(
                 self._trajectory.with_suffix(".json"),
@@ -138,7 +137,7 @@ class _Steps:
     flags: list[tuple[bool, bool, bool]] = field(default_factory=list)
     """terminated, truncated, success"""
     states: list[NDArray[np.float32]] = field(default_factory=list)
-    controllers: list[Any] = field(default_factory=list)
+    beside_bodies: list[Any] = field(default_factory=list)
     observations: list[Any] = field(default_factory=list)
 
 

@@ -51,6 +51,12 @@ class Reachability:
         qpos = found[np.arange(len(poses)), best]
         return np.isfinite(qpos[:, 0]), qpos
 
+    def everything(self, tcp_in_base: Array, near: Array) -> tuple[Array, NDArray[np.intp]]:
+        """Give all configurations (M, 7) that reach many poses (N, 4, 4), and of which pose each is one (M,)."""
+        found = self._solve(np.asarray(tcp_in_base, dtype=np.float64), np.asarray(near, dtype=np.float64), STEP)
+        exists = np.isfinite(found[..., 0])
+        return found[exists], np.nonzero(exists)[0]
+
     def solutions(self, tcp_in_base: Array, near: Array) -> list[Array]:
         """Give distinct configurations (7,) that reach one pose (4x4), nearest to ``near`` first."""
         found = self._solve(np.asarray(tcp_in_base, dtype=np.float64)[None], near, FINE_STEP)[0]

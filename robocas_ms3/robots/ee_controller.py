@@ -14,15 +14,17 @@ import sapien
 import torch
 from mani_skill.agents.controllers import PDEEPoseController, PDEEPoseControllerConfig
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
+from mani_skill.utils.geometry.rotation_conversions import matrix_to_quaternion, quaternion_invert, quaternion_multiply
 from mani_skill.utils.structs import Link, Pose
 
-from robocas_ms3.arrays import as_tensor, choose, clamp, join, length, native
+from robocas_ms3.arrays import as_tensor, choose, clamp, every, join, length, native, none
 from robocas_ms3.robots import rotations
 from robocas_ms3.robots.drives import ARM_SET_FROM_OUTSIDE, EvenDrives
 from robocas_ms3.robots.ee_deltas import ee_delta_target
 
 BODY_FRAME = "body_translation:body_aligned_body_rotation"
-BATCHED_IK_ITERATIONS = 5
+BATCHED_IK_ITERATIONS, IK_DAMPING = 8, 1e-4
+IK_TOLERANCE = 1e-4  # m and rad together, as SAPIEN's solver has it, which is used on a CPU
 # m and rad between the TCP and the pose it was asked for: beyond, something holds the arm back, or set it elsewhere.
 EE_HELD_BACK = (0.1, 0.5)
 
@@ -44,30 +46,41 @@ def _relative_pose(frame: Link, link: Link) -> Any:
 
 
 def batched_ik(
-    kinematics: Kinematics, target: Pose, qpos: torch.Tensor, joints: torch.Tensor, now: Pose
-) -> torch.Tensor:
-    """Solve inverse kinematics of many arms at once with ManiSkill's batched solver.
+    kinematics: Kinematics, target: Pose, qpos: torch.Tensor, limits: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Solve inverse kinematics of many arms at once, within their joints' limits.
 
-    That solver takes one linear step, too coarse for 0.5 rad, so it is repeated.
+    Levenberg's damped steps; a joint that a step would push beyond its limit takes no part in it. ManiSkill's batched
+    solver takes one step, too coarse for 0.5 rad, and knows no limits.
 
     Args:
         kinematics: set up for batches, as it is on a GPU.
         target: (N,) poses of the end link in the root frame of the kinematics.
-        qpos: (N, dof) present configuration of the whole articulation.
-        joints: indices in ``qpos`` of the joints to solve for.
-        now: (N,) present poses of the end link.
+        qpos: (N, joints) present configuration.
+        limits: (joints, 2), rad.
 
     Returns:
-        (N, joints) positions.
+        (N, joints) positions, and (N,) whether they reach the poses, to ``IK_TOLERANCE``.
     """
-    qpos = qpos.clone()
-    current: Pose | None = now
+    low, high = limits.unbind(1)
+    damping = IK_DAMPING * torch.eye(len(limits), device=qpos.device)
+    missed = _missed(kinematics, target, qpos)
     for _ in range(BATCHED_IK_ITERATIONS):
-        config = dict(type="levenberg_marquardt", alpha=1.0)
-        solved = kinematics.compute_ik(pose=target, q0=qpos, current_pose=current, solver_config=config)
-        qpos[:, joints] = cast("torch.Tensor", solved)
-        current = None
-    return qpos[:, joints]
+        jacobian = cast("torch.Tensor", kinematics.pk_chain.jacobian(qpos))
+        downhill = (jacobian.mT @ missed[..., None])[..., 0]
+        stuck = ((qpos <= low) & (downhill < 0)) | ((qpos >= high) & (downhill > 0))
+        jacobian = jacobian.masked_fill(stuck[:, None], 0.0)
+        step = torch.linalg.solve(jacobian.mT @ jacobian + damping, jacobian.mT @ missed[..., None])
+        qpos = (qpos + step[..., 0]).clamp(low, high)
+        missed = _missed(kinematics, target, qpos)
+    return qpos, torch.linalg.vector_norm(missed, dim=1) < IK_TOLERANCE
+
+
+def _missed(kinematics: Kinematics, target: Pose, qpos: torch.Tensor) -> torch.Tensor:
+    """(N, 6) translation, m, and rotation, about rad, from the end link to where it should be, in the root frame."""
+    reached = cast("Any", kinematics.pk_chain.forward_kinematics(qpos)).get_matrix()
+    turned = quaternion_multiply(target.q, quaternion_invert(matrix_to_quaternion(reached[:, :3, :3])))
+    return torch.cat([target.p - reached[:, :3, 3], 2 * turned[:, 1:] * turned[:, :1].sign()], dim=1)
 
 
 class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
@@ -102,6 +115,7 @@ class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
+        self._limits = self.articulation.get_qlimits()[0, self.active_joint_indices]
         if not self.kinematics.use_gpu_ik:
             of_model: list[torch.Tensor] = [
                 self.kinematics.pmodel_active_joint_indices,
@@ -111,7 +125,6 @@ class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
             self._chain, self._free, self._arm = (tensor.numpy() for tensor in of_model)
 
     sets_target_qvel = True
-    _forgotten: torch.Tensor | None = None  # (N,) whose targets count no longer
 
     def set_action(self, action: Any) -> None:
         """Drive the arm towards the pose; where no inverse kinematics is found it stays where it is."""
@@ -120,32 +133,18 @@ class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
         last = now = self._now()
         if self._target_qpos is not None:
             last = native(self._target_qpos)
-        moved = abs(last - now) > ARM_SET_FROM_OUTSIDE
-        if self._forgotten is not None:
-            moved |= native(self._forgotten)[:, None]
-        start, wanted = choose(moved, now, last), self._wanted_pose(reference, action)
-        target = self._solve(wanted)
-        if target is None:
-            target, wanted = now, self._reference_pose() if reference is None else reference
-        self._target_pose = Pose(raw_pose=as_tensor(wanted))
-        self._target_qpos, self._forgotten = as_tensor(target), None
+        start = choose(abs(last - now) > ARM_SET_FROM_OUTSIDE, now, last)
+        wanted = self._wanted_pose(reference, action)
+        target, solved = self._solve(wanted)
+        if not every(solved):
+            stay = self._reference_pose() if reference is None else reference
+            target, wanted = choose(solved[:, None], target, now), choose(solved[:, None], wanted, stay)
+        self._target_pose, self._target_qpos = Pose(raw_pose=as_tensor(wanted)), as_tensor(target)
         if self.config.use_delta:
             self._drive_with(start, (target - start) * self._control_freq)
             self._move_evenly(start, target)
         else:
             self._drive_with(target, torch.zeros_like(as_tensor(target)))
-
-    def forget_targets(self, env_idx: torch.Tensor | None = None) -> None:
-        """Let the next action start from where the arm is: its state was set from outside.
-
-        Args:
-            env_idx: of the envs; default: all.
-        """
-        forgotten = torch.zeros(len(self.qpos), dtype=torch.bool, device=self.device)
-        if self._forgotten is not None:
-            forgotten |= self._forgotten
-        forgotten[slice(None) if env_idx is None else env_idx] = True
-        self._forgotten = forgotten
 
     def _drive_with(self, targets: Any, velocities: Any) -> None:
         """Set drive targets and their velocities: an arm that is told its velocity does not lag."""
@@ -166,18 +165,15 @@ class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
         distance = length(target[:, :3] - now[:, :3])
         cosine = abs((target[:, 3:] * now[:, 3:]).sum(1))  # of half the angle between them
         lost = (distance > far) | (cosine < np.cos(turned / 2))
-        if self._forgotten is not None:
-            lost |= native(self._forgotten)
-        if not lost.any():
+        if none(lost):
             return target
         return choose(lost[:, None], native(self.ee_pose_at_base.raw_pose), target)
 
-    def _solve(self, target: Any) -> Any:
-        """(N, joints) that reach poses (N, 7) in the arm's base frame, native; None: not found, on a CPU."""
+    def _solve(self, target: Any) -> tuple[Any, Any]:
+        """(N, joints) that reach poses (N, 7) in the arm's base frame, and (N,) whether they do, native."""
         kinematics = self.kinematics
         if self.scene.gpu_sim_enabled:
-            qpos, pose = self.articulation.get_qpos(), Pose(raw_pose=target)
-            return batched_ik(kinematics, pose, qpos, self.active_joint_indices, self.ee_pose_at_base)
+            return batched_ik(kinematics, Pose(raw_pose=target), self.qpos, self._limits)
         # what ManiSkill's `compute_ik` does, without its conversions
         found, success, _ = kinematics.pmodel.compute_inverse_kinematics(
             kinematics.end_link_idx,
@@ -186,7 +182,7 @@ class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
             active_qmask=self._free,
             max_iterations=100,
         )
-        return found[self._arm].astype(np.float32)[None] if success else None
+        return found[self._arm].astype(np.float32)[None], np.array([success])
 
 
 @dataclass

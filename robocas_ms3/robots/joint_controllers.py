@@ -83,9 +83,9 @@ class HeldJointsController(DirectDrives):
         self.single_action_space = spaces.Box(np.empty(0, np.float32), np.empty(0, np.float32))
 
     def reset(self) -> None:
-        """Take the present configuration as the one to hold."""
+        """Take the present configuration as the one to hold, in the envs that are being reset."""
         super().reset()
-        self.set_drive_targets(self._target_qpos)
+        self.set_drive_targets(self._target_qpos[self.scene._reset_mask])
 
     def set_action(self, action: Any) -> None:
         """Keep the drive targets, unless the state was set from outside: then hold the joints where they are now."""

@@ -18,10 +18,10 @@ from mani_skill.utils import common
 from mani_skill.utils.structs import Actor, Link, Pose
 
 from robocas_ms3.robots import constants as c
+from robocas_ms3.robots.combined import RobotController, State
 from robocas_ms3.robots.drives import EvenDrives
 from robocas_ms3.robots.ee_controller import (
     BODY_FRAME,
-    RoboCASEEPoseController,
     RoboCASEEPoseControllerConfig,
     relative_pose,
 )
@@ -206,27 +206,44 @@ class RoboCASMobilePanda(BaseAgent):
 
     def set_control_mode(self, control_mode: str | None = None) -> None:
         """Change the control mode; what the last one told the arm about its velocity is forgotten."""
-        super().set_control_mode(cast("str", control_mode))
-        controllers: Any = self.controller
-        self._within_a_step = [part for part in controllers.controllers.values() if isinstance(part, EvenDrives)]
+        mode = control_mode or self._default_control_mode
+        if mode in self.supported_control_modes and mode not in self.controllers:
+            made = RobotController(self._controller_configs[mode], self.robot, self._control_freq, scene=self.scene)
+            made.set_drive_property()
+            self.controllers[mode] = made
+            if not self.scene._gpu_sim_initialized:
+                for link in self.robot.links:  # as ManiSkill does for those that it makes
+                    link.disable_gravity = True
+        super().set_control_mode(mode)
+        self._within_a_step = [part for part in self._parts.controllers.values() if isinstance(part, EvenDrives)]
         if hasattr(self, "tcp"):  # not while the robot is being made
             self._still()
+
+    @property
+    def _parts(self) -> RobotController:
+        return cast("RobotController", self.controller)
+
+    def reset_only(self, env_idx: torch.Tensor | None) -> None:
+        """Say which envs the next reset of the controllers is of; None: all."""
+        self._parts.reset_only = env_idx
+
+    def controller_targets(self) -> dict[str, dict[str, torch.Tensor]]:
+        """What the next actions start from, beside where the joints are; see `combined.RobotController.targets`."""
+        return self._parts.targets()
+
+    def set_controller_targets(self, state: State | None = None, env_idx: torch.Tensor | None = None) -> None:
+        """Let the next actions start from targets, and where there are none from where the joints are.
+
+        Args:
+            state: of `controller_targets`, a row for each env that is set.
+            env_idx: of these envs; default: all.
+        """
+        self._parts.set_targets(state, env_idx)
 
     def _still(self) -> None:
         """Take back the velocities that the drives were told, of the envs being reset."""
         joints = self.robot.active_joints
         self.robot.set_joint_drive_velocity_targets(torch.zeros(1, len(joints), device=self.device), joints)
-
-    def forget_targets(self, env_idx: torch.Tensor | None = None) -> None:
-        """Let the next action start from where the arm is: its state was set from outside.
-
-        Args:
-            env_idx: of the envs; default: all.
-        """
-        controllers: Any = self.controller
-        arm = controllers.controllers["arm"]
-        if isinstance(arm, RoboCASEEPoseController):
-            arm.forget_targets(env_idx)
 
     def get_proprioception(self) -> dict[str, Any]:
         """Joint state, TCP pose in the arm's base frame (N, 7), gripper width (N, 1), controller state."""

@@ -15,7 +15,7 @@ from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, has_free_grasps
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array, transform
 from robocas_ms3.scenes.relations import related
-from robocas_ms3.scenes.visibility import object_mesh, top_down_camera, visible_shares
+from robocas_ms3.scenes.visibility import PinholeCamera, object_mesh, top_down_camera, visible_shares
 
 
 @dataclass(frozen=True)
@@ -153,16 +153,21 @@ def _by_relation(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
     return None
 
 
+def selection_camera(model: SceneModel) -> PinholeCamera:
+    """The camera that p_vis is measured with: over the middle of the objects' region."""
+    region = model.region
+    middle = np.append(np.add(region.min_xy, region.max_xy) / 2, region.z)
+    center = transform(model.support_pose, middle[None])[0]
+    return top_down_camera(center[:2], center[2])
+
+
 def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
     """A hidden object, near ones more often: weight 1 / distance to the robot (upstream's).
 
     One that can't be grasped as it lies is none, whatever lies on it: a can on its broad side, a screwdriver in a gap.
     """
     model, slots = scene.model, np.flatnonzero(scene.present)
-    region = model.region
-    middle = np.append(np.add(region.min_xy, region.max_xy) / 2, region.z)
-    center = transform(model.support_pose, middle[None])[0]
-    camera = top_down_camera(center[:2], center[2])
+    camera = selection_camera(model)
     shares = np.full(len(scene.assets), np.nan)
     shares[slots] = visible_shares(camera, [object_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
     unique = np.array([scene.names.count(name) == 1 for name in scene.names])

@@ -207,6 +207,7 @@ class RoboCASEnv(SeededEnv):
             count = len(env_idx)
             rest = torch.as_tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32)
             self.agent.reset(rest.repeat(count, 1))
+            self.agent.reset_only(env_idx)
             self.agent.robot.set_pose(self._pose([layout.robot_pose for layout in layouts]))
             for name, furniture in self.fixtures.furniture.items():
                 if isinstance(furniture, Articulation):
@@ -229,15 +230,20 @@ class RoboCASEnv(SeededEnv):
             self.layouts[i] = layout
 
     def get_state_dict(self) -> dict:
-        """The state, in ManiSkill's form, from one read of all bodies."""
-        state: dict[str, Any] = dict(self.bodies.split(self.bodies.read().clone()))
-        controller = self.agent.get_controller_state()
-        return {**state, "controller": controller} if controller else state
+        """The state, in ManiSkill's form, from one read of all bodies, with all that what follows hangs on.
+
+        ``controller`` holds the targets that the next actions start from (`RobotController.targets`).
+        """
+        return {**self.bodies.split(self.bodies.read().clone()), **self.state_beside_bodies()}
+
+    def state_beside_bodies(self) -> dict:
+        """What `get_state_dict` holds but for poses and velocities."""
+        return {"controller": self.agent.controller_targets()}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state; the next action starts from there, whatever the last one had asked for."""
+        """Set the state. Where it has no targets, the next action starts from where the robot is."""
         super().set_state_dict(state, cast("torch.Tensor", env_idx))
-        self.agent.forget_targets(env_idx)
+        self.agent.set_controller_targets(state.get("controller"), env_idx)
 
     def _pose(self, matrices: list[Array]) -> Any:
         """Batch of poses from 4x4 matrices."""

@@ -39,9 +39,17 @@ class LearningEnv(TransferEnv):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
         self._target_extents = terms.of_target(self._extents, self.target_slot)
+        self._forget_the_last(env_idx)
+
+    def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
+        """Set the state; see `TransferEnv`. The next step's reward is as that after a reset."""
+        super().set_state_dict(state, env_idx)
+        self._forget_the_last(slice(None) if env_idx is None else env_idx)
+
+    def _forget_the_last(self, envs: Any) -> None:
         for last in (self._last_action, self._last_level):
             if last is not None:
-                last[env_idx] = torch.nan
+                last[envs] = torch.nan
 
     # ------------------------------------------------------------------ rewards
 

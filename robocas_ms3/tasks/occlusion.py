@@ -1,7 +1,9 @@
-"""What lies on and around a target, seen from above: pure functions on batched tensors. N envs, K slots; metres.
+"""What lies on and around a target, as a camera above sees it: pure functions on batched tensors. N envs, K slots.
 
-Objects are given as points on their surfaces. Each object's points are dropped into a grid of square cells around the
-target, which keeps the highest one of each cell; comparing these height maps says what hides what.
+Objects are given as points on their surfaces, m. Each object's points are seen in a grid of square cells around the
+target, which keeps the highest one of each cell; comparing these height maps says what hides what. The camera is the
+one that p_vis is measured with (`scenes.visibility.top_down_camera`): it looks straight down, so that of the points on
+a ray the highest is the nearest.
 """
 
 from __future__ import annotations
@@ -12,8 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-CELL = 0.005  # edge of a cell, m
-CELLS = 64  # cells a side, so that what is within 0.16 m of the target's middle counts
+CELL = 0.005  # edge of a cell, m, where the target is
+CELLS = 64  # cells a side, so that what is seen within 0.16 m of the target's middle counts
+NEAREST = 0.05  # m below the camera; what is higher counts as if it were there
 MAX_HIDDEN_SHARE = 0.2  # of a cleared target, the paper's
 MAX_OBSTACLES = 1  # around it, the same
 REACH = 2  # cells around the target's outline in which others count as neighbours: 1 cm
@@ -27,7 +30,7 @@ class Clutter(NamedTuple):
     """What is in the way of a target.
 
     Attributes:
-        hidden_share: (N,) share of the target's outline from above that others cover, 1 - p_vis.
+        hidden_share: (N,) share of the target's outline that others cover, 1 - p_vis.
         obstacles: (N, K) bool, which others stick out above the target's mean height, visibly and within 1 cm of its
             outline.
     """
@@ -61,7 +64,24 @@ def surface_points(poses: Tensor, points: Tensor) -> Tensor:
     return rotation @ points + poses[..., :3, None]
 
 
-def moved_near(poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, *, least: float = LEAST_MOTION) -> Tensor:
+def seen_from(points: Tensor, eye: Tensor, depth: Tensor) -> Tensor:
+    """Where points appear to a camera that looks straight down.
+
+    Args:
+        points: (N, K, 3, P) in the world, m.
+        eye: (3,) the camera, world, m.
+        depth: (N,) m below the camera, where sizes are to stay as they are.
+
+    Returns:
+        (N, K, 2, P) along the world's x and y, from right below the camera, m at ``depth``.
+    """
+    below = (eye[2] - points[:, :, 2]).clamp(min=NEAREST)
+    return (points[:, :, :2] - eye[:2, None]) * (depth[:, None, None] / below)[:, :, None]
+
+
+def moved_near(
+    poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, eye: Tensor, *, least: float = LEAST_MOTION
+) -> Tensor:
     """Whether anything that `clutter` looks at has moved, the targets included.
 
     Args:
@@ -69,21 +89,26 @@ def moved_near(poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, *, 
         before: the same, then.
         radii: (N, K) of spheres about the objects' origins that hold them, m.
         target: (N,) slots of the targets.
+        eye: (3,) the camera, world.
         least: m, and of a quaternion's components, what counts as motion.
 
     Returns:
         (N,) bool.
     """
     env = torch.arange(len(target), device=poses.device)
-    # the target's outline, the cells around it, and one for where in its cell a point lies
-    reach = radii + radii[env, target][:, None] + (REACH + 1) * CELL
     near = torch.zeros_like(radii, dtype=torch.bool)
     for at in (poses, before):
-        near |= ((at[..., :2] - at[env, target, None, :2]).abs() <= reach[..., None]).all(dim=-1)
+        aside, below = at[..., :2] - eye[:2], (eye[2] - at[..., 2]).clamp(min=NEAREST)
+        above = (below - radii).clamp(min=NEAREST)  # where the camera would see the sphere farthest out
+        seen = aside / below[..., None]
+        size = (aside.abs() + radii[..., None]) / above[..., None] - seen.abs()
+        # the target's outline, the cells around it, and one for where in its cell a point lies
+        reach = size + size[env, target][:, None] + ((REACH + 1) * CELL / above[env, target])[:, None, None]
+        near |= ((seen - seen[env, target][:, None]).abs() <= reach).all(dim=-1)
     return (((poses - before).abs() > least).any(dim=-1) & near).any(dim=-1)
 
 
-def clutter(points: Tensor, present: Tensor, target: Tensor) -> Clutter:
+def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clutter:
     """Measure what hides and surrounds the targets.
 
     A cell of the target is hidden where another object's highest point is above the target's. Gaps of one cell between
@@ -93,11 +118,15 @@ def clutter(points: Tensor, present: Tensor, target: Tensor) -> Clutter:
         points: (N, K, 3, P) on the objects' surfaces, world.
         present: (N, K) bool, slots that take part.
         target: (N,) slots of the targets.
+        eye: (3,) the camera, world.
     """
     env = torch.arange(len(target), device=points.device)
     own = points[env, target]  # (N, 3, P)
-    middle = (own[:, :2].amin(dim=-1) + own[:, :2].amax(dim=-1)) / 2
-    cells, heights = _cells(points[:, :, :2], middle), points[:, :, 2]
+    depth = (eye[2] - own[:, 2].mean(dim=-1)).clamp(min=NEAREST)
+    seen = seen_from(points, eye, depth)
+    outline = seen[env, target]
+    middle = (outline.amin(dim=-1) + outline.amax(dim=-1)) / 2
+    cells, heights = _cells(seen, middle), points[:, :, 2]
     others = present.clone()
     others[env, target] = False
     others_cells = torch.where(others[..., None], cells, _OUTSIDE).flatten(1)
@@ -105,10 +134,10 @@ def clutter(points: Tensor, present: Tensor, target: Tensor) -> Clutter:
 
     closed = _closed(torch.stack([_height_map(cells[env, target], own[:, 2]), top], dim=1))
     at_target, above_it = closed[:, 0], closed[:, 1] > closed[:, 0]
-    outline = at_target > _NOTHING
-    hidden_share = (outline & above_it).sum(dim=(1, 2)) / outline.sum(dim=(1, 2)).clamp(min=1)
+    filled = at_target > _NOTHING
+    hidden_share = (filled & above_it).sum(dim=(1, 2)) / filled.sum(dim=(1, 2)).clamp(min=1)
 
-    around = _widened(outline.float(), REACH) > 0
+    around = _widened(filled.float(), REACH) > 0
     sticks_out = around & (top > at_target) & (top > own[:, 2].mean(dim=-1)[:, None, None])
     # an object is an obstacle where one of its points is the highest of a cell that sticks out
     limit = torch.where(sticks_out, top, -_NOTHING).flatten(1)

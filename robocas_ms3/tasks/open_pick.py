@@ -9,7 +9,7 @@ import torch
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Articulation
 
-from robocas_ms3.arrays import as_tensor, native
+from robocas_ms3.arrays import as_tensor, native, none
 from robocas_ms3.tasks import rewards, terms
 from robocas_ms3.tasks.bodies import link_poses
 from robocas_ms3.tasks.learning import LearningEnv, seen_from
@@ -69,7 +69,7 @@ class RoboCASOpenPickEnv(LearningEnv):
         """As of `LearningEnv`; before the target may be grasped the furniture must have been opened."""
         stage, found = super()._progress()
         shut = (stage == self.REWARDS.index("grasp")) & ~native(self._stages["furniture_opened"])
-        if not shut.any():
+        if none(shut):
             return stage, found
         found["handle"] = rewards.closeness(self._tcp()[:, :3], self._handle_in_world())
         found["open"] = rewards.rise(native(self.opening_position()), 0.0, self.model.opened_position)

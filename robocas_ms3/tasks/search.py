@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from mani_skill.utils.registration import register_env
 
-from robocas_ms3.arrays import as_tensor, native
+from robocas_ms3.arrays import as_tensor, native, none
+from robocas_ms3.scenes.targets import selection_camera
 from robocas_ms3.tasks import occlusion, rewards, terms
 from robocas_ms3.tasks.learning import LearningEnv
 from robocas_ms3.tasks.spec import SEARCH
@@ -16,16 +17,21 @@ from robocas_ms3.tasks.transfer import STAGES
 
 # of each object's surface; hidden shares are then off ray casting by 0.03 on average, 0.08 at the 95th percentile
 _POINTS = 512
+LOOKS_PER_SECOND = 5  # at what is cleared
+ENVS_AT_ONCE = 512  # whose clutter is measured: a quarter of a GB with 15 objects each
 
 
 @register_env(SEARCH.env_id, max_episode_steps=SEARCH.max_episode_steps)
 class RoboCASSearchEnv(LearningEnv):
     """Search: the target is hidden in part (p_vis from above below ``target.max_visible_share``).
 
-    The stages add ``obstacles_cleared``: at most a fifth of the target is hidden from straight above, and fewer than
-    two other objects stick out next to it (`occlusion.clutter`). What counts is the heap while the target lies in it:
-    from the moment the gripper has held the target, nothing is cleared any more, so pulling or dragging it out from
-    under the heap does not reach this stage.
+    The stages add ``obstacles_cleared``: to the camera above that p_vis is measured with, at most a fifth of the target
+    is hidden, and fewer than two other objects stick out next to it (`occlusion.clutter`). It is looked at five times a
+    second. What counts is the heap while the target lies in it: from the moment the gripper has held the target,
+    nothing is cleared any more, so pulling or dragging it out from under the heap does not reach this stage.
+
+    ``cleared_at_reset`` (N,) bool says that the target lay clear from the beginning: then the stage says nothing of
+    what was done.
     """
 
     SPEC = SEARCH
@@ -38,65 +44,110 @@ class RoboCASSearchEnv(LearningEnv):
         columns = np.ascontiguousarray(np.array(points).swapaxes(-1, -2))
         self._surface_points = torch.as_tensor(columns, dtype=torch.float32, device=self.device)
         self._radii = torch.linalg.vector_norm(self._surface_points, dim=-2).amax(dim=-1)
+        eye = selection_camera(self.model).pose[:3, 3]
+        self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
+        self._looked: _Look | None = None
+        self._push_point: torch.Tensor | None = None  # (N, 3), of that look
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
-        self._last_clutter: tuple[torch.Tensor, occlusion.Clutter] | None = None
-        self._last_push: torch.Tensor | None = None  # of that clutter
+        if not hasattr(self, "hidden_share"):
+            self.hidden_share = torch.zeros(self.num_envs, device=self.device)
+            self._cleared_at_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+            self._obstacles = torch.zeros_like(self.present)
+        self._looked = None
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
         """Set the state; see `RoboCASEnv`."""
         super().set_state_dict(state, env_idx)
-        self._last_clutter = None  # else what follows would hang on what was before
+        self._looked = None  # else what follows would hang on what was before
 
-    def clutter(self) -> occlusion.Clutter:
-        """What hides and surrounds each env's target right now."""
-        points = occlusion.surface_points(self.object_states[..., :7], self._surface_points)
-        return occlusion.clutter(points, self.present, self.target_slot)
+    def clutter(self, envs: Any = slice(None)) -> occlusion.Clutter:
+        """What hides and surrounds the targets of some envs right now."""
+        points = occlusion.surface_points(self.object_states[envs, :, :7], self._surface_points[envs])
+        return occlusion.clutter(points, self.present[envs], self.target_slot[envs], self._eye)
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """See `TransferEnv`; ``cleared_at_reset`` besides."""
+        found = super().evaluate()
+        begins = self.elapsed_steps == 0
+        self._cleared_at_reset = torch.where(begins, found["obstacles_cleared"], self._cleared_at_reset)
+        return {**found, "cleared_at_reset": self._cleared_at_reset}
+
+    def _known_by(self, forces: Any) -> object:
+        known = super()._known_by(forces)
+        waits = self._looked is None or self._looked.others != self.bodies.others
+        return None if waits and not none(self._due()) else known
+
+    def _due(self) -> Any:
+        """(N,) bool, native: whose clutter is looked at in this step."""
+        every = max(1, self.control_freq // LOOKS_PER_SECOND)
+        settled = native(self._stages["target_grasped"]) | native(self._stages["obstacles_cleared"])
+        return (native(self.elapsed_steps) % every == 0) & ~settled
 
     def _task_stages(self, objects: Any, held: Any) -> dict[str, Any]:
-        """``obstacles_cleared``, (N,) bool, of this moment."""
-        taken = held | native(self._stages["target_grasped"])
-        if (taken | native(self._stages["obstacles_cleared"])).all():  # nothing can change it any more
+        """``obstacles_cleared``, (N,) bool, of this moment; nothing in steps in which no env is looked at."""
+        due = self._due() & ~held
+        if none(due):
             return {}
         lies = terms.of_target(objects[..., 2], native(self.target_slot)) > self._surface - terms.FALLEN
-        return {"obstacles_cleared": native(self._clutter_at(as_tensor(objects[..., :7])).cleared) & lies & ~taken}
+        return {"obstacles_cleared": native(self._look(as_tensor(due), as_tensor(objects[..., :7]))) & lies & due}
 
-    def _clutter_at(self, poses: torch.Tensor) -> occlusion.Clutter:
-        """`clutter` at these poses of now (N, K, 7), as it was when something in the heap last moved."""
-        if self._last_clutter is not None:
-            before, found = self._last_clutter
-            if torch.equal(poses, before) or not self._moved(poses, before):
-                return found
-        found = self.clutter()
-        self._last_clutter, self._last_push = (poses, found), None
-        return found
+    def _look(self, due: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
+        """(N,) bool, which of the envs that are due are cleared; keeps their hidden shares and obstacles.
+
+        Args:
+            due: (N,) bool.
+            poses: (N, K, 7) of the objects.
+        """
+        others, looked = self.bodies.others, self._looked
+        if others is not None and looked is not None:  # on a CPU it is known whether anything has moved
+            still = looked.others == others or not self._moved(poses, looked.poses)
+            if still:
+                self._looked = looked._replace(others=others)
+                return looked.cleared
+        cleared = torch.zeros_like(due)
+        for envs in due.nonzero()[:, 0].split(ENVS_AT_ONCE):
+            found = self.clutter(envs)
+            cleared[envs], self.hidden_share[envs] = found.cleared, found.hidden_share
+            self._obstacles[envs] = found.obstacles
+        self._looked, self._push_point = _Look(others, poses, cleared), None
+        return cleared
 
     def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:
-        return bool(occlusion.moved_near(poses, before, self._radii, self.target_slot).any())
+        return bool(occlusion.moved_near(poses, before, self._radii, self.target_slot, self._eye).any())
 
     def _progress(self) -> tuple[Any, dict[str, Any]]:
-        """As of `LearningEnv`; before the target may be grasped it has to be cleared, or must have been."""
+        """As of `LearningEnv`; before the target may be grasped it has to be cleared, or must have been held."""
         stage, found = super()._progress()
-        assert self._moment is not None
-        poses = as_tensor(self._moment.objects[..., :7])
-        covered = (stage == self.REWARDS.index("grasp")) & ~native(self._stages["obstacles_cleared"])
-        if not covered.any():
+        settled = native(self._stages["obstacles_cleared"]) | native(self._stages["target_grasped"])
+        covered = (stage == self.REWARDS.index("grasp")) & ~settled
+        if none(covered):
             return stage, found
-        clutter = self._clutter_at(poses)
-        if self._last_push is None:
-            points = occlusion.surface_points(poses, self._surface_points)
-            self._last_push = occlusion.push_point(points, clutter.obstacles, self.target_slot)
-        found["push_point"] = rewards.closeness(self._tcp()[:, :3], native(self._last_push))
-        found["clear"] = rewards.uncovered(native(clutter.hidden_share), native(clutter.obstacles.sum(dim=1)))
-        return rewards.furthest(stage, [(covered & ~native(clutter.cleared), self.REWARDS.index("clear"))]), found
+        if self._push_point is None:
+            points = occlusion.surface_points(self.object_states[..., :7], self._surface_points)
+            self._push_point = occlusion.push_point(points, self._obstacles, self.target_slot)
+        found["push_point"] = rewards.closeness(self._tcp()[:, :3], native(self._push_point))
+        found["clear"] = rewards.uncovered(native(self.hidden_share), native(self._obstacles.sum(dim=1)))
+        return rewards.furthest(stage, [(covered, self.REWARDS.index("clear"))]), found
 
     def _privileged(self) -> dict[str, torch.Tensor]:
-        """As of `LearningEnv`, and ``hidden_share`` (N, 1), 0 from when the target was first held."""
-        share = torch.where(
-            self._stages["target_grasped"], 0.0, self._clutter_at(self.object_states[..., :7]).hidden_share
-        )
-        return {**super()._privileged(), "hidden_share": share[:, None]}
+        """As of `LearningEnv`, and ``hidden_share`` (N, 1) at the last look; there is none once the target was held."""
+        return {**super()._privileged(), "hidden_share": self.hidden_share[:, None].clone()}
+
+
+class _Look(NamedTuple):
+    """The last look at the clutter.
+
+    Attributes:
+        others: all but the robot as it was then, on a CPU.
+        poses: (N, K, 7) of the objects when it was last measured.
+        cleared: (N,) bool, what was found.
+    """
+
+    others: object
+    poses: torch.Tensor
+    cleared: torch.Tensor
 
 
 def _sample(points: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from mani_skill.utils.structs import Articulation
 
-from robocas_ms3.arrays import as_tensor, count_up, native
+from robocas_ms3.arrays import as_tensor, count_up, every, native, none
 from robocas_ms3.assets.manifest import BODY
 from robocas_ms3.config.relations import Relation
 from robocas_ms3.language.instructions import Instruction, choose_instruction, part_name
@@ -96,9 +96,17 @@ class TransferEnv(RoboCASEnv):
             synonyms=config.language.synonyms,
         )
 
+    def state_beside_bodies(self) -> dict:
+        """See `RoboCASEnv`. ``task`` holds the ``stages`` reached so far, (N, stages) bool."""
+        return {**super().state_beside_bodies(), "task": {"stages": self._reached.T.clone()}}
+
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state; see `RoboCASEnv`."""
+        """Set the state; see `RoboCASEnv`. Where it has no stages, they stay as they are."""
         super().set_state_dict(state, env_idx)
+        if "task" in state:
+            stages = torch.as_tensor(state["task"]["stages"], dtype=torch.bool, device=self.device)
+            envs = slice(None) if env_idx is None else env_idx
+            self._reached[:, envs] = stages.reshape(-1, len(self.STAGES)).T
         self._last = None
 
     def evaluate(self) -> dict[str, torch.Tensor]:
@@ -154,7 +162,7 @@ class TransferEnv(RoboCASEnv):
         slot, start = native(self.target_slot), native(self.basket_at_start)
         height = terms.of_target(objects[..., 2], slot)
         low = height < self._surface - terms.FALLEN
-        if measures["basket_stands"].all() and not low.any():  # as nearly always
+        if every(measures["basket_stands"]) and none(low):  # as nearly always
             return low
         first, last = map(native, self._above_basket)
         above = terms.inside_box(terms.of_target(objects[..., :3], slot), basket[:, :3], basket[:, 3:], first, last)

@@ -119,6 +119,18 @@ def test_solutions_of_one_pose_differ_the_nearest_first(reachability):
         assert reachability.solutions(top_down(*place), REST) == []
 
 
+def test_everything_is_all_configurations_of_all_poses(reachability):
+    poses = np.concatenate([grasp_poses(20, 3), top_down(1.2, 0, 0.3)[None]])  # the last one is out of reach
+    qpos, of_pose = reachability.everything(poses, REST)
+    np.testing.assert_allclose(reachability.chain.tcp(qpos), poses[of_pose], atol=1e-9)
+    solved, nearest = reachability.reachable(poses, REST)
+    np.testing.assert_array_equal(np.unique(of_pose), np.flatnonzero(solved))
+    for pose in np.flatnonzero(solved):
+        own = qpos[of_pose == pose]
+        assert len(own) > 1
+        assert (own == nearest[pose]).all(axis=1).any()
+
+
 def test_how_far_two_configurations_are_apart_by_hand():
     assert turn_between(np.array([0.3, -0.4]), np.zeros(2)) == pytest.approx(0.4 + 0.2 * 0.5)
 

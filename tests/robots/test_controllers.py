@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import sapien
 import torch
 from mani_skill.agents.controllers import PDJointPosController
 from mani_skill.utils.geometry.rotation_conversions import matrix_to_quaternion
@@ -171,7 +172,7 @@ def test_ee_deltas_start_where_the_arm_is_after_its_state_was_set(make_env):
         env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
     agent.robot.set_qpos(before)
     agent.robot.set_qvel(torch.zeros_like(before))
-    agent.forget_targets()
+    agent.set_controller_targets()
     env.step(np.zeros(7, np.float32))
     translation, _ = moved(start, matrix(agent.tcp.pose))
     assert np.linalg.norm(translation) < 2e-3
@@ -310,6 +311,47 @@ def test_batched_inverse_kinematics_reaches_every_target(make_env):
     now = forward(qpos[:, 3:10])
     delta = torch.tensor(np.hstack([rng.uniform(-0.1, 0.1, (32, 3)), rng.uniform(-0.28, 0.28, (32, 3))])).float()
     target = Pose.create_from_pq(*ee_delta_target(now.p, now.q, delta))
-    reached = forward(batched_ik(kinematics, target, qpos, controller.active_joint_indices, now))
+    found, solved = batched_ik(kinematics, target, qpos[:, 3:10], controller._limits)
+    reached = forward(found)
+    assert solved.all()
     assert (reached.p - target.p).norm(dim=1).max() < 1e-4
     assert (reached.q * target.q).sum(dim=1).abs().min() > 1 - 1e-6
+
+
+def test_batched_inverse_kinematics_keeps_to_the_limits_and_says_what_it_did_not_reach(make_env):
+    _, agent = make_env("pd_ee_delta_pose")
+    controller = agent.controller.controllers["arm"]
+    kinematics, limits = controller.kinematics, controller._limits
+    solver, chain, free = kinematics.pmodel, controller._chain, controller._free
+    kinematics._setup_gpu()
+    rng = np.random.default_rng(1)
+    arm = rng.uniform(limits[:, 0], limits[:, 1], (64, 7)).astype(np.float32)  # many near a limit
+    qpos = agent.robot.qpos.repeat(64, 1)
+    qpos[:, 3:10] = torch.from_numpy(arm)
+    matrices = kinematics.pk_chain.forward_kinematics(qpos[:, 3:10]).get_matrix()
+    now = Pose.create_from_pq(matrices[:, :3, 3], matrix_to_quaternion(matrices[:, :3, :3]))
+    delta = torch.tensor(np.hstack([rng.uniform(-0.1, 0.1, (64, 3)), rng.uniform(-0.28, 0.28, (64, 3))])).float()
+    target = Pose.create_from_pq(*ee_delta_target(now.p, now.q, delta))
+    target.raw_pose[:4, :3] = torch.tensor([2.0, 0, 0.5])  # out of reach
+    found, solved = batched_ik(kinematics, target, qpos[:, 3:10], limits)
+    assert ((found >= limits[:, 0]) & (found <= limits[:, 1])).all()
+    assert not solved[:4].any()
+    on_a_cpu = []
+    low, high = limits.numpy().T
+    for pose, start in zip(target.raw_pose.numpy(), qpos.numpy(), strict=True):
+        qpos_on_a_cpu, success, _ = solver.compute_inverse_kinematics(
+            kinematics.end_link_idx,
+            sapien.Pose(pose[:3], pose[3:]),
+            initial_qpos=start[chain],
+            active_qmask=free,
+            max_iterations=100,
+        )
+        reached = qpos_on_a_cpu[controller._arm]
+        on_a_cpu.append(bool(success and (reached >= low).all() and (reached <= high).all()))
+    both = solved.numpy() & on_a_cpu
+    assert both.sum() > 30
+    assert both.sum() >= 0.95 * sum(on_a_cpu)
+    matrices = kinematics.pk_chain.forward_kinematics(found).get_matrix()
+    missed = (matrices[:, :3, 3] - target.p).norm(dim=1)
+    assert missed[solved].max() < 1.1e-4
+    assert missed[~solved].median() > 1e-3

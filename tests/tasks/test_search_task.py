@@ -11,6 +11,8 @@ from mani_skill.utils.structs import Pose
 
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.tasks import occlusion
+from robocas_ms3.tasks.search import LOOKS_PER_SECOND
 
 pytestmark = pytest.mark.slow
 
@@ -26,9 +28,10 @@ def env():
 
 
 def hold(env) -> bool:
-    """Step once with the arm held still; give `obstacles_cleared`."""
+    """Step until the heap has been looked at again, with the arm held still; give `obstacles_cleared`."""
     qpos = env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy()
-    *_, info = env.step(np.append(qpos, 1.0).astype(np.float32))
+    for _ in range(env.unwrapped.control_freq // LOOKS_PER_SECOND):
+        *_, info = env.step(np.append(qpos, 1.0).astype(np.float32))
     return bool(info["obstacles_cleared"][0])
 
 
@@ -65,10 +68,36 @@ def test_taking_the_others_away_clears_the_target_until_the_next_reset(env):
     assert not hold(env)
     take_away_the_others(base)
     assert hold(env)
+    assert base.hidden_share.tolist() == [0]
     base.set_state(before)
     assert hold(env)  # sticky
     _, info = env.reset(seed=seed)
     assert not bool(info["obstacles_cleared"][0])
+
+
+def test_the_heap_is_looked_at_five_times_a_second(env):
+    env.reset(seed=covered_seed(env))
+    base = env.unwrapped
+    qpos = base.agent.robot.get_qpos()[0, 3:10].numpy()
+    take_away_the_others(base)
+    seen = []
+    for _ in range(4):
+        *_, info = env.step(np.append(qpos, 1.0).astype(np.float32))
+        seen.append(bool(info["obstacles_cleared"][0]))
+        assert not bool(info["cleared_at_reset"][0])
+    assert seen == [False, False, False, True]
+
+
+def test_a_target_that_lies_clear_from_the_beginning_is_told_from_one_that_was_cleared(env, monkeypatch):
+    monkeypatch.setattr(occlusion.Clutter, "cleared", property(lambda found: found.hidden_share <= 1))
+    _, info = env.reset(seed=0)
+    assert bool(info["obstacles_cleared"][0])
+    assert bool(info["cleared_at_reset"][0])
+    *_, info = env.step(np.append(env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy(), 1.0).astype(np.float32))
+    assert bool(info["cleared_at_reset"][0])
+    monkeypatch.undo()
+    _, info = env.reset(seed=covered_seed(env))
+    assert not bool(info["cleared_at_reset"][0])
 
 
 def test_a_target_that_was_pulled_out_has_not_been_cleared(env):

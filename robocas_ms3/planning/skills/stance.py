@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, Obstacle
@@ -35,6 +36,7 @@ from robocas_ms3.scenes.placement import transform
 KINDS = 4  # of grasps that attempts take one after the other
 PLACES = 3  # to do one thing from
 GRASPS = 10  # grasps that stand for all when reach is judged
+GRASPS_THOROUGH = 40  # the same where none of those can be reached from anywhere
 GRASPS_LOOKED_AT = 250
 SIDE = "from_the_robots_side"
 # shares that are comfortable: of an object's grasps, of the way of a pull, of poses above the basket
@@ -100,9 +102,14 @@ def drive_to_object(arm: Arm, slot: int, *, elsewhere: bool = False) -> None:
         goals = places_before(arm, center)
         seen = np.array([len(_from_here(arm, arm_base_in_world(arm, goal), grasps)) for goal in goals])
         goals = goals[seen >= max(1, 0.3 * seen.max(initial=0))]
-        route = best_route(
-            arm, goals, around, lambda goal: reach_share(arm, goal, grasps, others), enough=2 * COMFORTABLE
-        )
+        try:
+            route = best_route(
+                arm, goals, around, lambda goal: reach_share(arm, goal, grasps, others), enough=2 * COMFORTABLE
+            )
+        except PlanningFailed:  # the elbow is in the way: what else is there for it?
+            route = best_route(
+                arm, goals, around, lambda goal: _elbows_share(arm, goal, grasps, others), enough=COMFORTABLE
+            )
     drive(arm, *route)
 
 
@@ -204,17 +211,39 @@ def reach_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle]) ->
         others: everything but the object, in the world.
     """
     frame = arm_base_in_world(arm, base)
-    chosen = _from_here(arm, frame, grasps)
-    if not len(chosen):
+    poses = _poses_of_some(arm, frame, grasps, GRASPS)
+    if not len(poses):
         return 0.0
-    chosen = chosen[np.linspace(0, len(chosen) - 1, min(GRASPS, len(chosen))).round().astype(int)]
-    poses = inverse(frame) @ np.concatenate([chosen, chosen @ HALF_TURN])  # and their twins
-    before = poses.copy()
-    before[:, :3, 3] -= PREGRASP_DISTANCE * before[:, :3, 2]
-    solved, qpos = arm.reachability.reachable(np.concatenate([poses, before]), arm.at)
+    solved, qpos = arm.reachability.reachable(poses, arm.at)
     arm.planner.set_scene(seen_from(others, frame))
     solved[solved] = arm.planner.free(qpos[solved])
-    held, entered = solved.reshape(2, 2, -1)  # grasp or pre-grasp; as annotated or its twin; which
+    return _share(solved)
+
+
+def _elbows_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle]) -> float:
+    """Judge as ``reach_share``, of more grasps and by every configuration, not by the nearest alone; dearer by far."""
+    frame = arm_base_in_world(arm, base)
+    poses = _poses_of_some(arm, frame, grasps, GRASPS_THOROUGH)
+    if not len(poses):
+        return 0.0
+    qpos, of_pose = arm.reachability.everything(poses, arm.at)
+    arm.planner.set_scene(seen_from(others, frame))
+    return _share(np.bincount(of_pose[arm.planner.free(qpos)], minlength=len(poses)) > 0)
+
+
+def _poses_of_some(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
+    """Poses (4K, 4, 4), seen from an arm's base: K <= count of the grasps and their twins, then their pre-grasps."""
+    chosen = _from_here(arm, frame, grasps)
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(int)]
+    poses = inverse(frame) @ np.concatenate([chosen, chosen @ HALF_TURN])
+    before = poses.copy()
+    before[:, :3, 3] -= PREGRASP_DISTANCE * before[:, :3, 2]
+    return np.concatenate([poses, before])
+
+
+def _share(possible: NDArray[np.bool_]) -> float:
+    """Share of grasps that are possible and can be entered; of poses as ``_poses_of_some`` gives them."""
+    held, entered = possible.reshape(2, 2, -1)  # grasp or pre-grasp; as annotated or its twin; which
     return float((held & entered).any(axis=0).mean())
 
 

@@ -1,0 +1,81 @@
+"""Where the base stands: what a place is good for, judged without a simulator."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from planning_scenes import REST
+
+from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.planning.skills import stance
+from robocas_ms3.planning.skills.driving import arm_base_in_world
+
+
+class _Planner:
+    """Rejects configurations near some, as if only those touched anything."""
+
+    def __init__(self) -> None:
+        self.blocked = np.empty((0, 7))
+
+    def set_scene(self, obstacles) -> None:
+        assert obstacles == []
+
+    def free(self, qpos) -> np.ndarray:
+        away = np.abs(qpos[:, None] - self.blocked[None]).max(axis=2)
+        return (away > 1e-6).all(axis=1)
+
+
+@pytest.fixture(scope="module")
+def reachability(panda_files) -> Reachability:
+    return Reachability(panda_files.arm_urdf)
+
+
+@pytest.fixture
+def arm(reachability):
+    robot = SimpleNamespace(pose=SimpleNamespace(raw_pose=np.array([[0.0, 0, 0, 1, 0, 0, 0]])))
+    config = SimpleNamespace(target=SimpleNamespace(approach="top"))
+    env = SimpleNamespace(agent=SimpleNamespace(robot=robot), task_config=config)
+    return SimpleNamespace(env=env, reachability=reachability, planner=_Planner(), at=REST)
+
+
+def grasps_in_world(arm) -> np.ndarray:
+    """Eight top-down grasps in front of the arm, at different turns."""
+    poses = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (8, 1, 1))
+    for pose, turn in zip(poses, np.linspace(-1, 1, 8), strict=True):
+        c, s = np.cos(turn), np.sin(turn)
+        pose[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ pose[:3, :3]
+        pose[:3, 3] = 0.5, 0.0, 0.1
+    return arm_base_in_world(arm, np.zeros(3)) @ poses
+
+
+def test_of_all_configurations_one_is_free_where_the_nearest_is_not(arm):
+    grasps, here = grasps_in_world(arm), np.zeros(3)
+    assert stance.reach_share(arm, here, grasps, []) == 1.0
+    assert stance._elbows_share(arm, here, grasps, []) == 1.0
+    poses = stance._poses_of_some(arm, arm_base_in_world(arm, here), grasps, len(grasps))
+    solved, nearest = arm.reachability.reachable(poses, REST)
+    assert solved.all()
+    arm.planner.blocked = nearest
+    assert stance.reach_share(arm, here, grasps, []) == 0.0
+    assert stance._elbows_share(arm, here, grasps, []) == 1.0
+
+
+def test_a_grasp_counts_only_with_its_pregrasp(arm):
+    grasps, here = grasps_in_world(arm), np.zeros(3)
+    poses = stance._poses_of_some(arm, arm_base_in_world(arm, here), grasps, len(grasps))
+    half = len(poses) // 2
+    everything, of_pose = arm.reachability.everything(poses, REST)
+    arm.planner.blocked = everything[of_pose >= half]  # each way in
+    assert stance._elbows_share(arm, here, grasps, []) == 0.0
+    one_and_its_twin = np.isin(of_pose, [half, half + len(grasps)])
+    arm.planner.blocked = everything[one_and_its_twin]
+    assert stance._elbows_share(arm, here, grasps, []) == pytest.approx(7 / 8)
+
+
+def test_out_of_reach_and_none_are_worth_nothing(arm):
+    grasps = grasps_in_world(arm)
+    for far in (grasps + np.array([[0, 0, 0, 2.0]] + [[0, 0, 0, 0]] * 3), grasps[:0]):
+        assert stance.reach_share(arm, np.zeros(3), far, []) == 0.0
+        assert stance._elbows_share(arm, np.zeros(3), far, []) == 0.0

@@ -1,0 +1,95 @@
+"""A state that was taken in the middle of an episode is come back to, with what the next actions hang on."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import robocas_ms3  # noqa: F401
+from robocas_ms3.robots.constants import ARM_REST
+
+MODES = ("pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose", "pd_joint_pos_base")
+FREE_FALL = 1e-5  # m, rad: contacts are found anew, and nothing else is
+
+
+@pytest.fixture(params=MODES)
+def env(request):
+    made = gym.make("RoboCASPick-v1", obs_mode="state_dict", control_mode=request.param, render_backend="none")
+    yield made
+    made.close()
+
+
+def actions(env, count: int, seed: int) -> list[np.ndarray]:
+    """Small motions about where the arm rests, whatever the control mode."""
+    rng, mode = np.random.default_rng(seed), env.unwrapped.control_mode
+    size = env.action_space.shape[0]
+    if mode == "pd_ee_pose":
+        tcp = env.unwrapped.agent.tcp_in_arm_base
+        start = np.concatenate([tcp.p[0].numpy(), [np.pi, 0, 0]])
+        drift = np.cumsum(rng.uniform(-0.005, 0.005, (count, 6)), axis=0)
+        return [np.append(start + step, -1).astype(np.float32) for step in drift]
+    if "delta" in mode:
+        return list(rng.uniform(-0.3, 0.3, (count, size)).astype(np.float32))
+    drift = np.cumsum(rng.uniform(-0.02, 0.02, (count, size)), axis=0)
+    rest = np.zeros(size)
+    rest[:7] = ARM_REST
+    return list((rest + drift).astype(np.float32))
+
+
+def play(env, todo: list[np.ndarray]) -> tuple[torch.Tensor, dict, dict]:
+    for action in todo:
+        observation, *_, info = env.step(action)
+    return env.unwrapped.agent.robot.get_qpos().clone(), observation, info
+
+
+def test_what_follows_is_what_followed(env):
+    base = env.unwrapped
+    env.reset(seed=0)
+    play(env, actions(env, 10, seed=1))
+    kept, seen = base.get_state_dict(), base.get_obs()
+    todo = actions(env, 10, seed=2)
+    after, observation, _ = play(env, todo)
+    play(env, actions(env, 7, seed=3))
+    base.set_state_dict(kept)
+    again = base.get_obs()
+    for part, value in seen["agent"].items():
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(again["agent"][part], value, atol=1e-6, rtol=0, msg=part)
+    for name, targets in seen["agent"].get("controller", {}).items():  # as the controller has them now
+        for what, value in targets.items():
+            torch.testing.assert_close(again["agent"]["controller"][name][what], value, atol=1e-6, rtol=0)
+    restored, same, _ = play(env, todo)
+    assert (restored - after).abs().max() < FREE_FALL
+    torch.testing.assert_close(
+        same["agent"]["tcp_in_arm_base"], observation["agent"]["tcp_in_arm_base"], atol=1e-5, rtol=0
+    )
+
+
+def test_stages_come_back_too(env):
+    base = env.unwrapped
+    env.reset(seed=0)
+    base._reached[0, 0] = True
+    kept = base.get_state_dict()
+    env.reset(seed=0)
+    assert not base.evaluate()[base.STAGES[0]]
+    base.set_state_dict(kept)
+    assert base.evaluate()[base.STAGES[0]]
+    assert not base.evaluate()[base.STAGES[1]]
+    base.set_state_dict({kind: kept[kind] for kind in ("actors", "articulations")})  # as others record it
+    assert base.evaluate()[base.STAGES[0]]
+
+
+def test_a_state_without_targets_starts_from_where_the_robot_is():
+    env = gym.make("RoboCASPick-v1", obs_mode="none", control_mode="pd_ee_delta_pose", render_backend="none")
+    base = env.unwrapped
+    env.reset(seed=0)
+    start = base.get_state_dict()
+    for _ in range(5):
+        env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
+    base.set_state_dict({kind: start[kind] for kind in ("actors", "articulations")})
+    targets = base.agent.controller_targets()["arm"]
+    assert torch.allclose(targets["target_pose"], base.agent.tcp_in_arm_base.raw_pose, atol=1e-5)
+    assert torch.equal(targets["target_qpos"], base.agent.robot.get_qpos()[:, 3:10])
+    env.close()
