@@ -219,8 +219,11 @@ def main(args: Args) -> None:
             rows.writerow([number * args.batch, f"{seconds:.1f}", *(f"{x:.3f}" for x in (*of_last, spread))])
             file.flush()
             if number % 10 == 0 or number == args.updates or seconds > 60 * args.minutes:
-                print(f"{number * args.batch} steps, {seconds:.0f} s: return {of_last[0]:.2f} of {STEPS}, held at the end "
-                      f"{of_last[1]:.0%}, lifted {of_last[2]:.0%}", flush=True)  # fmt: skip
+                done = f"held at the end {of_last[1]:.0%}, lifted {of_last[2]:.0%}"
+                print(
+                    f"{number * args.batch} steps, {seconds:.0f} s: return {of_last[0]:.2f} of {STEPS}, {done}",
+                    flush=True,
+                )
             if seconds > 60 * args.minutes:
                 break
     torch.save(agent.state_dict(), args.out / "policy.pt")

@@ -17,8 +17,11 @@ from mani_skill.utils.structs import Pose
 from scipy.stats import spearmanr
 
 import robocas_ms3  # noqa: F401
+from robocas_ms3.arrays import as_tensor
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
-from robocas_ms3.tasks import TASKS
+from robocas_ms3.tasks import TASKS, learning, open_pick, search
+from robocas_ms3.tasks import base as tasks_base
+from robocas_ms3.tasks.transfer import Moment
 
 STATE_ONLY: dict[str, Any] = {"render_backend": "none", "control_mode": "pd_joint_pos"}
 
@@ -254,6 +257,29 @@ def test_tasks_add_what_is_theirs(env_id, names):
         qpos[:, joint] = base.model.opened_position * 1.01
         furniture.set_qpos(qpos)
         assert reward_now(base)[0] > 4 / 14
+    env.close()
+
+
+@pytest.mark.parametrize("task", ["pick", "search", "open_pick"])
+def test_tensors_as_on_a_gpu_give_what_arrays_give(task, monkeypatch):
+    env = gym.make(TASKS[task].env_id, obs_mode="state_dict", reward_mode="normalized_dense", **STATE_ONLY)
+    env.reset(seed=1)
+    base: Any = env.unwrapped
+    action = torch.as_tensor(held_still(env))[None]
+    env.step(action[0].numpy())
+    action = action + 0.1
+    info = base.get_info()
+    expected, seen = base.compute_dense_reward({}, action, info), base._privileged()
+    for module in (tasks_base, learning, search, open_pick):
+        monkeypatch.setattr(module, "native", lambda tensor: tensor)
+    base._moment = Moment(*map(as_tensor, base._moment))
+    again = {name: value for name, value in info.items() if name != "reward_terms"}
+    assert torch.allclose(base.compute_dense_reward({}, action, again), expected, atol=1e-6)
+    for name, term in again["reward_terms"].items():
+        assert (type(term), term.dtype) == (torch.Tensor, torch.float32)
+        assert torch.allclose(term, info["reward_terms"][name], atol=1e-6)
+    for name, value in base._privileged().items():
+        assert torch.allclose(value, seen[name], atol=1e-6)
     env.close()
 
 
