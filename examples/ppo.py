@@ -16,8 +16,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 import tyro
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
-from mani_skill.utils.wrappers import CPUGymWrapper
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from torch import nn
 from torch.distributions import Normal
 
@@ -43,15 +42,17 @@ class Args:
     """Wall-clock time to learn for."""
     updates: int = 10**9
     """Or until there were so many updates."""
-    envs: int = min(8, os.cpu_count() or 1)
-    """Processes, an environment each."""
+    envs: int = 8
+    """Environments."""
+    processes: bool = (os.cpu_count() or 1) > 4
+    """Each in a process of its own, which takes cores that are free: else this one steps them all."""
     layouts: int = 64
     """Different scenes to learn from."""
     batch: int = 1024
     """Steps of all environments together between updates."""
     epochs: int = 10
     minibatches: int = 8
-    learning_rate: float = 5e-4
+    learning_rate: float = 7e-4
     gamma: float = 0.92
     trace: float = 0.9
     """Lambda of the advantages."""
@@ -62,27 +63,29 @@ class Args:
 class TopDown(gym.Wrapper):
     """Five numbers in [-1, 1] in place of the pose's seven: the gripper keeps pointing down and only turns about that.
 
-    1 is a shift by 5 cm, or a turn by 0.25 rad, in a fifth of a second. Of ``info`` only what came of an episode is
-    kept: all of it, at every step, would be much to hand on between processes.
+    1 is a shift by 5 cm, or a turn by 0.25 rad, in a fifth of a second. A success does not end an episode: the reward is
+    a level, and goes on. Of ``info`` only what came of an episode is kept: all of it, at every step, would be much to
+    hand on between processes.
     """
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         self.action_space = gym.spaces.Box(-1, 1, (5,), np.float32)
+        self.observation_space = env.unwrapped.single_observation_space
 
     def step(self, action: np.ndarray) -> tuple:
         x, y, z, yaw, gripper = np.clip(action, -1, 1)
         pose = np.array([x / 2, y / 2, z / 2, 0, 0, yaw / 2, gripper], np.float32)
-        obs, reward, terminated, truncated, info = self.env.step(pose)
-        held = {"held": info["reward_terms"]["grasp"] == 1, "lifted": info["target_lifted"]} if truncated else {}
-        return obs, reward, terminated, truncated, held
+        obs, reward, _, truncated, info = self.env.step(pose)
+        over = bool(truncated)
+        held = {"held": bool(info["reward_terms"]["grasp"] == 1), "lifted": bool(info["target_lifted"])} if over else {}
+        return obs[0].numpy(), float(reward), False, over, held
 
     def reset(self, **kwargs) -> tuple:
-        return self.env.reset(**kwargs)[0], {}
+        return self.env.reset(**kwargs)[0][0].numpy(), {}
 
 
 def make_env(layouts: int) -> gym.Env:
-    """At 5 Hz. A success does not end an episode: the reward is a level, and goes on."""
     torch.set_num_threads(1)
     env = gym.make(
         "RoboCASPick-v1",
@@ -96,13 +99,15 @@ def make_env(layouts: int) -> gym.Env:
         max_episode_steps=STEPS,
         render_backend="none",
     )
-    return TopDown(CPUGymWrapper(env, ignore_terminations=True))
+    return TopDown(env)
 
 
-def make_vec(count: int, layouts: int) -> VectorEnv:
-    """Environments in processes of their own; each starts anew when its episode is over."""
-    makers = [lambda: make_env(layouts)] * count
-    return AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
+def make_vec(args: "Args") -> VectorEnv:
+    """Environments that start anew when an episode is over, each in a process of its own or all in this one."""
+    makers = [lambda: make_env(args.layouts)] * args.envs
+    if args.processes:
+        return AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
+    return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
 
 
 class Agent(nn.Module):
@@ -205,7 +210,7 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
-    env = make_vec(args.envs, args.layouts)
+    env = make_vec(args)
     agent = Agent(env.single_observation_space.shape[0], env.single_action_space.shape[0])
     optimizer = torch.optim.Adam([p for p in agent.parameters() if p.requires_grad], lr=args.learning_rate, eps=1e-5)
     rollouts, begun = Rollouts(env, agent, args), time.perf_counter()
