@@ -31,10 +31,10 @@ def main(args: Args) -> None:
         for run, colour in zip(args.runs, COLOURS, strict=False):
             found = read(run / "progress.csv")
             steps = found["steps"] / 1000
-            left.plot(steps, found["return"] / 20, color=colour)
+            left.plot(steps, found["return"], color=colour)
             middle.plot(steps, 100 * found["held"], color=colour)
             right.plot(found["seconds"] / 60, 100 * found["held"], color=colour, label=run.name)
-        left.set(title="reward a step", xlabel="thousand steps", ylim=(0, 1))
+        left.set(title="return of an episode", xlabel="thousand steps")
         middle.set(title="held at the end, %", xlabel="thousand steps", ylim=(0, 100))
         right.set(title="held at the end, %", xlabel="minutes", ylim=(0, 100))
         right.legend(frameon=False)

@@ -38,7 +38,7 @@ class Args:
     """Folder to write to."""
     seed: int = 1
     """Of the policy and its noise."""
-    minutes: float = 6.0
+    minutes: float = 10.0
     """Wall-clock time to learn for."""
     updates: int = 10**9
     """Or until there were so many updates."""
@@ -48,10 +48,10 @@ class Args:
     """Each in a process of its own, which takes cores that are free: else this one steps them all."""
     layouts: int = 64
     """Different scenes to learn from."""
-    batch: int = 1024
+    batch: int = 512
     """Steps of all environments together between updates."""
     epochs: int = 10
-    minibatches: int = 8
+    minibatches: int = 4
     learning_rate: float = 7e-4
     gamma: float = 0.92
     trace: float = 0.9
@@ -63,9 +63,9 @@ class Args:
 class TopDown(gym.Wrapper):
     """Five numbers in [-1, 1] in place of the pose's seven: the gripper keeps pointing down and only turns about that.
 
-    1 is a shift by 5 cm, or a turn by 0.25 rad, in a fifth of a second. A success does not end an episode: the reward is
-    a level, and goes on. Of ``info`` only what came of an episode is kept: all of it, at every step, would be much to
-    hand on between processes.
+    1 is a shift by 5 cm, or a turn by 0.25 rad, in a fifth of a second. A success does not end an episode: the reward
+    is a level, and goes on. Of ``info`` only what came of an episode is kept: all of it, at every step, would be much
+    to hand on between processes.
     """
 
     def __init__(self, env: gym.Env) -> None:
