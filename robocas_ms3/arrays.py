@@ -27,6 +27,11 @@ def choose(condition: Array, yes: Array, no: Array) -> Array:
     return torch.where(condition, yes, no) if isinstance(condition, Tensor) else np.where(condition, yes, no)
 
 
+def as_float(values: Array) -> Array:
+    """Flags or numbers as float32."""
+    return values.float() if isinstance(values, Tensor) else np.asarray(values, np.float32)
+
+
 def clamp(values: Array, low: Any, high: Any) -> Array:
     """Values within limits, which are numbers or arrays of the same kind."""
     if isinstance(values, Tensor):

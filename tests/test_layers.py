@@ -36,6 +36,7 @@ SIMULATOR_FREE = (
     ),
     "tasks.terms",
     "tasks.occlusion",
+    "tasks.rewards",
     "datasets.schema",
     "planning.protocol",
     "language",

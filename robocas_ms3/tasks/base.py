@@ -185,6 +185,7 @@ class RoboCASEnv(SeededEnv):
         self._centers_of_mass = torch.tensor(
             [[f.center_of_mass for f in row] for row in facts], dtype=torch.float32, device=self.device
         )
+        self._extents = torch.tensor([[f.extents for f in row] for row in facts], dtype=torch.float32).to(self.device)
         slots = len(self.objects)
         self.layouts: list[Layout | None] = [None] * self.num_envs
         self.start_poses = torch.zeros(self.num_envs, slots, 7, device=self.device)
@@ -293,7 +294,7 @@ class RoboCASEnv(SeededEnv):
         self._after_control_step()
         self._elapsed_steps += 1
         info, self._last_obs = self.get_info(), {}
-        return {}, torch.zeros(1), info["success"].clone(), torch.zeros(1, dtype=torch.bool), info
+        return {}, torch.zeros(1), info["success"] | info["fail"], torch.zeros(1, dtype=torch.bool), info
 
     # ------------------------------------------------------------------ state
 
@@ -317,6 +318,10 @@ class RoboCASEnv(SeededEnv):
 
     def _basket_in(self, state: torch.Tensor) -> torch.Tensor:
         return self.bodies.of_actors(state)[:, self._basket_row, :7]
+
+    def _tcp(self) -> Any:
+        """(N, 7) pose of the TCP in the world, native (`arrays`)."""
+        return native(link_poses(self.scene, [self.agent.tcp]))[:, 0]
 
     def target_asset(self, env: int = 0) -> LoadedObject:
         """The target's asset in one env."""
@@ -344,6 +349,10 @@ class RoboCASEnv(SeededEnv):
         """Nothing in visual modes; in state modes what only a simulator knows."""
         if not self.obs_mode_struct.state and self.obs_mode not in {"state", "state_dict"}:
             return {}
+        return self._privileged()
+
+    def _privileged(self) -> dict[str, torch.Tensor]:
+        """What only a simulator knows, (N, D) each; see docs/rl.md."""
         return {
             "object_poses": torch.where(self.present[..., None], self.object_states[..., :7], 0.0).flatten(1),
             "target": self._is_target.float(),

@@ -18,6 +18,7 @@ CELL = 0.005  # edge of a cell, m, where the target is
 CELLS = 64  # cells a side, so that what is seen within 0.16 m of the target's middle counts
 NEAREST = 0.05  # m below the camera; what is higher counts as if it were there
 MAX_HIDDEN_SHARE = 0.2  # of a cleared target, the paper's
+MAX_OBSTACLES = 1  # around it, the same
 REACH = 2  # cells around the target's outline in which others count as neighbours: 1 cm
 LEAST_MOTION = 1e-4  # m, and of a quaternion's components: less changes nothing that counts in cells of 5 mm
 
@@ -40,7 +41,7 @@ class Clutter(NamedTuple):
     @property
     def cleared(self) -> Tensor:
         """(N,) bool, the paper's rule: at most a fifth is hidden, and fewer than two obstacles are left."""
-        return (self.hidden_share <= MAX_HIDDEN_SHARE) & (self.obstacles.sum(dim=1) < 2)
+        return (self.hidden_share <= MAX_HIDDEN_SHARE) & (self.obstacles.sum(dim=1) <= MAX_OBSTACLES)
 
 
 def surface_points(poses: Tensor, points: Tensor) -> Tensor:
@@ -143,6 +144,29 @@ def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clu
     limit = pad(limit, (0, 1), value=-_NOTHING)
     highest = heights >= limit.gather(1, others_cells).view_as(heights)
     return Clutter(hidden_share, highest.any(dim=-1))
+
+
+def push_point(points: Tensor, obstacles: Tensor, target: Tensor, *, stand_off: float = 0.02) -> Tensor:
+    """Where the paper's push of the highest obstacle begins: clear of it, on the target's side, level with its middle.
+
+    Args:
+        points: (N, K, 3, P) on the objects' surfaces, world.
+        obstacles: (N, K) bool, see `Clutter`; where there are none, the target's own middle is given.
+        target: (N,) slots of the targets.
+        stand_off: m between that point and the obstacle.
+
+    Returns:
+        (N, 3) world.
+    """
+    env = torch.arange(len(target), device=points.device)
+    tops = points[:, :, 2].amax(dim=-1).masked_fill(~obstacles, -torch.inf)
+    highest, goal = points[env, tops.argmax(dim=1)], points[env, target].mean(dim=-1)
+    middle = highest.mean(dim=-1)
+    away = (middle - goal)[:, :2]
+    away = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-6)
+    behind = ((highest - middle[..., None])[:, :2] * away[..., None]).sum(dim=1).amin(dim=-1)  # (N,), negative
+    beside = torch.cat([middle[:, :2] + (behind - stand_off)[:, None] * away, middle[:, 2:]], dim=-1)
+    return torch.where(obstacles.any(dim=1)[:, None], beside, goal)
 
 
 def _cells(points: Tensor, middle: Tensor) -> Tensor:

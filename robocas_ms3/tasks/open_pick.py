@@ -9,13 +9,16 @@ import torch
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Articulation
 
-from robocas_ms3.arrays import native
+from robocas_ms3.arrays import as_tensor, native, none
+from robocas_ms3.tasks import rewards, terms
+from robocas_ms3.tasks.bodies import link_poses
+from robocas_ms3.tasks.learning import LearningEnv, seen_from
 from robocas_ms3.tasks.spec import OPEN_PICK
-from robocas_ms3.tasks.transfer import STAGES, TransferEnv
+from robocas_ms3.tasks.transfer import STAGES
 
 
 @register_env(OPEN_PICK.env_id, max_episode_steps=OPEN_PICK.max_episode_steps)
-class RoboCASOpenPickEnv(TransferEnv):
+class RoboCASOpenPickEnv(LearningEnv):
     """Open and pick. The stages begin with ``furniture_opened``: the joint was past ``opening.opened_at`` of its range.
 
     Success is pick's: how the object got out is up to the policy.
@@ -23,6 +26,7 @@ class RoboCASOpenPickEnv(TransferEnv):
 
     SPEC = OPEN_PICK
     STAGES = ("furniture_opened", *STAGES)
+    REWARDS = rewards.OPEN_PICK
 
     def overview(self) -> tuple[np.ndarray, np.ndarray]:
         """From above the basket's side, where an opening door does not hide the gripper."""
@@ -47,6 +51,9 @@ class RoboCASOpenPickEnv(TransferEnv):
         furniture = self.fixtures.furniture[opening.furniture]
         assert isinstance(furniture, Articulation)
         self._opening = furniture, [active.name for active in furniture.active_joints].index(joint.name)
+        handle = self.model.furniture[opening.furniture].asset.handles[opening.handle]
+        # the frames of all parts coincide while everything is shut
+        self._handle = furniture.links_map[handle.link], torch.tensor([handle.position], device=self.device)
 
     def opening_position(self) -> torch.Tensor:
         """(N,) m or rad, where the joint stands that has to be opened."""
@@ -57,3 +64,29 @@ class RoboCASOpenPickEnv(TransferEnv):
         """Whether the furniture is open, (N,) bool."""
         goal, position = self.model.opened_position, native(self.opening_position())
         return {"furniture_opened": position >= goal if goal > 0 else position <= goal}
+
+    def _progress(self) -> tuple[Any, dict[str, Any]]:
+        """As of `LearningEnv`; before the target may be grasped the furniture must have been opened."""
+        stage, found = super()._progress()
+        shut = (stage == self.REWARDS.index("grasp")) & ~native(self._stages["furniture_opened"])
+        if none(shut):
+            return stage, found
+        found["handle"] = rewards.closeness(self._tcp()[:, :3], self._handle_in_world())
+        found["open"] = rewards.rise(native(self.opening_position()), 0.0, self.model.opened_position)
+        return rewards.furthest(stage, [(shut, self.REWARDS.index("open"))]), found
+
+    def _handle_in_world(self) -> Any:
+        """(N, 3) m where the handle is, native (`arrays`)."""
+        link, position = self._handle
+        pose = native(link_poses(self.scene, [link]))[:, 0]
+        return pose[:, :3] + terms.rotate(pose[:, 3:], native(position))
+
+    def _privileged(self) -> dict[str, torch.Tensor]:
+        """As of `LearningEnv`, and how far it is open (N, 1), 1 where that is enough, and the handle from the TCP."""
+        tcp = self._tcp()
+        opened = rewards.rise(native(self.opening_position()), 0.0, self.model.opened_position)
+        return {
+            **super()._privileged(),
+            "opened_share": as_tensor(opened)[:, None],
+            "tcp_to_handle": seen_from(tcp, (self._handle_in_world() - tcp[:, :3])[:, None])[:, 0],
+        }

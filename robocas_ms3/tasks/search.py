@@ -10,19 +10,19 @@ from mani_skill.utils.registration import register_env
 
 from robocas_ms3.arrays import as_tensor, native, none
 from robocas_ms3.scenes.targets import selection_camera
-from robocas_ms3.tasks import occlusion, terms
+from robocas_ms3.tasks import occlusion, rewards, terms
+from robocas_ms3.tasks.learning import LearningEnv
 from robocas_ms3.tasks.spec import SEARCH
-from robocas_ms3.tasks.transfer import STAGES, TransferEnv
+from robocas_ms3.tasks.transfer import STAGES
 
 # of each object's surface; hidden shares are then off ray casting by 0.03 on average, 0.08 at the 95th percentile
 _POINTS = 512
-FALLEN = 0.05  # m below the surface that objects stand on, at which one counts as fallen off it
 LOOKS_PER_SECOND = 5  # at what is cleared
 ENVS_AT_ONCE = 512  # whose clutter is measured: a quarter of a GB with 15 objects each
 
 
 @register_env(SEARCH.env_id, max_episode_steps=SEARCH.max_episode_steps)
-class RoboCASSearchEnv(TransferEnv):
+class RoboCASSearchEnv(LearningEnv):
     """Search: the target is hidden in part (p_vis from above below ``target.max_visible_share``).
 
     The stages add ``obstacles_cleared``: to the camera above that p_vis is measured with, at most a fifth of the target
@@ -36,6 +36,7 @@ class RoboCASSearchEnv(TransferEnv):
 
     SPEC = SEARCH
     STAGES = ("obstacles_cleared", *STAGES)
+    REWARDS = rewards.SEARCH
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
@@ -46,12 +47,14 @@ class RoboCASSearchEnv(TransferEnv):
         eye = selection_camera(self.model).pose[:3, 3]
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
         self._looked: _Look | None = None
+        self._push_point: torch.Tensor | None = None  # (N, 3), of that look
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
         if not hasattr(self, "hidden_share"):
             self.hidden_share = torch.zeros(self.num_envs, device=self.device)
             self._cleared_at_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+            self._obstacles = torch.zeros_like(self.present)
         self._looked = None
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
@@ -87,12 +90,11 @@ class RoboCASSearchEnv(TransferEnv):
         due = self._due() & ~held
         if none(due):
             return {}
-        surface = float(self.model.support_pose[2, 3]) + self.model.region.z
-        lies = terms.of_target(objects[..., 2], native(self.target_slot)) > surface - FALLEN
+        lies = terms.of_target(objects[..., 2], native(self.target_slot)) > self._surface - terms.FALLEN
         return {"obstacles_cleared": native(self._look(as_tensor(due), as_tensor(objects[..., :7]))) & lies & due}
 
     def _look(self, due: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
-        """(N,) bool, which of the envs that are due are cleared; keeps their hidden shares.
+        """(N,) bool, which of the envs that are due are cleared; keeps their hidden shares and obstacles.
 
         Args:
             due: (N,) bool.
@@ -108,11 +110,30 @@ class RoboCASSearchEnv(TransferEnv):
         for envs in due.nonzero()[:, 0].split(ENVS_AT_ONCE):
             found = self.clutter(envs)
             cleared[envs], self.hidden_share[envs] = found.cleared, found.hidden_share
-        self._looked = _Look(others, poses, cleared)
+            self._obstacles[envs] = found.obstacles
+        self._looked, self._push_point = _Look(others, poses, cleared), None
         return cleared
 
     def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:
         return bool(occlusion.moved_near(poses, before, self._radii, self.target_slot, self._eye).any())
+
+    def _progress(self) -> tuple[Any, dict[str, Any]]:
+        """As of `LearningEnv`; before the target may be grasped it has to be cleared, or must have been held."""
+        stage, found = super()._progress()
+        settled = native(self._stages["obstacles_cleared"]) | native(self._stages["target_grasped"])
+        covered = (stage == self.REWARDS.index("grasp")) & ~settled
+        if none(covered):
+            return stage, found
+        if self._push_point is None:
+            points = occlusion.surface_points(self.object_states[..., :7], self._surface_points)
+            self._push_point = occlusion.push_point(points, self._obstacles, self.target_slot)
+        found["push_point"] = rewards.closeness(self._tcp()[:, :3], native(self._push_point))
+        found["clear"] = rewards.uncovered(native(self.hidden_share), native(self._obstacles.sum(dim=1)))
+        return rewards.furthest(stage, [(covered, self.REWARDS.index("clear"))]), found
+
+    def _privileged(self) -> dict[str, torch.Tensor]:
+        """As of `LearningEnv`, and ``hidden_share`` (N, 1) at the last look; there is none once the target was held."""
+        return {**super()._privileged(), "hidden_share": self.hidden_share[:, None].clone()}
 
 
 class _Look(NamedTuple):

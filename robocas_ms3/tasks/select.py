@@ -9,12 +9,12 @@ from mani_skill.utils.registration import register_env
 
 from robocas_ms3.arrays import native
 from robocas_ms3.tasks import terms
+from robocas_ms3.tasks.learning import LearningEnv
 from robocas_ms3.tasks.spec import SELECT
-from robocas_ms3.tasks.transfer import TransferEnv
 
 
 @register_env(SELECT.env_id, max_episode_steps=SELECT.max_episode_steps)
-class RoboCASSelectEnv(TransferEnv):
+class RoboCASSelectEnv(LearningEnv):
     """Select: "the nearest soap", "the second soda can from the left", seen from the robot. The others are wrong.
 
     The relation is clear: what it compares differs from every other such object by at least 3 cm. Success asks for the

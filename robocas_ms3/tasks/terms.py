@@ -160,6 +160,40 @@ def stands(
     return (shift <= max_shift) & (upright >= math.cos(math.radians(max_tilt_deg)))
 
 
+FALLEN = 0.05  # m below the surface that objects stand on, at which one counts as fallen off it
+
+
+def fell_off(height: Array, surface: float, above_basket: Array, touched: Array, *, by: float = FALLEN) -> Array:
+    """Whether targets lie, or fall, below what they stood on, neither in the basket nor in the gripper.
+
+    Args:
+        height: (N,) of the targets, m.
+        surface: of what they stood on, m.
+        above_basket: (N,) bool, which are within the basket's outline, seen from above.
+        touched: (N,) bool, which the gripper touches.
+        by: m.
+
+    Returns:
+        (N,) bool.
+    """
+    return (height < surface - by) & ~above_basket & ~touched
+
+
+def fell_over(
+    position: Array,
+    quaternion: Array,
+    position_before: Array,
+    quaternion_before: Array,
+    *,
+    max_drop: float = 0.1,
+    max_tilt_deg: float = 60.0,
+) -> Array:
+    """(N,) whether a body has fallen: lower than it stood by more than ``max_drop`` m, or tilted past turning back."""
+    dropped = position_before[:, 2] - position[:, 2] > max_drop
+    upright = (upward(quaternion) * upward(quaternion_before)).sum(-1)  # cosine of the tilt
+    return dropped | (upright < math.cos(math.radians(max_tilt_deg)))
+
+
 def of_target(values: Array, target: Array) -> Array:
     """Pick the target's entry of per-object values: (N, K, ...) and (N,) indices -> (N, ...)."""
     return values[count_up(len(target), values), target]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from functools import reduce
 from operator import and_
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 import torch
 from mani_skill.utils.structs import Articulation
 
-from robocas_ms3.arrays import as_tensor, count_up, native
+from robocas_ms3.arrays import as_tensor, count_up, every, native, none
 from robocas_ms3.assets.manifest import BODY
 from robocas_ms3.config.relations import Relation
 from robocas_ms3.language.instructions import Instruction, choose_instruction, part_name
@@ -20,6 +20,29 @@ from robocas_ms3.tasks.bodies import link_poses
 
 _LANGUAGE = 100  # stream of an episode's seed; those of layouts are in scenes/sample.py
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
+_RIM = 0.05  # m around the basket's inside that still count as over it for a target that falls
+
+
+class Moment(NamedTuple):
+    """What `TransferEnv.evaluate` found last, all native (`arrays`).
+
+    Attributes:
+        objects: (N, K, 13) their states.
+        basket: (N, 7) its pose in the world.
+        held: (N,) bool, whether the target is held; so are the next ones.
+        lifted: it is held, and has been lifted.
+        touched: the gripper touches it.
+        in_basket: it is in the basket.
+        disturbed: (N,) int.
+    """
+
+    objects: Any
+    basket: Any
+    held: Any
+    lifted: Any
+    touched: Any
+    in_basket: Any
+    disturbed: Any
 
 
 class TransferEnv(RoboCASEnv):
@@ -29,8 +52,10 @@ class TransferEnv(RoboCASEnv):
     object), ``picked_any`` (both fingers held any object >= 3 cm above where it stood), ``reached_target``,
     ``target_grasped``, ``target_lifted`` (as ``picked_any``, of the target), ``target_in_basket``. ``success`` is not:
     the target was lifted, now lies in the basket's inner volume at rest, untouched by the gripper, and the basket
-    stands (moved <= 0.1 m, tilted <= 20 deg). ``disturbed`` (N,) int counts the objects other than the target that are
-    more than 3 cm from where they stood, or have fallen over (30 deg), relative to the door or drawer they are on.
+    stands (moved <= 0.1 m, tilted <= 20 deg). Nor is ``fail``: the target lies or falls more than 5 cm below what it
+    stood on, out of basket and gripper, or the basket has fallen (10 cm lower, or tilted by 60 deg). ``disturbed`` (N,)
+    int counts the objects other than the target that are more than 3 cm from where they stood, or have fallen over (30
+    deg), relative to the door or drawer they are on.
     """
 
     STAGES: ClassVar[tuple[str, ...]] = STAGES
@@ -39,6 +64,9 @@ class TransferEnv(RoboCASEnv):
         super()._load_scene(options)
         shut = self.model.support_motion(opened=False)
         self._support_shut = torch.as_tensor(shut, dtype=torch.float32, device=self.device)
+        self._surface = float(self.model.support_pose[2, 3]) + self.model.region.z
+        aside = torch.tensor([_RIM, _RIM, torch.inf], device=self.device)
+        self._above_basket = self._basket_low - aside, self._basket_high + aside
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
@@ -82,7 +110,7 @@ class TransferEnv(RoboCASEnv):
         self._last = None
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Stages and success of each env, (N,) bool each; ``disturbed`` (N,) int. Don't write to them."""
+        """Stages, success and fail of each env, (N,) bool each; ``disturbed`` (N,) int. Don't write to them."""
         state = self.bodies.read()
         forces = self._gripper_contacts.forces(self.bodies.others)
         found_by = self._known_by(forces)
@@ -120,9 +148,27 @@ class TransferEnv(RoboCASEnv):
             if stage in now:
                 reached[row] |= now[stage]
         success = native(self._stages["target_lifted"]) & reduce(and_, measures.values())
+        fail = self._has_failed(measures, objects, basket)
         stages = dict(zip(self.STAGES, self._reached.clone(), strict=True))
         disturbed = self._disturbed(objects[..., :7])
-        return {**stages, "success": as_tensor(success), "disturbed": as_tensor(disturbed)}
+        self._moment = Moment(
+            objects, basket, held, now["target_lifted"], now["reached_target"], measures["in_basket"], disturbed
+        )
+        flags = {"success": as_tensor(success), "fail": as_tensor(fail)}
+        return {**stages, **flags, "disturbed": as_tensor(disturbed)}
+
+    def _has_failed(self, measures: dict[str, Any], objects: Any, basket: Any) -> Any:
+        """(N,) bool of ``fail``, native, from `_target_measures`, states (N, K, 13) and the basket's pose (N, 7)."""
+        slot, start = native(self.target_slot), native(self.basket_at_start)
+        height = terms.of_target(objects[..., 2], slot)
+        low = height < self._surface - terms.FALLEN
+        if every(measures["basket_stands"]) and none(low):  # as nearly always
+            return low
+        first, last = map(native, self._above_basket)
+        above = terms.inside_box(terms.of_target(objects[..., :3], slot), basket[:, :3], basket[:, 3:], first, last)
+        fell = terms.fell_off(height, self._surface, above, ~measures["untouched"])
+        over = terms.fell_over(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:])
+        return fell | (over & ~measures["basket_stands"])
 
     def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """(N,) float32: 1 where the task has succeeded at this moment, else 0."""

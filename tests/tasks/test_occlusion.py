@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robocas_ms3.tasks.base import _raw_poses
-from robocas_ms3.tasks.occlusion import Clutter, clutter, moved_near, seen_from, surface_points
+from robocas_ms3.tasks.occlusion import Clutter, clutter, moved_near, push_point, seen_from, surface_points
 
 
 def plate(x: tuple[float, float], y: tuple[float, float], z: float) -> torch.Tensor:
@@ -148,6 +148,23 @@ def test_what_moves_far_away_does_not_count_as_motion():
     assert not moved(at((0, 0), (0.12, 0)), at((0, 0), (0.2, 0)))
     assert moved(at((0, 0), (0.2, 0)), at((0, 0), (0.11, 0)))  # comes near
     assert moved(at((0, 0), (0.11, 0)), at((0, 0), (0.2, 0)))  # leaves
+
+
+def test_a_push_begins_between_the_target_and_the_highest_obstacle():
+    low, high = plate((0.06, 0.10), (-0.05, 0.05), 0.66), plate((-0.14, -0.06), (-0.05, 0.05), 0.7)
+    points = torch.stack([TARGET, low, high, FAR])[None].repeat(3, 1, 1, 1)
+    obstacles = torch.tensor([[False, True, True, False], [False, True, False, False], [False] * 4])
+    found = push_point(points, obstacles, torch.zeros(3, dtype=torch.long))
+    # 2 cm inwards of the edge at x = -0.06; of that at 0.06; the target itself
+    expected = torch.tensor([[-0.04, 0, 0.7], [0.04, 0, 0.66], [0, 0, 0.65]])
+    assert torch.allclose(found, expected, atol=1e-5)
+
+
+def test_a_push_of_what_lies_on_top_of_the_target_is_finite():
+    points = torch.stack([TARGET, TARGET + torch.tensor([[0.0], [0.0], [0.1]])])[None]
+    found = push_point(points, torch.tensor([[False, True]]), torch.tensor([0]))
+    assert torch.isfinite(found).all()
+    assert found[0, 2] == pytest.approx(0.75)
 
 
 def test_what_is_near_in_the_picture_is_near():

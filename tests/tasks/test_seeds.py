@@ -258,3 +258,12 @@ def test_looks_follow_the_seed_and_leave_the_layout(needs_renderer):
     assert torch.equal(plain[1], random[1])
     assert (plain[0] - random[0]).abs().mean() > 5
     assert torch.equal(random[0], again[0])
+
+
+def test_envs_to_reset_may_be_an_array_as_stable_baselines_wrapper_gives_it():
+    env = gym.make("RoboCASPick-v1", **STATE_ONLY)
+    env.reset(seed=3)
+    before = env.unwrapped.get_state()
+    env.reset(seed=5, options={"env_idx": np.array([0])})
+    assert not torch.equal(before, env.unwrapped.get_state())
+    env.close()

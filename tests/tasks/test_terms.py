@@ -157,6 +157,21 @@ def test_basket_stands_up_to_10_cm_and_may_turn(make):
     assert not terms.stands(make([[0.08, 0.08, 0]]), upright, make([[0.0, 0, 0]]), upright).any()
 
 
+def test_a_target_fell_off_below_what_it_stood_on_beside_the_basket_and_out_of_the_gripper(make):
+    height = make([0.57, 0.54, 0.54, 0.54])  # of a surface at 0.6
+    above, touched = make([False, False, True, False]), make([False, False, False, True])
+    assert terms.fell_off(height, 0.6, above, touched).tolist() == [False, True, False, False]
+    assert not terms.fell_off(height, 0.6, above, touched, by=0.07).any()
+
+
+@pytest.mark.parametrize(("degrees", "drop", "expected"), [(59, 0.09, False), (61, 0.0, True), (0, 0.11, True)])
+def test_a_basket_has_fallen_when_it_lies_or_lies_lower(make, degrees, drop, expected):
+    half = math.radians(degrees) / 2
+    tilted, upright = make([[math.cos(half), math.sin(half), 0, 0]]), make([UPRIGHT])
+    at, before = make([[0.5, 0, 0.7 - drop]]), make([[0.0, 0, 0.7]])
+    assert terms.fell_over(at, tilted, before, upright).tolist() == [expected]
+
+
 def test_of_target_picks_one_slot_per_env(make):
     values = make([[0, 1, 2], [3, 4, 5]])
     assert terms.of_target(values, make([2, 0])).tolist() == [2, 3]
