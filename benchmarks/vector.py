@@ -1,10 +1,10 @@
 """Steps a second of several environments in processes, beside one plain environment, states only; prints JSON.
 
-Random actions. The cases take turns, so that what else the machine does meets them all; figures are medians over the
-rounds, CPU time is that of this process and of the case's workers. Resets are not timed. ``others`` is the share of the
-machine's CPU time that went elsewhere meanwhile: envs in step with each other all wait for one that is held up.
+Random actions; resets are not timed. The cases take turns. Environments that step together all wait for one that is
+held up, so a turn begins when the machine is quiet, and counts if nothing else took more than ``--others`` of its CPU
+time meanwhile. Figures are medians over turns; CPU time is that of this process and of the case's workers.
 
-Run: python benchmarks/vector.py [--rounds 5] [--steps 200]
+Run: python benchmarks/vector.py [--turns 7] [--steps 100]
 """
 
 from __future__ import annotations
@@ -38,10 +38,14 @@ class Args:
     """Observations; with pictures drop --render-backend none."""
     render_backend: str = "none"
     """None needs no renderer."""
-    rounds: int = 5
-    """How often every case has its turn."""
-    steps: int = 200
+    turns: int = 7
+    """That count, of each case."""
+    steps: int = 100
     """Of each env a turn."""
+    others: float = 0.05
+    """Share of the machine's CPU time that a quiet machine may spend elsewhere."""
+    minutes: float = 10
+    """After which it ends, with fewer turns than asked for."""
 
 
 def main(args: Args) -> None:
@@ -50,33 +54,54 @@ def main(args: Args) -> None:
     envs: dict[str, Any] = {"plain gym.make": gym.make(args.env_id, **kwargs)}
     for name, (count, processes) in CASES.items():
         envs[name] = robocas_ms3.make_vec(args.env_id, count, backend="processes", workers=processes, **kwargs)
-    wall: dict[str, list[float]] = {name: [] for name in envs}
-    cpu: dict[str, list[float]] = {name: [] for name in envs}
-    others: dict[str, list[float]] = {name: [] for name in envs}
-    for _ in range(args.rounds):
-        for name, env in envs.items():
-            env.reset(seed=0)
-            env.action_space.seed(0)
-            actions = [env.action_space.sample() for _ in range(args.steps)]
-            begun, spent, used = time.perf_counter(), cpu_seconds(env), machine_seconds()
-            for action in actions:
-                env.step(action)
-            wall[name].append(time.perf_counter() - begun)
-            cpu[name].append(cpu_seconds(env) - spent)
-            others[name].append(max(0.0, machine_seconds() - used - cpu[name][-1]) / wall[name][-1] / CORES)
-    report = {}
+    kept: dict[str, list[tuple[float, float]]] = {name: [] for name in envs}
+    dropped, until = 0, time.monotonic() + 60 * args.minutes
+    while min(map(len, kept.values())) < args.turns and time.monotonic() < until:
+        for name in sorted(envs, key=lambda name: len(kept[name])):
+            wait_for_quiet(args.others, until)
+            wall, cpu, others = turn(envs[name], args.steps)
+            if others <= args.others:
+                kept[name].append((wall, cpu))
+            else:
+                dropped += 1
+    if not all(kept.values()):
+        raise SystemExit(f"the machine was never quiet enough: {dropped} turns dropped")
+    report: dict[str, dict[str, float]] = {}
     for name, env in envs.items():
         steps = args.steps * CASES.get(name, (1, 1))[0]
+        wall, cpu = np.median(kept[name], axis=0) / steps
         report[name] = {
-            "steps_a_second": round(steps / float(np.median(wall[name]))),
-            "cpu_ms_a_step": round(1000 * float(np.median(cpu[name])) / steps, 2),
-            "others": round(float(np.median(others[name])), 2),
+            "steps_a_second": round(1 / wall),
+            "cpu_ms_a_step": round(1000 * cpu, 2),
+            "turns": len(kept[name]),
         }
         env.close()
     rate = {name: figures["steps_a_second"] for name, figures in report.items()}
     ratios = {f"{name} / plain": round(rate[name] / rate["plain gym.make"], 2) for name in CASES}
     ratios["2 processes / 1, 4 envs"] = round(rate["4 envs"] / rate["4 envs, 1 process"], 2)
-    print(json.dumps({"cores": CORES, **vars(args), "cases": report, "ratio": ratios}, indent=2))
+    ratios["2 envs / 1 env"] = round(rate["2 envs"] / rate["1 env"], 2)
+    print(json.dumps({"cores": CORES, **vars(args), "dropped": dropped, "cases": report, "ratio": ratios}, indent=2))
+
+
+def turn(env: Any, steps: int) -> tuple[float, float, float]:
+    """Seconds, CPU seconds, and the share of the machine's CPU time that others took meanwhile."""
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(steps)]
+    begun, spent, used = time.perf_counter(), cpu_seconds(env), machine_seconds()
+    for action in actions:
+        env.step(action)
+    wall, cpu = time.perf_counter() - begun, cpu_seconds(env) - spent
+    return wall, cpu, (machine_seconds() - used - cpu) / (wall * CORES)
+
+
+def wait_for_quiet(others: float, until: float) -> None:
+    """Wait until this machine does nothing, for 0.3 s."""
+    while time.monotonic() < until:
+        used = machine_seconds()
+        time.sleep(0.3)
+        if machine_seconds() - used <= others * 0.3 * CORES:
+            return
 
 
 def cpu_seconds(env: Any) -> float:

@@ -291,7 +291,7 @@ def test_infos_observations_and_metrics_in_numpy():
 
 @slow
 def test_a_seed_without_a_layout_is_an_error_where_it_was_asked_for():
-    with closing(make(2, 1, wrappers=[LacksLayouts])) as env:
+    with closing(make(2, 1, wrappers=[LacksLayouts], seeds=(4, 6))) as env:
         with pytest.raises(LayoutError, match="no object qualifies"):
             env.reset(seed=5)
         with pytest.raises(VectorEnvError, match="envs 0, 1.*failed.*Reset"):
@@ -300,6 +300,7 @@ def test_a_seed_without_a_layout_is_an_error_where_it_was_asked_for():
         with pytest.raises(LayoutError):
             env.reset(seed=[4, 5])
         assert torch.equal(drawn, env.reset(seed=4)[0])
+        assert torch.equal(drawn[0], env.reset(seed=6)[0][1])  # after the last seed of the range comes its first
 
 
 @slow

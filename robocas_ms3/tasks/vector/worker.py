@@ -216,17 +216,21 @@ class _Worker:
 
     def show(self, env: int, obs: Any, info: dict) -> None:
         """Write what an environment observes."""
+        written = 0
         for path, leaf in leaves(obs):
             self.obs[path][env] = _row(leaf)
-        rest, found = {}, 0
+            written += 1
+        rest = {}
         for path, leaf in leaves(info):
             if path in self.info:
                 self.info[path][env] = _row(leaf)
-                found += 1
+                written += 1
             else:
                 rest[path] = leaf
-        if found < len(self.info):
-            raise VectorEnvError("info lacks what it had at first", expected=sorted(self.info), found=sorted(info))
+        if written < len(self.obs) + len(self.info):
+            there = {path for nested in (obs, info) for path, _ in leaves(nested)}
+            lacking = [".".join(path) for path in [*self.obs, *self.info] if path not in there]
+            raise VectorEnvError("observation or info lacks what it had at first", expected=lacking)
         if rest:
             self.rest[env] = rest
 
