@@ -215,6 +215,9 @@ def test_an_env_is_the_same_whatever_the_others_are(four):
     steps = 2 * HORIZON + 2
     seen = episodes(four, 4, 10, steps)
     with closing(make(2, 2)) as two, closing(make(1, 1)) as one:
+        unseeded = two.reset()[0]
+        assert torch.equal(one.reset()[0], unseeded[:1])
+        assert not torch.equal(unseeded[1], unseeded[0])
         assert episodes(two, 2, 10, steps) == seen[:2]
         assert episodes(one, 1, 12, steps) == seen[2:3]
     with closing(make(4, 1)) as in_one_process:
@@ -365,8 +368,10 @@ def test_gymnasium_makes_the_same():
     one = gym.make("RoboCASPick-v1", **STATE_ONLY)  # its own time limit stays
     assert "TimeLimitWrapper" in str(one)
     one.close()
-    with closing(gym.make_vec("RoboCASPick-v1", 2, workers=1, max_episode_steps=1, **STATE_ONLY)) as env:
+    kwargs = {"max_episode_steps": 1, "reconfiguration_freq": 0, **STATE_ONLY}
+    with closing(gym.make_vec("RoboCASPick-v1", 2, backend="processes", workers=1, **kwargs)) as env:
         assert isinstance(env, RoboCASVectorEnv)
+        assert len({int(seed[0]) for seed in env.call("_objects_seeds")}) == 2  # each is built with its own seed
         assert env.num_envs == 2
         env.reset(seed=0)
         *_, truncated, _ = env.step(doing(0, 0))
@@ -419,7 +424,7 @@ def test_processes_end_with_a_program_that_was_read_from_a_pipe(end):
 @slow
 def test_pictures(needs_renderer):
     small = {"obs_mode": "rgb", "render_backend": "cpu", "sensor_configs": {"width": 32, "height": 24}}
-    with closing(make(2, 2, **small)) as env:
+    with closing(make(2, 1, **small)) as env:
         obs, _ = env.reset(seed=0)
         picture = obs["sensor_data"]["static_camera"]["rgb"]
         assert (picture.shape, picture.dtype) == ((2, 24, 32, 3), torch.uint8)
