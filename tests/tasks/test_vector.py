@@ -17,7 +17,7 @@ from vector_wrappers import LacksLayouts, Misbehaves, OwnError, Wins
 
 import robocas_ms3
 from robocas_ms3.errors import ConfigError, LayoutError, VectorEnvError, WorkerDied
-from robocas_ms3.tasks import vector
+from robocas_ms3.tasks import RoboCASPickEnv, vector
 from robocas_ms3.tasks.vector.backend import choose_backend
 from robocas_ms3.tasks.vector.environment import RoboCASVectorEnv
 
@@ -290,6 +290,7 @@ def test_infos_observations_and_metrics_in_numpy():
         assert truncated.tolist() == [False, True, False]
         assert info["final_info"]["episode"]["success_at_end"].tolist() == [False, False, False]
         assert env.unwrapped.call("control_freq") == (20, 20, 20)
+        assert len({len(one["actors"]) for one in env.unwrapped.call("get_state_dict")}) == 1
 
 
 @slow
@@ -386,6 +387,12 @@ def test_errors_of_making_arrive_as_themselves():
     assert "env 0" in str(error.value.__cause__)
     with pytest.raises(VectorEnvError, match="can't be sent"):
         make(1, 1, config={"lock": threading.Lock()})
+
+
+def test_an_env_of_the_program_itself_can_not_be_sent(monkeypatch):
+    monkeypatch.setattr(RoboCASPickEnv, "__module__", "__main__")
+    with pytest.raises(VectorEnvError, match=r"RoboCASPick-v1.*the_module:"):
+        make(1, 1)
 
 
 @slow

@@ -19,7 +19,7 @@ from robocas_ms3.errors import VectorEnvError, WorkerDied
 from robocas_ms3.tasks.seeds import following_seeds
 from robocas_ms3.tasks.vector.block import Block, nest, open_memory
 from robocas_ms3.tasks.vector.handle import STEP, EnvFailed, WorkerHandle, close_all, name_envs
-from robocas_ms3.tasks.vector.worker import Call, Made, Order, Reset
+from robocas_ms3.tasks.vector.worker import Call, Made, Order, Reset, Share
 
 
 class ProcessEnv(gym.Env):
@@ -60,6 +60,9 @@ class ProcessEnv(gym.Env):
         cuts = [num_envs * worker // workers for worker in range(workers + 1)]
         shares = [range(*cut) for cut in zip(cuts, cuts[1:], strict=False)]
         module = REGISTERED_ENVS[self.spec.id].cls.__module__
+        if module == "__main__":
+            fix = f'Put it into a module, and pass "the_module:{self.spec.id}".'
+            raise VectorEnvError("registered in the program itself, which processes don't know", where=env_id, fix=fix)
         orders = [_pickled(Order(env_id, module, share, kwargs, tuple(wrappers))) for share in shares]
         self._workers: list[WorkerHandle] = []
         memory = open_memory()
@@ -71,7 +74,7 @@ class ProcessEnv(gym.Env):
             if any(one.fields != made[0].fields for one in made):
                 raise VectorEnvError("environments differ in what they observe", where=env_id)
             self._share(Block(memory, made[0].fields, num_envs))
-            self._ask([pickle.dumps((made[0].fields, num_envs))] * workers)
+            self._ask([pickle.dumps(Share(made[0].fields, num_envs))] * workers)
         except BaseException:
             self.close()
             raise

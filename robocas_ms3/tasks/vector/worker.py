@@ -67,6 +67,19 @@ class Made:
 
 
 @dataclass(frozen=True)
+class Share:
+    """A command, the first: share memory.
+
+    Attributes:
+        fields: what lies there.
+        num_envs: how many environments there are in all processes.
+    """
+
+    fields: tuple[Field, ...]
+    num_envs: int
+
+
+@dataclass(frozen=True)
 class Reset:
     """A command: reset some environments.
 
@@ -122,10 +135,8 @@ class _Worker:
     def serve(self) -> None:
         try:
             self.answer(self.start(self.listen()))
-            act: Callable[[Any], Any] = self.share  # the second message
             while (message := self.listen()) != LEAVE:
-                self.answer(act(None if message == STEP else pickle.loads(message)))
-                act = self.obey
+                self.answer(self.obey(None if message == STEP else pickle.loads(message)))
         finally:
             self.each(self.envs, lambda env: self.envs[env].close())
 
@@ -175,17 +186,19 @@ class _Worker:
         if base.reconfiguration_freq == 0:  # else its scene would stay that of the seed that ManiSkill makes all with
             made.reset(options={"reconfigure": True})
 
-    def share(self, layout: tuple[Sequence[Field], int]) -> None:
-        """Read actions from shared memory, and write what comes of them there: fields for that many envs."""
-        block = Block(self.memory, *layout)
+    def share(self, command: Share) -> None:
+        """Read actions from shared memory, and write what comes of them there."""
+        block = Block(self.memory, command.fields, command.num_envs)
         arrays = block.arrays
         self.actions, self.at_work = arrays["action",], arrays["at_work",]
         self.reward, self.terminated, self.truncated = (arrays[name,] for name in ("reward", "terminated", "truncated"))
         self.obs, self.info = block.under("obs"), block.under("info")
         self.rest: dict[int, dict[Path, Any]] = {}  # infos for which the shared memory has no place
 
-    def obey(self, command: Reset | Call | None) -> Any:
+    def obey(self, command: Share | Reset | Call | None) -> Any:
         """Do as told, None: step. What is to be answered: an `EnvFailed`, results of a call, `rest`, or None."""
+        if isinstance(command, Share):
+            return self.share(command)
         results: dict[int, Any] = {}
         self.rest = {}
         if command is None:
