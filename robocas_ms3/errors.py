@@ -52,6 +52,14 @@ class MissingExtraError(RobocasError):
     """An optional dependency is needed; the message names the extra that brings it."""
 
 
+class VectorEnvError(RobocasError):
+    """Several environments at once can't be made, or can't go on."""
+
+
+class WorkerDied(VectorEnvError):
+    """A process that ran some of several environments is no more."""
+
+
 class PlanningFailed(RobocasError):
     """A scripted policy could not go on.
 

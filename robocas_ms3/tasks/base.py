@@ -34,6 +34,7 @@ from robocas_ms3.tasks.engine_errors import EngineErrors
 from robocas_ms3.tasks.gpu_memory import gpu_memory
 from robocas_ms3.tasks.seeds import SeededEnv
 from robocas_ms3.tasks.spec import TaskSpec
+from robocas_ms3.tasks.vector.backend import check_one_process
 
 # with a renderer what is left of a scene holds 8 MB until it is collected, without one 0.5 MB
 _RESETS_PER_COLLECTION, _RESETS_PER_COLLECTION_STATE_ONLY = 20, 30
@@ -59,6 +60,9 @@ class RoboCASEnv(SeededEnv):
         robot_uids: the robot; only RoboCAS's mobile Panda is supported.
         reconfiguration_freq: see ``BaseEnv``; default 1 for one env, 0 for several.
         kwargs: passed to ``BaseEnv``.
+
+    Raises:
+        VectorEnvError: there are several envs and no GPU.
     """
 
     SPEC: ClassVar[TaskSpec]
@@ -81,6 +85,7 @@ class RoboCASEnv(SeededEnv):
         reconfiguration_freq: int | None = None,
         **kwargs: Any,
     ) -> None:
+        check_one_process(num_envs, kwargs.get("sim_backend", "auto"))
         self.task_config = load_task_config(self.SPEC.default_config if config is None else config)
         if self.task_config.task != self.SPEC.name:
             raise ConfigError(

@@ -22,6 +22,14 @@ _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
 
+def following_seeds(first: int, count: int, within: tuple[int, int] | None) -> list[int]:
+    """Seeds one after the other; where the first is of the range ``within``, its least comes after its greatest."""
+    if within is None or not within[0] <= first <= within[1]:
+        return [first + i for i in range(count)]
+    low, high = within
+    return [low + (first - low + i) % (high - low + 1) for i in range(count)]
+
+
 class SeededEnv(BaseEnv):
     """Environment whose episodes follow from seeds, each env's from its own.
 
@@ -88,11 +96,12 @@ class SeededEnv(BaseEnv):
         if self.num_envs > 1:
             envs = options["env_idx"].tolist() if options and "env_idx" in options else range(self.num_envs)
             self._asked_for = set(envs) if self._resets_seeded else set()
+            within = self._seed_range or SEVERAL_ENVS_SEEDS
             if not self._made:
-                seed = self._seeds_from((self._seed_range or SEVERAL_ENVS_SEEDS)[0], self.num_envs)
+                seed = following_seeds(within[0], self.num_envs, within)
             elif seed is not None and np.ndim(seed) == 0:
                 self._asked_for = set(list(envs)[:1])
-                seed = self._seeds_from(int(np.asarray(seed)), len(envs))
+                seed = following_seeds(int(np.asarray(seed)), len(envs), within)  # ManiSkill's own would lie outside
             return super().reset(seed, options)
         for _ in range(self._other_seeds):
             try:
@@ -103,13 +112,6 @@ class SeededEnv(BaseEnv):
                 _log.warning("no layout for the seed of this reset, another is drawn: %s", error)
                 seed = None
         return super().reset(seed, options)
-
-    def _seeds_from(self, first: int, count: int) -> list[int]:
-        """Seeds one after the other; ManiSkill's own would lie outside the range."""
-        low, high = self._seed_range or SEVERAL_ENVS_SEEDS
-        if not low <= first <= high:
-            return [first + i for i in range(count)]
-        return [low + (first - low + i) % (high - low + 1) for i in range(count)]
 
     def _set_episode_rng(self, seed: Any, env_idx: torch.Tensor) -> None:
         """Seed the episodes of some envs and no others; ManiSkill's own forgets the others' seeds."""

@@ -112,6 +112,7 @@ def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEn
         env._episode_seed, env._batched_episode_rng = None, None
         env.reset([2022 + i for i in range(num_envs)], {"reconfigure": True})  # as ManiSkill does
 
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(BaseEnv, "__init__", makes)
     monkeypatch.setattr(BaseEnv, "reset", resets)
     return RoboCASPickEnv(num_envs=num_envs, layouts=folder, **arguments), asked

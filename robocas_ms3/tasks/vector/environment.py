@@ -1,0 +1,53 @@
+"""The vector environments that `make_vec` gives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import torch
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+from robocas_ms3.tasks.vector.processes import ProcessEnv
+
+
+class RoboCASVectorEnv(ManiSkillVectorEnv):
+    """ManiSkill's vector environment, over one batched environment: on a GPU, or a `ProcessEnv`.
+
+    ``info["episode"]`` and ``info["final_info"]["episode"]`` have ``success_at_end`` whether or not terminations are
+    ignored; ManiSkill's have it only if they are.
+    """
+
+    def step(self, actions: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Step every env; see ``ManiSkillVectorEnv``."""
+        obs, reward, terminated, truncated, info = super().step(actions)
+        at_end = info.get("final_info", info)
+        if self.record_metrics and "success" in at_end:
+            at_end["episode"]["success_at_end"] = at_end["success"].clone()
+        return obs, reward, terminated, truncated, info  # pyright: ignore[reportReturnType]
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
+        """What a method gives: in processes a tuple with each env's result, on a GPU the batched environment's."""
+        if isinstance(self._env, ProcessEnv):
+            return self._env.call(name, *args, **kwargs)
+        return super().call(name, *args, **kwargs)
+
+
+class NumpyVectorEnv(gym.vector.VectorWrapper):
+    """A vector environment whose tensors are NumPy arrays."""
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset; see the environment."""
+        return _as_numpy(self.env.reset(seed=seed, options=options))
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step every env; see the environment."""
+        return _as_numpy(self.env.step(actions))
+
+
+def _as_numpy(nested: Any) -> Any:
+    if isinstance(nested, torch.Tensor):
+        return nested.cpu().numpy()
+    if isinstance(nested, dict):
+        return {name: _as_numpy(value) for name, value in nested.items()}
+    return tuple(map(_as_numpy, nested)) if isinstance(nested, tuple) else nested

@@ -1,0 +1,172 @@
+"""A worker process as the process that started it sees it: starting, talking, dying, leaving."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, NoReturn
+
+from numpy.typing import NDArray
+
+from robocas_ms3.errors import VectorEnvError, WorkerDied
+
+STEP, LEAVE = b"s", b"q"  # messages; all others are pickled
+NUMBER = 8  # bytes before each message, its number, which the answer repeats
+_GRACE, _GRACE_AT_WORK = 10.0, 1.0  # s to leave in
+# Neither fork nor multiprocessing's spawn: a process with a renderer or CUDA can't be forked, and spawn runs the user's
+# program again, which a program without `if __name__ == "__main__"`, a notebook and a program from a pipe don't stand.
+_PROGRAM = """\
+import signal, sys
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+sys.path[:] = {path!r}
+from robocas_ms3.tasks.vector.worker import main
+main({connection}, {memory}, {parent})
+"""
+
+
+class EnvTraceback(Exception):
+    """Where in a worker an error arose: the cause of the error, as tracebacks show it."""
+
+
+@dataclass(frozen=True)
+class EnvFailed:
+    """An environment raised an error.
+
+    Attributes:
+        where: which one.
+        error: the error.
+        trace: its traceback.
+    """
+
+    where: str
+    error: Exception
+    trace: str
+
+    def reraise(self) -> NoReturn:
+        """Raise the error here."""
+        raise self.error from EnvTraceback(f"in {self.where}:\n{self.trace}")
+
+
+class WorkerHandle:
+    """A process that has some of the environments.
+
+    Args:
+        envs: their numbers.
+        memory: file descriptor of the shared memory.
+
+    Raises:
+        VectorEnvError: the system allows no more processes or open files.
+
+    Attributes:
+        at_work: (num_envs,) bool, shared, which envs are resetting or stepping; None: not known yet.
+    """
+
+    def __init__(self, envs: range, memory: int) -> None:
+        self.envs = envs
+        self._asked = self._answered = 0  # messages have numbers: an interrupted call leaves an answer behind
+        self.at_work: NDArray[Any] | None = None
+        here, there = socket.socketpair()
+        with there:
+            program = _PROGRAM.format(path=sys.path, connection=there.fileno(), memory=memory, parent=os.getpid())
+            try:
+                self.process = subprocess.Popen(
+                    [sys.executable, "-c", program],
+                    pass_fds=(there.fileno(), memory),
+                    stdin=subprocess.DEVNULL,
+                    # one thread each, also of the software renderer: those of several processes get in each other's way
+                    env={"OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1", **os.environ},
+                )
+            except OSError as error:
+                raise VectorEnvError(
+                    "can't start a process",
+                    where=name_envs(envs),
+                    found=error.strerror,
+                    fix="Use fewer workers, or raise the limits (ulimit -u, -n).",
+                ) from error
+        self.connection = Connection(here.detach())
+
+    @property
+    def busy(self) -> bool:
+        """Whether an answer is still to come."""
+        return self._answered < self._asked
+
+    def send(self, message: bytes) -> None:
+        """Ask for something.
+
+        Raises:
+            WorkerDied: the process is no more.
+        """
+        self._asked += 1
+        try:
+            self.connection.send_bytes(self._asked.to_bytes(NUMBER, "little") + message)
+        except OSError as error:
+            raise self._died() from error
+
+    def receive(self) -> Any:
+        """The answer to what was asked last; None where there is nothing to say, an `EnvFailed` if an env failed.
+
+        Raises:
+            WorkerDied: the process is no more.
+        """
+        while self.busy:
+            try:
+                answer = self.connection.recv_bytes()
+            except (EOFError, OSError) as error:
+                raise self._died() from error
+            self._answered = int.from_bytes(answer[:NUMBER], "little")
+        return pickle.loads(answer[NUMBER:]) if len(answer) > NUMBER else None
+
+    def _died(self) -> WorkerDied:
+        try:
+            code = self.process.wait(_GRACE_AT_WORK)
+        except subprocess.TimeoutExpired:
+            code = None  # it closed its end and lives on
+        how = f"exit code {code}"
+        if code is not None and code < 0:
+            how = f"{signal.Signals(-code).name}{', is memory short?' if code == -signal.SIGKILL else ''}"
+        at_work = [] if self.at_work is None else [env for env in self.envs if self.at_work[env]]
+        where = name_envs(at_work or self.envs)
+        return WorkerDied("its process died", where=where, found=how, fix="Make the environments again.")
+
+
+def name_envs(envs: Sequence[int]) -> str:
+    """Words for some environments."""
+    if len(envs) == 1:
+        return f"env {envs[0]}"
+    in_a_row = len(envs) > 2 and envs[-1] - envs[0] == len(envs) - 1
+    return f"envs {envs[0]} to {envs[-1]}" if in_a_row else f"envs {', '.join(map(str, envs))}"
+
+
+def close_all(workers: list[WorkerHandle], memory: int, owner: int) -> None:
+    """Let workers close their environments and leave, and end those that don't.
+
+    Args:
+        workers: all of them.
+        memory: file descriptor to close.
+        owner: process that started them; in another, as a fork of it, nothing happens.
+    """
+    if os.getpid() != owner:
+        return
+    busy = [worker for worker in workers if worker.busy]
+    for worker in workers:
+        with suppress(WorkerDied):
+            worker.send(LEAVE)
+        worker.connection.close()
+    begun = time.monotonic()
+    for worker in workers:
+        until = begun + (_GRACE_AT_WORK if worker in busy else _GRACE)
+        try:
+            worker.process.wait(max(0.0, until - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            worker.process.kill()
+            worker.process.wait()
+    os.close(memory)

@@ -1,0 +1,293 @@
+"""A worker process: makes its environments and does with them what it is told, until it is told to leave."""
+
+from __future__ import annotations
+
+import faulthandler
+import importlib
+import logging
+import os
+import pickle
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from robocas_ms3.errors import LayoutError, VectorEnvError
+from robocas_ms3.tasks.vector.block import Block, Field, Path, leaves, space_fields
+from robocas_ms3.tasks.vector.handle import LEAVE, NUMBER, STEP, EnvFailed, name_envs
+
+FIRST_SEED = 2022  # of env 0's resets without a seed, as in ManiSkill; env 1 has the next
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Order:
+    """What a worker is to make.
+
+    Attributes:
+        env_id: gymnasium's.
+        module: where that environment is registered.
+        envs: numbers of the worker's environments.
+        kwargs: for ``gym.make``.
+        wrappers: put around each environment, the first one first.
+    """
+
+    env_id: str
+    module: str
+    envs: range
+    kwargs: dict[str, Any]
+    wrappers: Sequence[Callable[[gym.Env], gym.Env]]
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a worker has made.
+
+    Attributes:
+        observation_space: of one environment.
+        action_space: of one environment.
+        fields: what the environments share with their starter.
+        render_mode: theirs.
+        metadata: theirs.
+    """
+
+    observation_space: gym.Space
+    action_space: gym.Space
+    fields: tuple[Field, ...]
+    render_mode: str | None
+    metadata: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Share:
+    """A command, the first: share memory.
+
+    Attributes:
+        fields: what lies there.
+        num_envs: how many environments there are in all processes.
+    """
+
+    fields: tuple[Field, ...]
+    num_envs: int
+
+
+@dataclass(frozen=True)
+class Reset:
+    """A command: reset some environments.
+
+    Attributes:
+        seeds: of each env to be reset its seed or None, and whether that seed must have a layout.
+        options: for each of them.
+    """
+
+    seeds: dict[int, tuple[int | None, bool]]
+    options: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Call:
+    """A command: call a method of every environment, or read an attribute."""
+
+    name: str
+    args: tuple
+    kwargs: dict[str, Any]
+
+
+def main(connection: int, memory: int, parent: int) -> None:
+    """Serve until told to leave, or until the process that started this one is no more.
+
+    Args:
+        connection: file descriptor of the way there.
+        memory: the same of the shared memory.
+        parent: that process.
+    """
+    faulthandler.enable()
+    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
+    for descriptor in (connection, memory):
+        os.set_inheritable(descriptor, False)
+    torch.set_num_threads(1)
+    with suppress(EOFError, OSError):  # nobody is there any more
+        _Worker(Connection(connection), memory).serve()
+    os._exit(0)  # environments are closed; what else would be torn down takes long, and may crash
+
+
+def _leave_with(parent: int) -> None:
+    # The end of the connection says so too, unless a fork of the parent keeps that open.
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
+
+
+class _Worker:
+    def __init__(self, connection: Connection, memory: int) -> None:
+        self.connection, self.memory = connection, memory
+        self.envs: dict[int, gym.Env] = {}
+        self.at_work: Any = {}
+
+    def serve(self) -> None:
+        try:
+            self.answer(self.start(self.listen()))
+            while (message := self.listen()) != LEAVE:
+                self.answer(self.obey(None if message == STEP else pickle.loads(message)))
+        finally:
+            self.each(self.envs, lambda env: self.envs[env].close())
+
+    def listen(self) -> bytes:
+        """The next message."""
+        message = self.connection.recv_bytes()
+        self.number = message[:NUMBER]
+        return message[NUMBER:]
+
+    def answer(self, found: Any) -> None:
+        """Send what was found, with the number of the message; of None there is nothing to say."""
+        self.connection.send_bytes(self.number + (b"" if found is None else pickle.dumps(found)))
+
+    def each(self, envs: Iterable[int], act: Callable[[int], None]) -> EnvFailed | None:
+        """Do something with each environment; the first error, after which the others have their turn all the same.
+
+        So what becomes of an environment does not depend on which others are in its process.
+        """
+        failed = None
+        for env in list(envs):
+            self.at_work[env] = True
+            try:
+                act(env)
+            except BaseException as error:  # noqa: BLE001  (it is raised again where it can be dealt with)
+                failed = failed or EnvFailed(name_envs([env]), _sendable(error), traceback.format_exc())
+            self.at_work[env] = False
+        return failed
+
+    def start(self, message: bytes) -> Made | EnvFailed:
+        """Make what was ordered."""
+        try:
+            order: Order = pickle.loads(message).fn
+            failed = self.each(order.envs, lambda env: self.make(order, env))
+            return failed or _describe(self.envs[order.envs[0]])
+        except BaseException as error:  # noqa: BLE001  (as in `each`)
+            return EnvFailed("a worker", _sendable(error), traceback.format_exc())
+
+    def make(self, order: Order, env: int) -> None:
+        """Make an environment, whose resets without a seed draw from a stream of its own."""
+        importlib.import_module(order.module)
+        made: Any = gym.make(order.env_id, **order.kwargs)
+        self.envs[env] = made
+        base = made.unwrapped
+        base._set_main_rng([FIRST_SEED + env])
+        for wrap in order.wrappers:
+            made = self.envs[env] = wrap(made)
+        if base.reconfiguration_freq == 0:  # else its scene would stay that of the seed that ManiSkill makes all with
+            made.reset(options={"reconfigure": True})
+
+    def share(self, command: Share) -> None:
+        """Read actions from shared memory, and write what comes of them there."""
+        block = Block(self.memory, command.fields, command.num_envs)
+        arrays = block.arrays
+        self.actions, self.at_work = arrays["action",], arrays["at_work",]
+        self.reward, self.terminated, self.truncated = (arrays[name,] for name in ("reward", "terminated", "truncated"))
+        self.obs, self.info = block.under("obs"), block.under("info")
+        self.rest: dict[int, dict[Path, Any]] = {}  # infos for which the shared memory has no place
+
+    def obey(self, command: Share | Reset | Call | None) -> Any:
+        """Do as told, None: step. What is to be answered: an `EnvFailed`, results of a call, `rest`, or None."""
+        if isinstance(command, Share):
+            return self.share(command)
+        results: dict[int, Any] = {}
+        self.rest = {}
+        if command is None:
+            failed = self.each(self.envs, self.step)
+        elif isinstance(command, Reset):
+            seeds = command.seeds
+            failed = self.each(seeds, lambda env: self.reset(env, *seeds[env], dict(command.options)))
+        else:
+            failed = self.each(self.envs, lambda env: results.update({env: self.call(env, command)}))
+        return failed or results or self.rest or None
+
+    def step(self, env: int) -> None:
+        """Take an action; what does not go into the shared memory goes to `rest`."""
+        obs, self.reward[env], terminated, truncated, info = self.envs[env].step(self.actions[env].copy())
+        self.terminated[env], self.truncated[env] = bool(terminated), bool(truncated)
+        self.show(env, obs, info)
+
+    def reset(self, env: int, seed: int | None, strict: bool, options: dict) -> None:
+        """Reset; without a layout for a seed that need not have one go on to another, the next of the seed's stream."""
+        try:
+            obs, info = self.envs[env].reset(seed=seed, options=options)
+        except LayoutError as error:
+            if strict:
+                raise
+            _log.warning("env %d: no layout for seed %d, another is drawn: %s", env, seed, error)
+            obs, info = self.envs[env].reset(options=options)
+        self.show(env, obs, info)
+
+    def show(self, env: int, obs: Any, info: dict) -> None:
+        """Write what an environment observes."""
+        written = 0
+        for path, leaf in leaves(obs):
+            self.obs[path][env] = _row(leaf)
+            written += 1
+        rest = {}
+        for path, leaf in leaves(info):
+            if path in self.info:
+                self.info[path][env] = _row(leaf)
+                written += 1
+            else:
+                rest[path] = leaf
+        if written < len(self.obs) + len(self.info):
+            there = {path for nested in (obs, info) for path, _ in leaves(nested)}
+            lacking = [".".join(path) for path in [*self.obs, *self.info] if path not in there]
+            raise VectorEnvError("observation or info lacks what it had at first", expected=lacking)
+        if rest:
+            self.rest[env] = rest
+
+    def call(self, env: int, command: Call) -> Any:
+        """The method's result, or the attribute."""
+        found: Any = self.envs[env].get_wrapper_attr(command.name)
+        result = found(*command.args, **command.kwargs) if callable(found) else found
+        pickle.dumps(result)  # if that can't be, it is this environment's error
+        return result
+
+
+def _row(leaf: Any) -> Any:
+    """The one env's row of a batch of one."""
+    return (leaf.cpu().numpy() if isinstance(leaf, torch.Tensor) else leaf)[0]
+
+
+def _describe(env: gym.Env) -> Made:
+    """What environments like this one share.
+
+    Raises:
+        VectorEnvError: actions or observations are not of a kind that can be shared.
+    """
+    observations, actions = (env.get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action"))
+    if not isinstance(actions, gym.spaces.Box):
+        raise VectorEnvError("these actions can't be sent to processes", expected="a box", found=actions)
+    base: Any = env.unwrapped
+    infos = [(path, np.asarray(leaf)) for path, leaf in leaves(base.get_info()) if isinstance(leaf, torch.Tensor)]
+    fields = [
+        Field(("action",), actions.shape, actions.dtype.name),
+        Field(("at_work",), (), "bool"),
+        Field(("reward",), (), "float32"),
+        Field(("terminated",), (), "bool"),
+        Field(("truncated",), (), "bool"),
+        *space_fields(observations, ("obs",)),
+        *(Field(("info", *path), array.shape[1:], array.dtype.name) for path, array in infos),
+    ]
+    return Made(observations, actions, tuple(fields), env.render_mode, dict(env.metadata))
+
+
+def _sendable(error: BaseException) -> Exception:
+    """The error as it can be sent: itself, if it is one that pickles."""
+    try:
+        if isinstance(error, Exception) and isinstance(pickle.loads(pickle.dumps(error)), type(error)):
+            return error
+    except Exception:  # noqa: BLE001, S110  (whatever its class does)
+        pass
+    return VectorEnvError(f"{type(error).__name__}: {error}")

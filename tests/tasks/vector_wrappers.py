@@ -1,0 +1,65 @@
+"""Wrappers that make an environment misbehave when its first action says so."""
+
+import os
+import signal
+import time
+
+import gymnasium as gym
+import torch
+
+from robocas_ms3.errors import LayoutError
+
+
+class OwnError(Exception):
+    """Of a user's wrapper; made of two words."""
+
+    def __init__(self, what: str, code: int) -> None:
+        super().__init__(what, code)
+
+
+class Unsendable(Exception):
+    """Pickles, and can't be read again."""
+
+    def __init__(self, what: str, where: str) -> None:
+        super().__init__(f"{what} {where}")
+
+
+class Misbehaves(gym.Wrapper):
+    """First number of an action: 2 an error, 3 one that can't be sent, 4 the process is killed, 5 takes 3 s."""
+
+    def step(self, action):
+        what = round(float(action[0]))
+        if what == 2:
+            raise OwnError("gripper fell off", 7)
+        if what == 3:
+            raise Unsendable("lost", "somewhere")
+        if what == 4:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if what == 5:
+            time.sleep(3)
+        return self.env.step(action)
+
+
+class Wins(gym.Wrapper):
+    """Succeeds at step 2 of an episode alone, where the first number of the action is positive."""
+
+    def step(self, action):
+        obs, _, _, truncated, info = self.env.step(action)
+        won = (info["elapsed_steps"] == 2) & bool(action[0] > 0)
+        info = {**info, "success": won, "note": f"step {int(info['elapsed_steps'])}", "more": torch.ones(1, 2)}
+        return obs, won.float(), won.clone(), truncated, info
+
+
+class LacksLayouts(gym.Wrapper):
+    """There is no layout for seed 5."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        base, layouts = env.unwrapped, env.unwrapped._layouts
+
+        def fussy(objects, seed):
+            if seed == 5:
+                raise LayoutError("no object qualifies as the target", where="layout")
+            return layouts(objects, seed)
+
+        base._layouts = fussy
