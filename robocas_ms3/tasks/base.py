@@ -351,10 +351,11 @@ class RoboCASEnv(SeededEnv):
         return terms.finger_grasps(forces[:, 0], forces[:, 1], opening)
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
-        """Nothing in visual modes; in state modes what only a simulator knows."""
-        if not self.obs_mode_struct.state and self.obs_mode not in {"state", "state_dict"}:
-            return {}
-        return self._privileged()
+        """``tcp_pose`` (N, 7) in the world; in state modes also what only a simulator knows."""
+        extra = {"tcp_pose": as_tensor(self._tcp())}
+        if self.obs_mode_struct.state or self.obs_mode in {"state", "state_dict"}:
+            extra |= self._privileged()
+        return extra
 
     def _privileged(self) -> dict[str, torch.Tensor]:
         """What only a simulator knows, (N, D) each; see docs/rl.md."""

@@ -1,13 +1,17 @@
 """Contract of every registered task: it makes, resets, steps, and repeats for the same seed."""
 
 import logging
+import re
+import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.utils.env_checker import check_env
 from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.tasks import TASKS
@@ -110,7 +114,7 @@ def test_layouts_are_settled_and_as_their_kind_says(env, seed):
         assert abs(local[:, 2].min() - base.model.region.z) < 0.002
 
 
-def test_visual_modes_hold_nothing_only_a_simulator_knows():
+def test_visual_modes_hold_nothing_only_a_simulator_knows(monkeypatch):
     from robocas_ms3.tasks.pick import RoboCASPickEnv
 
     class Mode:
@@ -118,7 +122,43 @@ def test_visual_modes_hold_nothing_only_a_simulator_knows():
 
     env = RoboCASPickEnv.__new__(RoboCASPickEnv)
     env.obs_mode_struct, env._obs_mode = Mode(), "rgb+depth"
-    assert env._get_obs_extra({}) == {}
+    monkeypatch.setattr(RoboCASPickEnv, "_tcp", lambda env: np.zeros((1, 7), np.float32))
+    assert list(env._get_obs_extra({})) == ["tcp_pose"]
+
+
+def complaints(env_id: str, **kwargs) -> tuple[str, list[str]]:
+    """What gymnasium's checker says of an environment: its error, and its warnings but for the environment's name."""
+    env = CPUGymWrapper(gym.make(env_id, control_mode="pd_joint_delta_pos", **kwargs))
+    error = ""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            check_env(env, skip_render_check=True)
+        except AssertionError as failure:
+            error = str(failure)
+    env.close()
+    return error, sorted({re.sub(r"\(<.*>\)", "", str(one.message)) for one in caught if "WARN" in str(one.message)})
+
+
+@pytest.mark.parametrize("mode", ["state", "rgb"])
+@pytest.mark.parametrize("name", sorted(TASKS))
+def test_gymnasiums_checker_finds_nothing_that_it_does_not_find_in_pick_cube(name, mode, needs_renderer):
+    import mani_skill.envs  # noqa: F401  (registers PickCube-v1)
+
+    size = {"obs_mode": mode, "sensor_configs": dict(width=32, height=24)}
+    error, warned = complaints(TASKS[name].env_id, **size)
+    theirs = complaints("PickCube-v1", **size)
+    assert error == theirs[0]
+    assert set(warned) <= set(theirs[1])
+
+
+def test_cameras_take_a_size(needs_renderer):
+    env = gym.make("RoboCASPick-v1", obs_mode="rgb", sensor_configs=dict(width=40, height=24))
+    observation, _ = env.reset(seed=0)
+    assert {name: tuple(seen["rgb"].shape) for name, seen in observation["sensor_data"].items()} == {
+        name: (1, 24, 40, 3) for name in ("base_camera", "gripper_camera", "static_camera")
+    }
+    env.close()
 
 
 def test_a_renderer_on_the_cpu_is_not_warned_of(caplog):
