@@ -96,6 +96,8 @@ def build(command: Build) -> int:
                 which = f"seed {seed}" if objects is None else f"objects {chosen}, seed {seed}"
                 progress.console.print(f"{which}: {problem}", highlight=False)
     console = Console(highlight=False, soft_wrap=True)
+    if objects is not None:
+        bank.write_table(pairs)  # for several envs, whose resets then read one file
     made = len(pairs) - there - failures
     console.print(f"{made} layouts made, {there} were there already, {failures} seeds have none")
     console.print(f"bank: {bank.folder}")

@@ -157,7 +157,7 @@ class EnvFrames:
 
 def describe_scene(env: Any) -> dict[str, Any]:
     """Task, configuration, layout and objects of an environment (one env)."""
-    layout = env.layouts[0]
+    layout = env.layout()
     return {
         "task": env.SPEC.name,
         "config": env.task_config.model_dump(mode="json"),

@@ -280,7 +280,7 @@ class EpisodeGenerator:
         env = executor.base_env
         target = env.target_asset().asset
         bounds = [s.first for s in executor.segments] + [len(executor.actions)]
-        said, layout = env.instructions[0], env.layouts[0]
+        said, layout = env.instruction(), env.layout()
         assert layout is not None  # there was a reset
         return {
             "instruction": said.text,

@@ -116,9 +116,7 @@ class OpenLoop:
     @property
     def layout(self) -> Layout:
         """Of the scene that was built last."""
-        layout = self.env.layouts[0]
-        assert layout is not None
-        return layout
+        return self.env.layout()
 
     def tcp_in_base(self) -> NDArray[np.float32]:
         """(3,) m, where the TCP is, in the arm's base frame."""

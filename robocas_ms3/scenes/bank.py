@@ -24,6 +24,7 @@ from robocas_ms3.paths import cache_dir
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
+from robocas_ms3.scenes.table import TABLE, LayoutTable, write_table
 
 LAYOUT_FORMAT = 13  # raised when the same seed gives another layout, or the files change
 ABOUT = "about.json"  # in the folder of a bank: all that its layouts depend on
@@ -52,9 +53,7 @@ def layout_bank(model: SceneModel, folder: str | Path | None = "auto") -> Layout
         model: the scene's assets.
         folder: of all banks; ``auto``: in the cache; None: no bank, every layout is sampled anew.
     """
-    if folder is None:
-        return partial(sample_layout, model)
-    return LayoutBank(model, folder).get
+    return partial(sample_layout, model) if folder is None else LayoutBank(model, folder)
 
 
 def banks_folder(root: str | Path = "auto") -> Path:
@@ -77,6 +76,25 @@ class LayoutBank:
         self._about = about(model)
         key = hashlib.sha256(json.dumps(self._about, sort_keys=True).encode()).hexdigest()[:16]
         self.folder = banks_folder(root) / f"{model.config.task}-{key}"
+
+    @property
+    def table(self) -> LayoutTable | None:
+        """Its layouts as one mapped file, if that was written; a damaged one is none."""
+        path = self.folder / TABLE
+        if not path.is_file():
+            return None
+        try:
+            return LayoutTable(path)
+        except LayoutError as error:
+            _log.warning("%s", error)
+            return None
+
+    def write_table(self, pairs: Iterable[Pair]) -> Path:
+        """Write those layouts of some pairs of seeds that are there as one file (`LayoutTable`), if any is."""
+        there = {pair: read_layout(self.path(*pair)) for pair in pairs if self.path(*pair).is_file()}
+        if there:
+            write_table(self.folder / TABLE, there)
+        return self.folder / TABLE
 
     def path(self, objects_seed: int, seed: int) -> Path:
         """File of a layout."""
@@ -102,6 +120,8 @@ class LayoutBank:
         make_folder(path.parent)
         write_layout(layout, path)
         return layout
+
+    __call__ = get  # a bank is a source of layouts
 
     def missing(self, pairs: Iterable[Pair]) -> list[Pair]:
         """Those of some pairs of seeds whose layouts are not there yet."""

@@ -13,7 +13,6 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs import Actor, Articulation, Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
-from scipy.spatial.transform import Rotation
 
 from robocas_ms3.arrays import as_tensor, native, none
 from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
@@ -24,7 +23,7 @@ from robocas_ms3.robots.constants import HAND_LINK
 from robocas_ms3.robots.mobile_panda import RoboCASMobilePanda
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.bank import layout_bank
-from robocas_ms3.scenes.layout import Array, Layout
+from robocas_ms3.scenes.layout import Array
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import object_set
 from robocas_ms3.tasks import terms
@@ -192,7 +191,6 @@ class RoboCASEnv(SeededEnv):
         )
         self._extents = torch.tensor([[f.extents for f in row] for row in facts], dtype=torch.float32).to(self.device)
         slots = len(self.objects)
-        self.layouts: list[Layout | None] = [None] * self.num_envs
         self.start_poses = torch.zeros(self.num_envs, slots, 7, device=self.device)
         self.present = torch.ones(self.num_envs, slots, dtype=torch.bool, device=self.device)
         self.target_slot = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
@@ -226,35 +224,32 @@ class RoboCASEnv(SeededEnv):
         build.shift_cameras(cameras, self.task_config, self._scene_seeds)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        layouts = [self._find_layout(env) for env in env_idx.tolist()]
+        layouts = self._find_layouts(env_idx.tolist())
         with torch.device(self.device):
             count = len(env_idx)
             rest = torch.as_tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32)
             self.agent.reset(rest.repeat(count, 1))
             self.agent.reset_only(env_idx)
-            self.agent.robot.set_pose(self._pose([layout.robot_pose for layout in layouts]))
+            self.agent.robot.set_pose(self._pose(layouts.robot_poses))
             for name, furniture in self.fixtures.furniture.items():
                 if isinstance(furniture, Articulation):
                     positions = self.model.joint_positions(name, opened=False)
                     qpos = torch.tensor([positions.get(joint.name, 0.0) for joint in furniture.active_joints])
                     furniture.set_qpos(qpos.repeat(count, 1))
                     furniture.set_qvel(torch.zeros(count, furniture.max_dof))
-            basket = self._pose([layout.basket_pose for layout in layouts])
+            basket = self._pose(layouts.basket_poses)
             self.fixtures.basket.set_pose(basket)
             self.basket_at_start[env_idx] = basket.raw_pose
-            raw = _raw_poses(np.concatenate([layout.object_poses for layout in layouts]))
-            poses = torch.as_tensor(raw, device=self.device).reshape(count, len(self.objects), 7)
+            poses = torch.as_tensor(layouts.object_poses, device=self.device)
             if self.gpu_sim_enabled:
                 self.bodies.put_actors(env_idx, self._object_rows, poses)
             else:
                 for slot, actor in enumerate(self.objects):
                     actor.set_pose(Pose.create(poses[:, slot]))
             self.start_poses[env_idx] = poses
-            self.target_slot[env_idx] = torch.tensor([layout.target for layout in layouts])
+            self.target_slot[env_idx] = torch.as_tensor(layouts.targets, device=self.device)
             self._is_target = torch.nn.functional.one_hot(self.target_slot, len(self.objects)).bool()
-            self.present[env_idx] = torch.as_tensor(np.stack([layout.present for layout in layouts])).to(self.device)
-        for i, layout in zip(env_idx.tolist(), layouts, strict=True):
-            self.layouts[i] = layout
+            self.present[env_idx] = torch.as_tensor(layouts.present, device=self.device)
 
     def get_state_dict(self) -> dict:
         """The state, in ManiSkill's form, from one read of all bodies, with all that what follows hangs on.
@@ -272,9 +267,9 @@ class RoboCASEnv(SeededEnv):
         super().set_state_dict(state, cast("torch.Tensor", env_idx))
         self.agent.set_controller_targets(state.get("controller"), env_idx)
 
-    def _pose(self, matrices: list[Array]) -> Any:
-        """Batch of poses from 4x4 matrices."""
-        return Pose.create(torch.as_tensor(_raw_poses(np.stack(matrices)), device=self.device))
+    def _pose(self, poses: np.ndarray) -> Any:
+        """Batch of poses (n, 7)."""
+        return Pose.create(torch.as_tensor(poses, device=self.device))
 
     # ------------------------------------------------------------------ step
 
@@ -364,9 +359,3 @@ class RoboCASEnv(SeededEnv):
             "target": self._is_target.float(),
             "basket_pose": self.basket_pose,
         }
-
-
-def _raw_poses(matrices: np.ndarray) -> np.ndarray:
-    """(n, 4, 4) -> (n, 7) float32: position, quaternion wxyz."""
-    xyzw = Rotation.from_matrix(matrices[:, :3, :3]).as_quat()
-    return np.concatenate([matrices[:, :3, 3], xyzw[:, [3, 0, 1, 2]]], axis=1).astype(np.float32)

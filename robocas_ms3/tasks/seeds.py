@@ -12,8 +12,9 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 
 from robocas_ms3.errors import ConfigError, LayoutError, RobocasError
-from robocas_ms3.scenes.bank import LayoutSource, Pair
+from robocas_ms3.scenes.bank import LayoutBank, LayoutSource, Pair
 from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.scenes.table import LayoutBatch
 
 SEVERAL_ENVS_SEEDS = (0, 99)  # least and greatest seed of several envs' unseeded resets
 _OTHER_SEEDS = 20  # tried where a seed has no layout
@@ -62,6 +63,8 @@ class SeededEnv(BaseEnv):
         if seeds is not None and not 0 <= seeds[0] <= seeds[1]:
             raise ConfigError("seeds are a range", expected="0 <= first <= last", found=seeds)
         self._layouts = layouts
+        self._table = layouts.table if isinstance(layouts, LayoutBank) and num_envs > 1 else None
+        self._found: dict[int, Layout] = {}
         self._seed_range = seeds or (SEVERAL_ENVS_SEEDS if num_envs > 1 else None)
         self._resets_seeded = False
         self._asked_for: set[int] = set()  # envs whose seeds were asked for
@@ -151,8 +154,23 @@ class SeededEnv(BaseEnv):
         self._objects_seeds = np.array(self._episode_seed)
         return chosen
 
-    def _find_layout(self, env: int) -> Layout:
+    def _find_layouts(self, envs: list[int]) -> LayoutBatch:
+        """The layouts of some envs' episodes; from the bank's table where that holds them all."""
+        for env in envs:
+            self._found.pop(env, None)
+        if self._table is not None:
+            batch = self._table.find(self._objects_seeds[envs], self._layout_seeds[envs])
+            if batch is not None:
+                return batch
+        return LayoutBatch.of([self.layout(env) for env in envs])
+
+    def layout(self, env: int = 0) -> Layout:
         """The layout of an env's episode."""
+        if env not in self._found:
+            self._found[env] = self._find_layout(env)
+        return self._found[env]
+
+    def _find_layout(self, env: int) -> Layout:
         objects_seed = int(self._objects_seeds[env])
         return self._first_possible(lambda seed: self._layout((objects_seed, seed)), env, self._layout_seeds)
 

@@ -75,13 +75,19 @@ class TransferEnv(RoboCASEnv):
             self._stages = dict(zip(self.STAGES, self._reached, strict=True))  # views
         self._reached[:, env_idx] = False
         self._last: tuple[object, dict[str, torch.Tensor]] | None = None
-        said = {env: self._instruct(env) for env in env_idx.tolist()}
-        kept = getattr(self, "instructions", [])
-        self.instructions = [said[env] if env in said else kept[env] for env in range(self.num_envs)]
+        if not hasattr(self, "_said"):
+            self._said: dict[int, Instruction] = {}
+        for env in env_idx.tolist():
+            self._said.pop(env, None)
+
+    def instruction(self, env: int = 0) -> Instruction:
+        """What is asked of an env's robot."""
+        if env not in self._said:
+            self._said[env] = self._instruct(env)
+        return self._said[env]
 
     def _instruct(self, env: int) -> Instruction:
-        config, layout = self.task_config, self.layouts[env]
-        assert layout is not None  # the reset gave it one
+        config, layout = self.task_config, self.layout(env)
         name = self.target_asset(env).asset.name
         names = {asset.asset.name for asset, used in zip(self.object_assets[env], layout.present, strict=True) if used}
         return choose_instruction(
@@ -232,4 +238,4 @@ class TransferEnv(RoboCASEnv):
 
     def get_language_instruction(self) -> list[str]:
         """The instruction of each env."""
-        return [said.text for said in self.instructions]
+        return [self.instruction(env).text for env in range(self.num_envs)]

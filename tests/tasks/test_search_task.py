@@ -53,7 +53,7 @@ def covered_seed(env) -> int:
 def test_the_target_of_a_heap_is_hidden_in_part(env):
     env.reset(seed=0)
     base = env.unwrapped
-    layout = base.layouts[0]
+    layout = base.layout()
     assert layout.visible_shares[layout.target] < base.task_config.target.max_visible_share
     found = base.clutter()
     assert found.hidden_share.shape == (1,)

@@ -13,6 +13,7 @@ from robocas_ms3.config import load_task_config
 from robocas_ms3.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.scenes import bank
 from robocas_ms3.scenes.sample import object_set
+from robocas_ms3.scenes.table import LayoutBatch
 from robocas_ms3.tasks import RoboCASPickEnv
 from robocas_ms3.tasks.seeds import SEVERAL_ENVS_SEEDS, SeededEnv
 
@@ -25,7 +26,7 @@ class FourEnvs(SeededEnv):
     def __init__(self, seed_range=None, layouts=None) -> None:
         self.num_envs, self._enhanced_determinism, self._batched_rng_backend = 4, False, "numpy:random_state"
         self._resets_seeded, self._seed_range, self._made = True, seed_range, True
-        self._layouts, self._failed, self._other_seeds = layouts, {}, 2
+        self._layouts, self._failed, self._other_seeds, self._table, self._found = layouts, {}, 2, None, {}
         self._layout_seeds, self._objects_seeds = np.zeros(4, dtype=np.int64), np.zeros(4, dtype=np.int64)
         self._episode_seed, self._batched_episode_rng = None, None
 
@@ -103,7 +104,8 @@ def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEn
         if (options or {}).get("reconfigure"):
             env.ids = env._choose_objects(lambda seed: object_set(env.model, seed))
             env._set_episode_rng(env._episode_seed, index)
-        env.layouts = [env._find_layout(i) for i in index.tolist()]
+        env._found.clear()
+        env.layouts = [env.layout(i) for i in index.tolist()]
         asked.append([(int(env._objects_seeds[i]), int(env._layout_seeds[i])) for i in index])
         return {}, {}
 
@@ -124,6 +126,13 @@ def test_several_envs_reset_from_a_bank_built_for_them(tmp_path, monkeypatch):
     assert bank.count_layouts(next(tmp_path.iterdir())) == 4
     monkeypatch.setattr(bank, "sample_layout", None)  # making one would fail
     env, asked = several(tmp_path, monkeypatch, seeds=(0, 1))
+    assert env._table is not None
+    one_by_one = LayoutBatch.of([env.layout(i) for i in range(4)])
+    assert env._table.find(env._objects_seeds, env._layout_seeds).object_poses.tobytes() == (
+        one_by_one.object_poses.tobytes()
+    )
+    assert env._find_layouts([0, 1, 2, 3]).object_poses.tobytes() == one_by_one.object_poses.tobytes()
+    assert not env._found  # read when they are asked for
     assert asked == [[(0, 0), (1, 1), (0, 0), (1, 1)]]
     for _ in range(20):
         env.reset()
