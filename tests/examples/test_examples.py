@@ -56,9 +56,10 @@ def test_read_dataset(recorded, needs_renderer, tmp_path):
 
 
 def test_ppo_in_a_shortened_form(tmp_path):
-    small = ["--updates", 2, "--envs", 1, "--batch", 64, "--epochs", 1, "--layouts", 2]
-    (last,) = run("ppo.py", *small, cwd=tmp_path)
-    assert last.startswith("128 steps, ")
+    small = ["--updates", 2, "--envs", 1, "--batch", 64, "--epochs", 1, "--layouts", 2, "--trials", 2]
+    learned, tried = run("ppo.py", *small, cwd=tmp_path)
+    assert learned.startswith("128 steps, ")
+    assert tried.startswith("without noise, in 2 layouts that are new to it: held ")
     with (tmp_path / "out/ppo/progress.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["steps"] for row in rows] == ["64", "128"]
