@@ -59,7 +59,7 @@ class EpisodeRecorder(gym.Wrapper):
         """Step the environment and keep what came of it."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._steps.actions.append(np.array(action, np.float32).reshape(-1))
-        self._steps.flags.append((bool(terminated), bool(truncated), bool(info["success"])))
+        self._steps.flags.append((bool(terminated), bool(truncated), bool(info["success"]), bool(info["fail"])))
         self._keep(observation)
         return observation, reward, terminated, truncated, info
 
@@ -81,13 +81,13 @@ class EpisodeRecorder(gym.Wrapper):
             episode: what ManiSkill's format has no place for: instruction, target, sub-goals.
         """
         steps, env = self._steps, self._base_env
-        terminated, truncated, success = np.array(steps.flags, bool).reshape(-1, 3).T
+        terminated, truncated, success, fail = np.array(steps.flags, bool).reshape(-1, 4).T
         with replacing(self._trajectory) as tmp:
             with h5py.File(tmp, "w") as file:
                 group = file.create_group("traj_0", track_order=True)
                 _write(group, "obs", _stacked(steps.observations))
                 group.create_dataset("actions", data=np.stack(steps.actions), dtype=np.float32)
-                flags = {"terminated": terminated, "truncated": truncated, "success": success}
+                flags = {"terminated": terminated, "truncated": truncated, "success": success, "fail": fail}
                 for name, values in flags.items():
                     group.create_dataset(name, data=values, dtype=bool)
                 _write(group, "env_states", {**self.states, **_stacked(steps.beside_bodies)})
@@ -104,6 +104,7 @@ class EpisodeRecorder(gym.Wrapper):
                             "elapsed_steps": len(steps.actions),
                             "reset_kwargs": self._reset_kwargs,
                             "success": bool(success[-1]),
+                            "fail": bool(fail[-1]),
                             "robocas": episode,
                         }
                     ],
@@ -134,8 +135,8 @@ class _Steps:
     """What was recorded since the reset: S actions and what came of them; of the rest S + 1."""
 
     actions: list[NDArray[np.float32]] = field(default_factory=list)
-    flags: list[tuple[bool, bool, bool]] = field(default_factory=list)
-    """terminated, truncated, success"""
+    flags: list[tuple[bool, bool, bool, bool]] = field(default_factory=list)
+    """terminated, truncated, success, fail"""
     states: list[NDArray[np.float32]] = field(default_factory=list)
     beside_bodies: list[Any] = field(default_factory=list)
     observations: list[Any] = field(default_factory=list)

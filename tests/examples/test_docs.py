@@ -12,12 +12,21 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 pytestmark = pytest.mark.slow
 
 
+def programs(page: str) -> list[str]:
+    """The Python programs of a page."""
+    return re.findall(r"^```python\n(.*?)^```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+
+
 def run_first_program(page: str, cwd: Path) -> list[str]:
     """What the first Python program of a page prints."""
-    found = re.search(r"^```python\n(.*?)^```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-    assert found, f"{page} has no program"
+    assert programs(page), f"{page} has no program"
+    return run_program(programs(page)[0], cwd)
+
+
+def run_program(program: str, cwd: Path) -> list[str]:
+    """What a program prints."""
     path = cwd / "program.py"
-    path.write_text(found[1], encoding="utf-8")
+    path.write_text(program, encoding="utf-8")
     done = subprocess.run(
         [sys.executable, str(path)], cwd=cwd, env=os.environ, capture_output=True, text=True, check=False
     )
@@ -27,5 +36,19 @@ def run_first_program(page: str, cwd: Path) -> list[str]:
 
 def test_batched(tmp_path):
     about, *ends = run_first_program("batched.md", tmp_path)
-    assert about.startswith("torch.Size([4, 126]) grasp the ")
+    assert about.startswith("torch.Size([4, 135]) grasp the ")
     assert ends == ["4 ended, 0.0 succeeded"] * 2
+
+
+def test_reinforcement_learning(tmp_path):
+    rewards = [float(line.split()[0]) for line in run_first_program("rl.md", tmp_path)]
+    assert len(rewards) == 5
+    assert rewards == sorted(rewards)
+    assert 0 < rewards[0] < rewards[-1] < 0.4
+
+
+def test_stable_baselines(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    _, program = programs("rl.md")
+    assert "learn(100_000)" in program
+    run_program(program.replace("100_000", "300"), tmp_path)
