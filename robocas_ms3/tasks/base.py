@@ -346,11 +346,9 @@ class RoboCASEnv(SeededEnv):
         return terms.finger_grasps(forces[:, 0], forces[:, 1], opening)
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
-        """``tcp_pose`` (N, 7) in the world; in state modes also what only a simulator knows."""
-        extra = {"tcp_pose": as_tensor(self._tcp())}
-        if self.obs_mode_struct.state or self.obs_mode in {"state", "state_dict"}:
-            extra |= self._privileged()
-        return extra
+        """``tcp_pose`` (N, 7) in the world; before it, in state modes, what only a simulator knows."""
+        told = self.obs_mode_struct.state or self.obs_mode in {"state", "state_dict"}
+        return {**(self._privileged() if told else {}), "tcp_pose": as_tensor(self._tcp())}
 
     def _privileged(self) -> dict[str, torch.Tensor]:
         """What only a simulator knows, (N, D) each; see docs/rl.md."""

@@ -6,6 +6,7 @@ import h5py
 import pytest
 
 from robocas_ms3.cli.main import run
+from robocas_ms3.config import load_task_config
 from robocas_ms3.demos import generate as module
 from robocas_ms3.demos.checks import SIM_FREQ
 from robocas_ms3.demos.convert_actions import CONVERTIBLE
@@ -50,7 +51,9 @@ def test_a_wrong_argument_of_generate_leaves_nothing(tmp_path, capsys, words, me
 
 
 def test_the_rate_of_physics_is_the_environments():
-    assert vars(RoboCASEnv)["_default_sim_config"].fget(None).sim_freq == SIM_FREQ
+    env = RoboCASEnv.__new__(RoboCASEnv)
+    env.num_envs, env.task_config = 1, load_task_config("pick_table_scattered")
+    assert env._default_sim_config.sim_freq == SIM_FREQ
 
 
 def begun(out, *, ledger=""):

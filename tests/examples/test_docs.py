@@ -36,7 +36,7 @@ def run_program(program: str, cwd: Path) -> list[str]:
 
 def test_batched(tmp_path):
     about, *ends = run_first_program("batched.md", tmp_path)
-    assert about.startswith("torch.Size([4, 135]) grasp the ")
+    assert about.startswith("torch.Size([4, 142]) grasp the ")
     assert ends == ["4 ended, 0.0 succeeded"] * 2
 
 

@@ -231,7 +231,7 @@ def test_tasks_add_what_is_theirs(env_id, names):
     env = gym.make(env_id, config=config, obs_mode="state_dict", reward_mode="normalized_dense", **STATE_ONLY)
     obs, _ = env.reset(seed=3)
     base: Any = env.unwrapped
-    assert list(obs["extra"])[-len(names) :] == names
+    assert list(obs["extra"])[-len(names) - 1 :] == [*names, "tcp_pose"]
     if names[0] == "hidden_share":
         assert obs["extra"]["hidden_share"].item() == pytest.approx(base.clutter().hidden_share.item())
         _, terms, info = reward_now(base)
