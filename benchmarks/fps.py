@@ -23,6 +23,7 @@ from mani_skill.utils import sapien_utils
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
+from sapien import physx
 
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.assets.pack import load_pack
@@ -110,7 +111,10 @@ class Args:
 def main(args: Args) -> None:
     torch.set_num_threads(1)
     gpu = torch.cuda.is_available()
+    if gpu:
+        physx.enable_gpu()  # which can't be done any more once a CPU env was made
     report: dict[str, Any] = {"device": torch.cuda.get_device_name() if gpu else "cpu", "steps_per_second": {}}
+    failed = 0
     for mode in args.modes:
         cases = {"pick_cube": ("PickCube-v1", {})}
         for config in args.configs:
@@ -124,6 +128,7 @@ def main(args: Args) -> None:
                         rates[name][count] = round(rate(env_id, count, mode, args, kwargs), 1)
                     except Exception as error:  # one case that fails, such as for memory, leaves the others
                         rates[name][count] = f"{type(error).__name__}: {error}"
+                        failed += 1
         report["steps_per_second"][mode] = rates
         report.setdefault("over_bare", {})[mode] = {
             config: {
@@ -136,6 +141,8 @@ def main(args: Args) -> None:
     if not gpu:
         report["skipped"] = "more than one env: no CUDA device"
     print(json.dumps(report, indent=2))
+    if failed:
+        raise SystemExit(f"{failed} cases could not be measured")
 
 
 def rate(env_id: str, count: int, mode: str, args: Args, kwargs: dict[str, Any]) -> float:

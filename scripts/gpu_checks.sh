@@ -1,8 +1,11 @@
 #!/usr/bin/env bash
-# All that only a GPU can show, in one command on a CUDA machine, offline too: tests marked gpu (contracts with 16 and 256
+# All that only a GPU can show, in one command on a CUDA machine: tests marked gpu (contracts with 16 and 256
 # envs, scenes as on a CPU, partial resets, restored states, contact buffers), then steps a second of 1 to 4096 envs.
 #
 #   bash scripts/gpu_checks.sh [FOLDER]     # reports go there; default: gpu_checks
+#
+# Offline too, once SAPIEN's library for GPUs is there: it is downloaded when it is first asked for, into
+# ~/.sapien/physx/<version>/libPhysXGpu_64.so; carry that file along.
 #
 # PYTHON names the interpreter; default: the one scripts/setup.sh made, else python3. It needs what the environments need
 # (sapien, mani_skill, torch with CUDA, ...) and pytest; the planner and mplib are not used.
@@ -23,6 +26,11 @@ if ! device=$("$python" -c 'import torch; print(torch.cuda.get_device_name())' 2
 fi
 
 echo "on $device"
+if ! "$python" -c 'from sapien import physx; physx.enable_gpu()' 2>"$out/physx.txt"; then
+    tail -n 3 "$out/physx.txt"
+    echo "PhysX does not start on the GPU. Offline, copy ~/.sapien/physx/ from a machine where it has started once."
+    exit 1
+fi
 failed=0
 "$python" -m pytest -m gpu tests/gpu -p no:cacheprovider -v --durations 0 2>&1 | tee "$out/tests.txt" || failed=1
 for mode in state rgb; do

@@ -24,6 +24,7 @@ from robocas_ms3.robots.ee_deltas import ee_delta_target
 
 BODY_FRAME = "body_translation:body_aligned_body_rotation"
 BATCHED_IK_ITERATIONS, IK_DAMPING = 8, 1e-4
+FARTHEST = 0.5  # m and rad together that one iteration goes: linear steps lead astray beyond
 IK_TOLERANCE = 1e-4  # m and rad together, as SAPIEN's solver has it, which is used on a CPU
 # m and rad between the TCP and the pose it was asked for: beyond, something holds the arm back, or set it elsewhere.
 EE_HELD_BACK = (0.1, 0.5)
@@ -67,6 +68,7 @@ def batched_ik(
     missed = _missed(kinematics, target, qpos)
     for _ in range(BATCHED_IK_ITERATIONS):
         jacobian = cast("torch.Tensor", kinematics.pk_chain.jacobian(qpos))
+        missed = missed * (FARTHEST / torch.linalg.vector_norm(missed, dim=1, keepdim=True)).clamp(max=1.0)
         downhill = (jacobian.mT @ missed[..., None])[..., 0]
         stuck = ((qpos <= low) & (downhill < 0)) | ((qpos >= high) & (downhill > 0))
         jacobian = jacobian.masked_fill(stuck[:, None], 0.0)

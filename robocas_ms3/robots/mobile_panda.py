@@ -218,6 +218,8 @@ class RoboCASMobilePanda(BaseAgent):
         self._within_a_step = [part for part in self._parts.controllers.values() if isinstance(part, EvenDrives)]
         if hasattr(self, "tcp"):  # not while the robot is being made
             self._still()
+            if self.scene.gpu_sim_enabled and self.scene._gpu_sim_initialized:
+                cast("Any", self.scene.px).gpu_apply_articulation_target_velocity()
 
     @property
     def _parts(self) -> RobotController:

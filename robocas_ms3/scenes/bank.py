@@ -10,17 +10,18 @@ import zipfile
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import fields
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sapien import physx
 
 from robocas_ms3.assets.pack import MANIFEST, LoadedFurniture, sha256
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import make_folder, replacing, write_json
 from robocas_ms3.paths import cache_dir
+from robocas_ms3.scenes.elsewhere import OtherProcess
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
@@ -53,7 +54,34 @@ def layout_bank(model: SceneModel, folder: str | Path | None = "auto") -> Layout
         model: the scene's assets.
         folder: of all banks; ``auto``: in the cache; None: no bank, every layout is sampled anew.
     """
-    return partial(sample_layout, model) if folder is None else LayoutBank(model, folder)
+    return Sampler(model) if folder is None else LayoutBank(model, folder)
+
+
+class Sampler:
+    """Makes layouts anew, the same ones in every process.
+
+    Where PhysX has a GPU it cooks hulls otherwise, on a CPU too, and heaps come to rest elsewhere. So such a process
+    has another one make them.
+
+    Args:
+        model: the scene's assets.
+    """
+
+    def __init__(self, model: SceneModel) -> None:
+        self._model = model
+        self._elsewhere: OtherProcess | None = None
+
+    def __call__(self, objects_seed: int, seed: int) -> Layout:
+        """The layout of two seeds; see `sample_layout`."""
+        if not physx.is_gpu_enabled():
+            return sample_layout(self._model, objects_seed, seed)
+        if self._elsewhere is None:
+            self._elsewhere = OtherProcess(self._model)
+        return self._elsewhere.layout(objects_seed, seed)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the other process."""
+        return {**self.__dict__, "_elsewhere": None}
 
 
 def banks_folder(root: str | Path = "auto") -> Path:
@@ -73,6 +101,7 @@ class LayoutBank:
 
     def __init__(self, model: SceneModel, root: str | Path = "auto") -> None:
         self.model = model
+        self._sample = Sampler(model)
         self._about = about(model)
         key = hashlib.sha256(json.dumps(self._about, sort_keys=True).encode()).hexdigest()[:16]
         self.folder = banks_folder(root) / f"{model.config.task}-{key}"
@@ -113,7 +142,7 @@ class LayoutBank:
                 return read_layout(path)
             except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
                 _log.warning("%s: damaged, made again (%s)", path, error)
-        layout = sample_layout(self.model, objects_seed, seed)
+        layout = self._sample(objects_seed, seed)
         if not (self.folder / ABOUT).is_file():
             make_folder(self.folder)
             write_json(self.folder / ABOUT, self._about)

@@ -80,12 +80,13 @@ class LayoutTable:
         rows = np.asarray(self._rows[sets, columns])
         if not (rows["there"] & (rows["objects_seed"] == objects_seeds) & (rows["seed"] == seeds)).all():
             return None
+        # a record's length is no multiple of a float's, which tensors can't be made of
         return LayoutBatch(
-            rows["object_poses"],
-            rows["robot_pose"],
-            rows["basket_pose"],
+            np.ascontiguousarray(rows["object_poses"]),
+            np.ascontiguousarray(rows["robot_pose"]),
+            np.ascontiguousarray(rows["basket_pose"]),
             rows["target"].astype(np.int64),
-            rows["present"],
+            np.ascontiguousarray(rows["present"]),
         )
 
 

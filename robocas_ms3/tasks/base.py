@@ -224,6 +224,8 @@ class RoboCASEnv(SeededEnv):
         build.shift_cameras(cameras, self.task_config, self._scene_seeds)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        if self._engine_errors is not None:
+            self._engine_errors.check()
         layouts = self._find_layouts(env_idx.tolist())
         with torch.device(self.device):
             count = len(env_idx)

@@ -12,6 +12,7 @@ from robocas_ms3.tasks.transfer import TransferEnv
 
 _DROP_HEIGHT, _LOWERING = 0.1, 0.25  # m above the basket's rim: where a carry leads; from where on lowering counts
 _FAR = 0.2  # m from there at which half of the carry is done
+DENSE = ("normalized_dense", "dense", "progress")  # reward modes whose terms are worked out
 _LIFT = 0.03  # m, that of `terms.lifted`
 
 
@@ -25,7 +26,7 @@ class LearningEnv(TransferEnv):
     In other modes nothing of this is worked out.
     """
 
-    SUPPORTED_REWARD_MODES = ("sparse", "normalized_dense", "dense", "progress", "none")  # the first is the default
+    SUPPORTED_REWARD_MODES = ("sparse", *DENSE, "none")  # the first is the default
     REWARDS: ClassVar[rewards.RewardTable] = rewards.TRANSFER
     # NaN where there was none since the reset
     _last_action: torch.Tensor | None = None  # (N, A)
@@ -61,7 +62,7 @@ class LearningEnv(TransferEnv):
             level = self.compute_normalized_dense_reward(obs, action, info)
             before = level if self._last_level is None else self._last_level
             reward, self._last_level = (level - before).nan_to_num(), level.clone()
-        if self._reward_mode not in {"sparse", "none"} and action is not None:
+        if self._reward_mode in DENSE and action is not None:
             self._last_action = torch.as_tensor(action, device=self.device).reshape(self.num_envs, -1).clone()
         return reward
 

@@ -11,7 +11,7 @@ from mani_skill.utils.registration import register_env
 from robocas_ms3.arrays import as_tensor, native, none
 from robocas_ms3.scenes.targets import selection_camera
 from robocas_ms3.tasks import occlusion, rewards, terms
-from robocas_ms3.tasks.learning import LearningEnv
+from robocas_ms3.tasks.learning import DENSE, LearningEnv
 from robocas_ms3.tasks.spec import SEARCH
 from robocas_ms3.tasks.transfer import STAGES
 
@@ -47,7 +47,6 @@ class RoboCASSearchEnv(LearningEnv):
         eye = selection_camera(self.model).pose[:3, 3]
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
         self._looked: _Look | None = None
-        self._push_point: torch.Tensor | None = None  # (N, 3), of that look
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
@@ -55,12 +54,27 @@ class RoboCASSearchEnv(LearningEnv):
             self.hidden_share = torch.zeros(self.num_envs, device=self.device)
             self._cleared_at_reset = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
             self._obstacles = torch.zeros_like(self.present)
+            self._push_point = torch.zeros(self.num_envs, 3, device=self.device)
+            self._look_again = torch.zeros_like(self._cleared_at_reset)  # whatever the time
+            self._begins = torch.zeros_like(self._cleared_at_reset)
         self._looked = None
+        self._begins[env_idx] = True
+        self._look_again[env_idx] = True
+
+    def state_beside_bodies(self) -> dict:
+        """See `TransferEnv`; ``task`` also holds ``cleared_at_reset`` (N, 1)."""
+        state = super().state_beside_bodies()
+        return {**state, "task": {**state["task"], "cleared_at_reset": self._cleared_at_reset[:, None].clone()}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state; see `RoboCASEnv`."""
+        """Set the state; see `RoboCASEnv`. The heap is looked at anew, at once."""
         super().set_state_dict(state, env_idx)
+        envs = slice(None) if env_idx is None else env_idx
         self._looked = None  # else what follows would hang on what was before
+        self._begins[envs], self._look_again[envs] = False, True
+        kept = state.get("task", {}).get("cleared_at_reset")
+        if kept is not None:
+            self._cleared_at_reset[envs] = torch.as_tensor(kept, dtype=torch.bool, device=self.device).reshape(-1)
 
     def clutter(self, envs: Any = slice(None)) -> occlusion.Clutter:
         """What hides and surrounds the targets of some envs right now."""
@@ -70,8 +84,8 @@ class RoboCASSearchEnv(LearningEnv):
     def evaluate(self) -> dict[str, torch.Tensor]:
         """See `TransferEnv`; ``cleared_at_reset`` besides."""
         found = super().evaluate()
-        begins = self.elapsed_steps == 0
-        self._cleared_at_reset = torch.where(begins, found["obstacles_cleared"], self._cleared_at_reset)
+        self._cleared_at_reset = torch.where(self._begins, found["obstacles_cleared"], self._cleared_at_reset)
+        self._begins = torch.zeros_like(self._begins)
         return {**found, "cleared_at_reset": self._cleared_at_reset}
 
     def _known_by(self, forces: Any) -> object:
@@ -83,7 +97,7 @@ class RoboCASSearchEnv(LearningEnv):
         """(N,) bool, native: whose clutter is looked at in this step."""
         every = max(1, self.control_freq // LOOKS_PER_SECOND)
         settled = native(self._stages["target_grasped"]) | native(self._stages["obstacles_cleared"])
-        return (native(self.elapsed_steps) % every == 0) & ~settled
+        return ((native(self.elapsed_steps) % every == 0) | native(self._look_again)) & ~settled
 
     def _task_stages(self, objects: Any, held: Any) -> dict[str, Any]:
         """``obstacles_cleared``, (N,) bool, of this moment; nothing in steps in which no env is looked at."""
@@ -111,7 +125,10 @@ class RoboCASSearchEnv(LearningEnv):
             found = self.clutter(envs)
             cleared[envs], self.hidden_share[envs] = found.cleared, found.hidden_share
             self._obstacles[envs] = found.obstacles
-        self._looked, self._push_point = _Look(others, poses, cleared), None
+            if self._reward_mode in DENSE:
+                points = occlusion.surface_points(poses[envs], self._surface_points[envs])
+                self._push_point[envs] = occlusion.push_point(points, found.obstacles, self.target_slot[envs])
+        self._looked, self._look_again = _Look(others, poses, cleared), self._look_again & ~due
         return cleared
 
     def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:
@@ -124,9 +141,6 @@ class RoboCASSearchEnv(LearningEnv):
         covered = (stage == self.REWARDS.index("grasp")) & ~settled
         if none(covered):
             return stage, found
-        if self._push_point is None:
-            points = occlusion.surface_points(self.object_states[..., :7], self._surface_points)
-            self._push_point = occlusion.push_point(points, self._obstacles, self.target_slot)
         found["push_point"] = rewards.closeness(self._tcp()[:, :3], native(self._push_point))
         found["clear"] = rewards.uncovered(native(self.hidden_share), native(self._obstacles.sum(dim=1)))
         return rewards.furthest(stage, [(covered, self.REWARDS.index("clear"))]), found

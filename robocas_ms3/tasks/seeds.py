@@ -93,8 +93,10 @@ class SeededEnv(BaseEnv):
         if options and "reset_to_env_states" in options:
             fix = "Reset with the seed of the recorded episode, then call set_state_dict."
             raise RobocasError("a state lacks objects, target and stages", where="reset_to_env_states", fix=fix)
-        if options and isinstance(options.get("env_idx"), np.ndarray):  # of ManiSkill's wrapper for Stable-Baselines3
-            options = {**options, "env_idx": torch.as_tensor(options["env_idx"], device=self.device)}
+        if options and "env_idx" in options:  # a list, or an array as of ManiSkill's wrapper for Stable-Baselines3
+            index = options["env_idx"]
+            index = index if isinstance(index, torch.Tensor) else torch.as_tensor(index, device=self.device)
+            options = {**options, "env_idx": index.nonzero()[:, 0] if index.dtype == torch.bool else index}
         self._resets_seeded = self._made and seed is not None
         if self.num_envs > 1:
             envs = options["env_idx"].tolist() if options and "env_idx" in options else range(self.num_envs)

@@ -1,5 +1,7 @@
 """The bank gives back what was made, makes what is missing, and knows what layouts depend on."""
 
+import subprocess
+import sys
 from dataclasses import fields, replace
 
 import numpy as np
@@ -96,3 +98,26 @@ def test_furniture_that_is_made_anew_has_layouts_of_its_own(tmp_path):
 def test_several_envs_want_each_objects_with_every_seed_and_their_own():
     assert pairs_of([0, 1]) == [(0, 0), (1, 1)]
     assert pairs_of([0, 1], [1, 7]) == [(1, 1), (1, 0), (7, 7), (7, 0), (7, 1)]
+
+
+@pytest.mark.slow
+def test_a_process_whose_physx_has_a_gpu_makes_the_same_layouts():
+    program = (
+        "import sys\nfrom sapien import physx\n"
+        "if sys.argv[1] == 'gpu':\n    physx._enable_gpu()\n"
+        "from robocas_ms3.assets.pack import load_pack\nfrom robocas_ms3.config import load_task_config\n"
+        "from robocas_ms3.scenes.bank import layout_bank\nfrom robocas_ms3.scenes.model import SceneModel\n"
+        "pack = load_pack('builtin')\n"
+        "model = SceneModel.load(load_task_config('search_table_small_heap'), pack, pack)\n"
+        "for seed in (0, 1):\n"
+        "    found = layout_bank(model, None)(seed, seed)\n"
+        "    sys.stdout.buffer.write(found.object_poses.tobytes() + bytes([found.target]))\n"
+    )
+    said = []
+    for way in ("cpu", "gpu"):
+        command = [sys.executable, "-c", program, way]
+        done = subprocess.run(command, capture_output=True, timeout=120, check=False)
+        assert done.returncode == 0, done.stderr.decode()
+        said.append(done.stdout)
+    assert len(said[0]) > 100
+    assert said[0] == said[1]

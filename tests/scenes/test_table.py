@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -50,6 +50,17 @@ def test_any_pairs_are_gathered_in_the_order_they_are_asked_for(layouts, tmp_pat
     found = table.find(*np.array(pairs).T)
     assert found is not None
     assert_same(found, LayoutBatch.of([layouts[pair] for pair in pairs]))
+
+
+def test_what_is_gathered_can_be_made_tensors(layouts, tmp_path):
+    import torch
+
+    write_table(tmp_path / "table.npy", layouts)
+    found = LayoutTable(tmp_path / "table.npy").find(np.array([5, 7]), np.array([40, 10]))
+    assert found is not None
+    for field in fields(found):
+        value = getattr(found, field.name)
+        assert torch.as_tensor(value).tolist() == value.tolist()
 
 
 def test_what_it_lacks_it_does_not_make_up(layouts, tmp_path):

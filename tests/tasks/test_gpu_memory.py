@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -16,7 +17,19 @@ from robocas_ms3.errors import SimulationError
 from robocas_ms3.tasks.engine_errors import EngineErrors
 from robocas_ms3.tasks.gpu_memory import gpu_memory
 
-COMPLAINT = "PhysX Internal CUDA error: Contact buffer overflow detected, please increase its size to at least 3145728"
+COMPLAINT = "[2026-01-01 00:00:00.000] [SAPIEN] [error] Contact buffer overflow detected, please increase its size to 9"
+OTHERS = (
+    "[SAPIEN] [critical] the application need to increase the PxgDynamicsMemoryConfig::foundLostPairsCapacity "
+    "parameter to 3000, otherwise the simulation will miss interactions",
+    "[SAPIEN] [error] PhysX Internal CUDA error. Simulation can not continue!",
+    "[SAPIEN] [error] PxgPinnedHostLinearMemoryAllocator: overflowing initial allocation size, increase capacity to at "
+    "least 9",
+)
+HARMLESS = (
+    "RuntimeWarning: overflow encountered in exp",
+    "[SAPIEN] [warning] the buffer is about to overflow",
+    "you may want to increase its size",
+)
 
 
 def test_few_envs_take_no_more_than_maniskills():
@@ -52,21 +65,43 @@ def heard(errors: EngineErrors) -> None:
 
 def test_an_overflow_is_an_error_that_says_what_to_do_and_is_passed_on(capfd):
     with listening() as errors:
-        os.write(2, f"[error] {COMPLAINT}\nand something else\n".encode())
-        with pytest.raises(SimulationError, match=r"ran out of memory.*at least 3145728.*gpu_memory_config"):
+        os.write(2, f"{COMPLAINT}\n{COMPLAINT}\nand something else\n".encode())
+        with pytest.raises(SimulationError, match=r"ran out of memory.*its size to 9.*gpu_memory_config"):
             heard(errors)
         errors.check()  # once
-    assert f"[error] {COMPLAINT}\nand something else\n" in capfd.readouterr().err
+    assert f"{COMPLAINT}\n{COMPLAINT}\nand something else\n" in capfd.readouterr().err
 
 
-def test_a_line_that_comes_in_pieces_is_understood_and_others_are_not_minded(capfd):
+@pytest.mark.parametrize("line", OTHERS)
+def test_other_complaints_are_understood(line, capfd):
     with listening() as errors:
-        os.write(2, b"a warning about nothing\n" + COMPLAINT[:40].encode())
-        time.sleep(0.05)
-        errors.check()
-        os.write(2, COMPLAINT[40:].encode() + b"\n")
+        os.write(2, f"{line}\n".encode())
         with pytest.raises(SimulationError):
             heard(errors)
+
+
+def test_what_others_write_is_not_minded(capfd):
+    with listening() as errors:
+        os.write(2, "\n".join(HARMLESS).encode() + b"\n")
+        time.sleep(0.2)
+        errors.check()
+
+
+def test_two_may_listen_and_the_last_one_gives_standard_error_back(capfd):
+    before = os.fstat(2)
+    one, two = EngineErrors(), EngineErrors()
+    os.write(2, f"{COMPLAINT}\n".encode())
+    for errors in (one, two):
+        with pytest.raises(SimulationError):
+            heard(errors)
+    one.close()
+    one.close()
+    assert not os.path.samestat(os.fstat(2), before)
+    os.write(2, f"{COMPLAINT}\n".encode())
+    with pytest.raises(SimulationError):
+        heard(two)
+    two.close()
+    assert os.path.samestat(os.fstat(2), before)
 
 
 def test_closing_leaves_a_standard_error_alone_that_is_not_its_own(capfd, tmp_path):
@@ -81,16 +116,12 @@ def test_closing_leaves_a_standard_error_alone_that_is_not_its_own(capfd, tmp_pa
     assert (tmp_path / "other").read_text() == "mine"
 
 
-def test_standard_error_is_given_back_even_where_nobody_closes():
+def test_what_a_crashing_process_says_is_not_lost():
     program = (
-        "import os\nfrom robocas_ms3.tasks.engine_errors import EngineErrors\n"
-        "one = EngineErrors()\nos.write(2, b'first\\n')\none.close()\nos.write(2, b'second\\n')\n"
-        "two = EngineErrors()\nos.write(2, b'third\\n')\n"
+        "import faulthandler, os\nfrom robocas_ms3.tasks.engine_errors import EngineErrors\nfaulthandler.enable()\n"
+        "errors = EngineErrors()\nos.write(2, b'x' * 300_000 + b'\\n')\nos.abort()\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60, check=False)
-    assert done.returncode == 0
-    assert [line for line in done.stderr.decode().splitlines() if line in {"first", "second", "third"}] == [
-        "first",
-        "second",
-        "third",
-    ]
+    assert done.returncode == -signal.SIGABRT
+    assert b"x" * 300_000 in done.stderr
+    assert b"Fatal Python error: Aborted" in done.stderr

@@ -100,6 +100,24 @@ def test_a_target_that_lies_clear_from_the_beginning_is_told_from_one_that_was_c
     assert not bool(info["cleared_at_reset"][0])
 
 
+def test_a_restored_heap_is_looked_at_at_once(env):
+    seed = covered_seed(env)
+    base = env.unwrapped
+    before, share = base.get_state_dict(), base.hidden_share.clone()
+    take_away_the_others(base)
+    assert hold(env)
+    cleared = base.get_state_dict()
+    base.set_state_dict(before)
+    info = base.get_info()
+    assert torch.equal(base.hidden_share, share)
+    assert not bool(info["obstacles_cleared"][0])
+    env.reset(seed=seed)
+    base.set_state_dict(cleared)
+    info = base.get_info()
+    assert bool(info["obstacles_cleared"][0])
+    assert not bool(info["cleared_at_reset"][0])
+
+
 def test_a_target_that_was_pulled_out_has_not_been_cleared(env):
     env.reset(seed=covered_seed(env))
     base = env.unwrapped
