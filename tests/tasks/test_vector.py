@@ -321,6 +321,10 @@ def test_what_goes_wrong_in_a_process(capfd):
         assert torch.equal(env.reset(seed=0)[0], begun)
         with pytest.raises(VectorEnvError, match="Unsendable: lost somewhere"):
             env.step(doing(3, 0, 0, 0))
+        env.reset(seed=0)
+        with pytest.raises(TypeError, match="pickle.*lock") as error:
+            env.step(doing(0, 6, 0, 0))
+        assert "env 1" in str(error.value.__cause__)
         # interrupted in the middle of a step
         env.reset(seed=0)
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()

@@ -197,7 +197,7 @@ class ProcessEnv(gym.Env):
     def _infos(self, answers: list[dict | None]) -> dict[str, Any]:
         """Infos of all envs; those that aren't numbers of each step as lists, None for the envs that have none."""
         infos = torch_clone_dict(self._info)
-        rest = {env: said for answer in answers if answer for env, said in answer.items()}
+        rest = {env: pickle.loads(said) for answer in answers if answer for env, said in answer.items()}
         gathered: dict[tuple[str, ...], Any] = {}
         for path in {path: None for said in rest.values() for path in said}:
             gathered[path] = [rest.get(env, {}).get(path) for env in range(self.num_envs)]

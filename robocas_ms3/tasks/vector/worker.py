@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from robocas_ms3.errors import LayoutError, VectorEnvError
-from robocas_ms3.tasks.vector.block import Block, Field, Path, leaves, space_fields
+from robocas_ms3.tasks.vector.block import Block, Field, leaves, space_fields
 from robocas_ms3.tasks.vector.handle import LEAVE, NUMBER, STEP, EnvFailed, name_envs
 
 FIRST_SEED = 2022  # of env 0's resets without a seed, as in ManiSkill; env 1 has the next
@@ -193,7 +193,7 @@ class _Worker:
         self.actions, self.at_work = arrays["action",], arrays["at_work",]
         self.reward, self.terminated, self.truncated = (arrays[name,] for name in ("reward", "terminated", "truncated"))
         self.obs, self.info = block.under("obs"), block.under("info")
-        self.rest: dict[int, dict[Path, Any]] = {}  # infos for which the shared memory has no place
+        self.rest: dict[int, bytes] = {}  # pickled infos for which the shared memory has no place, by their paths
 
     def obey(self, command: Share | Reset | Call | None) -> Any:
         """Do as told, None: step. What is to be answered: an `EnvFailed`, results of a call, `rest`, or None."""
@@ -245,7 +245,7 @@ class _Worker:
             lacking = [".".join(path) for path in [*self.obs, *self.info] if path not in there]
             raise VectorEnvError("observation or info lacks what it had at first", expected=lacking)
         if rest:
-            self.rest[env] = rest
+            self.rest[env] = pickle.dumps(rest)  # here: if that can't be, it is this environment's error
 
     def call(self, env: int, command: Call) -> Any:
         """The method's result, or the attribute."""
