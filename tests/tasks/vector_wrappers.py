@@ -52,6 +52,8 @@ class Wins(gym.Wrapper):
         obs, _, _, truncated, info = self.env.step(action)
         won = (info["elapsed_steps"] == 2) & bool(action[0] > 0)
         info = {**info, "success": won, "note": f"step {int(info['elapsed_steps'])}", "more": torch.ones(1, 2)}
+        if won:
+            info["of_some"] = torch.ones(1)
         return obs, won.float(), won.clone(), truncated, info
 
 
