@@ -282,7 +282,8 @@ def test_infos_observations_and_metrics_in_numpy():
         assert info["elapsed_steps"].tolist() == [0, 2, 0]
         final = info["final_info"]
         assert final["note"] == ["step 2"] * 3
-        assert final["more"][1].tolist() == [[1, 1]]
+        assert final["more"].tolist() == [[1, 1]] * 3
+        assert [type(some) for some in final["of_some"]] == [np.ndarray, type(None), np.ndarray]
         assert final["episode"]["success_once"].tolist() == [True, False, True]
         assert info["final_observation"]["agent"]["qpos"].shape == (3, 12)
         for _ in range(2):
@@ -291,6 +292,17 @@ def test_infos_observations_and_metrics_in_numpy():
         assert info["final_info"]["episode"]["success_at_end"].tolist() == [False, False, False]
         assert env.unwrapped.call("control_freq") == (20, 20, 20)
         assert len({len(one["actors"]) for one in env.unwrapped.call("get_state_dict")}) == 1
+
+
+@slow
+def test_terms_of_the_reward_are_batched():
+    with closing(make(3, 2, reward_mode="dense", arrays="numpy")) as env:
+        env.reset(seed=0)
+        *_, info = env.step(doing(0, 1, 0))
+        *_, last = [env.step(doing(0, 1, 0)) for _ in range(HORIZON - 1)][-1]
+        for terms in (info["reward_terms"], last["final_info"]["reward_terms"]):
+            assert {(type(term), term.shape, term.dtype.kind) for term in terms.values()} == {(np.ndarray, (3,), "f")}
+        assert not np.array_equal(*([terms[i] for terms in info["reward_terms"].values()] for i in (0, 1)))
 
 
 @slow
@@ -321,6 +333,10 @@ def test_what_goes_wrong_in_a_process(capfd):
         assert torch.equal(env.reset(seed=0)[0], begun)
         with pytest.raises(VectorEnvError, match="Unsendable: lost somewhere"):
             env.step(doing(3, 0, 0, 0))
+        env.reset(seed=0)
+        with pytest.raises(TypeError, match="pickle.*lock") as error:
+            env.step(doing(0, 6, 0, 0))
+        assert "env 1" in str(error.value.__cause__)
         # interrupted in the middle of a step
         env.reset(seed=0)
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 
 import gymnasium as gym
@@ -25,7 +26,10 @@ class Unsendable(Exception):
 
 
 class Misbehaves(gym.Wrapper):
-    """First number of an action: 2 an error, 3 one that can't be sent, 4 the process is killed, 5 takes 3 s."""
+    """First number of an action: 2 an error, 3 one that can't be sent, 4 the process is killed, 5 takes 3 s.
+
+    6: a lock in the info.
+    """
 
     def step(self, action):
         what = round(float(action[0]))
@@ -37,7 +41,8 @@ class Misbehaves(gym.Wrapper):
             os.kill(os.getpid(), signal.SIGKILL)
         if what == 5:
             time.sleep(3)
-        return self.env.step(action)
+        *result, info = self.env.step(action)
+        return *result, {**info, "lock": threading.Lock()} if what == 6 else info
 
 
 class Wins(gym.Wrapper):
@@ -47,6 +52,8 @@ class Wins(gym.Wrapper):
         obs, _, _, truncated, info = self.env.step(action)
         won = (info["elapsed_steps"] == 2) & bool(action[0] > 0)
         info = {**info, "success": won, "note": f"step {int(info['elapsed_steps'])}", "more": torch.ones(1, 2)}
+        if won:
+            info["of_some"] = torch.ones(1)
         return obs, won.float(), won.clone(), truncated, info
 
 

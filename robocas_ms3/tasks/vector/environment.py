@@ -50,4 +50,4 @@ def _as_numpy(nested: Any) -> Any:
         return nested.cpu().numpy()
     if isinstance(nested, dict):
         return {name: _as_numpy(value) for name, value in nested.items()}
-    return tuple(map(_as_numpy, nested)) if isinstance(nested, tuple) else nested
+    return type(nested)(map(_as_numpy, nested)) if type(nested) in (tuple, list) else nested

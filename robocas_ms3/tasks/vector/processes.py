@@ -19,7 +19,7 @@ from robocas_ms3.errors import VectorEnvError, WorkerDied
 from robocas_ms3.tasks.seeds import following_seeds
 from robocas_ms3.tasks.vector.block import Block, nest, open_memory
 from robocas_ms3.tasks.vector.handle import STEP, EnvFailed, WorkerHandle, close_all, name_envs
-from robocas_ms3.tasks.vector.worker import Call, Made, Order, Reset, Share
+from robocas_ms3.tasks.vector.worker import Call, Made, Order, Reset, Row, Share
 
 
 class ProcessEnv(gym.Env):
@@ -195,12 +195,12 @@ class ProcessEnv(gym.Env):
         return answers
 
     def _infos(self, answers: list[dict | None]) -> dict[str, Any]:
-        """Infos of all envs; those that aren't numbers of each step as lists, None for the envs that have none."""
+        """Infos of all envs; what isn't a tensor (1, ...) of each env as a list, None for the envs that have none."""
         infos = torch_clone_dict(self._info)
-        rest = {env: said for answer in answers if answer for env, said in answer.items()}
+        rest = {env: pickle.loads(said) for answer in answers if answer for env, said in answer.items()}
         gathered: dict[tuple[str, ...], Any] = {}
         for path in {path: None for said in rest.values() for path in said}:
-            gathered[path] = [rest.get(env, {}).get(path) for env in range(self.num_envs)]
+            gathered[path] = Row.join([rest.get(env, {}).get(path) for env in range(self.num_envs)])
         if ("reconfigure",) in gathered:
             gathered["reconfigure",] = any(gathered["reconfigure",])
         return {**infos, **nest(gathered)} if gathered else infos
