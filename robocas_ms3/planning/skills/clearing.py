@@ -83,7 +83,7 @@ class Heap:
 
     @property
     def uncovered(self) -> bool:
-        """Whether the target is free, by the paper's rule, as seen from straight above."""
+        """Whether the target is free, by the paper's rule, as the camera above sees it."""
         return bool(self.clutter().cleared[0])
 
     @property
