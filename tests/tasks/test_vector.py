@@ -317,6 +317,8 @@ def test_a_seed_without_a_layout_is_an_error_where_it_was_asked_for():
             env.reset(seed=[4, 5])
         assert torch.equal(drawn, env.reset(seed=4)[0])
         assert torch.equal(drawn[0], env.reset(seed=6)[0][1])  # after the last seed of the range comes its first
+        with pytest.raises(LayoutError, match="none was drawn"):  # without a seed env 1 does what it does alone
+            env.reset(options={"draws_none_after": 4})
 
 
 @slow

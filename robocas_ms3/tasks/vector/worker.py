@@ -85,7 +85,7 @@ class Reset:
     """A command: reset some environments.
 
     Attributes:
-        seeds: of each env to be reset its seed or None, and whether that seed must have a layout.
+        seeds: of each env to be reset its seed or None, and whether another may take its place if it has no layout.
         options: for each of them.
     """
 
@@ -243,12 +243,12 @@ class _Worker:
         self.terminated[env], self.truncated[env] = bool(terminated), bool(truncated)
         self.show(env, obs, info)
 
-    def reset(self, env: int, seed: int | None, strict: bool, options: dict) -> None:
-        """Reset; without a layout for a seed that need not have one go on to another, the next of the seed's stream."""
+    def reset(self, env: int, seed: int | None, replaceable: bool, options: dict) -> None:
+        """Reset; without a layout for a seed that may be replaced go on to the next of the seed's stream."""
         try:
             obs, info = self.envs[env].reset(seed=seed, options=options)
         except LayoutError as error:
-            if strict:
+            if not replaceable:
                 raise
             _log.warning("env %d: no layout for seed %d, another is drawn: %s", env, seed, error)
             obs, info = self.envs[env].reset(options=options)
