@@ -398,6 +398,20 @@ def test_gymnasium_makes_the_same():
 
 
 @slow
+def test_envs_that_keep_their_objects_have_those_that_gym_makes():
+    kwargs = {"reconfiguration_freq": 0, "seeds": (100, 199), **STATE_ONLY}
+    plain = gym.make("RoboCASPick-v1", **kwargs)
+    with closing(robocas_ms3.make_vec("RoboCASPick-v1", 2, backend="processes", workers=1, **kwargs)) as env:
+        unseeded, seeded = env.reset()[0], env.reset(seed=[5, 5])[0]
+        assert [int(seed[0]) for seed in env.call("_objects_seeds")] == [122, 123]  # 2022 and 2023, within the range
+    assert torch.equal(unseeded[0], plain.reset()[0][0])
+    assert torch.equal(seeded[0], plain.reset(seed=5)[0][0])
+    plain.reset(seed=123, options={"reconfigure": True})
+    assert torch.equal(seeded[1], plain.reset(seed=5)[0][0])
+    plain.close()
+
+
+@slow
 def test_errors_of_making_arrive_as_themselves():
 
     with pytest.raises(ConfigError, match="no_such_config") as error:

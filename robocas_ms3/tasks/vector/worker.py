@@ -207,11 +207,14 @@ class _Worker:
         made: Any = gym.make(order.env_id, **order.kwargs)
         self.envs[env] = made
         base = made.unwrapped
-        base._set_main_rng([FIRST_SEED + env])
+        if env > 0:  # ManiSkill makes each with the first one's seed
+            base._set_main_rng([FIRST_SEED + env])
+            if base.reconfiguration_freq == 0:  # its scene stays
+                base._made = False  # nobody asked for this seed either: `SeededEnv`
+                base.reset(seed=[FIRST_SEED + env], options={"reconfigure": True})
+                base._made = True
         for wrap in order.wrappers:
             made = self.envs[env] = wrap(made)
-        if base.reconfiguration_freq == 0:  # else its scene would stay that of the seed that ManiSkill makes all with
-            made.reset(options={"reconfigure": True})
 
     def share(self, command: Share) -> None:
         """Read actions from shared memory, and write what comes of them there."""
