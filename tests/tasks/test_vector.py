@@ -142,6 +142,13 @@ def test_an_episode_that_ends_with_success_succeeded_at_its_end():
     assert info["final_info"]["episode"]["success_at_end"].tolist() == [True, False, False]
 
 
+def test_calls_reach_through_wrappers():
+    env = RoboCASVectorEnv(gym.Wrapper(FakeBatch()))
+    env.reset()
+    assert env.call("elapsed_steps").tolist() == [0, 0, 0]
+    assert len(env.call("step", None)) == 5
+
+
 def test_a_gpu_gets_the_same_arguments_in_one_batch(monkeypatch):
     with_gpu(monkeypatch, True)
     monkeypatch.setattr(vector.gym, "make", lambda env_id, **kwargs: FakeBatch(env_id=env_id, **kwargs))
