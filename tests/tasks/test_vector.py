@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from vector_wrappers import LacksLayouts, Misbehaves, OwnError, Wins
+from vector_wrappers import LacksLayouts, Misbehaves, Narrow, OwnError, Wins
 
 import robocas_ms3
 from robocas_ms3.errors import ConfigError, LayoutError, VectorEnvError, WorkerDied
@@ -374,6 +374,13 @@ def test_what_goes_wrong_in_a_process(capfd):
         env.close()
     env.close()
     assert "Traceback" not in capfd.readouterr().err
+
+
+@slow
+def test_observations_of_another_shape_need_a_space():
+    words = r"obs.*expected \(1, \d\d+\), found \(1, 1\).*single_observation_space"
+    with closing(make(1, 1, wrappers=[Narrow])) as env, pytest.raises(VectorEnvError, match=words):
+        env.reset(seed=0)
 
 
 @slow

@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import LayoutError, VectorEnvError
-from robocas_ms3.tasks.vector.block import Block, Field, leaves, space_fields
+from robocas_ms3.tasks.vector.block import Block, Field, Path, leaves, space_fields
 from robocas_ms3.tasks.vector.handle import LEAVE, NUMBER, STEP, EnvFailed, name_envs
 
 FIRST_SEED = 2022  # of env 0's resets without a seed, as in ManiSkill; env 1 has the next
@@ -261,12 +261,15 @@ class _Worker:
         """Write what an environment observes."""
         written = 0
         for path, leaf in leaves(obs):
-            self.obs[path][env] = _row(leaf)
+            if path not in self.obs:
+                fix = "A wrapper that adds one needs a single_observation_space."
+                raise VectorEnvError("no such observation at first", where=".".join(path), fix=fix)
+            _write(leaf, self.obs[path][env : env + 1], ("obs", *path))
             written += 1
         rest = {}
         for path, leaf in leaves(info):
             if path in self.info:
-                self.info[path][env] = _row(leaf)
+                _write(leaf, self.info[path][env : env + 1], ("info", *path))
                 written += 1
             else:
                 rest[path] = Row.of(leaf)
@@ -285,9 +288,13 @@ class _Worker:
         return result
 
 
-def _row(leaf: Any) -> Any:
-    """The one env's row of a batch of one."""
-    return (leaf.cpu().numpy() if isinstance(leaf, torch.Tensor) else leaf)[0]
+def _write(leaf: Any, row: NDArray[Any], path: Path) -> None:
+    """Write a batch of one env to its row (1, ...)."""
+    shape = tuple(np.shape(leaf))
+    if shape != row.shape:  # NumPy would repeat what is smaller
+        where, fix = ".".join(path), "A wrapper that changes it needs a single_observation_space." * (path[0] == "obs")
+        raise VectorEnvError("has not the shape it had at first", where=where, expected=row.shape, found=shape, fix=fix)
+    row[...] = leaf.cpu().numpy() if isinstance(leaf, torch.Tensor) else leaf
 
 
 def _describe(env: gym.Env) -> Made:
