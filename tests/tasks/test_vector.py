@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from vector_wrappers import LacksLayouts, Misbehaves, OwnError, Wins
+from vector_wrappers import LacksLayouts, Misbehaves, Narrow, OwnError, Wins
 
 import robocas_ms3
 from robocas_ms3.errors import ConfigError, LayoutError, VectorEnvError, WorkerDied
@@ -140,6 +140,13 @@ def test_an_episode_that_ends_with_success_succeeded_at_its_end():
     *_, info = env.step(None)
     assert info["_final_info"].tolist() == [True, False, False]
     assert info["final_info"]["episode"]["success_at_end"].tolist() == [True, False, False]
+
+
+def test_calls_reach_through_wrappers():
+    env = RoboCASVectorEnv(gym.Wrapper(FakeBatch()))
+    env.reset()
+    assert env.call("elapsed_steps").tolist() == [0, 0, 0]
+    assert len(env.call("step", None)) == 5
 
 
 def test_a_gpu_gets_the_same_arguments_in_one_batch(monkeypatch):
@@ -317,6 +324,8 @@ def test_a_seed_without_a_layout_is_an_error_where_it_was_asked_for():
             env.reset(seed=[4, 5])
         assert torch.equal(drawn, env.reset(seed=4)[0])
         assert torch.equal(drawn[0], env.reset(seed=6)[0][1])  # after the last seed of the range comes its first
+        with pytest.raises(LayoutError, match="none was drawn"):  # without a seed env 1 does what it does alone
+            env.reset(options={"draws_none_after": 4})
 
 
 @slow
@@ -368,6 +377,13 @@ def test_what_goes_wrong_in_a_process(capfd):
 
 
 @slow
+def test_observations_of_another_shape_need_a_space():
+    words = r"obs.*expected \(1, \d\d+\), found \(1, 1\).*single_observation_space"
+    with closing(make(1, 1, wrappers=[Narrow])) as env, pytest.raises(VectorEnvError, match=words):
+        env.reset(seed=0)
+
+
+@slow
 def test_a_busy_process_is_not_waited_for():
     env = make(1, 1, wrappers=[Misbehaves])
     env.reset(seed=0)
@@ -393,6 +409,20 @@ def test_gymnasium_makes_the_same():
         env.reset(seed=0)
         *_, truncated, _ = env.step(doing(0, 0))
         assert truncated.tolist() == [True, True]
+
+
+@slow
+def test_envs_that_keep_their_objects_have_those_that_gym_makes():
+    kwargs = {"reconfiguration_freq": 0, "seeds": (100, 199), **STATE_ONLY}
+    plain = gym.make("RoboCASPick-v1", **kwargs)
+    with closing(robocas_ms3.make_vec("RoboCASPick-v1", 2, backend="processes", workers=1, **kwargs)) as env:
+        unseeded, seeded = env.reset()[0], env.reset(seed=[5, 5])[0]
+        assert [int(seed[0]) for seed in env.call("_objects_seeds")] == [122, 123]  # 2022 and 2023, within the range
+    assert torch.equal(unseeded[0], plain.reset()[0][0])
+    assert torch.equal(seeded[0], plain.reset(seed=5)[0][0])
+    plain.reset(seed=123, options={"reconfigure": True})
+    assert torch.equal(seeded[1], plain.reset(seed=5)[0][0])
+    plain.close()
 
 
 @slow

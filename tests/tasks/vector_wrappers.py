@@ -57,11 +57,19 @@ class Wins(gym.Wrapper):
         return obs, won.float(), won.clone(), truncated, info
 
 
+class Narrow(gym.ObservationWrapper):
+    """Shows the first number alone, and does not say so."""
+
+    def observation(self, observation):
+        return observation[:, :1]
+
+
 class LacksLayouts(gym.Wrapper):
-    """There is no layout for seed 5."""
+    """There is no layout for seed 5, nor every other time without a seed if the last one was ``draws_none_after``."""
 
     def __init__(self, env):
         super().__init__(env)
+        self.times = 0
         base, layouts = env.unwrapped, env.unwrapped._layouts
 
         def fussy(objects, seed):
@@ -70,3 +78,10 @@ class LacksLayouts(gym.Wrapper):
             return layouts(objects, seed)
 
         base._layouts = fussy
+
+    def reset(self, *, seed=None, options=None):
+        if seed is None and self.unwrapped._main_seed[0] == options.get("draws_none_after"):
+            self.times += 1
+            if self.times % 2:
+                raise LayoutError("none was drawn", where="layout")
+        return self.env.reset(seed=seed, options=options)

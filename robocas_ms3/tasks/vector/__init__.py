@@ -39,7 +39,8 @@ def make_vec(
     ``success_once``, ``success_at_end``. ``reset(seed=..., options={"env_idx": ...})`` resets some envs.
 
     In processes, what an env does follows from its seeds and actions alone, not from ``num_envs`` or ``workers``, and
-    is what ``gym.make`` gives. Close it, or let it be collected: its processes end with it, and with this one.
+    is what ``gym.make`` gives; with ``reconfiguration_freq=0`` env i keeps the objects of seed 2022 + i. Close it, or
+    let it be collected: its processes end with it, and with this one.
 
     Args:
         env_id: gymnasium's, such as ``RoboCASPick-v1``; ``module:Id-v1`` imports the module first.

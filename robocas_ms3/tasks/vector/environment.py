@@ -27,10 +27,11 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
         return obs, reward, terminated, truncated, info  # pyright: ignore[reportReturnType]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        """What a method gives: in processes a tuple with each env's result, on a GPU the batched environment's."""
+        """What a method gives, or an attribute: in processes a tuple of each env's, on a GPU the whole batch's."""
         if isinstance(self._env, ProcessEnv):
             return self._env.call(name, *args, **kwargs)
-        return super().call(name, *args, **kwargs)
+        found = self._env.get_wrapper_attr(name)  # ManiSkill's own does not look behind the outermost wrapper
+        return found(*args, **kwargs) if callable(found) else found
 
 
 class NumpyVectorEnv(gym.vector.VectorWrapper):

@@ -112,14 +112,14 @@ class ProcessEnv(gym.Env):
 
         Raises:
             VectorEnvError: seeds or envs don't fit.
-            LayoutError: there is no layout for a seed that was asked for.
+            LayoutError: there is no layout for a seed that was asked for, or for many that were drawn.
         """
         options = dict(options or {})
         envs = self._numbers(options.pop("env_idx")) if "env_idx" in options else list(range(self.num_envs))
         seeds = self._seeds(seed, len(envs))
-        # of a single seed only the first env's was asked for
-        strict = [np.ndim(seed) > 0 or i == 0 for i in range(len(envs))]
-        asked = dict(zip(envs, zip(seeds, strict, strict=True), strict=True))
+        # Of a single seed only the first env's was asked for. Without a seed each env looks for a possible one itself.
+        replaceable = [seed is not None and np.ndim(seed) == 0 and i > 0 for i in range(len(envs))]
+        asked = dict(zip(envs, zip(seeds, replaceable, strict=True), strict=True))
         self._must_reset |= set(envs)
         messages = [
             pickle.dumps(Reset({env: asked[env] for env in worker.envs if env in asked}, options))

@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import LayoutError, VectorEnvError
-from robocas_ms3.tasks.vector.block import Block, Field, leaves, space_fields
+from robocas_ms3.tasks.vector.block import Block, Field, Path, leaves, space_fields
 from robocas_ms3.tasks.vector.handle import LEAVE, NUMBER, STEP, EnvFailed, name_envs
 
 FIRST_SEED = 2022  # of env 0's resets without a seed, as in ManiSkill; env 1 has the next
@@ -85,7 +85,7 @@ class Reset:
     """A command: reset some environments.
 
     Attributes:
-        seeds: of each env to be reset its seed or None, and whether that seed must have a layout.
+        seeds: of each env to be reset its seed or None, and whether another may take its place if it has no layout.
         options: for each of them.
     """
 
@@ -207,11 +207,14 @@ class _Worker:
         made: Any = gym.make(order.env_id, **order.kwargs)
         self.envs[env] = made
         base = made.unwrapped
-        base._set_main_rng([FIRST_SEED + env])
+        if env > 0:  # ManiSkill makes each with the first one's seed
+            base._set_main_rng([FIRST_SEED + env])
+            if base.reconfiguration_freq == 0:  # its scene stays
+                base._made = False  # nobody asked for this seed either: `SeededEnv`
+                base.reset(seed=[FIRST_SEED + env], options={"reconfigure": True})
+                base._made = True
         for wrap in order.wrappers:
             made = self.envs[env] = wrap(made)
-        if base.reconfiguration_freq == 0:  # else its scene would stay that of the seed that ManiSkill makes all with
-            made.reset(options={"reconfigure": True})
 
     def share(self, command: Share) -> None:
         """Read actions from shared memory, and write what comes of them there."""
@@ -243,12 +246,12 @@ class _Worker:
         self.terminated[env], self.truncated[env] = bool(terminated), bool(truncated)
         self.show(env, obs, info)
 
-    def reset(self, env: int, seed: int | None, strict: bool, options: dict) -> None:
-        """Reset; without a layout for a seed that need not have one go on to another, the next of the seed's stream."""
+    def reset(self, env: int, seed: int | None, replaceable: bool, options: dict) -> None:
+        """Reset; without a layout for a seed that may be replaced go on to the next of the seed's stream."""
         try:
             obs, info = self.envs[env].reset(seed=seed, options=options)
         except LayoutError as error:
-            if strict:
+            if not replaceable:
                 raise
             _log.warning("env %d: no layout for seed %d, another is drawn: %s", env, seed, error)
             obs, info = self.envs[env].reset(options=options)
@@ -258,12 +261,15 @@ class _Worker:
         """Write what an environment observes."""
         written = 0
         for path, leaf in leaves(obs):
-            self.obs[path][env] = _row(leaf)
+            if path not in self.obs:
+                fix = "A wrapper that adds one needs a single_observation_space."
+                raise VectorEnvError("no such observation at first", where=".".join(path), fix=fix)
+            _write(leaf, self.obs[path][env : env + 1], ("obs", *path))
             written += 1
         rest = {}
         for path, leaf in leaves(info):
             if path in self.info:
-                self.info[path][env] = _row(leaf)
+                _write(leaf, self.info[path][env : env + 1], ("info", *path))
                 written += 1
             else:
                 rest[path] = Row.of(leaf)
@@ -282,9 +288,13 @@ class _Worker:
         return result
 
 
-def _row(leaf: Any) -> Any:
-    """The one env's row of a batch of one."""
-    return (leaf.cpu().numpy() if isinstance(leaf, torch.Tensor) else leaf)[0]
+def _write(leaf: Any, row: NDArray[Any], path: Path) -> None:
+    """Write a batch of one env to its row (1, ...)."""
+    shape = tuple(np.shape(leaf))
+    if shape != row.shape:  # NumPy would repeat what is smaller
+        where, fix = ".".join(path), "A wrapper that changes it needs a single_observation_space." * (path[0] == "obs")
+        raise VectorEnvError("has not the shape it had at first", where=where, expected=row.shape, found=shape, fix=fix)
+    row[...] = leaf.cpu().numpy() if isinstance(leaf, torch.Tensor) else leaf
 
 
 def _describe(env: gym.Env) -> Made:
