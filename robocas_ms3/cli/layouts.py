@@ -95,9 +95,10 @@ def build(command: Build) -> int:
                 failures += 1
                 which = f"seed {seed}" if objects is None else f"objects {chosen}, seed {seed}"
                 progress.console.print(f"{which}: {problem}", highlight=False)
+    if objects is not None:  # for several envs, whose resets then read one file
+        with Console(stderr=True).status("writing them as one file"):
+            bank.write_table(pairs)
     console = Console(highlight=False, soft_wrap=True)
-    if objects is not None:
-        bank.write_table(pairs)  # for several envs, whose resets then read one file
     made = len(pairs) - there - failures
     console.print(f"{made} layouts made, {there} were there already, {failures} seeds have none")
     console.print(f"bank: {bank.folder}")

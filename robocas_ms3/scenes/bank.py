@@ -119,7 +119,12 @@ class LayoutBank:
             return None
 
     def write_table(self, pairs: Iterable[Pair]) -> Path:
-        """Write those layouts of some pairs of seeds that are there as one file (`LayoutTable`), if any is."""
+        """Write those layouts of some pairs of seeds that are there as one file (`LayoutTable`), if any is.
+
+        What an earlier file holds stays in it.
+        """
+        before = self.table
+        pairs = dict.fromkeys([*(before.pairs if before else []), *pairs])
         there = {pair: read_layout(self.path(*pair)) for pair in pairs if self.path(*pair).is_file()}
         if there:
             write_table(self.folder / TABLE, there)

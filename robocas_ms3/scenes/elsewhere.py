@@ -7,9 +7,10 @@ import pickle
 import subprocess
 import sys
 import weakref
+from contextlib import suppress
 from typing import Any
 
-from robocas_ms3.errors import LayoutError
+from robocas_ms3.errors import LayoutError, SimulationError
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
 
@@ -50,22 +51,24 @@ class OtherProcess:
             stdout=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": path, "ROBOCAS_DEFER_REGISTRATION": "1"},
         )
-        self._end = weakref.finalize(self, _stop, self._process)
-        self._send(model)
+        weakref.finalize(self, _stop, self._process)
+        with suppress(BrokenPipeError):  # it died at once, as the first layout will tell
+            self._send(model)
 
     def layout(self, objects_seed: int, seed: int) -> Layout:
         """The layout of two seeds; see `sample.sample_layout`.
 
         Raises:
-            LayoutError: there is none, or the process died.
+            LayoutError: there is none.
+            SimulationError: the process died.
         """
-        self._send((objects_seed, seed))
         assert self._process.stdout is not None
         try:
+            self._send((objects_seed, seed))
             answer: Any = pickle.load(self._process.stdout)
-        except EOFError as error:
+        except (EOFError, OSError) as error:  # not a `LayoutError`: another seed would not help
             found = f"exit code {self._process.wait()}"
-            raise LayoutError("the process that makes layouts died", where=f"seed {seed}", found=found) from error
+            raise SimulationError("the process that makes layouts died", where=f"seed {seed}", found=found) from error
         if isinstance(answer, LayoutError):
             raise answer
         return answer
@@ -79,5 +82,6 @@ class OtherProcess:
 def _stop(process: subprocess.Popen[bytes]) -> None:
     for pipe in (process.stdin, process.stdout):
         assert pipe is not None
-        pipe.close()
+        with suppress(BrokenPipeError):  # what a dead process was not told
+            pipe.close()
     process.wait()

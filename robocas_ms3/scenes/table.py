@@ -72,6 +72,12 @@ class LayoutTable:
         except (OSError, ValueError, IndexError, EOFError) as error:  # IndexError: no such fields
             raise LayoutError("no table of layouts", where=path, found=error, fix=_MADE_BY) from error
 
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Objects seed and seed of all layouts that it holds."""
+        there = np.asarray(self._rows[self._rows["there"]])
+        return [*zip(there["objects_seed"].tolist(), there["seed"].tolist(), strict=True)]
+
     def find(self, objects_seeds: NDArray[np.int64], seeds: NDArray[np.int64]) -> LayoutBatch | None:
         """Gather the layouts of E pairs of seeds, (E,) each; None where it lacks one of them."""
         sets, columns = np.searchsorted(self._sets, objects_seeds), np.searchsorted(self._seeds, seeds)

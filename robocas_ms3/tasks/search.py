@@ -62,19 +62,21 @@ class RoboCASSearchEnv(LearningEnv):
         self._look_again[env_idx] = True
 
     def state_beside_bodies(self) -> dict:
-        """See `TransferEnv`; ``task`` also holds ``cleared_at_reset`` (N, 1)."""
+        """See `TransferEnv`; ``task`` also holds ``cleared_at_reset`` and ``hidden_share``, (N, 1) each."""
         state = super().state_beside_bodies()
-        return {**state, "task": {**state["task"], "cleared_at_reset": self._cleared_at_reset[:, None].clone()}}
+        kept = {"cleared_at_reset": self._cleared_at_reset, "hidden_share": self.hidden_share}
+        return {**state, "task": {**state["task"], **{name: value[:, None].clone() for name, value in kept.items()}}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state; see `RoboCASEnv`. The heap is looked at anew, at once."""
+        """Set the state; see `RoboCASEnv`. A heap that is not cleared is looked at anew, at once."""
         super().set_state_dict(state, env_idx)
         envs = slice(None) if env_idx is None else env_idx
         self._looked = None  # else what follows would hang on what was before
         self._begins[envs], self._look_again[envs] = False, True
-        kept = state.get("task", {}).get("cleared_at_reset")
-        if kept is not None:
-            self._cleared_at_reset[envs] = torch.as_tensor(kept, dtype=torch.bool, device=self.device).reshape(-1)
+        if "cleared_at_reset" in (kept := state.get("task", {})):
+            self._cleared_at_reset = self._cleared_at_reset.clone()  # infos hold it
+            self._cleared_at_reset[envs] = torch.as_tensor(kept["cleared_at_reset"]).to(self.present).reshape(-1)
+            self.hidden_share[envs] = torch.as_tensor(kept["hidden_share"]).to(self.hidden_share).reshape(-1)
 
     def clutter(self, envs: Any = slice(None)) -> occlusion.Clutter:
         """What hides and surrounds the targets of some envs right now."""

@@ -318,6 +318,23 @@ def test_batched_inverse_kinematics_reaches_every_target(make_env):
     assert (reached.q * target.q).sum(dim=1).abs().min() > 1 - 1e-6
 
 
+def test_batched_inverse_kinematics_goes_far_too(make_env):
+    """Up to half a metre and 1.5 rad along every axis: whatever a CPU reaches, within limits, nearly always."""
+    _, agent = make_env("pd_ee_pose")
+    controller = agent.controller.controllers["arm"]
+    kinematics, limits = controller.kinematics, controller._limits
+    kinematics._setup_gpu()
+    rng = np.random.default_rng(2)
+    start = agent.robot.qpos[:, 3:10].repeat(64, 1)
+    middle = torch.tensor(np.array(c.ARM_EVALUATION_START), dtype=torch.float32)
+    goal = (middle + torch.tensor(rng.uniform(-0.6, 0.6, (64, 7))).float()).clamp(limits[:, 0], limits[:, 1])
+    matrices = kinematics.pk_chain.forward_kinematics(goal).get_matrix()
+    target = Pose.create_from_pq(matrices[:, :3, 3], matrix_to_quaternion(matrices[:, :3, :3]))
+    _, solved = batched_ik(kinematics, target, start, limits)
+    assert (target.p - agent.tcp_in_arm_base.p).norm(dim=1).max() > 0.4
+    assert solved.float().mean() > 0.95
+
+
 def test_batched_inverse_kinematics_keeps_to_the_limits_and_says_what_it_did_not_reach(make_env):
     _, agent = make_env("pd_ee_delta_pose")
     controller = agent.controller.controllers["arm"]

@@ -100,6 +100,17 @@ def test_several_envs_want_each_objects_with_every_seed_and_their_own():
     assert pairs_of([0, 1], [1, 7]) == [(1, 1), (1, 0), (7, 7), (7, 0), (7, 1)]
 
 
+def test_a_table_keeps_what_an_earlier_one_holds(tmp_path):
+    bank = LayoutBank(model(), tmp_path)
+    assert bank.table is None
+    for pair in ((0, 0), (0, 1), (2, 1)):
+        bank.get(*pair)
+    bank.write_table([(0, 0), (0, 1)])
+    bank.write_table([(2, 1), (2, 9)])  # of the last there is no layout yet
+    assert bank.table is not None
+    assert bank.table.pairs == [(0, 0), (0, 1), (2, 1)]
+
+
 @pytest.mark.slow
 def test_a_process_whose_physx_has_a_gpu_makes_the_same_layouts():
     program = (
