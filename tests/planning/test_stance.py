@@ -53,13 +53,13 @@ def grasps_in_world(arm) -> np.ndarray:
 def test_of_all_configurations_one_is_free_where_the_nearest_is_not(arm):
     grasps, here = grasps_in_world(arm), np.zeros(3)
     assert stance.reach_share(arm, here, grasps, []) == 1.0
-    assert stance._elbows_share(arm, here, grasps, []) == 1.0
+    assert stance.reach_share(arm, here, grasps, [], thorough=True) == 1.0
     poses = stance._poses_of_some(arm, arm_base_in_world(arm, here), grasps, len(grasps))
     solved, nearest = arm.reachability.reachable(poses, REST)
     assert solved.all()
     arm.planner.blocked = nearest
     assert stance.reach_share(arm, here, grasps, []) == 0.0
-    assert stance._elbows_share(arm, here, grasps, []) == 1.0
+    assert stance.reach_share(arm, here, grasps, [], thorough=True) == 1.0
 
 
 def test_a_grasp_counts_only_with_its_pregrasp(arm):
@@ -68,14 +68,14 @@ def test_a_grasp_counts_only_with_its_pregrasp(arm):
     half = len(poses) // 2
     everything, of_pose = arm.reachability.everything(poses, REST)
     arm.planner.blocked = everything[of_pose >= half]  # each way in
-    assert stance._elbows_share(arm, here, grasps, []) == 0.0
+    assert stance.reach_share(arm, here, grasps, [], thorough=True) == 0.0
     one_and_its_twin = np.isin(of_pose, [half, half + len(grasps)])
     arm.planner.blocked = everything[one_and_its_twin]
-    assert stance._elbows_share(arm, here, grasps, []) == pytest.approx(7 / 8)
+    assert stance.reach_share(arm, here, grasps, [], thorough=True) == pytest.approx(7 / 8)
 
 
 def test_out_of_reach_and_none_are_worth_nothing(arm):
     grasps = grasps_in_world(arm)
     for far in (grasps + np.array([[0, 0, 0, 2.0]] + [[0, 0, 0, 0]] * 3), grasps[:0]):
         assert stance.reach_share(arm, np.zeros(3), far, []) == 0.0
-        assert stance._elbows_share(arm, np.zeros(3), far, []) == 0.0
+        assert stance.reach_share(arm, np.zeros(3), far, [], thorough=True) == 0.0

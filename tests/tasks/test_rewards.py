@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,17 +12,6 @@ from robocas_ms3.tasks import rewards
 from robocas_ms3.tasks.rewards import RewardTable
 
 TABLES = {"transfer": rewards.TRANSFER, "search": rewards.SEARCH, "open_pick": rewards.OPEN_PICK}
-
-
-@pytest.fixture(params=["torch", "numpy"])
-def make(request):
-    """Arrays of both kinds that rewards take: float32, or bool, or int64."""
-
-    def as_kind(values):
-        tensor = torch.as_tensor(values)
-        return tensor if request.param == "torch" else tensor.numpy()
-
-    return as_kind
 
 
 def floats(array) -> list[float]:

@@ -12,17 +12,6 @@ YAW_90 = [math.sqrt(0.5), 0, 0, math.sqrt(0.5)]
 UPRIGHT = [1.0, 0, 0, 0]
 
 
-@pytest.fixture(params=["torch", "numpy"])
-def make(request):
-    """Arrays of both kinds that terms take, as they lie on a GPU and on a CPU: float32, or bool, or int64."""
-
-    def as_kind(values):
-        tensor = torch.as_tensor(values)
-        return tensor if request.param == "torch" else tensor.numpy()
-
-    return as_kind
-
-
 def test_rotations_are_scipys(make):
     found = Rotation.random(5, random_state=0)
     quaternions = make(found.as_quat()[:, [3, 0, 1, 2]].astype("float32").reshape(1, 5, 4))

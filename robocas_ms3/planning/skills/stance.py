@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, Obstacle
@@ -108,7 +107,11 @@ def drive_to_object(arm: Arm, slot: int, *, elsewhere: bool = False) -> None:
             )
         except PlanningFailed:  # the elbow is in the way: what else is there for it?
             route = best_route(
-                arm, goals, around, lambda goal: _elbows_share(arm, goal, grasps, others), enough=COMFORTABLE
+                arm,
+                goals,
+                around,
+                lambda goal: reach_share(arm, goal, grasps, others, thorough=True),
+                enough=COMFORTABLE,
             )
     drive(arm, *route)
 
@@ -201,7 +204,7 @@ def clear_grasps(arm: Arm, slot: int) -> Array:
     return poses[gripper_is_clear(poses, transform(base, near))]
 
 
-def reach_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle]) -> float:
+def reach_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *, thorough: bool = False) -> float:
     """Share of grasps that the arm reaches from a base pose without touching anything, pre-grasps included.
 
     Args:
@@ -209,26 +212,21 @@ def reach_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle]) ->
         base: (3,).
         grasps: (G, 4, 4) from ``clear_grasps``; those that come from the far side count as out of reach.
         others: everything but the object, in the world.
+        thorough: judge more grasps, and by every configuration, not by the nearest alone; dearer by far.
     """
     frame = arm_base_in_world(arm, base)
-    poses = _poses_of_some(arm, frame, grasps, GRASPS)
+    poses = _poses_of_some(arm, frame, grasps, GRASPS_THOROUGH if thorough else GRASPS)
     if not len(poses):
         return 0.0
-    solved, qpos = arm.reachability.reachable(poses, arm.at)
+    if thorough:
+        qpos, of_pose = arm.reachability.everything(poses, arm.at)
+    else:
+        solved, nearest = arm.reachability.reachable(poses, arm.at)
+        qpos, of_pose = nearest[solved], np.flatnonzero(solved)
     arm.planner.set_scene(seen_from(others, frame))
-    solved[solved] = arm.planner.free(qpos[solved])
-    return _share(solved)
-
-
-def _elbows_share(arm: Arm, base: Array, grasps: Array, others: list[Obstacle]) -> float:
-    """Judge as ``reach_share``, of more grasps and by every configuration, not by the nearest alone; dearer by far."""
-    frame = arm_base_in_world(arm, base)
-    poses = _poses_of_some(arm, frame, grasps, GRASPS_THOROUGH)
-    if not len(poses):
-        return 0.0
-    qpos, of_pose = arm.reachability.everything(poses, arm.at)
-    arm.planner.set_scene(seen_from(others, frame))
-    return _share(np.bincount(of_pose[arm.planner.free(qpos)], minlength=len(poses)) > 0)
+    possible = np.bincount(of_pose[arm.planner.free(qpos)], minlength=len(poses)) > 0
+    held, entered = possible.reshape(2, 2, -1)  # grasp or pre-grasp; as annotated or its twin; which
+    return float((held & entered).any(axis=0).mean())
 
 
 def _poses_of_some(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
@@ -239,12 +237,6 @@ def _poses_of_some(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
     before = poses.copy()
     before[:, :3, 3] -= PREGRASP_DISTANCE * before[:, :3, 2]
     return np.concatenate([poses, before])
-
-
-def _share(possible: NDArray[np.bool_]) -> float:
-    """Share of grasps that are possible and can be entered; of poses as ``_poses_of_some`` gives them."""
-    held, entered = possible.reshape(2, 2, -1)  # grasp or pre-grasp; as annotated or its twin; which
-    return float((held & entered).any(axis=0).mean())
 
 
 def _from_here(arm: Arm, frame: Array, grasps: Array) -> Array:
