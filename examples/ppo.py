@@ -1,6 +1,6 @@
-"""PPO learns to reach for one of a few fruits and lift it, on a CPU: one file, torch only.
+"""PPO learns to reach for one of a few fruits and hold it, on a CPU: one file, torch only.
 
-    python examples/ppo.py --seed 1 --minutes 6 --out out/ppo
+    python examples/ppo.py --seed 1 --minutes 10 --out out/ppo_1
 
 writes `progress.csv`, a row an update, and `policy.pt`. docs/rl.md says what came of it.
 """
