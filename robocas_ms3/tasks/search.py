@@ -73,10 +73,11 @@ class RoboCASSearchEnv(LearningEnv):
         envs = slice(None) if env_idx is None else env_idx
         self._looked = None  # else what follows would hang on what was before
         self._begins[envs], self._look_again[envs] = False, True
-        if "cleared_at_reset" in (kept := state.get("task", {})):
-            self._cleared_at_reset = self._cleared_at_reset.clone()  # infos hold it
-            self._cleared_at_reset[envs] = torch.as_tensor(kept["cleared_at_reset"]).to(self.present).reshape(-1)
-            self.hidden_share[envs] = torch.as_tensor(kept["hidden_share"]).to(self.hidden_share).reshape(-1)
+        self._cleared_at_reset = self._cleared_at_reset.clone()  # infos hold it
+        own = {"cleared_at_reset": self._cleared_at_reset, "hidden_share": self.hidden_share}
+        for name, kept in state.get("task", {}).items():
+            if name in own:
+                own[name][envs] = torch.as_tensor(kept).to(own[name]).reshape(-1)
 
     def clutter(self, envs: Any = slice(None)) -> occlusion.Clutter:
         """What hides and surrounds the targets of some envs right now."""

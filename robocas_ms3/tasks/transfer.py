@@ -109,7 +109,7 @@ class TransferEnv(RoboCASEnv):
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
         """Set the state; see `RoboCASEnv`. Where it has no stages, they stay as they are."""
         super().set_state_dict(state, env_idx)
-        if "task" in state:
+        if "stages" in state.get("task", {}):
             stages = torch.as_tensor(state["task"]["stages"], dtype=torch.bool, device=self.device)
             envs = slice(None) if env_idx is None else env_idx
             self._reached[:, envs] = stages.reshape(-1, len(self.STAGES)).T

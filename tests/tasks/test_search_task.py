@@ -115,6 +115,8 @@ def test_a_restored_heap_is_looked_at_at_once(env):
     base.set_state_dict(cleared)
     info = base.get_info()
     assert base.hidden_share.tolist() == [0]  # it is not looked at any more
+    base.set_state_dict({**cleared, "task": {"stages": cleared["task"]["stages"]}})  # what is missing stays
+    assert base.hidden_share.tolist() == [0]
     assert bool(info["obstacles_cleared"][0])
     assert not bool(info["cleared_at_reset"][0])
 
