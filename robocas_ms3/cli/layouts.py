@@ -6,9 +6,15 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from robocas_ms3.scenes.bank import LayoutBank
+    from robocas_ms3.scenes.table import Engine
 
 
 @dataclass
@@ -19,6 +25,8 @@ class Build:
 
     One env has objects and arrangement of one seed. Several envs are built with the objects of seeds 0, 1, ... and keep
     them, while arrangements change: for num_envs=4, --objects 0:4 --seeds 0:100 is what resets without a seed use.
+    These are also written as one file, which such envs read at once. Where that is for a GPU, its engine tries each of
+    them: a layout of which an object moves more than 3 mm in the first second is marked, and no reset takes it.
     """
 
     config: Annotated[str, tyro.conf.Positional]
@@ -31,6 +39,8 @@ class Build:
     """First seed, and the one after the last."""
     objects: str | None = None
     """Seeds of objects of several envs, 0:4 or 3,7. Default: those of one env."""
+    engine: Literal["auto", "cpu", "gpu"] = "auto"
+    """With --objects: PhysX on the CPU or on a GPU, which is to run them. Auto: a GPU if there is one."""
     jobs: int | None = None
     """Processes. Default: one for each CPU core."""
     out: Path | None = None
@@ -73,7 +83,8 @@ def build(command: Build) -> int:
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.config import load_task_config
     from robocas_ms3.demos.checks import check_number
-    from robocas_ms3.scenes.bank import LayoutBank, fill, pairs_of
+    from robocas_ms3.scenes.bank import LayoutBank
+    from robocas_ms3.scenes.fill import fill, pairs_of
     from robocas_ms3.scenes.model import SceneModel
 
     if command.jobs is not None:
@@ -84,25 +95,67 @@ def build(command: Build) -> int:
         load_task_config(command.config), load_pack(command.pack), load_pack(command.furniture_pack)
     )
     bank = LayoutBank(model, command.out or "auto")
+    engine = choose_engine(command.engine) if objects is not None else None
     there = len(pairs) - len(bank.missing(pairs))
-    failures = 0
-    columns = (TextColumn("layouts"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    failures = moving = 0
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True)) as progress:
-        bar = progress.add_task("", total=len(pairs), completed=there)
+        bar = progress.add_task("layouts", total=len(pairs), completed=there)
         for (chosen, seed), problem in fill(bank, pairs, command.jobs or os.cpu_count() or 1):
             progress.advance(bar)
             if problem:
                 failures += 1
                 which = f"seed {seed}" if objects is None else f"objects {chosen}, seed {seed}"
                 progress.console.print(f"{which}: {problem}", highlight=False)
-    if objects is not None:  # for several envs, whose resets then read one file
-        with Console(stderr=True).status("writing them as one file"):
-            bank.write_table(pairs)
+        if engine is not None:  # for several envs, whose resets then read one file
+            writing = progress.add_task("writing them as one file", total=None)
+            bank.write_table(engine, pairs)
+            progress.remove_task(writing)
+        if engine == "gpu":
+            moving = try_all(bank, engine, progress, pack=command.pack, furniture_pack=command.furniture_pack)
     console = Console(highlight=False, soft_wrap=True)
     made = len(pairs) - there - failures
     console.print(f"{made} layouts made, {there} were there already, {failures} seeds have none")
+    if engine == "gpu":
+        console.print(f"objects of {moving} move when the GPU lets go of them: no reset takes these")
     console.print(f"bank: {bank.folder}")
     return 1 if failures else 0
+
+
+def choose_engine(wanted: Literal["auto", "cpu", "gpu"]) -> Engine:
+    """What is to run the layouts.
+
+    Raises:
+        ConfigError: there is no GPU.
+    """
+    from torch.cuda import is_available
+
+    from robocas_ms3.errors import ConfigError
+
+    if wanted == "gpu" and not is_available():
+        raise ConfigError("needs a GPU", where="--engine", found="no CUDA device", fix="Take --engine cpu.")
+    return "gpu" if wanted != "cpu" and is_available() else "cpu"
+
+
+def try_all(bank: LayoutBank, engine: Engine, progress: Progress, **packs: str) -> int:
+    """Let the engine try what it has not tried; how many layouts' objects move, of all in the table."""
+    from robocas_ms3.scenes.table import State
+    from robocas_ms3.tasks.trial import judged, try_layouts, untried
+
+    seeds = untried(bank, engine)
+    pairs = [(row, seed) for row, some in seeds.items() for seed in some]
+    if pairs:
+        bank.mark_table(engine, dict.fromkeys(pairs, State.UNTRIED))
+        trial = progress.track(try_layouts(bank, engine, seeds, **packs), len(pairs), description="trying them")
+        bank.mark_table(engine, {pair: judged(moved) for pair, moved in trial})
+    table = bank.table(engine)
+    return len(table.pairs(State.MOVES)) if table else 0
 
 
 def info(command: Info) -> int:

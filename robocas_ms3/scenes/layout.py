@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+ObjectIds = tuple[str, ...]
+"""Objects of a scene, one id of the object pack a slot."""
 
 PARKING_HEIGHT = -5.0  # z of the plane, m, on which slots wait that an episode does not use
 
@@ -28,7 +30,7 @@ class Layout:
         visible_shares: (K,) p_vis of each object from the selection camera; NaN where it was not asked for.
     """
 
-    object_ids: tuple[str, ...]
+    object_ids: ObjectIds
     object_poses: Array
     robot_pose: Array
     basket_pose: Array

@@ -10,7 +10,7 @@ import numpy as np
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject
 from robocas_ms3.config.task import OrderlyLayout, ScatteredLayout, StackedLayout
 from robocas_ms3.errors import LayoutError
-from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout
+from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout, ObjectIds
 from robocas_ms3.scenes.lookup import resolve_ids
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.orderly import sample_orderly
@@ -18,27 +18,29 @@ from robocas_ms3.scenes.placement import Array, Placeable, choose_objects, plana
 from robocas_ms3.scenes.settle import settle
 from robocas_ms3.scenes.stacked import drop_heap
 from robocas_ms3.scenes.standing import place_basket, place_robot
-from robocas_ms3.scenes.targets import Arrangement, Choice, choose_target
+from robocas_ms3.scenes.targets import Arrangement, choose_target
 
 # Every random decision of a scene has a stream of its own, so that a new one never shifts the others.
 _OBJECTS, _LAYOUT, _TARGET, _ROBOT, _BASKET, _COUNT = range(6)
-_TRIES = 50
+_SETS, _TRIES = 5, 10  # sets of objects that a seed may go on to, and layouts of each
+_KINDS = 50  # tries to find kinds whose columns fit
 _SEVERAL = 5  # layouts without a target, of which the target is to blame, not that others did not come to rest
 _log = logging.getLogger(__name__)
 
 
-def object_set(model: SceneModel, objects_seed: int) -> tuple[str, ...]:
-    """The objects of a scene, one id a slot: those of the task, then distractors.
+def object_set(model: SceneModel, objects_seed: int, number: int = 0) -> ObjectIds:
+    """A set of objects, one id a slot: those of the task, then distractors.
 
     Args:
         model: the scene's assets.
-        objects_seed: decides them, and nothing else does.
+        objects_seed: decides them, and nothing else but ``number`` does.
+        number: which of the sets that the seed draws one after the other.
 
     Raises:
         LayoutError: no object fits on the surface, or no columns of them do.
     """
     config = model.config
-    rng = np.random.default_rng([objects_seed, _OBJECTS])
+    rng = np.random.default_rng([objects_seed, _OBJECTS, number])
     ids = list(model.object_ids)
     if config.randomisation.object_sets:
         wanted = config.randomisation.object_sets[rng.integers(len(config.randomisation.object_sets))]
@@ -55,13 +57,17 @@ def object_set(model: SceneModel, objects_seed: int) -> tuple[str, ...]:
     return tuple(chosen)
 
 
-def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
+def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: ObjectIds | None = None) -> Layout:
     """Draw a layout, let it settle, and choose its target. The same seeds give the same layout.
+
+    The objects of a seed are the first set it draws (`object_set`) that can be laid out with this very seed: of some
+    kinds side by side on a shelf none can be grasped, whatever their order.
 
     Args:
         model: the scene's assets.
-        objects_seed: decides the objects (see `object_set`); on a CPU the same as ``seed``.
+        objects_seed: decides the objects; on a CPU the same as ``seed``.
         seed: decides everything else.
+        object_ids: the objects of ``objects_seed``, where they are known: it takes its own layout to know them.
 
     Raises:
         LayoutError: the objects don't fit, don't come to rest, or none qualifies as the target; or robot or basket
@@ -71,44 +77,44 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int) -> Layout:
     def rng(stream: int) -> np.random.Generator:
         return np.random.default_rng([seed, stream])
 
+    if object_ids is None and objects_seed != seed:
+        object_ids = sample_layout(model, objects_seed, objects_seed).object_ids
     config = model.config
-    ids = object_set(model, objects_seed)
-    assets = [model.object_pack.objects[i] for i in ids]
-    present, candidate = _presence(model, len(ids), rng(_COUNT))
     basket_rng = rng(_BASKET)
     robot_pose = place_robot(model, rng(_ROBOT))
     basket_pose = place_basket(model, robot_pose, basket_rng)
     layout_rng, target_rng = rng(_LAYOUT), rng(_TARGET)
-    used = [asset for asset, there in zip(assets, present, strict=True) if there]
     unsettled, untargeted, unarranged = 0, 0, []
-    choice: Choice | None = None
-    for _ in range(_TRIES):
-        poses = np.stack([_parked(slot, asset) for slot, asset in enumerate(assets)])
-        try:
-            arranged = _arrange(layout_rng, model, used)
-        except LayoutError as error:
-            if not isinstance(config.layout, OrderlyLayout):
-                raise  # it has tried often enough
-            unarranged.append(error)  # in another order the columns may fit
-            continue
-        placed = model.support_pose @ model.support_motion(opened=False) @ arranged
-        if config.randomisation.basket is not None and meets_basket(used, placed, model.basket, basket_pose):
-            basket_pose = place_basket(model, robot_pose, basket_rng)
-            unsettled += 1
-            continue
-        settled = settle(used, placed, model, basket_pose, heap=isinstance(config.layout, StackedLayout))
-        if not settled.stable:
-            unsettled += 1
-            continue
-        poses[present] = settled.poses
-        choice = choose_target(
-            target_rng, Arrangement(model, assets, poses, present, candidate, robot_pose, basket_pose)
-        )
-        if choice is not None:
-            return Layout(
-                ids, poses, robot_pose, basket_pose, choice.slot, choice.relation, present, choice.visible_shares
-            )
-        untargeted += 1
+    for number in range(_SETS):
+        ids = object_ids or object_set(model, objects_seed, number)
+        assets = [model.object_pack.objects[i] for i in ids]
+        present, candidate = _presence(model, len(ids), rng(_COUNT))
+        used = [asset for asset, there in zip(assets, present, strict=True) if there]
+        for _ in range(_TRIES):
+            poses = np.stack([_parked(slot, asset) for slot, asset in enumerate(assets)])
+            try:
+                arranged = _arrange(layout_rng, model, used)
+            except LayoutError as error:
+                if not isinstance(config.layout, OrderlyLayout):
+                    raise  # it has tried often enough
+                unarranged.append(error)  # in another order the columns may fit
+                continue
+            placed = model.support_pose @ model.support_motion(opened=False) @ arranged
+            if config.randomisation.basket is not None and meets_basket(used, placed, model.basket, basket_pose):
+                basket_pose = place_basket(model, robot_pose, basket_rng)
+                unsettled += 1
+                continue
+            settled = settle(used, placed, model, basket_pose, heap=isinstance(config.layout, StackedLayout))
+            if not settled.stable:
+                unsettled += 1
+                continue
+            poses[present] = settled.poses
+            scene = Arrangement(model, assets, poses, present, candidate, robot_pose, basket_pose)
+            if (choice := choose_target(target_rng, scene)) is not None:
+                return Layout(
+                    ids, poses, robot_pose, basket_pose, choice.slot, choice.relation, present, choice.visible_shares
+                )
+            untargeted += 1
     raise _failure(model, unarranged, unsettled, untargeted)
 
 
@@ -132,11 +138,11 @@ def meets_basket(assets: list[LoadedObject], poses: Array, basket: LoadedFurnitu
 
 def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, untargeted: int) -> LayoutError:
     """What to say of a layout that could not be made: where several came to rest, that none had a target."""
-    if untargeted < _SEVERAL and len(unarranged) > _TRIES // 2:
+    if untargeted < _SEVERAL and len(unarranged) > _SETS * _TRIES // 2:
         return unarranged[-1]
     found = (
-        f"{_TRIES} layouts tried: {len(unarranged)} did not fit, {unsettled} did not come to rest or met the basket, "
-        f"{untargeted} had no target"
+        f"{_SETS * _TRIES} layouts tried: {len(unarranged)} did not fit, {unsettled} did not come to rest or met the "
+        f"basket, {untargeted} had no target"
     )
     if untargeted < _SEVERAL:
         fix = "Lower objects.count, enlarge the surface, use objects that stand firmly, or move the basket less."
@@ -153,7 +159,7 @@ def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str],
     """Draw kinds until their columns fit on the surface."""
     objects, count = model.object_pack.objects, model.config.objects.count
     failure = LayoutError("no kinds to choose from", where="objects.ids")
-    for attempt in range(_TRIES):
+    for attempt in range(_KINDS):
         kinds = choose_objects(rng, ids, -(-count // copies))
         chosen = [kind for kind in kinds for _ in range(copies)][:count]
         try:

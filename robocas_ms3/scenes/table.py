@@ -1,14 +1,16 @@
 """Layouts of many envs as arrays: one file that is mapped into memory, so that a reset of any number is a gather.
 
-A table holds S sets of objects (by the seed that drew them) with L layouts each (by their own seeds). It is made of a
-bank (`bank.fill`, then `write_table`) and lies beside its layouts.
+A table holds S sets of objects (by the seed that drew them) with L layouts each (by their own seeds), for one engine:
+PhysX on a CPU or on a GPU. It is made of a bank (`fill.fill`, then `LayoutBank.write_table`) and lies beside its
+layouts. On a GPU the engine then tries whether the objects stay (`tasks.trial`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,118 +18,161 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import replacing
-from robocas_ms3.scenes.layout import Array, Layout
+from robocas_ms3.scenes.layout import Array, Layout, ObjectIds
 
-TABLE = "table.npy"  # in the folder of a bank
+Engine = Literal["cpu", "gpu"]
+
+Pair = tuple[int, int]
+"""Objects seed, seed."""
+
 _MADE_BY = "Make it again: robocas layouts build."
 _AXES = ("objects_seed", (slice(None), 0)), ("seed", (0, slice(None)))  # both in rising order
 
 
-@dataclass(frozen=True)
-class LayoutBatch:
-    """Layouts of E envs. K object slots; world frame, metres, quaternions wxyz.
+class State(IntEnum):
+    """What is known of a layout of a table."""
 
-    Attributes:
-        object_poses: (E, K, 7) float32.
-        robot_poses: (E, 7) of the robot's root.
-        basket_poses: (E, 7).
-        targets: (E,) slots.
-        present: (E, K) bool.
-    """
-
-    object_poses: NDArray[np.float32]
-    robot_poses: NDArray[np.float32]
-    basket_poses: NDArray[np.float32]
-    targets: NDArray[np.int64]
-    present: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, layouts: Sequence[Layout]) -> LayoutBatch:
-        """Stack layouts, one an env."""
-        return cls(
-            raw_poses(np.stack([layout.object_poses for layout in layouts])),
-            raw_poses(np.stack([layout.robot_pose for layout in layouts])),
-            raw_poses(np.stack([layout.basket_pose for layout in layouts])),
-            np.array([layout.target for layout in layouts]),
-            np.stack([layout.present for layout in layouts]),
-        )
+    LACKING = 0
+    UNTRIED = 1  # good, as far as the engine that made it can tell
+    STAYS = 2
+    MOVES = 3  # its objects do, by the engine that the table is for
 
 
 class LayoutTable:
     """Layouts from a mapped file.
 
-    What an episode needs is taken from it; what is said of one, such as its objects' ids, is the bank's to tell.
-
     Args:
         path: of the file.
+        names: ids of the object pack's objects, sorted.
+
+    Attributes:
+        rows: (S, L) records, mapped.
 
     Raises:
         LayoutError: it is damaged.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, names: Sequence[str]) -> None:
+        self._names: list[str] = list(names)
         try:
-            self._rows: NDArray[np.void] = np.lib.format.open_memmap(path, mode="r")
-            self._sets, self._seeds = (self._rows[name][place].copy() for name, place in _AXES)
+            self.rows: NDArray[np.void] = np.lib.format.open_memmap(path, mode="r")
+            self._sets, self._seeds = (self.rows[name][place].copy() for name, place in _AXES)
+            self._states = self.rows["state"].copy()
+            self._fields_are_all_there()
         except (OSError, ValueError, IndexError, EOFError) as error:  # IndexError: no such fields
             raise LayoutError("no table of layouts", where=path, found=error, fix=_MADE_BY) from error
 
-    @property
-    def pairs(self) -> list[tuple[int, int]]:
-        """Objects seed and seed of all layouts that it holds."""
-        there = np.asarray(self._rows[self._rows["there"]])
-        return [*zip(there["objects_seed"].tolist(), there["seed"].tolist(), strict=True)]
+    def _fields_are_all_there(self) -> None:
+        slots, words = self.rows["present"].shape[-1], self.rows["relation"].dtype.itemsize // 4
+        if self.rows.dtype != _record(slots, words):
+            raise ValueError("other fields than a table's")
 
-    def find(self, objects_seeds: NDArray[np.int64], seeds: NDArray[np.int64]) -> LayoutBatch | None:
-        """Gather the layouts of E pairs of seeds, (E,) each; None where it lacks one of them."""
-        sets, columns = np.searchsorted(self._sets, objects_seeds), np.searchsorted(self._seeds, seeds)
-        if sets.max(initial=0) >= len(self._sets) or columns.max(initial=0) >= len(self._seeds):
+    def places(self, objects_seeds: NDArray[np.int64], seeds: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
+        """Where E pairs are, (E,) each: the `State`, of what is not there `LACKING`; row; column."""
+        rows = np.minimum(np.searchsorted(self._sets, objects_seeds), len(self._sets) - 1)
+        columns = np.minimum(np.searchsorted(self._seeds, seeds), len(self._seeds) - 1)
+        there = (self._sets[rows] == objects_seeds) & (self._seeds[columns] == seeds)
+        return np.where(there, self._states[rows, columns], State.LACKING), rows, columns
+
+    def state(self, pair: Pair) -> State:
+        """What is known of a layout."""
+        return State(int(self.places(np.array([pair[0]]), np.array([pair[1]]))[0][0]))
+
+    def pairs(self, *states: State) -> list[Pair]:
+        """Objects seed and seed of the layouts that it holds, of those states alone if any is named."""
+        rows, columns = np.nonzero(np.isin(self._states, states) if states else self._states)
+        return [*zip(self._sets[rows].tolist(), self._seeds[columns].tolist(), strict=True)]
+
+    def object_ids(self, objects_seed: int) -> ObjectIds | None:
+        """The objects of a seed; None where it has no layout of them."""
+        row = int(np.searchsorted(self._sets, objects_seed))
+        if row == len(self._sets) or self._sets[row] != objects_seed:
             return None
-        rows = np.asarray(self._rows[sets, columns])
-        if not (rows["there"] & (rows["objects_seed"] == objects_seeds) & (rows["seed"] == seeds)).all():
+        some = int(np.argmax(self._states[row] != State.LACKING))
+        return tuple(self._names[i] for i in self.rows["objects"][row, some].tolist())
+
+    def layout(self, pair: Pair) -> Layout | None:
+        """A layout, in single precision; None where it lacks it."""
+        state, rows, columns = self.places(np.array([pair[0]]), np.array([pair[1]]))
+        if state[0] == State.LACKING:
             return None
-        # a record's length is no multiple of a float's, which tensors can't be made of
-        return LayoutBatch(
-            np.ascontiguousarray(rows["object_poses"]),
-            np.ascontiguousarray(rows["robot_pose"]),
-            np.ascontiguousarray(rows["basket_pose"]),
-            rows["target"].astype(np.int64),
-            np.ascontiguousarray(rows["present"]),
+        row = self.rows[rows[0], columns[0]]
+        return Layout(
+            object_ids=tuple(self._names[i] for i in row["objects"].tolist()),
+            object_poses=_matrices(row["object_poses"]),
+            robot_pose=_matrices(row["robot_pose"]),
+            basket_pose=_matrices(row["basket_pose"]),
+            target=int(row["target"]),
+            relation=str(row["relation"]),
+            present=row["present"].copy(),
+            visible_shares=row["visible_shares"].astype(np.float64),
         )
 
 
-def write_table(path: Path, layouts: Mapping[tuple[int, int], Layout]) -> None:
+def write_table(
+    path: Path, names: Sequence[str], layouts: Mapping[Pair, Layout], states: Mapping[Pair, State] | None = None
+) -> None:
     """Write layouts as a table.
 
     Args:
         path: of the file.
-        layouts: by objects seed and seed; pairs of these seeds that are missing have no layout.
+        names: ids of the object pack's objects, sorted.
+        layouts: by objects seed and seed, those of an objects seed all of the same objects; pairs of these seeds that
+            are missing have no layout.
+        states: what is known of them; default: `State.UNTRIED`.
     """
     slots = len(next(iter(layouts.values())).object_ids)
+    words = max(1, *(len(layout.relation) for layout in layouts.values()))
     sets, seeds = (sorted({pair[side] for pair in layouts}) for side in (0, 1))
-    rows = np.zeros((len(sets), len(seeds)), _record(slots))
+    number = {name: i for i, name in enumerate(names)}
+    rows = np.zeros((len(sets), len(seeds)), _record(slots, words))
     rows["objects_seed"], rows["seed"] = np.array(sets)[:, None], seeds
-    batch = LayoutBatch.of(list(layouts.values()))
-    place = [sets.index(pair[0]) for pair in layouts], [seeds.index(pair[1]) for pair in layouts]
-    rows["there"][place] = True
-    rows["object_poses"][place], rows["present"][place] = batch.object_poses, batch.present
-    rows["robot_pose"][place], rows["basket_pose"][place] = batch.robot_poses, batch.basket_poses
-    rows["target"][place] = batch.targets
+    row_of, column_of = ({seed: i for i, seed in enumerate(axis)} for axis in (sets, seeds))
+    for pair, layout in layouts.items():
+        rows[row_of[pair[0]], column_of[pair[1]]] = (
+            *pair,
+            (states or {}).get(pair, State.UNTRIED),
+            [number[name] for name in layout.object_ids],
+            raw_poses(layout.object_poses),
+            raw_poses(layout.robot_pose),
+            raw_poses(layout.basket_pose),
+            layout.target,
+            layout.relation,
+            layout.present,
+            layout.visible_shares,
+        )
+    _save(path, rows)
+
+
+def mark_table(path: Path, names: Sequence[str], states: Mapping[Pair, State]) -> None:
+    """Write what is known of some of a table's layouts."""
+    table = LayoutTable(path, names)
+    rows = np.array(table.rows)
+    for pair, state in states.items():
+        _, row, column = table.places(np.array([pair[0]]), np.array([pair[1]]))
+        rows["state"][row[0], column[0]] = state
+    _save(path, rows)
+
+
+def _save(path: Path, rows: NDArray[np.void]) -> None:
     with replacing(path) as tmp, tmp.open("wb") as file:
         np.save(file, rows)
 
 
-def _record(slots: int) -> np.dtype:
+def _record(slots: int, words: int) -> np.dtype:
     return np.dtype(
         [
             ("objects_seed", "i8"),
             ("seed", "i8"),
-            ("there", "?"),
+            ("state", "u1"),
+            ("objects", "i4", (slots,)),  # numbers among the names
             ("object_poses", "f4", (slots, 7)),
             ("robot_pose", "f4", 7),
             ("basket_pose", "f4", 7),
             ("target", "i2"),
+            ("relation", f"U{words}"),
             ("present", "?", (slots,)),
+            ("visible_shares", "f4", (slots,)),
         ]
     )
 
@@ -138,3 +183,12 @@ def raw_poses(matrices: Array) -> NDArray[np.float32]:
     xyzw = Rotation.from_matrix(flat[:, :3, :3]).as_quat()
     poses = np.concatenate([flat[:, :3, 3], xyzw[:, [3, 0, 1, 2]]], axis=1).astype(np.float32)
     return poses.reshape(*matrices.shape[:-2], 7)
+
+
+def _matrices(poses: NDArray[np.float32]) -> Array:
+    """(..., 7) -> (..., 4, 4); `raw_poses` the other way round."""
+    flat = poses.reshape(-1, 7).astype(np.float64)
+    matrices = np.tile(np.eye(4), (len(flat), 1, 1))
+    matrices[:, :3, :3] = Rotation.from_quat(flat[:, [4, 5, 6, 3]]).as_matrix()
+    matrices[:, :3, 3] = flat[:, :3]
+    return matrices.reshape(*poses.shape[:-1], 4, 4)

@@ -10,17 +10,24 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
+from numpy.typing import NDArray
 
 from robocas_ms3.errors import ConfigError, LayoutError, RobocasError
-from robocas_ms3.scenes.bank import LayoutBank, LayoutSource, Pair
-from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.table import LayoutBatch
+from robocas_ms3.scenes.bank import LayoutBank
+from robocas_ms3.scenes.layout import Layout, ObjectIds
+from robocas_ms3.scenes.source import LayoutSource
+from robocas_ms3.scenes.table import LayoutTable, Pair, State
+from robocas_ms3.tasks.starts import Starts, TabledStarts, good
 
 SEVERAL_ENVS_SEEDS = (0, 99)  # least and greatest seed of several envs' unseeded resets
 _OTHER_SEEDS = 20  # tried where a seed has no layout
 _FIRST_SEEDS = 2  # the same before any had one: that a configuration can't be laid out should not take long to find
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
+
+
+class _Moves(LayoutError):
+    """The engine does not leave the objects where a layout has them."""
 
 
 def following_seeds(first: int, count: int, within: tuple[int, int] | None) -> list[int]:
@@ -63,8 +70,11 @@ class SeededEnv(BaseEnv):
         if seeds is not None and not 0 <= seeds[0] <= seeds[1]:
             raise ConfigError("seeds are a range", expected="0 <= first <= last", found=seeds)
         self._layouts = layouts
-        self._table = layouts.table if isinstance(layouts, LayoutBank) and num_envs > 1 else None
-        self._found: dict[int, Layout] = {}
+        self._table: LayoutTable | None = None
+        self._tabled: TabledStarts | None = None
+        self._found: dict[int, Layout] = {}  # of envs
+        self._own: dict[int, Layout] = {}  # of the seeds that envs are built with
+        self._object_ids: list[ObjectIds] = []  # of each env
         self._seed_range = seeds or (SEVERAL_ENVS_SEEDS if num_envs > 1 else None)
         self._resets_seeded = False
         self._asked_for: set[int] = set()  # envs whose seeds were asked for
@@ -72,6 +82,7 @@ class SeededEnv(BaseEnv):
         self._objects_seeds = np.zeros(num_envs, dtype=np.int64)
         if reconfiguration_freq is None:
             reconfiguration_freq = 1 if num_envs == 1 else 0
+        self._objects_stay = reconfiguration_freq == 0
         self._failed: dict[Pair, LayoutError] = {}
         self._other_seeds = _FIRST_SEEDS
         self._made = False
@@ -149,22 +160,41 @@ class SeededEnv(BaseEnv):
         assert self._episode_seed is not None
         return [int(seed) for seed in self._episode_seed]
 
-    def _choose_objects(self, choose: Callable[[int], _T]) -> list[_T]:
-        """What ``choose`` makes of each env's seed, as the scene is built; these seeds decide objects and looks."""
-        assert self._episode_seed is not None
-        chosen = [self._first_possible(choose, env, self._episode_seed) for env in range(self.num_envs)]
-        self._objects_seeds = np.array(self._episode_seed)
-        return chosen
+    def _reconfigure(self, options: dict | None = None) -> None:
+        """Build anew; see ``BaseEnv``. Where a seed has no layout, what was built before stays."""
+        self._choose_objects()
+        super()._reconfigure(options)
 
-    def _find_layouts(self, envs: list[int]) -> LayoutBatch:
-        """The layouts of some envs' episodes; from the bank's table where that holds them all."""
-        for env in envs:
+    def _choose_objects(self) -> None:
+        """The objects that each env is to be built with: those of its seed, which decides its looks, too."""
+        assert self._episode_seed is not None
+        self._own = {}
+        if self._objects_stay and isinstance(self._layouts, LayoutBank):
+            self._table = self._layouts.table("gpu" if self._sim_device.is_cuda() else "cpu")
+        seeds = self._episode_seed
+        self._object_ids = [self._first_possible(self._objects_of, env, seeds) for env in range(self.num_envs)]
+        self._objects_seeds = np.array(seeds)
+        self._tabled = TabledStarts(self._table, self._objects_seeds, self.device) if self._table else None
+
+    def _objects_of(self, seed: int) -> ObjectIds:
+        tabled = self._table.object_ids(seed) if self._table else None
+        if tabled is not None:
+            return tabled
+        if seed not in self._own:
+            self._own[seed] = self._layout((seed, seed))
+        return self._own[seed].object_ids
+
+    def _find_starts(self, envs: NDArray[np.int64]) -> Starts:
+        """Where some envs' episodes begin; gathered on their device where the bank's table holds them all."""
+        for env in envs.tolist():
             self._found.pop(env, None)
-        if self._table is not None:
-            batch = self._table.find(self._objects_seeds[envs], self._layout_seeds[envs])
-            if batch is not None:
-                return batch
-        return LayoutBatch.of([self.layout(env) for env in envs])
+        if self._tabled is not None:
+            for env in envs[~good(self._tabled.states(envs, self._layout_seeds[envs]))].tolist():
+                self.layout(env)  # of another seed perhaps, which the table holds
+            gathered = self._tabled.gather(envs, self._layout_seeds[envs])
+            if gathered is not None:
+                return gathered
+        return Starts.of([self.layout(env) for env in envs.tolist()], self.device)
 
     def layout(self, env: int = 0) -> Layout:
         """The layout of an env's episode."""
@@ -181,12 +211,22 @@ class SeededEnv(BaseEnv):
         if pair in self._failed:
             raise self._failed[pair]
         try:
-            layout = self._layouts(*pair)
+            layout = self._tabled_layout(pair) or self._layouts(*pair)
         except LayoutError as error:
             self._failed[pair] = error
             raise
         self._other_seeds = _OTHER_SEEDS
         return layout
+
+    def _tabled_layout(self, pair: Pair) -> Layout | None:
+        if pair[0] == pair[1] and pair[0] in self._own:
+            return self._own[pair[0]]
+        if self._table is None:
+            return None
+        if self._table.state(pair) == State.MOVES:
+            where = f"objects seed {pair[0]}, seed {pair[1]}"
+            raise _Moves("objects move as soon as this engine runs", where=where, fix="Take another seed.")
+        return self._table.layout(pair)
 
     def _first_possible(self, make: Callable[[int], _T], env: int, seeds: np.ndarray) -> _T:
         """What ``make`` makes of an env's seed; where that can't be and nobody asked for the seed, of another one."""
@@ -196,6 +236,7 @@ class SeededEnv(BaseEnv):
             except LayoutError as error:
                 if env in self._asked_for or self.num_envs == 1:  # one env starts over, as its objects change too
                     raise
-                _log.warning("env %d: no layout for seed %d, another is drawn: %s", env, seeds[env], error)
+                level = logging.DEBUG if isinstance(error, _Moves) else logging.WARNING  # the former was told before
+                _log.log(level, "env %d: no layout for seed %d, another is drawn: %s", env, seeds[env], error)
                 seeds[env] = self._draw_seed(env)
         return make(int(seeds[env]))

@@ -4,7 +4,7 @@ from robocas_ms3.cli import layouts
 from robocas_ms3.cli.layouts import Build, Info, Layouts, main, objects_seeds, seed_range
 from robocas_ms3.cli.main import run
 from robocas_ms3.errors import ConfigError, LayoutError
-from robocas_ms3.scenes import bank
+from robocas_ms3.scenes import bank, source
 from robocas_ms3.scenes.sample import sample_layout
 
 
@@ -14,7 +14,9 @@ def build(folder, seeds):
 
 def test_layouts_are_made_once_and_a_later_run_goes_on(tmp_path, monkeypatch, capsys):
     made = []
-    monkeypatch.setattr(bank, "sample_layout", lambda model, o, s: made.append((o, s)) or sample_layout(model, o, s))
+    monkeypatch.setattr(
+        source, "sample_layout", lambda model, o, s, ids: made.append((o, s)) or sample_layout(model, o, s)
+    )
     assert build(tmp_path, "0:2") == 0
     assert build(tmp_path, "0:3") == 0
     assert made == [(0, 0), (1, 1), (2, 2)]
@@ -25,12 +27,12 @@ def test_layouts_are_made_once_and_a_later_run_goes_on(tmp_path, monkeypatch, ca
 
 
 def test_seeds_without_a_layout_are_named_and_the_others_made(tmp_path, monkeypatch, capsys):
-    def fussy(model, objects_seed, seed):
+    def fussy(model, objects_seed, seed, object_ids):
         if seed == 1:
             raise LayoutError("no object qualifies as the target", where="target")
         return sample_layout(model, objects_seed, seed)
 
-    monkeypatch.setattr(bank, "sample_layout", fussy)
+    monkeypatch.setattr(source, "sample_layout", fussy)
     assert build(tmp_path, "0:3") == 1
     captured = capsys.readouterr()
     assert "2 layouts made, 0 were there already, 1 seeds have none" in captured.out

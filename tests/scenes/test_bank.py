@@ -10,11 +10,13 @@ import pytest
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import load_task_config
 from robocas_ms3.errors import LayoutError
-from robocas_ms3.scenes import bank as module
-from robocas_ms3.scenes.bank import LayoutBank, layout_bank, pairs_of
+from robocas_ms3.scenes import source
+from robocas_ms3.scenes.bank import LayoutBank, layout_bank
+from robocas_ms3.scenes.fill import fill, pairs_of
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
+from robocas_ms3.scenes.table import State
 
 
 def model(**changes) -> SceneModel:
@@ -36,7 +38,7 @@ def test_a_layout_is_made_once_and_comes_back_the_same(tmp_path, monkeypatch):
     assert bank.missing(pairs_of(range(3))) == [(0, 0), (1, 1), (2, 2)]
     made = bank.get(1, 1)
     assert_same(made, sample_layout(scene, 1, 1))
-    monkeypatch.setattr(module, "sample_layout", None)  # making it again would fail
+    monkeypatch.setattr(source, "sample_layout", None)  # making it again would fail
     assert_same(LayoutBank(scene, tmp_path).get(1, 1), made)
     assert bank.missing(pairs_of(range(3))) == [(0, 0), (2, 2)]
     assert bank.count() == 1
@@ -60,7 +62,7 @@ def test_a_damaged_file_is_made_again(tmp_path, caplog):
 
 
 def test_a_seed_without_a_layout_leaves_nothing_behind(tmp_path):
-    bank = LayoutBank(model(target={"max_distance": 0.1}), tmp_path)
+    bank = LayoutBank(model(target={"max_distance": 0.1}, objects={"ids": "all", "count": 2}), tmp_path)
     with pytest.raises(LayoutError):
         bank.get(0, 0)
     assert bank.count() == 0
@@ -100,15 +102,49 @@ def test_several_envs_want_each_objects_with_every_seed_and_their_own():
     assert pairs_of([0, 1], [1, 7]) == [(1, 1), (1, 0), (7, 7), (7, 0), (7, 1)]
 
 
-def test_a_table_keeps_what_an_earlier_one_holds(tmp_path):
+def test_a_table_keeps_what_an_earlier_one_holds_and_what_is_known_of_it(tmp_path):
     bank = LayoutBank(model(), tmp_path)
-    assert bank.table is None
+    assert bank.table("cpu") is None
     for pair in ((0, 0), (0, 1), (2, 1)):
         bank.get(*pair)
-    bank.write_table([(0, 0), (0, 1)])
-    bank.write_table([(2, 1), (2, 9)])  # of the last there is no layout yet
-    assert bank.table is not None
-    assert bank.table.pairs == [(0, 0), (0, 1), (2, 1)]
+    bank.write_table("cpu", [(0, 0), (0, 1)])
+    bank.mark_table("cpu", {(0, 1): State.MOVES})
+    bank.path(0, 0).unlink()
+    table = bank.write_table("cpu", [(2, 1), (2, 9)])  # of the last there is no layout yet
+    assert table is not None
+    assert table.pairs() == [(0, 0), (0, 1), (2, 1)]
+    assert table.pairs(State.MOVES) == [(0, 1)]
+    assert table.pairs(State.UNTRIED) == [(0, 0), (2, 1)]
+    assert bank.table("gpu") is None
+
+
+def test_a_damaged_table_is_none_and_said(tmp_path, caplog):
+    bank = LayoutBank(model(), tmp_path)
+    bank.get(0, 0)
+    bank.write_table("gpu", [(0, 0)])
+    path = bank.table_path("gpu")
+    path.write_bytes(path.read_bytes()[:-9])
+    assert bank.table("gpu") is None
+    assert "no table of layouts" in caplog.text
+
+
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_objects_that_can_not_be_laid_out_are_tried_but_once(jobs, tmp_path):
+    bank = LayoutBank(model(target={"max_distance": 0.1}, objects={"ids": "all", "count": 2}), tmp_path)
+    problems = dict(fill(bank, pairs_of([0, 1, 2], [1]), jobs))
+    assert problems.keys() == {(1, 1), (1, 0), (1, 2)}
+    assert len(set(problems.values())) == 1
+    assert "no object qualifies" in problems[1, 1]
+
+
+def test_without_a_bank_the_objects_of_a_seed_are_looked_for_once(monkeypatch):
+    asked = []
+    make = sample_layout
+    monkeypatch.setattr(source, "sample_layout", lambda *order: asked.append(order[1:]) or make(*order))
+    layouts = layout_bank(model(), None)
+    ids = layouts(1, 2).object_ids
+    assert layouts(1, 3).object_ids == layouts(1, 1).object_ids == ids
+    assert asked == [(1, 1, None), (1, 2, ids), (1, 3, ids), (1, 1, None)]
 
 
 @pytest.mark.slow

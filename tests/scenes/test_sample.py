@@ -8,6 +8,7 @@ import pytest
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import load_task_config
 from robocas_ms3.errors import ConfigError, LayoutError
+from robocas_ms3.scenes import sample
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import transform
@@ -34,6 +35,22 @@ def test_objects_and_their_places_have_seeds_of_their_own():
     one, two = sample_layout(scene, 4, 4), sample_layout(scene, 4, 5)
     assert one.object_ids == two.object_ids == object_set(scene, 4)
     assert not np.allclose(one.object_poses, two.object_poses)
+
+
+def test_objects_among_which_no_target_is_found_give_way_to_others(monkeypatch):
+    scene, choose, asked = model(), sample.choose_target, []
+
+    def fussy(rng, arrangement):
+        asked.append(tuple(asset.asset.id for asset in arrangement.assets))
+        return None if set(asked[-1]) == set(asked[0]) else choose(rng, arrangement)
+
+    monkeypatch.setattr(sample, "choose_target", fussy)
+    found = sample_layout(scene, 4, 4)
+    assert asked[0] == object_set(scene, 4) != found.object_ids == object_set(scene, 4, 1)
+    assert len(asked) == 11
+    assert sample_layout(scene, 4, 5).object_ids == found.object_ids
+    monkeypatch.setattr(sample, "choose_target", choose)
+    assert sample_layout(scene, 4, 5, found.object_ids).object_ids == found.object_ids
 
 
 def test_orderly_objects_come_in_kinds():
@@ -193,7 +210,7 @@ def test_layouts_that_come_to_rest_without_a_target_blame_the_target():
 
 def test_no_target_is_an_error_that_says_what_to_change():
     with pytest.raises(LayoutError, match=r"no object qualifies.*Raise target.max_distance"):
-        sample_layout(model(target={"max_distance": 0.1}), 0, 0)
+        sample_layout(model(target={"max_distance": 0.1}, objects={"ids": "all", "count": 2}), 0, 0)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Layouts made in a process of its own, for one whose PhysX would make others."""
+"""Layouts made anew: here, or in a process of its own where PhysX would make others here."""
 
 from __future__ import annotations
 
@@ -7,12 +7,19 @@ import pickle
 import subprocess
 import sys
 import weakref
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+from sapien import physx
+
 from robocas_ms3.errors import LayoutError, SimulationError
-from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.scenes.layout import Layout, ObjectIds
 from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.sample import sample_layout
+
+LayoutSource = Callable[[int, int], Layout]
+"""(objects seed, seed) -> layout."""
 
 # What libraries print must not get among the answers. No `multiprocessing`: it would run the program's main part again.
 _PROGRAM = """
@@ -24,16 +31,52 @@ from robocas_ms3.scenes.sample import sample_layout
 model = pickle.load(sys.stdin.buffer)
 while True:
     try:
-        seeds = pickle.load(sys.stdin.buffer)
+        order = pickle.load(sys.stdin.buffer)
     except EOFError:
         break
     try:
-        answer = sample_layout(model, *seeds)
+        answer = sample_layout(model, *order)
     except LayoutError as error:
         answer = error
     pickle.dump(answer, answers)
     answers.flush()
 """
+
+
+class Sampler:
+    """Makes layouts anew, the same ones in every process.
+
+    Where PhysX has a GPU it cooks hulls otherwise, on a CPU too, and heaps come to rest elsewhere. So such a process
+    has another one make them.
+
+    Args:
+        model: the scene's assets.
+    """
+
+    def __init__(self, model: SceneModel) -> None:
+        self._model = model
+        self._elsewhere: OtherProcess | None = None
+        self._object_ids: dict[int, ObjectIds] = {}
+
+    def __call__(self, objects_seed: int, seed: int) -> Layout:
+        """The layout of two seeds; see `sample_layout`."""
+        if objects_seed == seed:
+            return self.make(seed, seed)
+        if objects_seed not in self._object_ids:
+            self._object_ids[objects_seed] = self.make(objects_seed, objects_seed).object_ids
+        return self.make(objects_seed, seed, self._object_ids[objects_seed])
+
+    def make(self, objects_seed: int, seed: int, object_ids: ObjectIds | None = None) -> Layout:
+        """The same, of objects that are known if the seeds differ."""
+        if not physx.is_gpu_enabled():
+            return sample_layout(self._model, objects_seed, seed, object_ids)
+        if self._elsewhere is None:
+            self._elsewhere = OtherProcess(self._model)
+        return self._elsewhere.layout(objects_seed, seed, object_ids)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the other process."""
+        return {**self.__dict__, "_elsewhere": None}
 
 
 class OtherProcess:
@@ -55,7 +98,7 @@ class OtherProcess:
         with suppress(BrokenPipeError):  # it died at once, as the first layout will tell
             self._send(model)
 
-    def layout(self, objects_seed: int, seed: int) -> Layout:
+    def layout(self, objects_seed: int, seed: int, object_ids: ObjectIds | None = None) -> Layout:
         """The layout of two seeds; see `sample.sample_layout`.
 
         Raises:
@@ -64,7 +107,7 @@ class OtherProcess:
         """
         assert self._process.stdout is not None
         try:
-            self._send((objects_seed, seed))
+            self._send((objects_seed, seed, object_ids))
             answer: Any = pickle.load(self._process.stdout)
         except (EOFError, OSError) as error:  # not a `LayoutError`: another seed would not help
             found = f"exit code {self._process.wait()}"

@@ -11,9 +11,9 @@ import pytest
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import load_task_config
 from robocas_ms3.errors import LayoutError, SimulationError
-from robocas_ms3.scenes.elsewhere import OtherProcess
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
+from robocas_ms3.scenes.source import OtherProcess
 
 
 def model(**changes) -> SceneModel:

@@ -1,0 +1,81 @@
+"""Where everything is at the beginning of episodes, as tensors: of layouts one by one, or gathered from a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.scenes.table import LayoutTable, State, raw_poses
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Layouts of E envs. K object slots; world frame, metres, quaternions wxyz; on the envs' device.
+
+    Attributes:
+        object_poses: (E, K, 7) float32.
+        robot_poses: (E, 7) of the robot's root.
+        basket_poses: (E, 7).
+        targets: (E,) int64, slots.
+        present: (E, K) bool.
+    """
+
+    object_poses: torch.Tensor
+    robot_poses: torch.Tensor
+    basket_poses: torch.Tensor
+    targets: torch.Tensor
+    present: torch.Tensor
+
+    @classmethod
+    def of(cls, layouts: Sequence[Layout], device: torch.device | str) -> Starts:
+        """Stack layouts, one an env."""
+        return cls(
+            torch.from_numpy(raw_poses(np.stack([layout.object_poses for layout in layouts]))).to(device),
+            torch.from_numpy(raw_poses(np.stack([layout.robot_pose for layout in layouts]))).to(device),
+            torch.from_numpy(raw_poses(np.stack([layout.basket_pose for layout in layouts]))).to(device),
+            torch.tensor([layout.target for layout in layouts], device=device),
+            torch.from_numpy(np.stack([layout.present for layout in layouts])).to(device),
+        )
+
+
+class TabledStarts:
+    """Starts of envs that keep their objects: a reset gathers them on the device.
+
+    All layouts of these objects are in its memory, 0.4 kB each with ten objects.
+
+    Args:
+        table: of the engine that runs them.
+        objects_seeds: (N,) of the envs.
+        device: theirs.
+    """
+
+    def __init__(self, table: LayoutTable, objects_seeds: NDArray[np.int64], device: torch.device | str) -> None:
+        self._table, self._objects_seeds, self._device = table, objects_seeds, device
+        there = table.places(objects_seeds, np.zeros_like(objects_seeds))[1]
+        rows, self._row_of_env = np.unique(there, return_inverse=True)
+        taken = table.rows[rows]  # copied: records of any length, which tensors can't be made of
+        names = ("object_poses", "robot_pose", "basket_pose", "target", "present")
+        self._kept = [torch.from_numpy(np.ascontiguousarray(taken[name])).to(device) for name in names]
+
+    def states(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """(E,) the `State` of some envs' layouts, by their seeds (E,)."""
+        return self._table.places(self._objects_seeds[envs], seeds)[0]
+
+    def gather(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> Starts | None:
+        """Starts of some envs, by the seeds (E,) of their layouts; None where one of them is no good."""
+        states, _, columns = self._table.places(self._objects_seeds[envs], seeds)
+        if not good(states).all():
+            return None
+        row, column = (torch.from_numpy(index).to(self._device) for index in (self._row_of_env[envs], columns))
+        objects, robots, baskets, targets, present = (kept[row, column] for kept in self._kept)
+        return Starts(objects, robots, baskets, targets.long(), present)
+
+
+def good(states: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Which `State` allows an episode to begin there."""
+    return (states == State.UNTRIED) | (states == State.STAYS)

@@ -1,0 +1,83 @@
+"""Whether objects stay where layouts put them, tried by the very engine that is to run them."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+import gymnasium as gym
+
+from robocas_ms3.scenes.bank import LayoutBank
+from robocas_ms3.scenes.settle import CHECK_SECONDS, MAX_SHIFT
+from robocas_ms3.scenes.table import Engine, Pair, State
+from robocas_ms3.tasks.spec import TASKS
+
+_ENVS = {"cpu": 1, "gpu": 256}  # at once
+_BACKENDS = {"cpu": "physx_cpu", "gpu": "physx_cuda"}
+
+
+def untried(bank: LayoutBank, engine: Engine) -> dict[int, list[int]]:
+    """Seeds of layouts that are to be tried, by objects seed.
+
+    Those of a set of objects are all tried again where one of them was not: an env is built with its own layout.
+    """
+    table = bank.table(engine)
+    if table is None:
+        return {}
+    new = {objects_seed for objects_seed, _ in table.pairs(State.UNTRIED)}
+    seeds: dict[int, list[int]] = {objects_seed: [] for objects_seed in sorted(new)}
+    for objects_seed, seed in table.pairs():
+        if objects_seed in new:
+            seeds[objects_seed].append(seed)
+    return seeds
+
+
+def try_layouts(
+    bank: LayoutBank, engine: Engine, seeds: dict[int, list[int]], **kwargs: Any
+) -> Generator[tuple[Pair, float]]:
+    """Let an environment begin with each layout and do nothing for a second.
+
+    Args:
+        bank: whose table it is; the layouts must be good for all that is known (`State.UNTRIED`).
+        engine: that is to run them.
+        seeds: of layouts, by objects seed (`untried`).
+        kwargs: for ``gym.make``: the packs that the bank is of.
+
+    Yields:
+        Objects seed and seed, and how far the object that moved farthest has moved then, m.
+    """
+    count = min(_ENVS[engine], len(seeds))
+    env: Any = gym.make(
+        TASKS[bank.model.config.task].env_id,
+        num_envs=count,
+        config=bank.model.config,
+        layouts=bank.folder.parent,
+        reconfiguration_freq=0,
+        sim_backend=_BACKENDS[engine],
+        render_backend="none",
+        obs_mode="none",
+        reward_mode="none",
+        **kwargs,
+    )
+    try:
+        base: Any = env.unwrapped
+        rows = list(seeds)
+        for first in range(0, len(rows), count):
+            some = rows[first : first + count]
+            padded = some + some[:1] * (count - len(some))
+            env.reset(seed=padded, options={"reconfigure": True})
+            for i in range(max(len(seeds[row]) for row in some)):
+                env.reset(seed=[seeds[row][min(i, len(seeds[row]) - 1)] for row in padded])
+                for _ in range(round(CHECK_SECONDS * base.control_freq)):
+                    env.step(None)  # the arm stays where it is
+                shift = (base.object_poses - base.start_poses)[..., :3].norm(dim=-1).where(base.present, 0.0)
+                for row, moved in zip(some, shift.amax(dim=-1).tolist(), strict=False):
+                    if i < len(seeds[row]):
+                        yield (row, seeds[row][i]), moved
+    finally:
+        env.close()
+
+
+def judged(moved: float) -> State:
+    """What is known of a layout whose objects moved that far, m."""
+    return State.STAYS if moved <= MAX_SHIFT else State.MOVES

@@ -1,0 +1,50 @@
+"""Layouts are tried by the engine that runs them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config import load_task_config
+from robocas_ms3.scenes.bank import LayoutBank, write_layout
+from robocas_ms3.scenes.fill import fill, pairs_of
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.table import State
+from robocas_ms3.tasks.trial import judged, try_layouts, untried
+
+
+@pytest.fixture
+def bank(tmp_path) -> LayoutBank:
+    """Of small heaps, two sets of objects with two layouts each; in one of them an object hangs in the air."""
+    pack = load_pack("builtin")
+    bank = LayoutBank(SceneModel.load(load_task_config("search_table_small_heap"), pack, pack), tmp_path)
+    pairs = pairs_of([0, 1], [0, 1])
+    assert not any(problem for _, problem in fill(bank, pairs))
+    layout = bank.get(1, 0)
+    poses = layout.object_poses.copy()
+    poses[np.argmax(poses[:, 2, 3]), 2, 3] += 0.03
+    write_layout(type(layout)(**{**vars(layout), "object_poses": poses}), bank.path(1, 0))
+    bank.write_table("cpu", pairs)
+    return bank
+
+
+@pytest.mark.slow
+def test_a_heap_that_moves_is_found(bank):
+    assert untried(bank, "gpu") == {}
+    seeds = untried(bank, "cpu")
+    assert seeds == {0: [0, 1], 1: [0, 1]}
+    moved = dict(try_layouts(bank, "cpu", seeds))
+    assert moved.keys() == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    assert moved.pop((1, 0)) > 0.02
+    assert max(moved.values()) < 0.003
+    bank.mark_table("cpu", {pair: judged(by) for pair, by in moved.items()})
+    table = bank.table("cpu")
+    assert table is not None
+    assert table.pairs(State.STAYS) == [(0, 0), (0, 1), (1, 1)]
+    assert untried(bank, "cpu") == {1: [0, 1]}  # with its own layout
+
+
+def test_three_millimetres_are_allowed():
+    assert judged(0.0029) == State.STAYS
+    assert judged(0.0031) == judged(float("nan")) == State.MOVES
