@@ -10,7 +10,10 @@ import pytest
 import torch
 
 import robocas_ms3  # noqa: F401
+from robocas_ms3.cli.layouts import Build, Layouts, main
+from robocas_ms3.scenes.table import State
 from robocas_ms3.tasks import TASKS
+from robocas_ms3.tasks.starts import Starts
 
 pytestmark = [
     pytest.mark.gpu,
@@ -132,6 +135,33 @@ def test_a_state_is_come_back_to(mode):
     generator.set_state(kept_generator)
     assert (play() - after).abs().max() < 1e-4
     env.close()
+
+
+def test_heaps_are_tried_by_this_engine_and_resets_gather_what_stays(tmp_path):
+    command = Build("search_table_small_heap", objects="0:4", seeds="0:4", jobs=2, out=tmp_path, engine="gpu")
+    assert main(Layouts(command)) == 0
+    made = gym.make(
+        "RoboCASSearch-v1",
+        config="search_table_small_heap",
+        num_envs=8,
+        layouts=tmp_path,
+        seeds=(0, 3),
+        obs_mode="none",
+        render_backend="none",
+    )
+    env: Any = made.unwrapped
+    assert env._tabled is not None
+    assert not env._table.pairs(State.UNTRIED)
+    tried = {state: len(env._table.pairs(state)) for state in (State.STAYS, State.MOVES)}
+    assert sum(tried.values()) == 16
+    assert tried[State.MOVES] <= 4, tried
+    for _ in range(5):
+        made.reset()
+        assert env.object_poses.device == env.device
+        for i in (0, 7):
+            wanted = Starts.of([env.layout(i)], env.device).object_poses[0]
+            torch.testing.assert_close(env.object_poses[i], wanted, atol=1e-4, rtol=0)
+    made.close()
 
 
 def test_contact_buffers_hold_what_256_heaps_need():
