@@ -5,7 +5,7 @@ held up, so steps a second are the median over turns in which nothing else took 
 machine's CPU time, null without one. CPU time counts in every turn: of this process, of the busiest worker and of all
 together. A step takes at least what this process and then the busiest worker need, which is what free cores would give.
 
-Run: python benchmarks/vector.py [--turns 7] [--steps 100]
+Run: python benchmarks/vector.py [--turns 5] [--steps 100]
 """
 
 from __future__ import annotations
@@ -25,10 +25,15 @@ import tyro
 import robocas_ms3
 from robocas_ms3.tasks.vector.processes import ProcessEnv
 
-CASES = {"1 env": (1, 1), "2 envs": (2, 2), "4 envs": (4, 2), "4 envs, 1 process": (4, 1)}  # envs, processes
+CASES = {  # envs, processes
+    "1 env": (1, 1),
+    "2 envs": (2, 2),
+    **{f"{n} envs": (n, 2) for n in (4, 8, 16)},
+    **{f"{n} envs, 1 process": (n, 1) for n in (4, 8, 16)},
+}
 COMPARED = [
     *((name, "plain gym.make") for name in CASES),
-    ("4 envs", "4 envs, 1 process"),
+    *((f"{n} envs", f"{n} envs, 1 process") for n in (4, 8, 16)),
     ("2 envs", "1 env"),
 ]
 CPU = ("this process", "busiest worker", "together")
@@ -45,13 +50,13 @@ class Args:
     """Observations; with pictures drop --render-backend none."""
     render_backend: str = "none"
     """None needs no renderer."""
-    turns: int = 7
+    turns: int = 5
     """That count, of each case."""
     steps: int = 100
     """Of each env a turn."""
     others: float = 0.05
     """Share of the machine's CPU time that a quiet machine may spend elsewhere."""
-    minutes: float = 5
+    minutes: float = 8
     """After which it ends, with fewer turns than asked for."""
 
 

@@ -33,9 +33,9 @@ def test_it_makes_the_same_layouts_and_ends_with_its_object():
 
 
 def test_what_it_can_not_make_is_an_error_as_here_and_it_goes_on():
-    target = {"min_grasps": 10_000}
+    target, few = {"min_grasps": 10_000}, {"ids": "all", "count": 2}
     data = load_task_config("pick_table_scattered").model_dump(mode="json")
-    other = OtherProcess(model(target={**data["target"], **target}))
+    other = OtherProcess(model(target={**data["target"], **target}, objects=few))
     for _ in range(2):
         with pytest.raises(LayoutError, match="no object qualifies"):
             other.layout(0, 0)
