@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from learning_envs import STATE_ONLY, held_still, put, reward_now, target_of
+from mani_skill.utils.structs import Pose
 
 import robocas_ms3  # noqa: F401
 
@@ -110,3 +111,21 @@ def test_success_is_exactly_one_and_a_shifted_basket_keeps_it_below(env):
     assert terms["basket_shift"] == 1
     assert 0.8 < reward < 0.9  # the basket only stands elsewhere
     assert not info["fail"]
+
+
+def test_a_tipped_basket_is_not_above_what_lies_beside_it(env):
+    env.reset(seed=0)
+    base = env.unwrapped
+    basket, target, at = base.fixtures.basket, target_of(base), base.basket_pose[0, :3].clone()
+    height = target.pose.p[0, 2]
+    base._stages["target_lifted"][:] = True
+    for axis in range(1, 3):
+        for way in (-1, 1):
+            turned = torch.zeros(1, 4)
+            turned[0, 0], turned[0, axis] = np.cos(np.radians(59) / 2), way * np.sin(np.radians(59) / 2)
+            basket.set_pose(Pose.create_from_pq(at[None], turned))
+            for x, y in ((0.25, 0), (0.4, 0), (-0.25, 0), (-0.4, 0), (0, 0.25), (0, 0.4), (0, -0.25), (0, -0.4)):
+                put(target, torch.stack([at[0] + x, at[1] + y, height]))
+                reward, _, info = reward_now(base)
+                assert not info["fail"]
+                assert reward < 0.2  # what reaching for it earns from afar
