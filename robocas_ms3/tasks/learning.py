@@ -97,7 +97,8 @@ class LearningEnv(TransferEnv):
             0 * slot + table.index("grasp"),
             [
                 (now.held, table.index("lift")),
-                (now.lifted, table.index("carry")),
+                # a basket may stand lower than where the target stood
+                (now.held & brought, table.index("carry")),
                 (brought & over, table.index("place")),
                 (delivered, table.index("release")),
                 (delivered & ~now.touched, table.index("rest")),

@@ -30,7 +30,6 @@ class Moment(NamedTuple):
         objects: (N, K, 13) their states.
         basket: (N, 7) its pose in the world.
         held: (N,) bool, whether the target is held; so are the next ones.
-        lifted: it is held, and has been lifted.
         touched: the gripper touches it.
         in_basket: it is in the basket.
         disturbed: (N,) int.
@@ -39,7 +38,6 @@ class Moment(NamedTuple):
     objects: Any
     basket: Any
     held: Any
-    lifted: Any
     touched: Any
     in_basket: Any
     disturbed: Any
@@ -157,9 +155,7 @@ class TransferEnv(RoboCASEnv):
         fail = self._has_failed(measures, objects, basket)
         stages = dict(zip(self.STAGES, self._reached.clone(), strict=True))
         disturbed = self._disturbed(objects[..., :7])
-        self._moment = Moment(
-            objects, basket, held, now["target_lifted"], now["reached_target"], measures["in_basket"], disturbed
-        )
+        self._moment = Moment(objects, basket, held, now["reached_target"], measures["in_basket"], disturbed)
         flags = {"success": as_tensor(success), "fail": as_tensor(fail)}
         return {**stages, **flags, "disturbed": as_tensor(disturbed)}
 

@@ -1,0 +1,112 @@
+"""Dense rewards of demonstrations, and of those who leave them on the way.
+
+Idlers stop somewhere and hold still from then on, as a policy would that has found a reward it likes. Harvesters go
+back and forth, to earn the same way twice. Neither may earn more than going on, in whatever way rewards are summed up.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from demonstrations import OPEN, SHUT, Demonstration
+from scipy.stats import spearmanr
+
+DEMONSTRATED = [
+    ("pick", "pick_table_scattered", 0),
+    ("pick", "pick_side_table_scattered", 0),  # the basket stands on the floor
+    ("select", "select_table_orderly", 0),
+    ("select", "select_shelf_orderly", 0),  # and lower than the shelf
+    ("search", "search_table_small_heap", 3),
+    ("search", "search_table_stacked", 70200),
+    ("open_pick", "open_pick_drawer", 0),
+]
+HELD = 40  # steps that an idler is watched for
+HORIZON = 1000  # steps that it goes on in the same way, beyond the demonstration's
+
+
+@pytest.fixture(scope="module", params=DEMONSTRATED, ids=lambda row: row[1])
+def demonstration(request, tmp_path_factory):
+    made = Demonstration(*request.param, tmp_path_factory.mktemp("demonstrations"))
+    yield made
+    made.env.close()
+
+
+def earns_less(demonstration: Demonstration, step: int, levels: np.ndarray, stays: float) -> bool:
+    """Whether who leaves a demonstration at a step, and stays at some level in the end, earns less than it does."""
+    went = demonstration.levels
+    end = len(went) + HORIZON
+    # while episodes go on after a success
+    going_on = went.sum() + HORIZON * 1.0
+    instead = went[:step].sum() + levels.sum() + (end - step - len(levels)) * stays
+    # where a success ends them: what an episode of `progress` sums up to
+    return instead < going_on and stays - went[0] < 0.95 * (1 - went[0])
+
+
+@pytest.mark.slow
+class TestDemonstrations:
+    def test_the_reward_of_a_demonstration_rises(self, demonstration):
+        levels = demonstration.levels
+        assert levels.min() >= 0
+        won = np.array([bool(info["success"][0]) for info in demonstration.infos])
+        assert won[-1]
+        assert ((levels == 1) == won).all()
+        assert not any(info["fail"][0] for info in demonstration.infos)
+        assert spearmanr(np.arange(len(levels)), levels)[0] > 0.8
+        tenths = [part.mean() for part in np.array_split(levels, 5)]
+        assert tenths == sorted(tenths)
+
+    def test_every_stage_is_worth_more_than_the_one_before(self, demonstration):
+        steps = [demonstration.first(flag) for flag in ("reached_target", "target_grasped", "target_lifted", "success")]
+        first = {"search": "obstacles_cleared", "open_pick": "furniture_opened"}.get(demonstration.task)
+        if first:
+            steps.insert(0, demonstration.first(first))
+        found = [demonstration.levels[step] for step in steps]
+        assert found == sorted(found)
+        assert len(set(found)) >= len(found) - 1  # what is touched may be held in the same step
+
+    def test_who_stops_on_the_way_earns_less(self, demonstration):
+        """In the middle of each stage, where the next begins, and just before the target is let go of."""
+        changes = np.flatnonzero(np.diff(demonstration.stages)) + 1
+        bounds = [0, *changes[changes < demonstration.released], demonstration.released]
+        stops = sorted({*bounds, *((first + last) // 2 for first, last in zip(bounds, bounds[1:], strict=False))})
+        assert len(stops) >= 9
+        reached = []
+        for stop in stops:
+            held = demonstration.actions[max(stop - 1, 0)]
+            levels, infos = demonstration.leave(stop, [held] * HELD)
+            assert not any(info["success"][0] for info in infos)
+            assert earns_less(demonstration, stop, levels, levels.max())
+            reached.append(levels[-1])
+        assert reached[-1] > 0.97 * max(reached)
+        assert reached[0] == min(reached)
+
+    def test_fingers_that_are_shut_earn_no_more_than_reaching(self, demonstration):
+        grasped = demonstration.first("target_grasped")
+        begin = grasped - 50  # when the target is not between them yet
+        path = demonstration.path(begin, grasped, SHUT)
+        levels, infos = demonstration.leave(begin, [*path, *path[-1:] * HELD])
+        assert not any(info["success"][0] for info in infos)
+        assert levels[-1] < demonstration.levels[grasped]  # they may fling it up, which is a grasp for a moment
+        assert earns_less(demonstration, begin, levels, levels.max())
+
+    @pytest.mark.parametrize("way", ["carries", "grasps_again", "opens"])
+    def test_going_back_and_forth_earns_no_more_than_staying(self, demonstration, way):
+        """With the target held; down, to let go of it and grasp it anew; with the handle, not quite open and back."""
+        if way == "opens" and demonstration.task != "open_pick":
+            pytest.skip("nothing to open")
+        first, path = demonstration.first, demonstration.path
+        grasped, lifted = first("target_grasped"), first("target_lifted") + 3
+        if way == "carries":
+            begin = (lifted + demonstration.released) // 2
+            cycle = [*path(begin, lifted, SHUT), *path(lifted, begin, SHUT)]
+        elif way == "grasps_again":
+            begin, there = lifted, path(grasped, lifted, SHUT)
+            cycle = [*there[::-1], *path(grasped, grasped, OPEN) * 6, *there[:1] * 6, *there]
+        else:
+            begin = first("furniture_opened") - 2
+            cycle = [*path(begin, begin - 30, SHUT), *path(begin - 30, begin, SHUT)]
+        stays, _ = demonstration.leave(begin, cycle[:1] * HELD)
+        levels, infos = demonstration.leave(begin, cycle * 2)
+        assert not any(info["success"][0] for info in infos)
+        assert levels.mean() < stays.max()
+        assert earns_less(demonstration, begin, levels, levels.max())

@@ -1,0 +1,93 @@
+"""What only a simulator can tell a policy, and that a GPU's tensors tell the same as a CPU's arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from learning_envs import STATE_ONLY, held_still, put, reward_now, target_of
+
+import robocas_ms3  # noqa: F401
+from robocas_ms3.arrays import as_tensor
+from robocas_ms3.tasks import TASKS, learning, open_pick, search
+from robocas_ms3.tasks import base as tasks_base
+from robocas_ms3.tasks.transfer import Moment
+
+
+def test_observations_are_seen_from_the_tcp(env):
+    obs, _ = env.reset(seed=2)
+    base, extra = env.unwrapped, obs["extra"]
+    tcp, target = base.agent.tcp.pose.sp, target_of(base).pose.sp
+    center = target.p + target.to_transformation_matrix()[:3, :3] @ base.target_asset().asset.center_of_mass
+    seen = tcp.inv().to_transformation_matrix() @ np.append(center, 1)
+    assert extra["tcp_to_target"][0].numpy() == pytest.approx(seen[:3], abs=1e-5)
+    drop = tcp.to_transformation_matrix()[:3, :3] @ extra["target_to_drop"][0].numpy() + center
+    basket = base.basket_pose[0].numpy()
+    assert drop[:2] == pytest.approx(basket[:2], abs=0.02)
+    assert 0.1 < drop[2] - basket[2] < 0.3
+    assert extra["target_extents"][0].tolist() == pytest.approx(base.target_asset().asset.extents)
+    assert list(extra)[:3] == ["object_poses", "target", "basket_pose"]  # what was there before keeps its place
+
+
+@pytest.mark.parametrize(
+    ("env_id", "names"),
+    [("RoboCASSearch-v1", ["hidden_share"]), ("RoboCASOpenPick-v1", ["opened_share", "tcp_to_handle"])],
+)
+def test_tasks_add_what_is_theirs(env_id, names):
+    config = {"RoboCASSearch-v1": "search_table_small_heap"}.get(env_id)
+    env = gym.make(env_id, config=config, obs_mode="state_dict", reward_mode="normalized_dense", **STATE_ONLY)
+    obs, _ = env.reset(seed=3)
+    base: Any = env.unwrapped
+    assert list(obs["extra"])[-len(names) - 1 :] == [*names, "tcp_pose"]
+    if names[0] == "hidden_share":
+        assert obs["extra"]["hidden_share"].item() == pytest.approx(base.clutter().hidden_share.item())
+        _, terms, info = reward_now(base)
+        assert bool(info["obstacles_cleared"]) is (terms["reach"] > 0)
+        for slot in range(len(base.objects)):
+            if slot != int(base.target_slot[0]):
+                put(base.objects[slot], [-2.0, slot * 0.3 - 2.0, 0.1])
+        reward, terms, _ = reward_now(base)
+        assert terms["clear"] == terms["push_point"] == 1
+        assert reward > 4 / 14
+    else:
+        assert obs["extra"]["opened_share"].item() == pytest.approx(0, abs=1e-3)
+        furniture, joint = base._opening
+        handle = base._handle_in_world()[0].copy()
+        shut = reward_now(base)
+        qpos = furniture.get_qpos().clone()
+        qpos[:, joint] = base.model.opened_position / 2
+        furniture.set_qpos(qpos)
+        half = reward_now(base)
+        assert (shut[1]["open"], half[1]["open"]) == pytest.approx((0, 0.5), abs=1e-3)
+        assert half[0] > shut[0]
+        assert np.linalg.norm(base._handle_in_world()[0] - handle) > 0.1  # it moves with the door
+        qpos[:, joint] = base.model.opened_position * 1.01
+        furniture.set_qpos(qpos)
+        assert reward_now(base)[0] > 4 / 14
+    env.close()
+
+
+@pytest.mark.parametrize("task", ["pick", "search", "open_pick"])
+def test_tensors_as_on_a_gpu_give_what_arrays_give(task, monkeypatch):
+    env = gym.make(TASKS[task].env_id, obs_mode="state_dict", reward_mode="normalized_dense", **STATE_ONLY)
+    env.reset(seed=1)
+    base: Any = env.unwrapped
+    action = torch.as_tensor(held_still(env))[None]
+    env.step(action[0].numpy())
+    action = action + 0.1
+    info = base.get_info()
+    expected, seen = base.compute_dense_reward({}, action, info), base._privileged()
+    for module in (tasks_base, learning, search, open_pick):
+        monkeypatch.setattr(module, "native", lambda tensor: tensor)
+    base._moment = Moment(*map(as_tensor, base._moment))
+    again = {name: value for name, value in info.items() if name != "reward_terms"}
+    assert torch.allclose(base.compute_dense_reward({}, action, again), expected, atol=1e-6)
+    for name, term in again["reward_terms"].items():
+        assert (type(term), term.dtype) == (torch.Tensor, torch.float32)
+        assert torch.allclose(term, info["reward_terms"][name], atol=1e-6)
+    for name, value in base._privileged().items():
+        assert torch.allclose(value, seen[name], atol=1e-6)
+    env.close()

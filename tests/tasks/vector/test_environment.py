@@ -1,0 +1,83 @@
+"""ManiSkill's conventions: how episodes end and are counted, on a batch that only counts its steps."""
+
+import gymnasium as gym
+import numpy as np
+import torch
+from vector_envs import STATE_ONLY, with_gpu
+
+import robocas_ms3
+from robocas_ms3.tasks import vector
+from robocas_ms3.tasks.vector.environment import RoboCASVectorEnv
+
+
+class FakeBatch(gym.Env):
+    """Three envs that count their steps: env i succeeds at step i + 2 alone, and every fourth step is the last."""
+
+    reconfiguration_freq, device, spec = 0, torch.device("cpu"), None
+    single_action_space = gym.spaces.Box(-1, 1, (2,))
+    single_observation_space = gym.spaces.Box(0, 9, (1,))
+    action_space, observation_space = gym.spaces.Box(-1, 1, (3, 2)), gym.spaces.Box(0, 9, (3, 1))
+
+    def __init__(self, **kwargs) -> None:
+        self.metadata, self.kwargs, self.num_envs = {}, kwargs, kwargs.get("num_envs", 3)
+        self.elapsed_steps = torch.zeros(3, dtype=torch.int32)
+
+    def reset(self, *, seed=None, options=None):
+        self.elapsed_steps[options["env_idx"] if options else slice(None)] = 0
+        return self.elapsed_steps[:, None].float(), {"elapsed_steps": self.elapsed_steps.clone()}
+
+    def step(self, action):
+        self.elapsed_steps += 1
+        won = self.elapsed_steps == torch.arange(3) + 2
+        info = {"success": won, "elapsed_steps": self.elapsed_steps.clone()}
+        ended = self.elapsed_steps >= 4
+        return self.elapsed_steps[:, None].float(), won.float(), won.clone(), ended, info
+
+
+def test_success_once_and_at_end_of_an_episode():
+    env = RoboCASVectorEnv(FakeBatch(), ignore_terminations=True, record_metrics=True)
+    env.reset()
+    for _ in range(3):
+        *_, info = env.step(None)
+        assert "final_info" not in info
+    assert info["episode"]["success_at_end"].tolist() == [False, True, False]
+    obs, _, terminated, truncated, info = env.step(None)
+    episode = info["final_info"]["episode"]
+    assert episode["success_once"].tolist() == [True, True, True]
+    assert episode["success_at_end"].tolist() == [False, False, True]
+    assert (obs.tolist(), info["final_observation"].tolist()) == ([[0.0]] * 3, [[4.0]] * 3)
+    assert not terminated.any() and truncated.all()
+
+
+def test_an_episode_that_ends_with_success_succeeded_at_its_end():
+    env = RoboCASVectorEnv(FakeBatch(), record_metrics=True)
+    env.reset()
+    env.step(None)
+    *_, info = env.step(None)
+    assert info["_final_info"].tolist() == [True, False, False]
+    assert info["final_info"]["episode"]["success_at_end"].tolist() == [True, False, False]
+
+
+def test_calls_reach_through_wrappers():
+    env = RoboCASVectorEnv(gym.Wrapper(FakeBatch()))
+    env.reset()
+    assert env.call("elapsed_steps").tolist() == [0, 0, 0]
+    assert len(env.call("step", None)) == 5
+
+
+def test_a_gpu_gets_the_same_arguments_in_one_batch(monkeypatch):
+    with_gpu(monkeypatch, True)
+    monkeypatch.setattr(vector.gym, "make", lambda env_id, **kwargs: FakeBatch(env_id=env_id, **kwargs))
+    wrapped = []
+    env = robocas_ms3.make_vec("RoboCASPick-v1", 3, wrappers=[lambda env: wrapped.append(env) or env], **STATE_ONLY)
+    expected = {"env_id": "RoboCASPick-v1", "num_envs": 3, "sim_backend": "physx_cuda", **STATE_ONLY}
+    assert env.unwrapped.kwargs == expected
+    assert wrapped == [env.unwrapped]
+    assert (env.auto_reset, env.ignore_terminations, env.record_metrics) == (True, False, True)
+    assert env.metadata["autoreset_mode"] == gym.vector.AutoresetMode.SAME_STEP
+    env = robocas_ms3.make_vec("RoboCASPick-v1", 3, sim_backend="cuda:1", arrays="numpy", **STATE_ONLY)
+    assert env.unwrapped.kwargs["sim_backend"] == "cuda:1"
+    env.reset()
+    obs, reward, terminated, truncated, info = env.step(None)
+    for array in (obs, reward, terminated, truncated, info["episode"]["success_once"]):
+        assert isinstance(array, np.ndarray)

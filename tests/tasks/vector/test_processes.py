@@ -1,0 +1,146 @@
+"""What goes wrong in processes, and how they end."""
+
+import gc
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing
+
+import pytest
+import torch
+from vector_envs import doing, gone, make
+from vector_wrappers import LacksLayouts, Misbehaves, OwnError
+
+from robocas_ms3.errors import ConfigError, LayoutError, VectorEnvError, WorkerDied
+from robocas_ms3.tasks import RoboCASPickEnv
+
+slow = pytest.mark.slow
+
+
+@slow
+def test_a_seed_without_a_layout_is_an_error_where_it_was_asked_for():
+    with closing(make(2, 1, wrappers=[LacksLayouts], seeds=(4, 6))) as env:
+        with pytest.raises(LayoutError, match="no object qualifies"):
+            env.reset(seed=5)
+        with pytest.raises(VectorEnvError, match="envs 0, 1.*failed.*Reset"):
+            env.step(doing(0, 0))
+        drawn, _ = env.reset(seed=4)  # 4, and for env 1 another than 5
+        with pytest.raises(LayoutError):
+            env.reset(seed=[4, 5])
+        assert torch.equal(drawn, env.reset(seed=4)[0])
+        assert torch.equal(drawn[0], env.reset(seed=6)[0][1])  # after the last seed of the range comes its first
+        with pytest.raises(LayoutError, match="none was drawn"):  # without a seed env 1 does what it does alone
+            env.reset(options={"draws_none_after": 4})
+
+
+@slow
+def test_what_goes_wrong_in_a_process(capfd):
+    with closing(make(4, 2, wrappers=[Misbehaves])) as env:
+        begun, _ = env.reset(seed=0)
+        with pytest.raises(OwnError) as error:
+            env.step(doing(0, 0, 2, 3))
+        assert error.value.args == ("gripper fell off", 7)
+        assert "env 2" in str(error.value.__cause__)
+        assert "in step\n    raise OwnError" in str(error.value.__cause__)
+        with pytest.raises(VectorEnvError, match="Reset them first"):
+            env.step(doing(0, 0, 0, 0))
+        assert torch.equal(env.reset(seed=0)[0], begun)
+        with pytest.raises(VectorEnvError, match="Unsendable: lost somewhere"):
+            env.step(doing(3, 0, 0, 0))
+        env.reset(seed=0)
+        with pytest.raises(TypeError, match="pickle.*lock") as error:
+            env.step(doing(0, 6, 0, 0))
+        assert "env 1" in str(error.value.__cause__)
+        # interrupted in the middle of a step
+        env.reset(seed=0)
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+        with pytest.raises(KeyboardInterrupt):
+            env.step(doing(5, 0, 0, 0))
+        with pytest.raises(VectorEnvError, match="interrupted"):
+            env.step(doing(0, 0, 0, 0))
+        assert torch.equal(env.reset(seed=0)[0], begun)
+        plain = env.step(doing(1, 1, 1, 1))[0]
+        env.reset(seed=0)
+        assert torch.equal(env.step(doing(1, 1, 1, 1))[0], plain)
+        # a fork of this process has no say
+        child = os.fork()
+        if not child:
+            env.close()
+            os._exit(0)
+        os.waitpid(child, 0)
+        env.step(doing(1, 1, 1, 1))
+        # killed
+        pids = env.unwrapped.pids
+        with pytest.raises(WorkerDied, match=r"env 3: its process died \(found SIGKILL"):
+            env.step(doing(0, 0, 0, 4))
+        assert gone(pids)
+        with pytest.raises(VectorEnvError, match="closed"):
+            env.step(doing(0, 0, 0, 0))
+        env.close()
+    env.close()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@slow
+def test_a_busy_process_is_not_waited_for():
+    env = make(1, 1, wrappers=[Misbehaves])
+    env.reset(seed=0)
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        env.step(doing(5))
+    begun, pids = time.monotonic(), env.unwrapped.pids
+    env.close()
+    assert time.monotonic() - begun < 2.5
+    assert gone(pids)
+
+
+@slow
+def test_errors_of_making_arrive_as_themselves():
+
+    with pytest.raises(ConfigError, match="no_such_config") as error:
+        make(2, 2, config="no_such_config")
+    assert "env 0" in str(error.value.__cause__)
+    with pytest.raises(VectorEnvError, match="can't be sent"):
+        make(1, 1, config={"lock": threading.Lock()})
+
+
+def test_an_env_of_the_program_itself_can_not_be_sent(monkeypatch):
+    monkeypatch.setattr(RoboCASPickEnv, "__module__", "__main__")
+    with pytest.raises(VectorEnvError, match=r"RoboCASPick-v1.*the_module:"):
+        make(1, 1)
+
+
+@slow
+def test_what_is_forgotten_is_closed():
+    env = make(1, 1)
+    pids = env.unwrapped.pids
+    del env
+    gc.collect()
+    assert gone(pids)
+
+
+PROGRAM = """
+import os, signal, sys, gymnasium
+import robocas_ms3
+
+class Own(gymnasium.Wrapper):
+    pass
+
+env = robocas_ms3.make_vec("RoboCASPick-v1", backend="processes", wrappers=[Own, lambda env: env],
+                           render_backend="none", obs_mode="none")
+env.reset(seed=0)
+print(*env.unwrapped.pids, flush=True)
+"""
+
+
+@slow
+@pytest.mark.parametrize("end", ["", "os.kill(os.getpid(), signal.SIGKILL)", "os.kill(os.getpid(), signal.SIGINT)"])
+def test_processes_end_with_a_program_that_was_read_from_a_pipe(end):
+    done = subprocess.run([sys.executable, "-"], input=PROGRAM + end, capture_output=True, text=True, check=False)
+    assert done.returncode == (-signal.SIGKILL if "SIGKILL" in end else -signal.SIGINT if end else 0), done.stderr
+    assert gone([int(pid) for pid in done.stdout.split()])
+    assert len(done.stdout.split()) == 1
+    assert done.stderr.count("Traceback") == ("SIGINT" in end)
