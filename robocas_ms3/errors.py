@@ -60,6 +60,10 @@ class WorkerDied(VectorEnvError):
     """A process that ran some of several environments is no more."""
 
 
+class EvaluationError(RobocasError):
+    """A protocol, policy, result or figure of an evaluation is not what it should be."""
+
+
 class PlanningFailed(RobocasError):
     """A scripted policy could not go on.
 

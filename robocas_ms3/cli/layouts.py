@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from robocas_ms3.scenes.bank import LayoutBank
-    from robocas_ms3.scenes.table import Engine
+    from robocas_ms3.scenes.table import Engine, Pair
 
 
 @dataclass
@@ -149,11 +149,14 @@ def try_all(bank: LayoutBank, engine: Engine, progress: Progress, **packs: str) 
     from robocas_ms3.tasks.trial import judged, try_layouts, untried
 
     seeds = untried(bank, engine)
-    pairs = [(row, seed) for row, some in seeds.items() for seed in some]
-    if pairs:
-        bank.mark_table(engine, dict.fromkeys(pairs, State.UNTRIED))
-        trial = progress.track(try_layouts(bank, engine, seeds, **packs), len(pairs), description="trying them")
-        bank.mark_table(engine, {pair: judged(moved) for pair, moved in trial})
+    if seeds:
+        found: dict[Pair, State] = {}
+        trial = try_layouts(bank, engine, seeds, **packs)
+        try:
+            for pair, moved in progress.track(trial, sum(map(len, seeds.values())), description="trying them"):
+                found[pair] = judged(moved)
+        finally:  # interrupted, it keeps what was found
+            bank.mark_table(engine, found)
     table = bank.table(engine)
     return len(table.pairs(State.MOVES)) if table else 0
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import logging
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
@@ -37,13 +39,15 @@ _NO_MATTER = (
 _log = logging.getLogger(__name__)
 
 
-def layout_bank(model: SceneModel, folder: str | Path | None = "auto") -> LayoutSource:
+def layout_bank(model: SceneModel, folder: str | Path | LayoutSource | None = "auto") -> LayoutSource:
     """Where an environment gets its layouts from.
 
     Args:
         model: the scene's assets.
-        folder: of all banks; ``auto``: in the cache; None: no bank, every layout is sampled anew.
+        folder: of all banks; ``auto``: in the cache; None: no bank, every layout is sampled anew; or a source itself.
     """
+    if callable(folder):
+        return folder
     return Sampler(model) if folder is None else LayoutBank(model, folder)
 
 
@@ -90,22 +94,30 @@ class LayoutBank:
 
         What an earlier file holds stays in it.
         """
-        before = self.table(engine)
-        states = {pair: before.state(pair) for pair in before.pairs()} if before else {}
-        layouts: dict[Pair, Layout] = {}
-        for pair in dict.fromkeys([*states, *pairs]):
-            tabled = before.layout(pair) if before else None
-            if self.path(*pair).is_file():
-                layouts[pair] = self.get(*pair)
-            elif tabled is not None:
-                layouts[pair] = tabled
-        if layouts:
-            write_table(self.table_path(engine), self._names, layouts, states)
-        return self.table(engine)
+        with self._alone():
+            before = self.table(engine)
+            states = {pair: before.state(pair) for pair in before.pairs()} if before else {}
+            layouts: dict[Pair, Layout] = {}
+            for pair in dict.fromkeys([*states, *pairs]):
+                if self.path(*pair).is_file():
+                    layouts[pair] = self.get(*pair)
+                elif before is not None and (tabled := before.layout(pair)) is not None:
+                    layouts[pair] = tabled
+            if layouts:
+                write_table(self.table_path(engine), self._names, layouts, states)
+            return self.table(engine)
 
     def mark_table(self, engine: Engine, states: Mapping[Pair, State]) -> None:
-        """Write into the table what its engine has found of layouts."""
-        mark_table(self.table_path(engine), self._names, states)
+        """Write into the table what its engine has found of layouts; those that it lacks it goes on lacking."""
+        with self._alone():
+            mark_table(self.table_path(engine), self._names, states)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """While no other process changes the tables: each change begins with what is there."""
+        with (make_folder(self.folder) / ".tables.lock").open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
 
     def path(self, objects_seed: int, seed: int) -> Path:
         """File of a layout."""

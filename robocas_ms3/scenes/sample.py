@@ -86,7 +86,11 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
     layout_rng, target_rng = rng(_LAYOUT), rng(_TARGET)
     unsettled, untargeted, unarranged = 0, 0, []
     for number in range(_SETS):
-        ids = object_ids or object_set(model, objects_seed, number)
+        try:
+            ids = object_ids or object_set(model, objects_seed, number)
+        except LayoutError as error:
+            unarranged += [error] * _TRIES
+            continue
         assets = [model.object_pack.objects[i] for i in ids]
         present, candidate = _presence(model, len(ids), rng(_COUNT))
         used = [asset for asset, there in zip(assets, present, strict=True) if there]
@@ -95,10 +99,13 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
             try:
                 arranged = _arrange(layout_rng, model, used)
             except LayoutError as error:
-                if not isinstance(config.layout, OrderlyLayout):
+                if isinstance(config.layout, OrderlyLayout):
+                    unarranged.append(error)  # in another order the columns may fit
+                    continue
+                if object_ids is not None:
                     raise  # it has tried often enough
-                unarranged.append(error)  # in another order the columns may fit
-                continue
+                unarranged += [error] * _TRIES
+                break
             placed = model.support_pose @ model.support_motion(opened=False) @ arranged
             if config.randomisation.basket is not None and meets_basket(used, placed, model.basket, basket_pose):
                 basket_pose = place_basket(model, robot_pose, basket_rng)

@@ -21,6 +21,8 @@ from robocas_ms3.scenes.sample import sample_layout
 LayoutSource = Callable[[int, int], Layout]
 """(objects seed, seed) -> layout."""
 
+_GRACE = 0.5  # s to leave in
+
 # What libraries print must not get among the answers. No `multiprocessing`: it would run the program's main part again.
 _PROGRAM = """
 import os, pickle, sys
@@ -72,7 +74,13 @@ class Sampler:
             return sample_layout(self._model, objects_seed, seed, object_ids)
         if self._elsewhere is None:
             self._elsewhere = OtherProcess(self._model)
-        return self._elsewhere.layout(objects_seed, seed, object_ids)
+        try:
+            return self._elsewhere.layout(objects_seed, seed, object_ids)
+        except LayoutError:
+            raise
+        except BaseException:  # such as an interrupt: its answer would be taken for that to the next question
+            self._elsewhere = None
+            raise
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the other process."""
@@ -92,6 +100,7 @@ class OtherProcess:
             [sys.executable, "-c", _PROGRAM],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            start_new_session=True,  # an interrupt from the keyboard is not its to deal with
             env={**os.environ, "PYTHONPATH": path, "ROBOCAS_DEFER_REGISTRATION": "1"},
         )
         weakref.finalize(self, _stop, self._process)
@@ -127,4 +136,8 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
         assert pipe is not None
         with suppress(BrokenPipeError):  # what a dead process was not told
             pipe.close()
-    process.wait()
+    try:
+        process.wait(_GRACE)
+    except subprocess.TimeoutExpired:  # in the middle of a layout that nobody waits for
+        process.kill()
+        process.wait()

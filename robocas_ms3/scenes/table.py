@@ -38,6 +38,11 @@ class State(IntEnum):
     MOVES = 3  # its objects do, by the engine that the table is for
 
 
+def good(states: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Which `State` allows an episode to begin there."""
+    return (states == State.UNTRIED) | (states == State.STAYS)
+
+
 class LayoutTable:
     """Layouts from a mapped file.
 
@@ -82,6 +87,11 @@ class LayoutTable:
         """Objects seed and seed of the layouts that it holds, of those states alone if any is named."""
         rows, columns = np.nonzero(np.isin(self._states, states) if states else self._states)
         return [*zip(self._sets[rows].tolist(), self._seeds[columns].tolist(), strict=True)]
+
+    def stays(self, objects_seed: int) -> bool:
+        """Whether any layout of a seed's objects is good, as far as is known."""
+        row = self._states[self._sets == objects_seed]
+        return bool(good(row).any())
 
     def object_ids(self, objects_seed: int) -> ObjectIds | None:
         """The objects of a seed; None where it has no layout of them."""
@@ -145,12 +155,13 @@ def write_table(
 
 
 def mark_table(path: Path, names: Sequence[str], states: Mapping[Pair, State]) -> None:
-    """Write what is known of some of a table's layouts."""
+    """Write what is known of some layouts into a table; those that it lacks it goes on lacking."""
     table = LayoutTable(path, names)
     rows = np.array(table.rows)
     for pair, state in states.items():
-        _, row, column = table.places(np.array([pair[0]]), np.array([pair[1]]))
-        rows["state"][row[0], column[0]] = state
+        before, row, column = table.places(np.array([pair[0]]), np.array([pair[1]]))
+        if before[0] != State.LACKING:
+            rows["state"][row[0], column[0]] = state
     _save(path, rows)
 
 

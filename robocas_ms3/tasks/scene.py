@@ -24,6 +24,7 @@ from robocas_ms3.scenes import build
 from robocas_ms3.scenes.bank import layout_bank
 from robocas_ms3.scenes.layout import Array
 from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.source import LayoutSource
 from robocas_ms3.tasks.bodies import Bodies
 from robocas_ms3.tasks.contacts import Contacts
 from robocas_ms3.tasks.engine_errors import EngineErrors
@@ -50,7 +51,8 @@ class SceneEnv(SeededEnv):
         furniture_pack: the same for room, furniture and basket.
         visual_level: ``fast`` or ``full`` meshes to render.
         layouts: folder of the layout bank; default: in the cache, filled as layouts are asked for; None: no bank,
-            every layout is sampled anew (the same ones, only slower).
+            every layout is sampled anew (the same ones, only slower); or a function that gives the layout of an objects
+            seed and a seed.
         seeds: least and greatest seed that unseeded resets draw from, such as those of a bank built ahead; default: any
             seed, with several envs 0 to 99.
         robot_uids: the robot; only RoboCAS's mobile Panda is supported.
@@ -74,7 +76,7 @@ class SceneEnv(SeededEnv):
         pack: str | Path = "builtin",
         furniture_pack: str | Path = "builtin",
         visual_level: VisualLevel = "fast",
-        layouts: str | Path | None = "auto",
+        layouts: str | Path | LayoutSource | None = "auto",
         seeds: tuple[int, int] | None = None,
         robot_uids: str = "robocas_mobile_panda",
         num_envs: int = 1,

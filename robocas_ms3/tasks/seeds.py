@@ -17,7 +17,7 @@ from robocas_ms3.scenes.bank import LayoutBank
 from robocas_ms3.scenes.layout import Layout, ObjectIds
 from robocas_ms3.scenes.source import LayoutSource
 from robocas_ms3.scenes.table import LayoutTable, Pair, State
-from robocas_ms3.tasks.starts import Starts, TabledStarts, good
+from robocas_ms3.tasks.starts import Starts, TabledStarts
 
 SEVERAL_ENVS_SEEDS = (0, 99)  # least and greatest seed of several envs' unseeded resets
 _OTHER_SEEDS = 20  # tried where a seed has no layout
@@ -28,6 +28,11 @@ _log = logging.getLogger(__name__)
 
 class _Moves(LayoutError):
     """The engine does not leave the objects where a layout has them."""
+
+
+def _level(error: LayoutError) -> int:
+    """Of a message that another seed is drawn: how many layouts move was told when they were tried."""
+    return logging.DEBUG if isinstance(error, _Moves) else logging.WARNING
 
 
 def following_seeds(first: int, count: int, within: tuple[int, int] | None) -> list[int]:
@@ -118,14 +123,19 @@ class SeededEnv(BaseEnv):
             elif seed is not None and np.ndim(seed) == 0:
                 self._asked_for = set(list(envs)[:1])
                 seed = following_seeds(int(np.asarray(seed)), len(envs), within)  # ManiSkill's own would lie outside
-            return super().reset(seed, options)
+            before = self._layout_seeds.copy(), dict(self._found)
+            try:
+                return super().reset(seed, options)
+            except LayoutError:  # the envs are where they were
+                self._layout_seeds[:], self._found = before
+                raise
         for _ in range(self._other_seeds):
             try:
                 return super().reset(seed, options)
             except LayoutError as error:
                 if self._resets_seeded:
                     raise
-                _log.warning("no layout for the seed of this reset, another is drawn: %s", error)
+                _log.log(_level(error), "no layout for the seed of this reset, another is drawn: %s", error)
                 seed = None
         return super().reset(seed, options)
 
@@ -169,16 +179,19 @@ class SeededEnv(BaseEnv):
         """The objects that each env is to be built with: those of its seed, which decides its looks, too."""
         assert self._episode_seed is not None
         self._own = {}
-        if self._objects_stay and isinstance(self._layouts, LayoutBank):
-            self._table = self._layouts.table("gpu" if self._sim_device.is_cuda() else "cpu")
+        on_gpu = self._sim_device.is_cuda()
+        if isinstance(self._layouts, LayoutBank) and (self._objects_stay or on_gpu):
+            self._table = self._layouts.table("gpu" if on_gpu else "cpu")
+            self._other_seeds = _OTHER_SEEDS if self._table else self._other_seeds
         seeds = self._episode_seed
         self._object_ids = [self._first_possible(self._objects_of, env, seeds) for env in range(self.num_envs)]
         self._objects_seeds = np.array(seeds)
         self._tabled = TabledStarts(self._table, self._objects_seeds, self.device) if self._table else None
 
     def _objects_of(self, seed: int) -> ObjectIds:
-        tabled = self._table.object_ids(seed) if self._table else None
-        if tabled is not None:
+        if self._table is not None and (tabled := self._table.object_ids(seed)) is not None:
+            if not self._table.stays(seed):
+                raise _Moves("no layout of these objects stays", where=f"objects seed {seed}", fix="Take another seed.")
             return tabled
         if seed not in self._own:
             self._own[seed] = self._layout((seed, seed))
@@ -188,13 +201,15 @@ class SeededEnv(BaseEnv):
         """Where some envs' episodes begin; gathered on their device where the bank's table holds them all."""
         for env in envs.tolist():
             self._found.pop(env, None)
-        if self._tabled is not None:
-            for env in envs[~good(self._tabled.states(envs, self._layout_seeds[envs]))].tolist():
-                self.layout(env)  # of another seed perhaps, which the table holds
-            gathered = self._tabled.gather(envs, self._layout_seeds[envs])
-            if gathered is not None:
-                return gathered
-        return Starts.of([self.layout(env) for env in envs.tolist()], self.device)
+        if self._tabled is None:
+            return Starts.of([self.layout(env) for env in envs.tolist()], self.device)
+        for env in envs[~self._tabled.good(envs, self._layout_seeds[envs])].tolist():
+            self.layout(env)  # of another seed perhaps, which the table holds
+        tabled = self._tabled.good(envs, self._layout_seeds[envs])
+        found = self._tabled.gather(envs[tabled], self._layout_seeds[envs[tabled]])
+        if tabled.all():
+            return found
+        return found.with_rows(tabled, Starts.of([self.layout(env) for env in envs[~tabled].tolist()], self.device))
 
     def layout(self, env: int = 0) -> Layout:
         """The layout of an env's episode."""
@@ -208,10 +223,13 @@ class SeededEnv(BaseEnv):
 
     def _layout(self, pair: Pair) -> Layout:
         """A layout; that there is none takes long to find out, and is remembered."""
+        tabled = self._tabled_layout(pair)
+        if tabled is not None:
+            return tabled
         if pair in self._failed:
-            raise self._failed[pair]
+            raise self._failed[pair].with_traceback(None)
         try:
-            layout = self._tabled_layout(pair) or self._layouts(*pair)
+            layout = self._layouts(*pair)
         except LayoutError as error:
             self._failed[pair] = error
             raise
@@ -236,7 +254,6 @@ class SeededEnv(BaseEnv):
             except LayoutError as error:
                 if env in self._asked_for or self.num_envs == 1:  # one env starts over, as its objects change too
                     raise
-                level = logging.DEBUG if isinstance(error, _Moves) else logging.WARNING  # the former was told before
-                _log.log(level, "env %d: no layout for seed %d, another is drawn: %s", env, seeds[env], error)
+                _log.log(_level(error), "env %d: no layout for seed %d, another is drawn: %s", env, seeds[env], error)
                 seeds[env] = self._draw_seed(env)
         return make(int(seeds[env]))

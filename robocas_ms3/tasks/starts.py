@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.table import LayoutTable, State, raw_poses
+from robocas_ms3.scenes.table import LayoutTable, good, raw_poses
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,13 @@ class Starts:
             torch.from_numpy(np.stack([layout.present for layout in layouts])).to(device),
         )
 
+    def with_rows(self, rows: NDArray[np.bool_], others: Starts) -> Starts:
+        """These, in the order of ``rows`` (E,) where they are True, and others where not."""
+        order = torch.from_numpy(np.argsort(np.argsort(~rows, kind="stable"))).to(self.targets.device)
+        return Starts(
+            **{f.name: torch.cat([getattr(self, f.name), getattr(others, f.name)])[order] for f in fields(Starts)}
+        )
+
 
 class TabledStarts:
     """Starts of envs that keep their objects: a reset gathers them on the device.
@@ -62,20 +69,13 @@ class TabledStarts:
         names = ("object_poses", "robot_pose", "basket_pose", "target", "present")
         self._kept = [torch.from_numpy(np.ascontiguousarray(taken[name])).to(device) for name in names]
 
-    def states(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """(E,) the `State` of some envs' layouts, by their seeds (E,)."""
-        return self._table.places(self._objects_seeds[envs], seeds)[0]
+    def good(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(E,) which of some envs' layouts, by their seeds (E,), are there and good, as far as is known."""
+        return good(self._table.places(self._objects_seeds[envs], seeds)[0])
 
-    def gather(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> Starts | None:
-        """Starts of some envs, by the seeds (E,) of their layouts; None where one of them is no good."""
-        states, _, columns = self._table.places(self._objects_seeds[envs], seeds)
-        if not good(states).all():
-            return None
+    def gather(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> Starts:
+        """Starts of some envs, by the seeds (E,) of their layouts, all of which are good."""
+        columns = self._table.places(self._objects_seeds[envs], seeds)[2]
         row, column = (torch.from_numpy(index).to(self._device) for index in (self._row_of_env[envs], columns))
         objects, robots, baskets, targets, present = (kept[row, column] for kept in self._kept)
         return Starts(objects, robots, baskets, targets.long(), present)
-
-
-def good(states: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Which `State` allows an episode to begin there."""
-    return (states == State.UNTRIED) | (states == State.STAYS)

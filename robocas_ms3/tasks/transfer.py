@@ -209,6 +209,12 @@ class TransferEnv(RoboCASEnv):
             "basket_stands": terms.stands(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:]),
         }
 
+    def fallen(self) -> torch.Tensor:
+        """(N, K) bool: which objects lie more than 5 cm below what they stood on, and not in the basket."""
+        objects, centers = native(self.object_states), native(self._centers_of_mass)
+        low = (objects[..., 2] < self._surface - terms.FALLEN) & native(self.present)
+        return as_tensor(low & ~self._in_basket(objects[..., :7], centers, native(self.basket_pose)))
+
     def _in_basket(self, poses: Any, centers_of_mass: Any, basket: Any) -> Any:
         """(N,) or (N, K) bool: whose centre of mass is in the basket's inner volume; all native (`arrays`).
 

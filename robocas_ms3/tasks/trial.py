@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 
 from robocas_ms3.scenes.bank import LayoutBank
+from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.settle import CHECK_SECONDS, MAX_SHIFT
 from robocas_ms3.scenes.table import Engine, Pair, State
 from robocas_ms3.tasks.spec import TASKS
@@ -17,18 +18,11 @@ _BACKENDS = {"cpu": "physx_cpu", "gpu": "physx_cuda"}
 
 
 def untried(bank: LayoutBank, engine: Engine) -> dict[int, list[int]]:
-    """Seeds of layouts that are to be tried, by objects seed.
-
-    Those of a set of objects are all tried again where one of them was not: an env is built with its own layout.
-    """
+    """Seeds of layouts that are to be tried, by objects seed."""
     table = bank.table(engine)
-    if table is None:
-        return {}
-    new = {objects_seed for objects_seed, _ in table.pairs(State.UNTRIED)}
-    seeds: dict[int, list[int]] = {objects_seed: [] for objects_seed in sorted(new)}
-    for objects_seed, seed in table.pairs():
-        if objects_seed in new:
-            seeds[objects_seed].append(seed)
+    seeds: dict[int, list[int]] = {}
+    for objects_seed, seed in table.pairs(State.UNTRIED) if table else ():
+        seeds.setdefault(objects_seed, []).append(seed)
     return seeds
 
 
@@ -38,7 +32,7 @@ def try_layouts(
     """Let an environment begin with each layout and do nothing for a second.
 
     Args:
-        bank: whose table it is; the layouts must be good for all that is known (`State.UNTRIED`).
+        bank: where the layouts are.
         engine: that is to run them.
         seeds: of layouts, by objects seed (`untried`).
         kwargs: for ``gym.make``: the packs that the bank is of.
@@ -46,12 +40,18 @@ def try_layouts(
     Yields:
         Objects seed and seed, and how far the object that moved farthest has moved then, m.
     """
+    first_row = next(iter(seeds))
+
+    def layouts(objects_seed: int, seed: int) -> Layout:  # a bank as an env's own would tell what moves
+        known = objects_seed in seeds  # else the env is only being made
+        return bank.get(objects_seed, seed) if known else bank.get(first_row, first_row)
+
     count = min(_ENVS[engine], len(seeds))
     env: Any = gym.make(
         TASKS[bank.model.config.task].env_id,
         num_envs=count,
         config=bank.model.config,
-        layouts=bank.folder.parent,
+        layouts=layouts,
         reconfiguration_freq=0,
         sim_backend=_BACKENDS[engine],
         render_backend="none",

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from dataclasses import fields, replace
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -116,6 +117,21 @@ def test_a_table_keeps_what_an_earlier_one_holds_and_what_is_known_of_it(tmp_pat
     assert table.pairs(State.MOVES) == [(0, 1)]
     assert table.pairs(State.UNTRIED) == [(0, 0), (2, 1)]
     assert bank.table("gpu") is None
+
+
+def test_a_table_is_changed_by_one_process_at_a_time(tmp_path):
+    bank, other = LayoutBank(model(), tmp_path), LayoutBank(model(), tmp_path)
+    bank.get(0, 0)
+    bank.get(1, 1)
+    with bank._alone():
+        writing = Thread(target=other.write_table, args=("cpu", [(1, 1)]))
+        writing.start()
+        writing.join(0.3)
+        assert writing.is_alive()
+    writing.join()
+    table = bank.write_table("cpu", [(0, 0)])
+    assert table is not None
+    assert table.pairs() == [(0, 0), (1, 1)]
 
 
 def test_a_damaged_table_is_none_and_said(tmp_path, caplog):

@@ -53,6 +53,23 @@ def test_objects_among_which_no_target_is_found_give_way_to_others(monkeypatch):
     assert sample_layout(scene, 4, 5, found.object_ids).object_ids == found.object_ids
 
 
+def test_objects_that_do_not_fit_give_way_to_others(monkeypatch):
+    scene, arrange, tried = model(), sample._arrange, []
+
+    def fussy(rng, model, assets):
+        tried.append({asset.asset.id for asset in assets})
+        if tried[-1] == tried[0]:
+            raise LayoutError("no room", where="layout")
+        return arrange(rng, model, assets)
+
+    monkeypatch.setattr(sample, "_arrange", fussy)
+    assert sample_layout(scene, 4, 4).object_ids == object_set(scene, 4, 1)
+    assert len(tried) == 2  # it tries often itself
+    tried[:] = []
+    with pytest.raises(LayoutError, match="no room"):
+        sample_layout(scene, 4, 4, object_set(scene, 4))
+
+
 def test_orderly_objects_come_in_kinds():
     scene = model(layout={"kind": "orderly", "copies": 3}, objects={"ids": "all", "count": 7})
     ids = object_set(scene, 0)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from sapien import physx
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import load_task_config
 from robocas_ms3.errors import LayoutError, SimulationError
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
-from robocas_ms3.scenes.source import OtherProcess
+from robocas_ms3.scenes.source import OtherProcess, Sampler
 
 
 def model(**changes) -> SceneModel:
@@ -50,3 +53,18 @@ def test_that_it_died_is_no_want_of_a_layout():
             SimulationError, match=r"seed 1: the process that makes layouts died \(found exit code -9\)"
         ):
             other.layout(1, 1)
+
+
+def test_after_an_interruption_no_answer_is_taken_for_another(monkeypatch):
+    monkeypatch.setattr(physx, "is_gpu_enabled", lambda: True)
+    scene = model()
+    layouts = Sampler(scene)
+    layouts(1, 1)
+    process = layouts._elsewhere._process
+    monkeypatch.setattr(pickle, "load", Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        layouts(2, 2)
+    monkeypatch.undo()
+    assert process.poll() is not None
+    monkeypatch.setattr(physx, "is_gpu_enabled", lambda: True)
+    np.testing.assert_array_equal(layouts(3, 3).object_poses, sample_layout(scene, 3, 3).object_poses)

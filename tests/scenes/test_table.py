@@ -76,15 +76,20 @@ def test_what_it_lacks_it_does_not_make_up(layouts, tmp_path):
 
 
 def test_what_is_found_of_layouts_is_kept(layouts, table, tmp_path):
-    mark_table(tmp_path / "table.npy", NAMES, {(5, 40): State.MOVES, (2, 10): State.STAYS})
+    found = {(5, 40): State.MOVES, (2, 10): State.STAYS, (0, 0): State.STAYS, (9, 9): State.MOVES, (5, 15): State.STAYS}
+    mark_table(tmp_path / "table.npy", NAMES, found)  # some of which it lacks
     marked = LayoutTable(tmp_path / "table.npy", NAMES)
     assert marked.pairs(State.MOVES) == [(5, 40)]
     assert marked.pairs(State.STAYS) == [(2, 10)]
     assert len(marked.pairs(State.UNTRIED)) == len(layouts) - 2
     assert not table.pairs(State.MOVES)  # that was opened before
-    found = marked.layout((5, 40))
-    assert found is not None
-    assert_same(found, layouts[5, 40])
+    assert marked.pairs() == sorted(layouts)
+    known = marked.layout((5, 40))
+    assert known is not None
+    assert_same(known, layouts[5, 40])
+    assert marked.stays(5)
+    mark_table(tmp_path / "table.npy", NAMES, dict.fromkeys([pair for pair in layouts if pair[0] == 5], State.MOVES))
+    assert [LayoutTable(tmp_path / "table.npy", NAMES).stays(seed) for seed in (2, 5, 9)] == [True, False, False]
 
 
 def test_a_damaged_one_is_named(tmp_path):

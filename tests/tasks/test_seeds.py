@@ -196,6 +196,37 @@ def test_what_moves_where_it_would_run_is_drawn_no_more_and_an_error_where_it_is
         env.reset(seed=[1, 0])
 
 
+def test_many_layouts_may_move_and_all_of_some_objects(tabled, monkeypatch, caplog):
+    env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
+    layouts: Any = env._layouts
+    layouts.mark_table("gpu", {pair: State.MOVES for pair in [(0, 0), (0, 2), (1, 0), (1, 1), (1, 2)]})
+    for _ in range(10):
+        env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 1))
+        assert env._objects_seeds.tolist() == [0, 0]
+        for _ in range(10):
+            env._set_episode_rng(None, torch.tensor([0, 1]))
+            assert env._find_starts(np.arange(2)).targets.shape == (2,)
+            assert env._layout_seeds.tolist() == [1, 1]
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+
+
+def test_a_reset_that_is_refused_leaves_the_envs_as_they_were(tabled, monkeypatch):
+    env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
+    layouts: Any = env._layouts
+    layouts.mark_table("gpu", {(0, 1): State.MOVES})
+    env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
+    env.reset(seed=[2, 0])
+    before = [env.layout(i).object_poses for i in range(2)]
+    for _ in range(3):
+        with pytest.raises(LayoutError):
+            env.reset(seed=[1, 2])
+    assert env._layout_seeds.tolist() == [2, 0]
+    np.testing.assert_array_equal([env.layout(i).object_poses for i in range(2)], before)
+    layouts.mark_table("gpu", {(0, 1): State.STAYS})
+    env.reset(options={"reconfigure": True}, seed=[0, 1])
+    env.reset(seed=[1, 2])  # nothing is remembered of what it was
+
+
 def test_where_a_table_lacks_layouts_the_bank_makes_them(built, tmp_path, monkeypatch):
     shutil.copytree(built, tmp_path, dirs_exist_ok=True)
     table = next(tmp_path.glob("*/table-cpu.npy"))

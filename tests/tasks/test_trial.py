@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rich.progress import Progress
 
 from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.cli.layouts import try_all
 from robocas_ms3.config import load_task_config
 from robocas_ms3.scenes.bank import LayoutBank, write_layout
 from robocas_ms3.scenes.fill import fill, pairs_of
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.table import State
+from robocas_ms3.tasks import trial
 from robocas_ms3.tasks.trial import judged, try_layouts, untried
 
 
@@ -42,7 +45,25 @@ def test_a_heap_that_moves_is_found(bank):
     table = bank.table("cpu")
     assert table is not None
     assert table.pairs(State.STAYS) == [(0, 0), (0, 1), (1, 1)]
-    assert untried(bank, "cpu") == {1: [0, 1]}  # with its own layout
+    assert untried(bank, "cpu") == {1: [0]}
+    assert bank.count() == 4  # none was made on the way
+
+
+@pytest.mark.slow
+def test_what_was_found_before_an_interruption_is_kept(bank, monkeypatch):
+    def tried(*args, **kwargs):
+        yield (0, 0), 0.001
+        yield (0, 1), 0.02
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trial, "try_layouts", tried)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            try_all(bank, "cpu", Progress(disable=True))
+    table = bank.table("cpu")
+    assert table is not None
+    assert (table.pairs(State.STAYS), table.pairs(State.MOVES)) == ([(0, 0)], [(0, 1)])
+    assert table.pairs(State.UNTRIED) == [(1, 0), (1, 1)]
 
 
 def test_three_millimetres_are_allowed():

@@ -1,0 +1,1 @@
+"""Evaluation that others can reproduce: protocols, policies, rollouts, measures, statistics."""

@@ -1,0 +1,130 @@
+"""What a policy is to the evaluation: what it wants to see, what its actions mean, and how it is asked for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.actions import CONVENTIONS
+
+Language = Literal["none", "text", "embedding"]
+Reference = Literal["tcp", "target"]
+CAMERAS = ("base_camera", "gripper_camera", "static_camera")
+
+
+@dataclass(frozen=True)
+class Wants:
+    """What a policy declares of itself; a mismatch with the protocol is refused before the first step.
+
+    Attributes:
+        convention: what its actions mean, one of ``actions.CONVENTIONS``.
+        reference: motions are relative to where the TCP is, or to where the last action sent it.
+        rate_hz: actions a second; None: whatever the protocol has.
+        cameras: (width, height) in pixels by camera; empty: it sees nothing.
+        depth: whether pictures come with depth.
+        state: whether it is told what only a simulator knows (docs/rl.md).
+        language: how it is told what to do.
+    """
+
+    convention: str = "robocas"
+    reference: Reference = "target"
+    rate_hz: float | None = None
+    cameras: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    depth: bool = False
+    state: bool = False
+    language: Language = "text"
+
+    def __post_init__(self) -> None:
+        for name, value, known in (
+            ("convention", self.convention, sorted(CONVENTIONS)),
+            ("reference", self.reference, ["tcp", "target"]),
+            ("language", self.language, ["none", "text", "embedding"]),
+            *(("cameras", camera, list(CAMERAS)) for camera in self.cameras),
+        ):
+            if value not in known:
+                raise EvaluationError(
+                    "a policy can't want that", where=name, expected=f"one of {known}", found=repr(value)
+                )
+
+
+@dataclass(frozen=True)
+class Start:
+    """An episode as a policy is told of it.
+
+    Attributes:
+        env: number of the env that plays it, by which rows of observations are known.
+        episode: its number in the protocol's list.
+        task: short name.
+        config: name of its configuration, in the protocol's folder.
+        config_file: that file.
+        seed: of its scene.
+        instruction: what is asked.
+    """
+
+    env: int
+    episode: int
+    task: str
+    config: str
+    config_file: str
+    seed: int
+    instruction: str
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What E envs show, a row each; NumPy arrays.
+
+    Attributes:
+        envs: (E,) their numbers.
+        instructions: E texts; empty strings for a policy that wants none.
+        embeddings: (E, 384) float32 sentence embeddings, or None.
+        images: by camera (E, H, W, 3) uint8.
+        depths: by camera (E, H, W, 1) int16, mm.
+        qpos: (E, 12) base x, y, yaw, seven arm joints, two fingers; m and rad.
+        tcp_in_base: (E, 7) pose of the TCP in the arm's base frame: position m, quaternion wxyz.
+        gripper_width: (E, 1) m.
+        state: (E, D) what only a simulator knows, or None.
+    """
+
+    envs: NDArray[np.int64]
+    instructions: list[str]
+    embeddings: NDArray[np.float32] | None
+    images: dict[str, NDArray[np.uint8]]
+    depths: dict[str, NDArray[Any]]
+    qpos: NDArray[np.float32]
+    tcp_in_base: NDArray[np.float32]
+    gripper_width: NDArray[np.float32]
+    state: NDArray[np.float32] | None
+
+
+class Policy(Protocol):
+    """A policy. It is made once for a run, and plays several episodes at a time."""
+
+    @property
+    def wants(self) -> Wants:
+        """What it declares of itself."""
+        ...
+
+    def reset(self, starts: list[Start]) -> None:
+        """Begin episodes in some envs; what was kept of these envs is over."""
+        ...
+
+    def act(self, observations: Observations) -> NDArray[np.floating]:
+        """Actions (E, A), or chunks (E, H, A) of which all are played before the env is asked for again."""
+        ...
+
+
+def describe(policy: Policy) -> dict[str, Any]:
+    """What a result says of a policy: its class and what it wants, and what its ``describe()`` adds if it has one."""
+    wants = policy.wants
+    said = {
+        "class": f"{type(policy).__module__}:{type(policy).__qualname__}",
+        "wants": {**vars(wants), "cameras": {name: list(size) for name, size in wants.cameras.items()}},
+    }
+    more = getattr(policy, "describe", None)
+    return {**said, **(more() if more is not None else {})}

@@ -1,0 +1,178 @@
+"""A policy plays a list of episodes in several envs at a time; one loop, whatever the backend."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.actions import CONVENTIONS
+from robocas_ms3.evaluation.policy import Observations, Policy, Start
+from robocas_ms3.language.embed import TextEmbedder
+
+TRACKED = ("path_length", "contact_impulse", "disturbed_most", "fallen")  # of `tracking`, as they end
+
+
+@dataclass
+class Played:
+    """What came of an episode.
+
+    Attributes:
+        start: which one.
+        steps: policy steps.
+        seconds: of the scene's time.
+        flags: by name of a stage or rule, the policy step after which it first held, from 1 on; None: never.
+        flag_seconds: the same in the scene's seconds.
+        at_end: whether it held after the last step.
+        measures: sums and extremes (`tracking`).
+        inference_seconds: clock time the policy took, its share of each batch.
+        error: why it was broken off, as by a policy that failed; empty: it was not.
+    """
+
+    start: Start
+    steps: int = 0
+    seconds: float = 0.0
+    flags: dict[str, int | None] = field(default_factory=dict)
+    flag_seconds: dict[str, float | None] = field(default_factory=dict)
+    at_end: dict[str, bool] = field(default_factory=dict)
+    measures: dict[str, float] = field(default_factory=dict)
+    inference_seconds: float = 0.0
+    error: str = ""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """When an episode ends.
+
+    Attributes:
+        max_steps: policy steps.
+        ends_on: flags at which it ends at once, such as ``success`` and ``fail``.
+        max_v0_steps: it ends when upstream's success has held that often; None: that ends nothing.
+    """
+
+    max_steps: int
+    ends_on: tuple[str, ...] = ("success", "fail")
+    max_v0_steps: int | None = None
+
+
+class Rollouts:
+    """Plays episodes in a vector environment (`make_vec`, NumPy arrays, no resets of its own).
+
+    In processes an env that is done begins the next episode at once; in a GPU's batch, where objects are built for all
+    envs together, it waits, masked, until all are done. What comes of an episode follows from its seed and the policy's
+    actions alone.
+
+    Args:
+        env: whose envs take actions of the policy's convention (`stepping.PolicyStepping`).
+        policy: that acts.
+        rules: when an episode ends.
+        control_dt: s of the scene a control step takes.
+        refill: whether envs may begin anew while others go on.
+    """
+
+    def __init__(self, env: Any, policy: Policy, rules: Rules, control_dt: float, *, refill: bool) -> None:
+        self._env, self._policy, self._rules, self._dt, self._refill = env, policy, rules, control_dt, refill
+        self._size = CONVENTIONS[policy.wants.convention].size
+        self._count: int = env.num_envs
+        self._playing: dict[int, Played] = {}
+        self._chunks: dict[int, list[NDArray[np.floating]]] = {}
+        self._obs: Any = None
+        self._embed = TextEmbedder() if policy.wants.language == "embedding" else None
+
+    def play(self, episodes: Sequence[Start]) -> Iterator[Played]:
+        """Play episodes; each is given as it ends, in any order. Their ``env`` is set here."""
+        waiting = list(reversed(episodes))
+        while waiting or self._playing:
+            free = [env for env in range(self._count) if env not in self._playing]
+            if waiting and free and (self._refill or not self._playing):
+                self._begin([(env, waiting.pop()) for env in free[: len(waiting)]])
+            yield from self._step()
+
+    def _begin(self, pairs: list[tuple[int, Start]]) -> None:
+        envs = [env for env, _ in pairs]
+        seeds = [start.seed for _, start in pairs]
+        if self._refill:
+            self._obs, info = self._env.reset(seed=seeds, options={"env_idx": np.array(envs)})
+        else:  # a batch is reset as a whole, with the objects of these seeds
+            rest = [seeds[0]] * (self._count - len(seeds))
+            self._obs, info = self._env.reset(seed=seeds + rest, options={"reconfigure": True})
+        starts = [Start(**{**vars(start), "env": env}) for env, start in pairs]
+        for start in starts:
+            self._playing[start.env], self._chunks[start.env] = Played(start), []
+            self._note(self._playing[start.env], info)
+        self._policy.reset(starts)
+
+    def _step(self) -> Iterator[Played]:
+        self._ask()
+        actions = np.zeros((self._count, self._size), np.float32)  # of envs that are done; nobody looks
+        for env in self._playing:
+            actions[env] = self._chunks[env].pop(0)
+        self._obs, _, _, _, info = self._env.step(actions)
+        for env, played in list(self._playing.items()):
+            played.steps += 1
+            self._note(played, info)
+            if self._is_over(played, info):
+                del self._playing[env]
+                yield played
+
+    def _ask(self) -> None:
+        """See that every env that plays has an action."""
+        envs = [env for env in self._playing if not self._chunks[env]]
+        if not envs:
+            return
+        seen = self._observed(envs)
+        begun = time.perf_counter()
+        actions = np.asarray(self._policy.act(seen), np.float32)
+        spent = (time.perf_counter() - begun) / len(envs)
+        chunks = actions[:, None] if actions.ndim == 2 else actions
+        if chunks.ndim != 3 or chunks.shape[0] != len(envs) or chunks.shape[1] < 1 or chunks.shape[2] != self._size:
+            raise EvaluationError(
+                "actions don't fit",
+                where=type(self._policy).__name__,
+                expected=f"({len(envs)}, {self._size}) or ({len(envs)}, chunk, {self._size})",
+                found=actions.shape,
+            )
+        for env, chunk in zip(envs, chunks, strict=True):
+            self._chunks[env] = list(chunk)
+            self._playing[env].inference_seconds += spent
+
+    def _observed(self, envs: list[int]) -> Observations:
+        obs, wants, index = self._obs, self._policy.wants, np.array(envs)
+        agent, extra, cameras = obs["agent"], dict(obs["extra"]), obs.get("sensor_data", {})
+        extra.pop("tcp_pose", None)
+        playing = [self._playing[env].start for env in envs]
+        texts = [start.instruction if wants.language != "none" else "" for start in playing]
+        return Observations(
+            envs=index,
+            instructions=texts,
+            embeddings=self._embed(texts) if self._embed else None,
+            images={name: cameras[name]["rgb"][index] for name in wants.cameras},
+            depths={name: cameras[name]["depth"][index] for name in wants.cameras} if wants.depth else {},
+            qpos=agent["qpos"][index],
+            tcp_in_base=agent["tcp_in_arm_base"][index],
+            gripper_width=agent["gripper_width"][index],
+            state=np.concatenate([value[index] for value in extra.values()], axis=1) if wants.state else None,
+        )
+
+    def _note(self, played: Played, info: dict[str, Any]) -> None:
+        env = played.start.env
+        played.seconds = float(info["elapsed_steps"][env]) * self._dt
+        for name, value in info.items():
+            if isinstance(value, np.ndarray) and value.dtype == bool and value.ndim == 1:
+                now = bool(value[env])
+                played.at_end[name] = now
+                if now and played.flags.get(name) is None:
+                    played.flags[name], played.flag_seconds[name] = played.steps, round(played.seconds, 4)
+                played.flags.setdefault(name, None)
+                played.flag_seconds.setdefault(name, None)
+        played.measures = {name: round(float(info[name][env]), 4) for name in TRACKED}
+
+    def _is_over(self, played: Played, info: dict[str, Any]) -> bool:
+        rules, env = self._rules, played.start.env
+        v0 = rules.max_v0_steps is not None and info["v0_steps"][env] >= rules.max_v0_steps
+        return v0 or played.steps >= rules.max_steps or any(played.at_end.get(name) for name in rules.ends_on)

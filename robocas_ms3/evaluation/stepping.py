@@ -1,0 +1,145 @@
+"""The environment as policies act in it: their conventions in, an action a policy step, and what happened meanwhile."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+import torch
+from mani_skill.utils.structs import Pose
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.actions import CONVENTIONS, Motion
+from robocas_ms3.evaluation.policy import Reference
+from robocas_ms3.evaluation.tracking import Tracker
+from robocas_ms3.robots.ee_deltas import to_ee_delta_action
+
+Stepping = Literal["timed", "upstream"]
+UPSTREAM_HZ = 5
+# evaluation_v0.md: the gripper first, until it stands, 5 control steps at most; then the motion, 2 at most
+_GRIPPER_STEPS, _MOTION_STEPS = 5, 2
+_STANDS = 0.002  # m/s of a finger
+_NEAR, _TURNED, _SPIN = 0.02, np.deg2rad(5), np.deg2rad(3)  # m, rad, rad/s: where upstream's motion ends early
+
+
+class PolicyStepping(gym.Wrapper):
+    """Takes actions of a convention, a policy step each, and adds to ``info`` what happened (`tracking`).
+
+    Works on one env and on a batch of them.
+
+    Args:
+        env: a RoboCAS environment in control mode `control_mode`.
+        convention: of the actions.
+        reference: what motions are relative to.
+        stepping: ``timed``: a step is one control step. ``upstream``: a step moves the gripper until it stands, then
+            the TCP, on a straight line, until it is there or 0.4 s are over. Envs of a batch that are there wait.
+    """
+
+    def __init__(self, env: gym.Env, convention: str, reference: Reference, stepping: Stepping) -> None:
+        super().__init__(env)
+        self._convention, self._reference, self._stepping = CONVENTIONS[convention], reference, stepping
+        self._base: Any = env.unwrapped
+        count = self._base.num_envs
+        bound = np.full(self._convention.size, np.inf, np.float32)
+        self.single_action_space = gym.spaces.Box(-bound, bound)
+        batched = np.tile(bound, (count, 1))
+        self.action_space = gym.spaces.Box(-batched, batched) if count > 1 else self.single_action_space
+        self.single_observation_space = self._base.single_observation_space
+        self._tracker = Tracker(self._base)
+        self._told = np.ones(count, dtype=bool)  # whether each gripper was told to be open last
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """Reset; see ``BaseEnv``."""
+        obs, info = self.env.reset(**kwargs)
+        envs = (kwargs.get("options") or {}).get("env_idx", slice(None))
+        self._tracker.reset(envs)
+        self._told[envs if isinstance(envs, slice) else np.asarray(torch.as_tensor(envs).cpu())] = True
+        return obs, {**info, **self._tracker.read()}
+
+    def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """One policy step.
+
+        Args:
+            action: (A,) or (N, A) of the convention.
+
+        Raises:
+            EvaluationError: a number of it is not finite.
+        """
+        actions = np.asarray(action.cpu() if isinstance(action, torch.Tensor) else action, np.float64)
+        actions = actions.reshape(self._base.num_envs, self._convention.size)
+        if not np.isfinite(actions).all():
+            raise EvaluationError("an action is not finite", where="action", found=actions.tolist())
+        if self._convention.read is None:
+            result = self._control(actions)
+        else:
+            motion = self._convention.read(actions)
+            result = self._timed(motion) if self._stepping == "timed" else self._upstream(motion)
+        *others, info = result
+        return (*others, {**info, **self._tracker.read()})
+
+    def _timed(self, motion: Motion) -> tuple:
+        start = self._tcp() if self._reference == "tcp" else self._target()
+        return self._go(*_moved(start, motion), motion.open)
+
+    def _upstream(self, motion: Motion) -> tuple:
+        """Gripper, then motion; an env that is done with either waits."""
+        result, here = None, self._target()
+        turned = motion.open != self._told
+        for _ in range(_GRIPPER_STEPS):
+            if not (turned | ~self._fingers_stand()).any():
+                break
+            result, turned = self._go(*here, motion.open), np.zeros_like(turned)
+        wanted = _moved(self._tcp() if self._reference == "tcp" else self._target(), motion)
+        for _ in range(_MOTION_STEPS):
+            result = self._go(*wanted, motion.open)
+            if self._is_there(*wanted).all():
+                break
+        assert result is not None
+        return result
+
+    def _go(self, position: np.ndarray, rotation: Rotation, opened: np.ndarray) -> tuple:
+        """Send TCPs to poses in the arm's base frame, in one control step, as far as that can go."""
+        self._told = opened
+        at, turn = self._target()
+        delta = to_ee_delta_action(turn.inv().apply(position - at), turn.inv() * rotation)
+        size = np.linalg.norm(delta[:, 3:], axis=1, keepdims=True)
+        delta = np.concatenate([np.clip(delta[:, :3], -1, 1), delta[:, 3:] / np.maximum(size, 1)], axis=1)
+        return self._control(np.concatenate([delta, np.where(opened, 1.0, -1.0)[:, None]], axis=1))
+
+    def _control(self, actions: np.ndarray) -> tuple:
+        result = self.env.step(torch.as_tensor(actions, dtype=torch.float32, device=self._base.device))
+        self._tracker.look(result[-1], self._told if self._convention.read else actions[:, 7] > 0)
+        return result
+
+    def _tcp(self) -> tuple[np.ndarray, Rotation]:
+        return _pose(self._base.agent.tcp_in_arm_base)
+
+    def _target(self) -> tuple[np.ndarray, Rotation]:
+        """Where the last action sent the TCPs."""
+        return _pose(self._base.agent.controller.controllers["arm"].reference_pose())
+
+    def _fingers_stand(self) -> np.ndarray:
+        return (self._base.agent.robot.get_qvel()[:, -2:].abs().amax(dim=1) < _STANDS).cpu().numpy()
+
+    def _is_there(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
+        at, turn = self._tcp()
+        spin = torch.linalg.vector_norm(self._base.agent.tcp.angular_velocity, dim=-1).cpu().numpy()
+        near = np.linalg.norm(position - at, axis=1) < _NEAR
+        return near & ((turn.inv() * rotation).magnitude() < _TURNED) & (spin < _SPIN)
+
+
+def control_mode(convention: str) -> str:
+    """The control mode that actions of a convention are turned into."""
+    return "pd_joint_pos" if CONVENTIONS[convention].read is None else "pd_ee_delta_pose"
+
+
+def _pose(pose: Pose) -> tuple[np.ndarray, Rotation]:
+    raw = pose.raw_pose.cpu().numpy().astype(np.float64)
+    return raw[:, :3], Rotation.from_quat(raw[:, [4, 5, 6, 3]])
+
+
+def _moved(start: tuple[np.ndarray, Rotation], motion: Motion) -> tuple[np.ndarray, Rotation]:
+    position, turn = start
+    return position + turn.apply(motion.translation), turn * motion.rotation
