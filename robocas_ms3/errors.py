@@ -48,6 +48,10 @@ class DatasetError(RobocasError):
     """A trajectory file or dataset can't be read or written."""
 
 
+class EvaluationError(RobocasError):
+    """Outcomes of episodes can't be evaluated as asked."""
+
+
 class MissingExtraError(RobocasError):
     """An optional dependency is needed; the message names the extra that brings it."""
 

@@ -1,0 +1,1 @@
+"""How good a policy is: what can be said of successes in a finite number of episodes."""
