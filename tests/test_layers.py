@@ -40,6 +40,7 @@ SIMULATOR_FREE = (
     "tasks.rewards",
     "datasets.schema",
     "evaluation.statistics",
+    "evaluation.power",
     "planning.protocol",
     "language",
 )
