@@ -140,10 +140,11 @@ def paired_interval(only_a: int, only_b: int, n: int, level: float = 0.95) -> tu
 
         |only_a - only_b - n d| <= z sqrt(n (2 q + d (1 - d)))
 
-    where q is the likeliest probability of a scene that B alone solves, given d. It stays within -1..1, has a width
-    where the runs disagree in no scene, and at 95 % holds 91 % of the true differences at least and 95 % or more on
-    average, from 6 scenes on. The test in it is approximate: where the exact p-value is a little above 1 - level, the
-    interval can leave 0 out. Claims go by the p-value.
+    where q is the likeliest probability of a scene that B alone solves, given d. It stays within -1..1 and has a
+    width where the runs disagree in no scene. Of 6 to 50 scenes at 95 % it holds the true difference in 95 % of cases
+    or more on average over the truths, in 94 % or more for nineteen truths of twenty, and in 89 % at worst from 9
+    scenes on (83 % below); the worst are runs that disagree nearly everywhere. The test in it is approximate: where the
+    exact p-value is a little above 1 - level, the interval can leave 0 out. Claims go by the p-value.
     """
     only_a, only_b, n = _check_counts(only_a=only_a, only_b=only_b, n=n)
     if only_a + only_b > n or n == 0:

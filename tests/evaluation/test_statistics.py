@@ -127,17 +127,18 @@ def test_paired_interval_of_runs_that_disagree_everywhere_is_wilsons():
     assert paired_interval(k, n - k, n) == pytest.approx((2 * (centre - half) - 1, 2 * (centre + half) - 1), abs=1e-9)
 
 
-@pytest.mark.parametrize("n", [6, 20])
-def test_paired_interval_covers_about_as_often_as_it_says(n):
+@pytest.mark.parametrize(("n", "worst"), [(7, 0.835), (22, 0.89)])
+def test_paired_interval_covers_about_as_often_as_it_says(n, worst):
     tables = np.array([(a, b, n - a - b) for a in range(n + 1) for b in range(n + 1 - a)])
     low, high = np.array([paired_interval(a, b, n) for a, b, _ in tables.tolist()]).T
     coverage = []
-    for discordant in np.linspace(0.05, 1, 20):
-        for difference in discordant * np.linspace(0, 1, 11):
+    for discordant in np.linspace(0.02, 1, 50):
+        for difference in discordant * np.linspace(0, 1, 21):
             chances = [(discordant + difference) / 2, (discordant - difference) / 2, 1 - discordant]
             covered = (low - 1e-9 <= difference) & (difference <= high + 1e-9)
             coverage.append(multinomial.pmf(tables, n, chances) @ covered)
-    assert min(coverage) > 0.91
+    assert min(coverage) > worst
+    assert np.percentile(coverage, 5) > 0.94
     assert np.mean(coverage) > 0.95
 
 
