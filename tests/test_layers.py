@@ -22,6 +22,7 @@ LAYERS = (
     ("planning",),
     ("demos",),
     ("datasets",),
+    ("evaluation",),
     ("viewer",),
     ("doctor",),
     ("cli",),
@@ -38,6 +39,8 @@ SIMULATOR_FREE = (
     "tasks.occlusion",
     "tasks.rewards",
     "datasets.schema",
+    "evaluation.statistics",
+    "evaluation.power",
     "planning.protocol",
     "language",
 )

@@ -1,0 +1,116 @@
+"""What a number of episodes can tell: the smallest difference of two rates that it shows, and a warning below it."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import root_scalar
+from scipy.stats import binom, norm
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.statistics import Comparison
+
+
+def mcnemar_power(n: int, difference: float, discordant: float, *, alpha: float = 0.05) -> float:
+    """The probability that the exact McNemar test tells two runs over the same n scenes apart.
+
+    Summed exactly over the number of scenes in which the runs disagree, and over whose they are.
+
+    Args:
+        n: scenes.
+        difference: of the true rates, 0..1.
+        discordant: the probability that the runs disagree in a scene, ``difference`` at least.
+        alpha: they are told apart where the p-value is this or less.
+    """
+    if not 0 <= difference <= discordant <= 1:
+        raise EvaluationError(
+            "no such runs",
+            where="difference",
+            expected="0 <= difference <= discordant <= 1",
+            found=(difference, discordant),
+        )
+    m = np.arange(1, n + 1)  # scenes in which they disagree
+    # The largest count of the weaker run that is told apart; -1 where none is.
+    most = binom.ppf(alpha / 2, m, 0.5)
+    most = np.where(binom.cdf(most, m, 0.5) <= alpha / 2, most, most - 1)
+    better = (1 + difference / discordant) / 2 if discordant else 0.5
+    told = binom.cdf(most, m, 1 - better) + binom.cdf(most, m, better)
+    return float(binom.pmf(m, n, discordant) @ told)
+
+
+def smallest_paired_difference(n: int, discordant: float, *, power: float = 0.8, alpha: float = 0.05) -> float | None:
+    """The smallest difference of rates that two runs over the same n scenes show with probability ``power``.
+
+    None where n is too small for any: six scenes that one run alone solves make the first p-value below 0.05.
+
+    Args:
+        n: scenes.
+        discordant: the share of scenes in which the runs disagree, 0..1. Of a difference greater than it, all scenes in
+            which they disagree are the better run's; with 0 that holds for every difference, the best of cases but for
+            a handful of scenes.
+        power: probability, 0..1.
+        alpha: see `mcnemar_power`.
+    """
+
+    def missing(difference: float) -> float:
+        return power - mcnemar_power(n, difference, max(difference, discordant), alpha=alpha)
+
+    _check({"n": n}, "discordant", discordant, power, alpha)
+    return None if missing(1.0) > 0 else float(root_scalar(missing, bracket=(0.0, 1.0)).root)
+
+
+def smallest_unpaired_difference(
+    n_a: int, n_b: int, rate: float, *, power: float = 0.8, alpha: float = 0.05
+) -> float | None:
+    """The smallest difference of rates around ``rate`` that runs over different scenes show with probability ``power``.
+
+    By the arcsine transformation (Cohen, Statistical Power Analysis, 1988, ch. 6): phi = 2 arcsin(sqrt(rate)) has the
+    variance 1/n at every rate, so runs are told apart when their phi are h = (z_alpha/2 + z_power) sqrt(1/n_a + 1/n_b)
+    apart; rates at phi +- h/2 differ by sin(phi) sin(h/2). None where n is too small for any.
+
+    Args:
+        n_a: episodes of one run.
+        n_b: episodes of the other.
+        rate: between the two, 0..1.
+        power: probability, 0..1.
+        alpha: of the two-sided test.
+    """
+    _check({"n_a": n_a, "n_b": n_b}, "rate", rate, power, alpha)
+    h = float(norm.isf(alpha / 2) + norm.ppf(power)) * np.sqrt(1 / n_a + 1 / n_b)
+    if h > np.pi:
+        return None
+    phi = np.clip(2 * np.arcsin(np.sqrt(rate)), h / 2, np.pi - h / 2)  # neither rate beyond 0 or 1
+    return float(np.sin(phi) * np.sin(h / 2))
+
+
+def too_few(comparison: Comparison, *, alpha: float = 0.05, power: float = 0.8) -> str | None:
+    """A sentence of warning where the runs are not told apart, with the difference that so many scenes would show.
+
+    That difference takes the runs to disagree in as many scenes as they did, so it is an estimate itself.
+
+    Args:
+        comparison: the two runs.
+        alpha: they are told apart where the p-value is this or less; of m comparisons, each may have alpha / m.
+        power: see `smallest_paired_difference`.
+    """
+    c = comparison
+    if c.p_value <= alpha:
+        return None
+    shown = smallest_paired_difference(c.n, (c.only_a + c.only_b) / c.n, power=power, alpha=alpha)
+    what_shows = (
+        "no difference, however large" if shown is None else f"differences of {np.ceil(100 * shown):.0f} points"
+    )
+    return (
+        f"{c.successes_a} of {c.n} against {c.successes_b} of {c.n} differ by less than {c.n} episodes can tell: "
+        f"{100 * c.difference:+.1f} points, {100 * c.level:g} % interval {100 * c.low:+.1f} to {100 * c.high:+.1f}, "
+        f"p = {c.p_value:.2g}; so few show {what_shows} ({100 * power:g} % power)"
+    )
+
+
+def _check(counts: dict[str, int], name: str, share: float, power: float, alpha: float) -> None:
+    for where, n in counts.items():
+        if n < 1:
+            raise EvaluationError("no episodes", where=where, expected="1 or more", found=n)
+    if not 0 <= share <= 1:
+        raise EvaluationError("no share of episodes", where=name, expected="0..1", found=share)
+    if not 0 < alpha < power < 1:
+        raise EvaluationError("no power", where="power", expected="0 < alpha < power < 1", found=f"{alpha=}, {power=}")
