@@ -29,3 +29,8 @@ def task_configs_dir() -> Path:
 def builtin_packs_dir() -> Path:
     """The asset packs that travel with the package."""
     return PACKAGE_DIR / "data" / "packs"
+
+
+def protocols_dir() -> Path:
+    """The evaluation protocols that travel with the package."""
+    return PACKAGE_DIR / "data" / "protocols"

@@ -56,6 +56,7 @@ class EpisodeSettings:
         noisy_failures: attempts that may fail for noise alone; after so many an episode counts without, and says so.
         noise_mm: its standard deviation, of each component of each action's translation, mm.
         noise_deg: the same of its Euler angles.
+        layouts: where layouts come from, see ``RoboCASEnv``.
     """
 
     task: str
@@ -69,6 +70,7 @@ class EpisodeSettings:
     noisy_failures: int = 1
     noise_mm: float = 0.5
     noise_deg: float = 0.2
+    layouts: str = "auto"
 
 
 @dataclass
@@ -138,6 +140,7 @@ class EpisodeGenerator:
             max_episode_steps=self.horizon,
             config=settings.config,
             pack=settings.pack,
+            layouts=settings.layouts,
             obs_mode="none",
             reward_mode="none",
             control_mode="pd_joint_pos_base" if config.base_motion else "pd_joint_pos",
@@ -156,7 +159,7 @@ class EpisodeGenerator:
         if settings.replay_rate and not config.base_motion:
             info = {
                 "env_id": TASKS[settings.task].env_id,
-                "env_kwargs": {"config": settings.config, "pack": settings.pack},
+                "env_kwargs": {"config": settings.config, "pack": settings.pack, "layouts": settings.layouts},
             }
             self.worlds = [OpenLoop(info, settings.replay_rate) for _ in range(1 + settings.noisy_trials)]
             noise = Noise(settings.noise_mm / 1000, float(np.deg2rad(settings.noise_deg)))

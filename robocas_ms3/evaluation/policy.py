@@ -60,8 +60,9 @@ class Start:
         env: number of the env that plays it, by which rows of observations are known.
         episode: its number in the protocol's list.
         task: short name.
-        config: name of its configuration, in the protocol's folder.
-        config_file: that file.
+        config_file: its configuration.
+        layouts_file: its scene's, among others.
+        pack: object pack.
         seed: of its scene.
         instruction: what is asked.
     """
@@ -69,8 +70,9 @@ class Start:
     env: int
     episode: int
     task: str
-    config: str
     config_file: str
+    layouts_file: str
+    pack: str
     seed: int
     instruction: str
 

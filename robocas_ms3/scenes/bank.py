@@ -20,6 +20,7 @@ from robocas_ms3.assets.pack import MANIFEST, LoadedFurniture, sha256
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import make_folder, replacing, write_json
 from robocas_ms3.paths import cache_dir
+from robocas_ms3.scenes.frozen import FrozenLayouts
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.source import LayoutSource, Sampler
@@ -44,10 +45,13 @@ def layout_bank(model: SceneModel, folder: str | Path | LayoutSource | None = "a
 
     Args:
         model: the scene's assets.
-        folder: of all banks; ``auto``: in the cache; None: no bank, every layout is sampled anew; or a source itself.
+        folder: of all banks; ``auto``: in the cache; None: no bank, every layout is sampled anew; a file: of frozen
+            layouts; or a source itself.
     """
     if callable(folder):
         return folder
+    if str(folder).endswith(".npy"):
+        return FrozenLayouts(Path(str(folder)), model.object_pack.objects)
     return Sampler(model) if folder is None else LayoutBank(model, folder)
 
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from pathlib import Path
-from typing import Literal
+from types import MappingProxyType
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,14 +64,9 @@ class LayoutTable:
             self.rows: NDArray[np.void] = np.lib.format.open_memmap(path, mode="r")
             self._sets, self._seeds = (self.rows[name][place].copy() for name, place in _AXES)
             self._states = self.rows["state"].copy()
-            self._fields_are_all_there()
-        except (OSError, ValueError, IndexError, EOFError) as error:  # IndexError: no such fields
+            check_record(self.rows.dtype)
+        except (OSError, ValueError, IndexError, KeyError, EOFError) as error:  # of other fields
             raise LayoutError("no table of layouts", where=path, found=error, fix=_MADE_BY) from error
-
-    def _fields_are_all_there(self) -> None:
-        slots, words = self.rows["present"].shape[-1], self.rows["relation"].dtype.itemsize // 4
-        if self.rows.dtype != _record(slots, words):
-            raise ValueError("other fields than a table's")
 
     def places(self, objects_seeds: NDArray[np.int64], seeds: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
         """Where E pairs are, (E,) each: the `State`, of what is not there `LACKING`; row; column."""
@@ -99,24 +95,14 @@ class LayoutTable:
         if row == len(self._sets) or self._sets[row] != objects_seed:
             return None
         some = int(np.argmax(self._states[row] != State.LACKING))
-        return tuple(self._names[i] for i in self.rows["objects"][row, some].tolist())
+        return tuple(str(self._names[i]) for i in self.rows["objects"][row, some].tolist())
 
     def layout(self, pair: Pair) -> Layout | None:
         """A layout, in single precision; None where it lacks it."""
         state, rows, columns = self.places(np.array([pair[0]]), np.array([pair[1]]))
         if state[0] == State.LACKING:
             return None
-        row = self.rows[rows[0], columns[0]]
-        return Layout(
-            object_ids=tuple(self._names[i] for i in row["objects"].tolist()),
-            object_poses=_matrices(row["object_poses"]),
-            robot_pose=_matrices(row["robot_pose"]),
-            basket_pose=_matrices(row["basket_pose"]),
-            target=int(row["target"]),
-            relation=str(row["relation"]),
-            present=row["present"].copy(),
-            visible_shares=row["visible_shares"].astype(np.float64),
-        )
+        return read_record(self.rows[rows[0], columns[0]], self._names)
 
 
 def write_table(
@@ -131,26 +117,12 @@ def write_table(
             are missing have no layout.
         states: what is known of them; default: `State.UNTRIED`.
     """
-    slots = len(next(iter(layouts.values())).object_ids)
-    words = max(1, *(len(layout.relation) for layout in layouts.values()))
     sets, seeds = (sorted({pair[side] for pair in layouts}) for side in (0, 1))
-    number = {name: i for i, name in enumerate(names)}
-    rows = np.zeros((len(sets), len(seeds)), _record(slots, words))
+    records = as_records(names, layouts, states or {})
+    rows = np.zeros((len(sets), len(seeds)), records.dtype)
     rows["objects_seed"], rows["seed"] = np.array(sets)[:, None], seeds
     row_of, column_of = ({seed: i for i, seed in enumerate(axis)} for axis in (sets, seeds))
-    for pair, layout in layouts.items():
-        rows[row_of[pair[0]], column_of[pair[1]]] = (
-            *pair,
-            (states or {}).get(pair, State.UNTRIED),
-            [number[name] for name in layout.object_ids],
-            raw_poses(layout.object_poses),
-            raw_poses(layout.robot_pose),
-            raw_poses(layout.basket_pose),
-            layout.target,
-            layout.relation,
-            layout.present,
-            layout.visible_shares,
-        )
+    rows[[row_of[one] for one, _ in layouts], [column_of[other] for _, other in layouts]] = records
     _save(path, rows)
 
 
@@ -163,6 +135,55 @@ def mark_table(path: Path, names: Sequence[str], states: Mapping[Pair, State]) -
         if before[0] != State.LACKING:
             rows["state"][row[0], column[0]] = state
     _save(path, rows)
+
+
+def as_records(
+    names: Sequence[str], layouts: Mapping[Pair, Layout], states: Mapping[Pair, State] = MappingProxyType({})
+) -> NDArray[np.void]:
+    """Layouts of equally many slots as records (E,); see `write_table`."""
+    slots = len(next(iter(layouts.values())).object_ids)
+    words = max(1, *(len(layout.relation) for layout in layouts.values()))
+    number = {name: i for i, name in enumerate(names)}
+    records = np.zeros(len(layouts), _record(slots, words))
+    for i, (pair, layout) in enumerate(layouts.items()):
+        records[i] = (
+            *pair,
+            states.get(pair, State.UNTRIED),
+            [number[name] for name in layout.object_ids],
+            raw_poses(layout.object_poses),
+            raw_poses(layout.robot_pose),
+            raw_poses(layout.basket_pose),
+            layout.target,
+            layout.relation,
+            layout.present,
+            layout.visible_shares,
+        )
+    return records
+
+
+def read_record(record: Any, names: Sequence[str]) -> Layout:
+    """The layout of a record, in single precision."""
+    return Layout(
+        object_ids=tuple(str(names[i]) for i in record["objects"].tolist()),
+        object_poses=_matrices(record["object_poses"]),
+        robot_pose=_matrices(record["robot_pose"]),
+        basket_pose=_matrices(record["basket_pose"]),
+        target=int(record["target"]),
+        relation=str(record["relation"]),
+        present=record["present"].copy(),
+        visible_shares=record["visible_shares"].astype(np.float64),
+    )
+
+
+def check_record(dtype: np.dtype) -> None:
+    """See that an array is one of records.
+
+    Raises:
+        ValueError: it isn't.
+    """
+    slots, words = dtype["present"].shape[0], dtype["relation"].itemsize // 4
+    if dtype != _record(slots, words):
+        raise ValueError("other fields than a table's")
 
 
 def _save(path: Path, rows: NDArray[np.void]) -> None:

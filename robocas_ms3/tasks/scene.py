@@ -51,8 +51,8 @@ class SceneEnv(SeededEnv):
         furniture_pack: the same for room, furniture and basket.
         visual_level: ``fast`` or ``full`` meshes to render.
         layouts: folder of the layout bank; default: in the cache, filled as layouts are asked for; None: no bank,
-            every layout is sampled anew (the same ones, only slower); or a function that gives the layout of an objects
-            seed and a seed.
+            every layout is sampled anew (the same ones, only slower); a file of frozen ones (`scenes.frozen`); or a
+            function that gives the layout of an objects seed and a seed.
         seeds: least and greatest seed that unseeded resets draw from, such as those of a bank built ahead; default: any
             seed, with several envs 0 to 99.
         robot_uids: the robot; only RoboCAS's mobile Panda is supported.

@@ -1,0 +1,44 @@
+"""Policies by name: ``scripted``, ``random``, ``still``, ``replay:DATASET``, ``module:Class``."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.policies.plain import RandomPolicy, StillPolicy
+from robocas_ms3.evaluation.policies.replay import ReplayPolicy
+from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
+from robocas_ms3.evaluation.policy import Policy
+
+BUILTIN: dict[str, Callable[[], Policy]] = {
+    "scripted": ScriptedPolicy,
+    "random": RandomPolicy,
+    "still": StillPolicy,
+}
+
+
+def make_policy(name: str) -> Policy:
+    """Make a policy.
+
+    Args:
+        name: of a builtin one; ``replay:TRAJECTORY.h5``; or ``module:Class`` of your own, called without arguments.
+
+    Raises:
+        EvaluationError: there is no such policy.
+    """
+    if name in BUILTIN:
+        return BUILTIN[name]()
+    kind, _, rest = name.partition(":")
+    if kind == "replay" and rest:
+        return ReplayPolicy(Path(rest))
+    if not kind or not rest:
+        expected = f"{', '.join(BUILTIN)}, replay:TRAJECTORY.h5 or module:Class"
+        raise EvaluationError("no such policy", where=name, expected=expected)
+    try:
+        made: Any = getattr(importlib.import_module(kind), rest)
+    except (ImportError, AttributeError) as error:
+        raise EvaluationError("no such policy", where=name, found=error) from error
+    return made()

@@ -1,0 +1,63 @@
+"""Recorded episodes, played again in the scenes of the same seeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.demos.record import open_trajectory, read_json
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.policies.tracks import Followers, Track
+from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.robots.constants import ARM_REST
+
+
+class ReplayPolicy:
+    """Plays the actions of a trajectory file, at its own rate; an episode whose seed it lacks is played standing still.
+
+    Args:
+        trajectory: HDF5 file of joint targets (``pd_joint_pos``), its JSON beside it.
+
+    Raises:
+        EvaluationError: its actions are no joint targets.
+        DatasetError: it can't be read.
+    """
+
+    def __init__(self, trajectory: Path) -> None:
+        data = read_json(trajectory)
+        kwargs = data["env_info"]["env_kwargs"]
+        if kwargs["control_mode"] != "pd_joint_pos":
+            raise EvaluationError(
+                "can't be played here", where=trajectory, expected="pd_joint_pos", found=kwargs["control_mode"]
+            )
+        self._trajectory = trajectory
+        self._episodes = {int(one["episode_seed"]): one["episode_id"] for one in data["episodes"]}
+        self.wants = Wants(
+            convention="joint_positions",
+            rate_hz=kwargs.get("sim_config", {}).get("control_freq", 20),
+            language="none",
+        )
+        self._followers = Followers(np.array([*ARM_REST, 1.0]), motions=False)
+
+    def describe(self) -> dict[str, Any]:
+        """What a result says of it."""
+        return {"trajectory": self._trajectory.name, "episodes": len(self._episodes)}
+
+    def reset(self, starts: list[Start]) -> None:
+        """Look up the episodes by their seeds."""
+        for start in starts:
+            self._followers.begin(start.env, self._track(start.seed))
+
+    def act(self, observations: Observations) -> NDArray[np.floating]:
+        """(E, 8) joint targets."""
+        return self._followers.next(observations)
+
+    def _track(self, seed: int) -> Track | None:
+        if seed not in self._episodes:
+            return None
+        with open_trajectory(self._trajectory) as file:
+            group: Any = file[f"traj_{self._episodes[seed]}"]
+            return Track(np.array(group["actions"]))

@@ -1,0 +1,207 @@
+"""A protocol: what is evaluated, frozen. A folder with its rules, configurations, episodes and their scenes.
+
+::
+
+    protocol.yaml            the rules, see `Protocol`
+    episodes.jsonl           an episode a line, see `Episode`
+    configs/NAME.yaml        the configurations that episodes name, whole
+    layouts/NAME.npy         the scenes of a configuration's episodes (`scenes.frozen`)
+
+Its hash is that of all these files, so two results of one hash were measured by the same thing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Literal
+
+import yaml
+from pydantic import Field, ValidationError
+
+from robocas_ms3.config.load import nearest
+from robocas_ms3.config.task import StrictModel
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.actions import CONVENTIONS
+from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.paths import protocols_dir
+
+RULES, EPISODES, CONFIGS, LAYOUTS = "protocol.yaml", "episodes.jsonl", "configs", "layouts"
+
+
+class Protocol(StrictModel):
+    """Rules that all episodes of a protocol have in common."""
+
+    name: str
+    description: str = Field(description="what a score by it says")
+    rate_hz: Annotated[int, Field(ge=1, le=100)] | None = Field(
+        default=None, description="actions a second; null: what the policy wants, else 20"
+    )
+    stepping: Literal["timed", "upstream"] = Field(
+        default="timed", description="a step is one action of 1 / rate_hz s; or gripper, then motion, as upstream's"
+    )
+    max_steps: Annotated[int, Field(ge=1)] | None = Field(default=None, description="actions an episode may have")
+    max_seconds: dict[str, Annotated[float, Field(gt=0)]] = Field(
+        default={}, description="by task, s of the scene an episode may have; max_steps, if given, ends it earlier"
+    )
+    conventions: list[str] = Field(default=sorted(CONVENTIONS), description="of actions that a policy may speak")
+    references: list[Literal["tcp", "target"]] = Field(
+        default=["tcp", "target"], description="that its motions may be relative to"
+    )
+    ends_on: list[str] = Field(default=["success", "fail"], description="flags at which an episode ends")
+    max_v0_steps: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="it also ends when upstream's success has held after so many actions"
+    )
+    pack: str = Field(default="builtin", description="object pack")
+    pack_hash: str = Field(description="sha256 of its manifest")
+
+    def refuse(self, wants: Wants) -> None:
+        """See that a policy can be evaluated by this.
+
+        Raises:
+            EvaluationError: its actions or its rate are others.
+        """
+        for what, found, allowed in (
+            ("convention", wants.convention, self.conventions),
+            ("reference", wants.reference, self.references),
+        ):
+            if found not in allowed:
+                raise EvaluationError(
+                    f"the policy's {what} is none of this protocol's",
+                    where=self.name,
+                    expected=" or ".join(allowed),
+                    found=found,
+                )
+        if self.rate_hz is not None and wants.rate_hz not in (None, self.rate_hz):
+            raise EvaluationError(
+                "the policy acts at another rate",
+                where=self.name,
+                expected=f"{self.rate_hz} Hz",
+                found=f"{wants.rate_hz:g} Hz",
+            )
+
+    def rate(self, wants: Wants) -> int:
+        """Actions a second.
+
+        Raises:
+            EvaluationError: physics at 100 Hz can't be stopped at that rate.
+        """
+        rate = self.rate_hz or wants.rate_hz or 20
+        if rate < 1 or rate != int(rate) or 100 % int(rate):
+            raise EvaluationError("no such rate", where="rate_hz", expected="a divisor of 100", found=f"{rate:g}")
+        return int(rate)
+
+
+class Episode(StrictModel):
+    """One episode of a protocol's list."""
+
+    episode: Annotated[int, Field(ge=0)] = Field(description="its number, from 0 on")
+    task: str
+    config: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] = Field(description="name of a file in configs/")
+    seed: Annotated[int, Field(ge=0)]
+    split: str = Field(default="test", description="what it belongs to, such as a suite's")
+    instruction: str = Field(description="what the policy is told")
+    target: str = Field(description="id of the object that is meant")
+    p_vis: float | None = Field(default=None, description="share of it that is seen from above; search")
+
+
+@dataclass(frozen=True)
+class LoadedProtocol:
+    """A protocol as it was read.
+
+    Attributes:
+        folder: that it came from.
+        rules: of all episodes.
+        episodes: in the order of their numbers.
+    """
+
+    folder: Path
+    rules: Protocol
+    episodes: tuple[Episode, ...]
+
+    @cached_property
+    def hash(self) -> str:
+        """Hex sha256 of its files, by their names."""
+        digest = hashlib.sha256()
+        for path in files_of(self.folder):
+            content = hashlib.sha256(path.read_bytes()).hexdigest()
+            digest.update(f"{path.relative_to(self.folder).as_posix()} {content}\n".encode())
+        return digest.hexdigest()
+
+    def config_file(self, config: str) -> Path:
+        """Of a configuration that episodes name."""
+        return self.folder / CONFIGS / f"{config}.yaml"
+
+    def layouts_file(self, config: str) -> Path:
+        """Of the scenes of a configuration's episodes."""
+        return self.folder / LAYOUTS / f"{config}.npy"
+
+    def max_seconds(self, task: str) -> float:
+        """How long an episode may take, s of the scene."""
+        return self.rules.max_seconds.get(task, float("inf"))
+
+
+def files_of(folder: Path) -> list[Path]:
+    """The files that a protocol is made of, sorted."""
+    found = [folder / RULES, folder / EPISODES, *folder.glob(f"{CONFIGS}/*.yaml"), *folder.glob(f"{LAYOUTS}/*.npy")]
+    return sorted(found)
+
+
+def shipped_protocols() -> dict[str, Path]:
+    """Name -> folder of the protocols that travel with the package."""
+    return {path.parent.name: path.parent for path in sorted(protocols_dir().glob(f"*/{RULES}"))}
+
+
+def load_protocol(name: str | Path) -> LoadedProtocol:
+    """Read a protocol.
+
+    Args:
+        name: of a shipped one, or a folder.
+
+    Raises:
+        EvaluationError: there is none, or it is not what it should be.
+    """
+    shipped = shipped_protocols()
+    folder = shipped.get(str(name), Path(name))
+    if not (folder / RULES).is_file():
+        likely = nearest(str(name), shipped)
+        expected = f"a folder with {RULES}, or one of {', '.join(sorted(shipped))}"
+        raise EvaluationError("no such protocol", where=name, expected=expected, fix=likely)
+    rules = _rules(folder / RULES)
+    episodes = tuple(_episodes(folder / EPISODES))
+    loaded = LoadedProtocol(folder, rules, episodes)
+    for config in {episode.config for episode in episodes}:
+        for path in (loaded.config_file(config), loaded.layouts_file(config)):
+            if not path.is_file():
+                raise EvaluationError("a protocol's file is not there", where=path)
+    return loaded
+
+
+def _rules(path: Path) -> Protocol:
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return Protocol.model_validate_json(json.dumps(data), strict=True)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError, ValidationError) as error:
+        raise EvaluationError("no rules of a protocol", where=path, found=" ".join(str(error).split())) from error
+
+
+def _episodes(path: Path) -> Iterator[Episode]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise EvaluationError("can't read the episodes", where=path, found=error) from error
+    for number, line in enumerate(lines):
+        try:
+            episode = Episode.model_validate_json(line, strict=True)
+        except ValidationError as error:
+            found = " ".join(str(error).split())
+            raise EvaluationError("no episode", where=f"{path}:{number + 1}", found=found) from error
+        if episode.episode != number:
+            raise EvaluationError(
+                "episodes are not in order", where=f"{path}:{number + 1}", expected=number, found=episode.episode
+            )
+        yield episode
