@@ -76,7 +76,7 @@ SEARCH = TaskSpec(
     default_config="search_table_stacked",
     solver="robocas_ms3.planning.solvers.search",
     max_episode_steps=2400,
-    training_steps=300,
+    training_steps=450,
     summary="find the named object in a heap, clear what covers it, and drop it into the basket",
 )
 OPEN_PICK = TaskSpec(

@@ -13,7 +13,7 @@ HORIZONS = {
     ("pick", None): 100,
     ("pick", "pick_shelf_orderly"): 100,
     ("select", None): 100,
-    ("search", None): 300,
+    ("search", None): 450,
     ("open_pick", None): 200,
     ("open_pick", "open_pick_drawer"): 200,
     ("open_pick", "open_pick_cabinet_door"): 350,
