@@ -72,8 +72,7 @@ class TopDown(gym.ActionWrapper):
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         self.single_action_space = gym.spaces.Box(-1, 1, (5,), np.float32)
-        count = env.unwrapped.num_envs  # in a process one; on a GPU the batch
-        self.action_space = self.single_action_space if count == 1 else batch_space(self.single_action_space, count)
+        self.action_space = batch_space(self.single_action_space, env.unwrapped.num_envs)  # a GPU's batch
 
     def action(self, action: np.ndarray | torch.Tensor) -> torch.Tensor:
         """From (..., 5) to (..., 7)."""
