@@ -6,7 +6,6 @@ writes `progress.csv`, a row an update, and `policy.pt`. docs/rl.md says what ca
 """
 
 import csv
-import os
 import time
 from collections import deque
 from dataclasses import dataclass
@@ -16,14 +15,16 @@ import gymnasium as gym
 import numpy as np
 import torch
 import tyro
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import VectorEnv
+from gymnasium.vector.utils import batch_space
 from torch import nn
 from torch.distributions import Normal
 
-import robocas_ms3  # noqa: F401  (registers the environments)
+import robocas_ms3
 from robocas_ms3.config import load_task_config
 
 STEPS = 15  # an episode, of 0.2 s
+TRIAL = 20_000  # first seed of the layouts that are not learned from
 REDUCED = {  # of pick_table_scattered: one small fruit, more or less under the gripper
     "description": "A single fruit on a table.",
     "objects": {"ids": ["lemon", "plum"], "count": 1},
@@ -44,8 +45,8 @@ class Args:
     """Or until there were so many updates."""
     envs: int = 8
     """Environments."""
-    processes: bool = (os.cpu_count() or 1) > 4
-    """Each in a process of its own, which takes cores that are free: else this one steps them all."""
+    workers: int | None = None
+    """Processes that they are in; default: one an environment, but no more than cores."""
     layouts: int = 64
     """Different scenes to learn from."""
     batch: int = 512
@@ -62,55 +63,37 @@ class Args:
     """Episodes at the end, in layouts that were not learned from, without noise."""
 
 
-class TopDown(gym.Wrapper):
+class TopDown(gym.ActionWrapper):
     """Five numbers in [-1, 1] in place of the pose's seven: the gripper keeps pointing down and only turns about that.
 
-    1 is a shift by 5 cm, or a turn by 0.25 rad, in a fifth of a second. A success does not end an episode: the reward
-    is a level, and goes on. Of ``info`` only what came of an episode is kept: all of it, at every step, would be much
-    to hand on between processes.
+    1 is a shift by 5 cm, or a turn by 0.25 rad, in a fifth of a second.
     """
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        self.action_space = gym.spaces.Box(-1, 1, (5,), np.float32)
-        self.observation_space = env.unwrapped.single_observation_space
+        self.single_action_space = gym.spaces.Box(-1, 1, (5,), np.float32)
+        self.action_space = batch_space(self.single_action_space, env.unwrapped.num_envs)  # a GPU's batch
 
-    def step(self, action: np.ndarray) -> tuple:
-        x, y, z, yaw, gripper = np.clip(action, -1, 1)
-        pose = np.array([x / 2, y / 2, z / 2, 0, 0, yaw / 2, gripper], np.float32)
-        obs, reward, _, truncated, info = self.env.step(pose)
-        over = bool(truncated)
-        held = {"held": bool(info["reward_terms"]["grasp"] == 1), "lifted": bool(info["target_lifted"])} if over else {}
-        return obs[0].numpy(), float(reward), False, over, held
-
-    def reset(self, **kwargs) -> tuple:
-        return self.env.reset(**kwargs)[0][0].numpy(), {}
+    def action(self, action: np.ndarray | torch.Tensor) -> torch.Tensor:
+        """From (..., 5) to (..., 7)."""
+        x, y, z, yaw, gripper = torch.as_tensor(action, device=self.unwrapped.device).clip(-1, 1).unbind(-1)
+        still = torch.zeros_like(x)
+        return torch.stack([x / 2, y / 2, z / 2, still, still, yaw / 2, gripper], dim=-1)
 
 
-def make_env(first: int, last: int) -> gym.Env:
-    """An environment whose layouts are those of some seeds."""
-    torch.set_num_threads(1)
-    env = gym.make(
+def make_envs(count: int, first_seed: int, last_seed: int, workers: int | None = None) -> VectorEnv:
+    """Environments whose layouts are those of some seeds; each keeps its fruit. A success does not end an episode."""
+    config = load_task_config("pick_table_scattered").model_dump(mode="json") | REDUCED
+    return robocas_ms3.make_vec(
         "RoboCASPick-v1",
-        config={**load_task_config("pick_table_scattered").model_dump(mode="json"), **REDUCED},
-        seeds=(first, last),
-        reconfiguration_freq=0,  # each environment keeps its fruit
-        obs_mode="state",
-        reward_mode="normalized_dense",
-        control_mode="pd_ee_delta_pose",
-        sim_config={"control_freq": 5},
-        max_episode_steps=STEPS,
-        render_backend="none",
+        count,
+        workers=workers,
+        wrappers=[TopDown],
+        ignore_terminations=True,
+        reconfiguration_freq=0,
+        seeds=(first_seed, last_seed),
+        **robocas_ms3.rl_kwargs("pick", config) | {"max_episode_steps": STEPS},
     )
-    return TopDown(env)
-
-
-def make_vec(args: "Args") -> VectorEnv:
-    """Environments that start anew when an episode is over, each in a process of its own or all in this one."""
-    makers = [lambda: make_env(0, args.layouts - 1)] * args.envs
-    if args.processes:
-        return AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
-    return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
 
 
 class Agent(nn.Module):
@@ -139,6 +122,9 @@ class Agent(nn.Module):
     def policy(self, seen: torch.Tensor) -> Normal:
         return Normal(self.actor(seen), self.log_std.exp())
 
+    def value(self, seen: torch.Tensor) -> torch.Tensor:
+        return self.critic(seen)[:, 0]
+
 
 def _layers(inputs: int, outputs: int, gain: float) -> nn.Sequential:
     layers = nn.Sequential(
@@ -150,17 +136,13 @@ def _layers(inputs: int, outputs: int, gain: float) -> nn.Sequential:
     return layers
 
 
-def tensor(array: np.ndarray) -> torch.Tensor:
-    return torch.as_tensor(np.asarray(array, np.float32))
-
-
 class Rollouts:
-    """Steps the environments with the policy, and keeps what came of the last episodes."""
+    """Steps the environments with the policy, and keeps what came of the last episodes: return, held, lifted."""
 
-    def __init__(self, env: VectorEnv, agent: Agent, args: Args) -> None:
-        self.env, self.agent, self.args = env, agent, args
-        self.obs = tensor(env.reset(seed=args.seed * 1000)[0])
-        self.returns, self.episodes = np.zeros(args.envs), deque(maxlen=100)
+    def __init__(self, envs: VectorEnv, agent: Agent, args: Args) -> None:
+        self.envs, self.agent, self.args = envs, agent, args
+        self.obs = envs.reset(seed=args.seed * args.envs % args.layouts)[0]  # each env of each run goes on otherwise
+        self.episodes = deque(maxlen=100)
 
     @torch.no_grad()
     def collect(self) -> list[torch.Tensor]:
@@ -172,25 +154,27 @@ class Rollouts:
             policy = agent.policy(seen)
             action = policy.sample()
             raw.append(self.obs)
-            obs, reward, _, over, info = self.env.step(action.numpy())
-            value, after = agent.critic(seen)[:, 0], tensor(obs)
-            following = after.clone()
-            self.returns += reward
-            for i in np.flatnonzero(over):  # time was up, and nothing else: what would have come next still counts
-                following[i] = tensor(info["final_obs"][i])
-                ended = info["final_info"]
-                self.episodes.append((self.returns[i], float(ended["held"][i]), float(ended["lifted"][i])))
-                self.returns[i] = 0
-            next_value = agent.critic(agent.normal(following))[:, 0]
-            delta = tensor(reward) + args.gamma * next_value - value
-            steps.append((seen, action, policy.log_prob(action).sum(-1), delta, tensor(over), value))
-            self.obs = after
+            self.obs, reward, _, over, info = self.envs.step(action)
+            # time was up, and nothing else: what would have come next still counts
+            following = info.get("final_observation", self.obs)
+            value, next_value = agent.value(seen), agent.value(agent.normal(following))
+            delta = reward + args.gamma * next_value - value
+            steps.append((seen, action, policy.log_prob(action).sum(-1), delta, over.float(), value))
+            if "final_info" in info:
+                self.episodes.extend(outcomes(info).tolist())
         agent.see(torch.cat(raw))
         seen, action, log_prob, delta, over, value = (torch.stack(part) for part in zip(*steps, strict=True))
-        advantage, last = torch.zeros_like(delta), torch.zeros(args.envs)
+        advantage, last = torch.zeros_like(delta), torch.zeros_like(delta[0])
         for t in reversed(range(len(delta))):
             last = advantage[t] = delta[t] + args.gamma * args.trace * (1 - over[t]) * last
         return [part.flatten(0, 1) for part in (seen, action, log_prob, advantage, advantage + value)]
+
+
+def outcomes(info: dict) -> torch.Tensor:
+    """(n, 3) of the episodes that have just ended: return, whether the target is held, whether it was lifted."""
+    final = info["final_info"]
+    held = final["reward_terms"]["grasp"] == 1
+    return torch.stack([final["episode"]["return"], held, final["target_lifted"]], dim=1)[info["_final_info"]]
 
 
 def update(agent: Agent, optimizer: torch.optim.Optimizer, data: list[torch.Tensor], args: Args) -> None:
@@ -202,7 +186,7 @@ def update(agent: Agent, optimizer: torch.optim.Optimizer, data: list[torch.Tens
             policy = agent.policy(seen)
             ratio = (policy.log_prob(action).sum(-1) - log_prob).exp()
             gain = torch.min(ratio * advantage, ratio.clamp(1 - args.clip, 1 + args.clip) * advantage).mean()
-            error = (agent.critic(seen)[:, 0] - returns).square().mean()
+            error = (agent.value(seen) - returns).square().mean()
             optimizer.zero_grad()
             (error / 2 - gain - args.entropy * policy.entropy().sum(-1).mean()).backward()
             nn.utils.clip_grad_norm_(agent.parameters(), 0.5)
@@ -212,24 +196,22 @@ def update(agent: Agent, optimizer: torch.optim.Optimizer, data: list[torch.Tens
 @torch.no_grad()
 def try_out(agent: Agent, args: Args) -> float:
     """The share of unseen layouts in which the policy, without its noise, holds the target at the end."""
-    env, held = make_env(10_000, 10_000 + args.trials), 0
-    for seed in range(10_000, 10_000 + args.trials):
-        obs, info = env.reset(seed=seed)
-        while not info:
-            obs, _, _, _, info = env.step(agent.actor(agent.normal(tensor(obs))).numpy())
-        held += info["held"]
-    env.close()
-    return held / args.trials
+    envs = make_envs(args.trials, TRIAL, TRIAL + args.trials - 1, args.workers)
+    obs, info = envs.reset(seed=TRIAL)
+    while "final_info" not in info:  # all end at once
+        obs, _, _, _, info = envs.step(agent.actor(agent.normal(obs)))
+    envs.close()
+    return outcomes(info)[:, 1].mean().item()
 
 
 def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
-    env = make_vec(args)
-    agent = Agent(env.single_observation_space.shape[0], env.single_action_space.shape[0])
+    envs = make_envs(args.envs, 0, args.layouts - 1, args.workers)
+    agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0]).to(envs.device)
     optimizer = torch.optim.Adam([p for p in agent.parameters() if p.requires_grad], lr=args.learning_rate, eps=1e-5)
-    rollouts, begun = Rollouts(env, agent, args), time.perf_counter()
+    rollouts, begun = Rollouts(envs, agent, args), time.perf_counter()
     with (args.out / "progress.csv").open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["steps", "seconds", "return", "held", "lifted", "std"])
@@ -248,7 +230,7 @@ def main(args: Args) -> None:
             if seconds > 60 * args.minutes:
                 break
     torch.save(agent.state_dict(), args.out / "policy.pt")
-    env.close()
+    envs.close()
     print(f"without noise, in {args.trials} layouts that are new to it: held {try_out(agent, args):.0%}")
 
 

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.config import load_task_config
 from robocas_ms3.demos.episode import EpisodeSettings
-from robocas_ms3.errors import ConfigError, RobocasError
+from robocas_ms3.errors import RobocasError
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.tasks.spec import TASKS
 
@@ -60,14 +59,7 @@ def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int
             expected=f"a divisor of {settings.control_freq}, or 0 for no trial",
             found=settings.replay_rate,
         )
-    config = load_task_config(settings.config)
-    if config.task != settings.task:
-        name = f" {settings.config}" if isinstance(settings.config, str) else ""
-        raise ConfigError(
-            f"{TASKS[settings.task].env_id} can't run the configuration{name}",
-            expected=f"task: {settings.task}",
-            found=f"task: {config.task}",
-        )
+    config = TASKS[settings.task].load_config(settings.config)
     SceneModel.load(config, load_pack(settings.pack), load_pack("builtin"))
 
 

@@ -16,7 +16,7 @@ from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
 from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
-from robocas_ms3.config import TaskConfig, load_task_config
+from robocas_ms3.config import TaskConfig
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.robots.constants import HAND_LINK
 from robocas_ms3.robots.mobile_panda import RoboCASMobilePanda
@@ -84,13 +84,7 @@ class SceneEnv(SeededEnv):
         **kwargs: Any,
     ) -> None:
         check_one_process(num_envs, kwargs.get("sim_backend", "auto"))
-        self.task_config = load_task_config(self.SPEC.default_config if config is None else config)
-        if self.task_config.task != self.SPEC.name:
-            raise ConfigError(
-                f"{self.SPEC.env_id} can't run this configuration",
-                expected=f"task: {self.SPEC.name}",
-                found=f"task: {self.task_config.task}",
-            )
+        self.task_config = self.SPEC.load_config(config)
         if visual_level not in VISUALS:
             raise ConfigError("no such visual_level", expected=f"one of {list(VISUALS)}", found=visual_level)
         self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack))

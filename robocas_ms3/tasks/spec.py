@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+
+from robocas_ms3.config import TaskConfig, load_task_config
+from robocas_ms3.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -15,6 +19,7 @@ class TaskSpec:
         default_config: task configuration used when none is given.
         solver: import path of the scripted policy, a module with ``attempt(arm)``.
         max_episode_steps: horizon at 20 Hz; upstream allows 200 steps of 5 Hz.
+        training_steps: horizon at 5 Hz to train with where the base stands still (`rl_kwargs`).
         summary: one line for people.
     """
 
@@ -23,7 +28,27 @@ class TaskSpec:
     default_config: str
     solver: str
     max_episode_steps: int
+    training_steps: int
     summary: str
+
+    def load_config(self, config: str | Path | dict | TaskConfig | None = None) -> TaskConfig:
+        """Read a configuration of the task.
+
+        Args:
+            config: see `load_task_config`; None: the default.
+
+        Raises:
+            ConfigError: it is wrong, or another task's.
+        """
+        loaded = load_task_config(self.default_config if config is None else config)
+        if loaded.task != self.name:
+            name = f" {config}" if isinstance(config, str) else ""
+            raise ConfigError(
+                f"{self.env_id} can't run the configuration{name}",
+                expected=f"task: {self.name}",
+                found=f"task: {loaded.task}",
+            )
+        return loaded
 
 
 PICK = TaskSpec(
@@ -32,6 +57,7 @@ PICK = TaskSpec(
     default_config="pick_table_scattered",
     solver="robocas_ms3.planning.solvers.pick",
     max_episode_steps=800,
+    training_steps=100,
     summary="grasp the named object among scattered ones and drop it into the basket",
 )
 
@@ -41,6 +67,7 @@ SELECT = TaskSpec(
     default_config="select_table_orderly",
     solver="robocas_ms3.planning.solvers.pick",
     max_episode_steps=800,
+    training_steps=100,
     summary="grasp the one of several identical objects that the instruction names by where it stands",
 )
 SEARCH = TaskSpec(
@@ -49,6 +76,7 @@ SEARCH = TaskSpec(
     default_config="search_table_stacked",
     solver="robocas_ms3.planning.solvers.search",
     max_episode_steps=2400,
+    training_steps=450,
     summary="find the named object in a heap, clear what covers it, and drop it into the basket",
 )
 OPEN_PICK = TaskSpec(
@@ -57,6 +85,7 @@ OPEN_PICK = TaskSpec(
     default_config="open_pick_container",
     solver="robocas_ms3.planning.solvers.open_pick",
     max_episode_steps=2000,
+    training_steps=200,
     summary="open a door or drawer, take the named object out and drop it into the basket",
 )
 

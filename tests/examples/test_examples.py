@@ -54,7 +54,7 @@ def test_read_dataset(recorded, needs_renderer, tmp_path):
 
 
 def test_ppo_in_a_shortened_form(tmp_path):
-    small = ["--updates", 2, "--envs", 1, "--batch", 64, "--epochs", 1, "--layouts", 2, "--trials", 2]
+    small = ["--updates", 2, "--envs", 2, "--workers", 1, "--batch", 64, "--epochs", 1, "--layouts", 2, "--trials", 2]
     learned, tried = run("ppo.py", *small, cwd=tmp_path)
     assert learned.startswith("128 steps, ")
     assert tried.startswith("without noise, in 2 layouts that are new to it: held ")

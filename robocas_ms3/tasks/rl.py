@@ -1,0 +1,48 @@
+"""What an environment is made with to learn in it by trial and error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.config import TaskConfig
+from robocas_ms3.errors import ConfigError
+from robocas_ms3.tasks.spec import TASKS, TaskSpec
+
+CONTROL_FREQ = 5  # Hz: `pd_ee_delta_pose` was made for it
+DRIVING_STEPS = 150  # more where the base drives
+
+
+def rl_kwargs(task: str, config: str | Path | dict | TaskConfig | None = None) -> dict[str, Any]:
+    """Give keyword arguments for ``gym.make`` and `make_vec` to train with: states, dense rewards, 5 Hz, a fit horizon.
+
+    ``max_episode_steps`` holds a demonstration (docs/rl.md). Where the configuration lets the base drive
+    (``base_motion``), an action moves it too, and there are more steps. ``rl_kwargs("pick") | {"reward_mode":
+    "progress"}`` changes one of them.
+
+    Args:
+        task: its name, ``pick``, or environment, ``RoboCASPick-v1``.
+        config: the environment's; None: the task's own.
+
+    Raises:
+        ConfigError: there is no such task or configuration, or the task can't run it.
+    """
+    spec = _find(task)
+    drives = spec.load_config(config).base_motion
+    return {
+        **({} if config is None else {"config": config}),
+        "obs_mode": "state",
+        "reward_mode": "normalized_dense",
+        "control_mode": "pd_ee_delta_pose_base" if drives else "pd_ee_delta_pose",
+        "sim_config": {"control_freq": CONTROL_FREQ},
+        "max_episode_steps": spec.training_steps + drives * DRIVING_STEPS,
+        "render_backend": "none",
+    }
+
+
+def _find(task: str) -> TaskSpec:
+    for spec in TASKS.values():
+        if task in (spec.name, spec.env_id):
+            return spec
+    known = ", ".join(f"{spec.name} or {spec.env_id}" for spec in TASKS.values())
+    raise ConfigError("no such task", where="rl_kwargs", expected=known, found=repr(task))
