@@ -37,6 +37,7 @@ COMMANDS = (
     "import-robocas",
     "assets",
     "layouts",
+    "eval",
 )
 DESCRIPTION = (
     "RoboCAS for ManiSkill3: demonstrations and datasets of manipulation in complex object arrangements. "

@@ -33,6 +33,14 @@ class FrozenLayouts:
         except (OSError, ValueError, IndexError, KeyError, EOFError, TypeError) as error:
             raise LayoutError("no frozen layouts", where=path, found=error) from error
 
+    @property
+    def seeds(self) -> tuple[int, int]:
+        """Least and greatest of the seeds that follow one another from the least on."""
+        first = last = min(self._places)
+        while last + 1 in self._places:
+            last += 1
+        return first, last
+
     def __call__(self, objects_seed: int, seed: int) -> Layout:
         """The layout of a seed, and of its own objects.
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.scenes.bank import LayoutBank
+from robocas_ms3.scenes.frozen import FrozenLayouts
 from robocas_ms3.scenes.layout import Layout, ObjectIds
 from robocas_ms3.scenes.source import LayoutSource
 from robocas_ms3.scenes.table import LayoutTable, Pair, State
@@ -54,7 +55,8 @@ class SeededEnv(BaseEnv):
 
     Args:
         layouts: where layouts come from.
-        seeds: least and greatest seed of resets without one; default: any, for several envs `SEVERAL_ENVS_SEEDS`.
+        seeds: least and greatest seed of resets without one; default: any, for several envs `SEVERAL_ENVS_SEEDS`; of
+            frozen layouts theirs.
         num_envs: see ``BaseEnv``.
         reconfiguration_freq: see ``BaseEnv``; default 1 for one env, 0 for several.
         kwargs: passed to ``BaseEnv``.
@@ -80,6 +82,8 @@ class SeededEnv(BaseEnv):
         self._found: dict[int, Layout] = {}  # of envs
         self._own: dict[int, Layout] = {}  # of the seeds that envs are built with
         self._object_ids: list[ObjectIds] = []  # of each env
+        if seeds is None and isinstance(layouts, FrozenLayouts):
+            seeds = layouts.seeds
         self._seed_range = seeds or (SEVERAL_ENVS_SEEDS if num_envs > 1 else None)
         self._resets_seeded = False
         self._asked_for: set[int] = set()  # envs whose seeds were asked for

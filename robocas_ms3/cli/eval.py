@@ -1,0 +1,194 @@
+"""``robocas eval``: measure a policy by a protocol; compare, verify and list."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from robocas_ms3.evaluation.results import Result
+
+
+@dataclass
+class Eval:
+    """Measure a policy by a protocol: every episode of its list once, written as it ends.
+
+    robocas eval [TASK ...] --policy P --protocol NAME --out DIR   plays the episodes of these tasks, or of all
+    robocas eval report DIR                                        tables of a result
+    robocas eval compare DIR DIR                                   two results over the same episodes, by an exact test
+    robocas eval verify DIR                                        whether a result is whole, and of this protocol
+    robocas eval protocols                                         lists the protocols that are shipped
+    robocas eval freeze PLAN.yaml --out DIR                        makes a protocol of your own
+    """
+
+    words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Tasks; or one of the words above, and what it is about."""
+    policy: str = "scripted"
+    """scripted, random, still, replay:TRAJECTORY.h5, or module:Class of your own."""
+    protocol: str = "ms3-v1"
+    """Name of a shipped protocol, or its folder."""
+    out: Path | None = None
+    """Folder to write to. Default: eval/PROTOCOL/POLICY."""
+    resume: bool = False
+    """Go on with a result that is there."""
+    envs: int = 2
+    """Envs at a time; the outcome does not depend on it."""
+    workers: int | None = None
+    """Processes. Default: one an env, no more than cores."""
+    backend: Literal["auto", "processes", "gpu"] = "auto"
+    """Where envs run. Auto: a GPU if there is one."""
+    shard: str = "0/1"
+    """Only a part of the episodes, K/N: the K-th of N runs, from 0 on; `report` and `compare` take several folders'."""
+    episodes: int | None = None
+    """Only the first so many of each configuration."""
+
+
+WORDS = ("report", "compare", "verify", "protocols", "freeze")
+
+
+def main(cfg: Eval) -> int:
+    """Run the command; gives the exit code."""
+    first = cfg.words[0] if cfg.words else ""
+    if first not in WORDS:
+        return run(cfg)
+    about = [Path(word) for word in cfg.words[1:]]
+    if first == "protocols":
+        return protocols()
+    if first == "freeze":
+        return freeze(_one(about, first), cfg.out)
+    if first == "compare":
+        return compare(about)
+    return report(_one(about, first)) if first == "report" else verify(_one(about, first), cfg.protocol)
+
+
+def run(cfg: Eval) -> int:
+    """Play what a result lacks."""
+    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.demos.checks import check_number
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.evaluation.policies import make_policy
+    from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.run import Settings, evaluate
+    from robocas_ms3.evaluation.tables import markdown
+    from robocas_ms3.tasks.spec import TASKS
+
+    for word in cfg.words:
+        if word not in TASKS:
+            expected = f"one of {', '.join(TASKS)}; or {', '.join(WORDS)}"
+            raise EvaluationError("no such task", where=word, expected=expected)
+    check_number("envs", cfg.envs, 1)
+    protocol = load_protocol(cfg.protocol)
+    policy = make_policy(cfg.policy)
+    out = cfg.out or Path("eval") / protocol.rules.name / cfg.policy.replace(":", "_").replace("/", "_")
+    settings = Settings(cfg.envs, cfg.backend, cfg.workers, shard_of(cfg.shard), cfg.words, cfg.episodes)
+    succeeded = played = 0
+    with bar("episodes") as shown:
+        for outcome, left in evaluate(protocol, policy, cfg.policy, out, settings, resume=cfg.resume):
+            played += 1
+            succeeded += outcome.success
+            shown.at(played, played + left)
+    result = read(out)
+    (out / "report.md").write_text(markdown(result), encoding="utf-8")
+    say(f"{played} episodes played, {succeeded} succeeded; {out}: {len(result.outcomes)} episodes, see report.md")
+    return 0
+
+
+def report(folder: Path) -> int:
+    """Print a result's tables."""
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.tables import markdown
+
+    say(markdown(read(folder)))
+    return 0
+
+
+def compare(folders: list[Path]) -> int:
+    """Compare two results."""
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.tables import comparison
+
+    if len(folders) != 2:
+        raise EvaluationError("compares two results", where="compare", expected="two folders", found=len(folders))
+    say(comparison(*map(read, folders)))
+    return 0
+
+
+def verify(folder: Path, protocol: str) -> int:
+    """See that a result is whole, and of a protocol that is here; 1 where it isn't."""
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.verify import problems
+
+    result: Result = read(folder)
+    name = str(result.run.get("protocol", protocol))
+    found = problems(result, load_protocol(protocol if Path(protocol).is_dir() else name))
+    for problem in found:
+        say(problem)
+    say(f"{folder}: " + (f"{len(found)} problems" if found else f"{len(result.outcomes)} episodes of {name}, all well"))
+    return 1 if found else 0
+
+
+def protocols() -> int:
+    """List the protocols that are shipped."""
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+
+    for name in shipped_protocols():
+        protocol = load_protocol(name)
+        say(f"{name}: {len(protocol.episodes)} episodes, {protocol.hash[:12]}: {protocol.rules.description}")
+    return 0
+
+
+def freeze(plan: Path, out: Path | None) -> int:
+    """Make a protocol."""
+    import yaml
+
+    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.evaluation.freeze import Plan
+    from robocas_ms3.evaluation.freeze import freeze as make
+    from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.files import claim_output
+
+    if out is None:
+        raise EvaluationError("where to?", where="--out", expected="a folder")
+    try:
+        read = Plan.model_validate(yaml.safe_load(plan.read_text(encoding="utf-8")))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise EvaluationError("no plan of a protocol", where=plan, found=" ".join(str(error).split())) from error
+    claim_output(out, resume=None)
+    with bar("episodes") as shown:
+        for done, total in make(read, out):
+            shown.at(done, total)
+    say(f"{out}: {len(load_protocol(out).episodes)} episodes, {load_protocol(out).hash}")
+    return 0
+
+
+def shard_of(text: str) -> tuple[int, int]:
+    """(number, of how many) of ``K/N``.
+
+    Raises:
+        EvaluationError: it is none.
+    """
+    from robocas_ms3.errors import EvaluationError
+
+    number, _, of = text.partition("/")
+    if not (number.isdecimal() and of.isdecimal() and int(number) < int(of)):
+        raise EvaluationError("no part of a whole", where="--shard", expected="K/N such as 0/4", found=text)
+    return int(number), int(of)
+
+
+def _one(about: list[Path], word: str) -> Path:
+    from robocas_ms3.errors import EvaluationError
+
+    if len(about) != 1:
+        raise EvaluationError("takes one thing", where=word, expected="a folder or file", found=len(about))
+    return about[0]

@@ -1,0 +1,184 @@
+"""Evaluate a policy by a protocol: every episode of its list once, in as many envs as there is room for."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.policy import CAMERAS, Policy, Start, Wants, describe
+from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
+from robocas_ms3.evaluation.results import Outcome
+from robocas_ms3.evaluation.rollout import Rollouts, Rules
+from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, control_mode
+from robocas_ms3.tasks.spec import TASKS
+from robocas_ms3.tasks.vector import make_vec
+from robocas_ms3.tasks.vector.backend import Backend, choose_backend
+
+_UNSEEN = 8  # pixels a side of cameras that nobody asked for, which are rendered all the same
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How an evaluation runs; nothing of it changes what comes out.
+
+    Attributes:
+        num_envs: envs at a time.
+        backend: where they run, see `make_vec`.
+        workers: processes.
+        shard: (number, of how many): only these episodes, every n-th.
+        tasks: only these; empty: all of the protocol's.
+        episodes: only the first so many of each configuration.
+    """
+
+    num_envs: int = 2
+    backend: Backend = "auto"
+    workers: int | None = None
+    shard: tuple[int, int] = (0, 1)
+    tasks: tuple[str, ...] = ()
+    episodes: int | None = None
+
+
+def evaluate(
+    protocol: LoadedProtocol, policy: Policy, name: str, folder: Path, settings: Settings, *, resume: bool = False
+) -> Iterator[tuple[Outcome, int]]:
+    """Play the episodes that a result lacks, and write each as it ends.
+
+    Args:
+        protocol: what is measured.
+        policy: of whom.
+        name: that the policy was asked for by.
+        folder: of the result.
+        settings: how.
+        resume: whether to go on with a result that is there.
+
+    Yields:
+        What came of an episode, and how many are still to come.
+
+    Raises:
+        EvaluationError: the policy does not fit the protocol, the pack is another, or the result is of another run.
+    """
+    protocol.rules.refuse(policy.wants)
+    wanted = chosen(protocol.episodes, settings)
+    if not wanted:
+        raise EvaluationError("no episodes", where=protocol.rules.name, found=f"tasks {list(settings.tasks)}")
+    done = results.begin(folder, about(protocol, policy, name, settings), resume=resume)
+    left = [episode for episode in wanted if episode.episode not in done]
+    count = len(left)
+    for config in dict.fromkeys(episode.config for episode in left):
+        of_config = [episode for episode in left if episode.config == config]
+        for outcome in _play(protocol, policy, of_config, settings):
+            results.append(folder, outcome)
+            count -= 1
+            yield outcome, count
+
+
+def chosen(episodes: Sequence[Episode], settings: Settings) -> list[Episode]:
+    """The episodes of a run."""
+    number, of = settings.shard
+    taken: dict[str, int] = {}
+    found = []
+    for episode in episodes:
+        if settings.tasks and episode.task not in settings.tasks:
+            continue
+        taken[episode.config] = taken.get(episode.config, 0) + 1
+        if settings.episodes is not None and taken[episode.config] > settings.episodes:
+            continue
+        if episode.episode % of == number:
+            found.append(episode)
+    return found
+
+
+def about(protocol: LoadedProtocol, policy: Policy, name: str, settings: Settings) -> dict[str, Any]:
+    """What a result says of what it was measured with.
+
+    Raises:
+        EvaluationError: the pack is not the protocol's.
+    """
+    pack = sha256(load_pack(protocol.rules.pack).root / MANIFEST)
+    if pack != protocol.rules.pack_hash:
+        raise EvaluationError(
+            "the object pack is another", where=protocol.rules.name, expected=protocol.rules.pack_hash, found=pack
+        )
+    return {
+        "protocol": protocol.rules.name,
+        "protocol_hash": protocol.hash,
+        "policy": {"name": name, **describe(policy)},
+        "backend": choose_backend(settings.backend),
+        "versions": results.versions(),
+        "pack_hashes": {protocol.rules.pack: pack},
+        "machine": {"processor": platform.machine(), "python": platform.python_version()},
+    }
+
+
+def _play(protocol: LoadedProtocol, policy: Policy, episodes: list[Episode], settings: Settings) -> Iterator[Outcome]:
+    rules, wants, first = protocol.rules, policy.wants, episodes[0]
+    rate = UPSTREAM_HZ if rules.stepping == "upstream" else rules.rate(wants)
+    files = {"config_file": protocol.config_file(first.config), "layouts_file": protocol.layouts_file(first.config)}
+    starts = [
+        Start(
+            env=-1,
+            episode=one.episode,
+            task=one.task,
+            **{name: str(path) for name, path in files.items()},
+            pack=rules.pack,
+            seed=one.seed,
+            instruction=one.instruction,
+        )
+        for one in episodes
+    ]
+    gpu = choose_backend(settings.backend) == "gpu"
+    torch.set_num_threads(1)
+    env = make_vec(
+        TASKS[first.task].env_id,
+        min(settings.num_envs, len(episodes)),
+        backend=settings.backend,
+        workers=settings.workers,
+        arrays="numpy",
+        auto_reset=False,
+        ignore_terminations=True,
+        record_metrics=False,
+        wrappers=[
+            partial(PolicyStepping, convention=wants.convention, reference=wants.reference, stepping=rules.stepping)
+        ],
+        config=str(files["config_file"]),
+        layouts=str(files["layouts_file"]),
+        pack=rules.pack,
+        control_mode=control_mode(wants.convention),
+        reward_mode="none",
+        sim_config={"control_freq": rate},
+        max_episode_steps=10**9,
+        **_looks(wants),
+    )
+    try:
+        steps = rules.max_steps or 10**9
+        seconds = protocol.max_seconds(first.task)
+        if rules.stepping == "timed" and seconds < float("inf"):
+            steps = min(steps, round(seconds * rate))
+        ends = Rules(steps, tuple(rules.ends_on), rules.max_v0_steps)
+        known = {one.episode: one for one in episodes}
+        for played in Rollouts(env, policy, ends, 1 / rate, refill=not gpu).play(starts):
+            one = known[played.start.episode]
+            yield Outcome.of(played, config=one.config, split=one.split, p_vis=one.p_vis)
+    finally:
+        env.close()
+
+
+def _looks(wants: Wants) -> dict[str, Any]:
+    """Arguments of an environment that shows what a policy wants to see."""
+    if not wants.cameras:
+        return {"obs_mode": "state_dict", "render_backend": "none"}
+    modes = ["rgb", *(["depth"] if wants.depth else []), *(["state"] if wants.state else [])]
+    sizes = {name: wants.cameras.get(name, (_UNSEEN, _UNSEEN)) for name in CAMERAS}
+    return {
+        "obs_mode": "+".join(modes),
+        "sensor_configs": {name: dict(width=width, height=height) for name, (width, height) in sizes.items()},
+    }

@@ -1,0 +1,114 @@
+"""A result, and two of them, as Markdown."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.power import too_few
+from robocas_ms3.evaluation.results import STAGES, Outcome, Result
+from robocas_ms3.evaluation.statistics import Share, compare, success_by
+
+P_VIS_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+
+
+def markdown(result: Result) -> str:
+    """The tables of a result."""
+    run = result.run
+    lines = [
+        f"# {run['policy']['name']} by {run['protocol']}",
+        "",
+        f"Protocol hash `{run['protocol_hash'][:16]}`, {len(result.outcomes)} episodes, {run['backend']}; "
+        + ", ".join(f"{name} {number}" for name, number in run["versions"].items())
+        + ". Intervals are Clopper-Pearson's, 95 %.",
+        "",
+        "| configuration | n | success | at the end | upstream's | " + " | ".join(STAGES) + " | steps | s |",
+        "|---|---|---|---|---|" + "---|" * (len(STAGES) + 2),
+    ]
+    for config, outcomes in _by_config(result).items():
+        cells = [
+            config,
+            str(len(outcomes)),
+            percent(result.rate("success", outcomes)),
+            percent(result.rate("success_at_end", outcomes), interval=False),
+            percent(result.rate("success_v0", outcomes), interval=False),
+            *(_stage(result, stage, outcomes) for stage in STAGES.values()),
+            f"{_mean([one.steps for one in outcomes]):.0f}",
+            f"{_mean([one.seconds for one in outcomes]):.1f}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    lines += ["", "## Where episodes failed", "", "| configuration | first stage not reached |", "|---|---|"]
+    for config, outcomes in _by_config(result).items():
+        found = Counter(one.failure_stage for one in outcomes if one.failure_stage)
+        said = ", ".join(f"{stage} {count}" for stage, count in found.most_common())
+        lines.append(f"| {config} | {said or 'none failed'} |")
+    hidden = [one for one in result.outcomes.values() if one.p_vis is not None]
+    if hidden:
+        lines += ["", "## By what is seen of the target (p_vis)", "", "| p_vis | n | success |", "|---|---|---|"]
+        for found in success_by([one.p_vis or 0.0 for one in hidden], [one.success for one in hidden], P_VIS_EDGES):
+            rate = "" if found.share is None else percent(found.share)
+            lines.append(
+                f"| {found.low:g} to {found.high:g} | {0 if found.share is None else found.share.n} | {rate} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def comparison(one: Result, other: Result) -> str:
+    """Two results over the same episodes.
+
+    Raises:
+        EvaluationError: they are of different protocols, or have no episodes in common.
+    """
+    if one.run["protocol_hash"] != other.run["protocol_hash"]:
+        raise EvaluationError(
+            "results of different protocols can't be compared",
+            where=other.folder,
+            expected=one.run["protocol_hash"][:16],
+            found=other.run["protocol_hash"][:16],
+        )
+    both = sorted(one.outcomes.keys() & other.outcomes.keys())
+    if not both:
+        raise EvaluationError("these results have no episodes in common", where=other.folder)
+    names = [result.run["policy"]["name"] for result in (one, other)]
+    lines = [
+        f"A: {names[0]} ({one.folder}), B: {names[1]} ({other.folder}); {len(both)} episodes of {one.run['protocol']} "
+        "that both have. McNemar's exact test, Tango's interval; claims go by the p-value.",
+        "",
+        "| configuration | n | A | B | only A | only B | B - A | p |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    warnings = []
+    configs = sorted({one.outcomes[number].config for number in both})
+    for config in [*configs, *(["all"] if len(configs) > 1 else [])]:
+        numbers = [number for number in both if config in ("all", one.outcomes[number].config)]
+        a, b = ([result.outcomes[number].success for number in numbers] for result in (one, other))
+        found = compare(b, a)
+        lines.append(
+            f"| {config} | {len(numbers)} | {sum(a)} | {sum(b)} | {found.only_b} | {found.only_a} | "
+            f"{100 * (sum(b) - sum(a)) / len(numbers):+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f}) | "
+            f"{found.p_value:.3g} |"
+        )
+        warning = too_few(found)
+        warnings += [f"- {config}: {warning}"] if warning else []
+    return "\n".join([*lines, *(["", *warnings] if warnings else [])]) + "\n"
+
+
+def percent(share: Share, *, interval: bool = True) -> str:
+    """A share in words: ``72 % (65 to 78)``."""
+    text = f"{100 * share.k / share.n:.0f} %"
+    return f"{text} ({100 * share.low:.0f} to {100 * share.high:.0f})" if interval else text
+
+
+def _stage(result: Result, stage: str, outcomes: list[Outcome]) -> str:
+    return percent(result.rate(stage, outcomes), interval=False) if stage in outcomes[0].flags else ""
+
+
+def _by_config(result: Result) -> dict[str, list[Outcome]]:
+    found: dict[str, list[Outcome]] = {}
+    for outcome in result.outcomes.values():
+        found.setdefault(outcome.config, []).append(outcome)
+    return dict(sorted(found.items()))
+
+
+def _mean(values: list[float] | list[int]) -> float:
+    return sum(values) / max(len(values), 1)
