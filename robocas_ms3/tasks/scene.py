@@ -174,8 +174,7 @@ class SceneEnv(SeededEnv):
             )
             for slot in range(len(self._object_ids[0]))
         ]
-        random = self.task_config.randomisation
-        if random.count or random.distractors:
+        if self.task_config.leaves_slots_empty:
             build.build_parking(self.scene, len(self.objects))
         facts = [[asset.asset for asset in assets] for assets in self.object_assets]
         self._centers_of_mass = torch.tensor(
