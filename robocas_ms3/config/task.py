@@ -146,7 +146,7 @@ class ObjectsConfig(StrictModel):
 class TargetConfig(StrictModel):
     """Which of the objects may be the target."""
 
-    min_grasps: Annotated[int, Field(ge=1)] = Field(default=20, description="fewer annotated grasps: never the target")
+    min_grasps: Annotated[int, Field(ge=0)] = Field(default=20, description="fewer annotated grasps: never the target")
     min_free_grasps: Annotated[int, Field(ge=0)] = Field(
         default=6, description="fewer of them from the robot's side and clear of everything else: not the target"
     )
@@ -156,11 +156,16 @@ class TargetConfig(StrictModel):
     approach: Literal["top", "front"] = Field(
         default="top", description="top: from above; front: level, as into a shelf"
     )
-    relations: Annotated[list[Relation], Field(min_length=1)] = Field(
-        default=list(RELATIONS), description="select: how the target is told apart; default: all that its copies allow"
+    relations: list[Relation] = Field(
+        default=list(RELATIONS),
+        description="select: how the target is told apart; default: all that its copies allow; []: it is not, the "
+        "nearest of its name is meant (upstream's)",
     )
-    max_visible_share: Annotated[float, Field(gt=0, le=1)] = Field(
-        default=0.9, description="search: the target's p_vis from above is lower"
+    max_visible_share: Annotated[float, Field(gt=0, le=1)] | None = Field(
+        default=0.9, description="search: the target's p_vis from above is lower; null: it may lie open"
+    )
+    weight: Literal["nearness", "uniform"] = Field(
+        default="nearness", description="search: near ones are drawn more often, 1 / distance; or all alike"
     )
     min_uncovered_grasps: Annotated[int, Field(ge=0)] = Field(
         default=6,
@@ -264,6 +269,10 @@ class TaskConfig(StrictModel):
     furniture: dict[str, FurnitureConfig]
     basket: BasketConfig
     robot: PoseConfig = Field(description="pose of the mobile base's frame on the floor")
+    robot_start: Literal["rest", "evaluation"] = Field(
+        default="rest",
+        description="the arm at the beginning: folded, or above the table as upstream's evaluation starts",
+    )
     surface: SurfaceConfig
     objects: ObjectsConfig = ObjectsConfig()
     layout: LayoutConfig

@@ -220,8 +220,8 @@ class SceneEnv(SeededEnv):
         starts = self._find_starts(env_idx.cpu().numpy())
         with torch.device(self.device):
             count = len(env_idx)
-            rest = torch.as_tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32)
-            self.agent.reset(rest.repeat(count, 1))
+            start = self.agent.keyframes[self.task_config.robot_start].qpos
+            self.agent.reset(torch.as_tensor(start, dtype=torch.float32).repeat(count, 1))
             self.agent.reset_only(env_idx)
             self.agent.robot.set_pose(cast("Any", Pose.create(starts.robot_poses)))
             for name, furniture in self.fixtures.furniture.items():

@@ -266,6 +266,7 @@ def test_layouts_that_come_to_rest_without_a_target_blame_the_target():
     crowded = LayoutError("no room", where="layout")
     assert _failure(scene, [crowded] * 48, 2, 0) is crowded
     assert "relations" not in _failure(model(), [], 0, 50).fix
+    assert "relations" not in _failure(rows(2, []), [], 0, 50).fix
 
 
 def test_no_target_is_an_error_that_says_what_to_change():
