@@ -96,6 +96,13 @@ class OrderlyLayout(StrictModel):
         default=1.3, description="distance of neighbouring columns as a multiple of their width"
     )
     yaw_jitter_deg: Annotated[float, Field(ge=0, le=45)] = Field(default=0.0, description="greatest turn of an object")
+    column_yaw: Literal["front", "random"] = Field(
+        default="front", description="random: each column is turned by any angle, the same for its objects (upstream's)"
+    )
+    keep_what_fits: bool = Field(
+        default=False,
+        description="leave out columns that don't fit, and objects too far back (upstream's); else draw others",
+    )
 
 
 class StackedLayout(StrictModel):
@@ -105,6 +112,21 @@ class StackedLayout(StrictModel):
     drop_height: Annotated[float, Field(gt=0, le=1)] = Field(default=0.3, description="above the surface or heap, m")
     tumble_probability: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.6, description="of an object falling in any orientation; else in a stable pose at a random yaw"
+    )
+    bucket: Annotated[float, Field(gt=0, le=1)] = Field(
+        default=0.8, description="sides of the walls as a share of the region's; narrow ones bury more (upstream: 1)"
+    )
+    drop_spread: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=1.0,
+        description="share of the room between the walls that objects fall into; 0: its middle (upstream's)",
+    )
+    order_noise: Annotated[float, Field(ge=0)] | None = Field(
+        default=0.5,
+        description="small objects rather fall first: deviation of the logarithm of their sizes; null: in any order "
+        "(upstream's)",
+    )
+    fall_seconds: Annotated[float, Field(gt=0, le=5)] = Field(
+        default=0.5, description="until the next object falls; one takes 0.25 to land (upstream: 1)"
     )
 
 
@@ -118,12 +140,13 @@ class ObjectsConfig(StrictModel):
         default="all", description="asset ids of the object pack, or their numbers in GraspNet-1Billion"
     )
     count: Annotated[int, Field(ge=1, le=64)] = Field(default=10, description="how many of them")
+    repeats: bool = Field(default=False, description="an object, or a kind of columns, may be drawn more than once")
 
 
 class TargetConfig(StrictModel):
     """Which of the objects may be the target."""
 
-    min_grasps: Annotated[int, Field(ge=1)] = Field(default=20, description="fewer annotated grasps: never the target")
+    min_grasps: Annotated[int, Field(ge=0)] = Field(default=20, description="fewer annotated grasps: never the target")
     min_free_grasps: Annotated[int, Field(ge=0)] = Field(
         default=6, description="fewer of them from the robot's side and clear of everything else: not the target"
     )
@@ -133,11 +156,16 @@ class TargetConfig(StrictModel):
     approach: Literal["top", "front"] = Field(
         default="top", description="top: from above; front: level, as into a shelf"
     )
-    relations: Annotated[list[Relation], Field(min_length=1)] = Field(
-        default=list(RELATIONS), description="select: how the target is told apart; default: all that its copies allow"
+    relations: list[Relation] = Field(
+        default=list(RELATIONS),
+        description="select: how the target is told apart; default: all that its copies allow; []: it is not, the "
+        "nearest of its name is meant (upstream's)",
     )
-    max_visible_share: Annotated[float, Field(gt=0, le=1)] = Field(
-        default=0.9, description="search: the target's p_vis from above is lower"
+    max_visible_share: Annotated[float, Field(gt=0, le=1)] | None = Field(
+        default=0.9, description="search: the target's p_vis from above is lower; null: it may lie open"
+    )
+    weight: Literal["nearness", "uniform"] = Field(
+        default="nearness", description="search: near ones are drawn more often, 1 / distance; or all alike"
     )
     min_uncovered_grasps: Annotated[int, Field(ge=0)] = Field(
         default=6,
@@ -241,6 +269,10 @@ class TaskConfig(StrictModel):
     furniture: dict[str, FurnitureConfig]
     basket: BasketConfig
     robot: PoseConfig = Field(description="pose of the mobile base's frame on the floor")
+    robot_start: Literal["rest", "evaluation"] = Field(
+        default="rest",
+        description="the arm at the beginning: folded, or above the table as upstream's evaluation starts",
+    )
     surface: SurfaceConfig
     objects: ObjectsConfig = ObjectsConfig()
     layout: LayoutConfig
@@ -271,3 +303,10 @@ class TaskConfig(StrictModel):
                 f"randomisation.count {list(count)} must rise and end at objects.count {self.objects.count}"
             )
         return self
+
+    @property
+    def leaves_slots_empty(self) -> bool:
+        """Whether an episode may use fewer objects than there are slots."""
+        random, layout = self.randomisation, self.layout
+        kept = isinstance(layout, OrderlyLayout) and layout.keep_what_fits
+        return kept or bool(random.count or random.distractors)

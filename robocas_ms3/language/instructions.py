@@ -28,7 +28,7 @@ class Instruction:
         split: of the template, and of synonyms.
         object_word: what the target is called: its name or a synonym.
         support_word: the same of the support; the template need not mention it.
-        relation_phrase: how the relation is said, ``closest {object}``; none outside of select.
+        relation_phrase: how the relation is said, ``closest {object}``; none where there is none.
     """
 
     text: str
@@ -54,12 +54,12 @@ def instruction(
         task: pick, select, search or open_pick.
         object: the target's name, 'sugar box'.
         support: what the objects are on or in, 'table'.
-        relation: select only: which one of several identical objects.
+        relation: select only: which one of several identical objects; none: the nearest, which upstream does not say.
         part: open_pick only: what has to be opened, 'left door'; see ``part_name``.
         template_id: of the template; none: upstream's.
 
     Raises:
-        RobocasError: no such template, or relation or part missing or out of place.
+        RobocasError: no such template, part missing, or relation or part out of place.
     """
     template_id = template_id or f"{task}/upstream/00"
     for split in SPLITS:
@@ -103,7 +103,7 @@ def choose_instruction(
         synonyms: False: the plain names and plain relations in every template.
 
     Raises:
-        RobocasError: relation or part missing or out of place.
+        RobocasError: part missing, or relation or part out of place.
     """
     draws = rng.random(4)
     texts, words = instruction_texts(), synonym_texts()
@@ -165,11 +165,11 @@ def _render(
     phrase: str,
     part: str,
 ) -> Instruction:
-    for name, value, owner in (("relation", phrase, "select"), ("part", part, "open_pick")):
-        if bool(value) != (task == owner):
-            raise RobocasError(
-                f"the task {owner}, and no other, needs a {name}", where=task, found=repr(value) if value else "none"
-            )
+    if phrase and task != "select":
+        raise RobocasError("the task select, and no other, may have a relation", where=task, found=repr(phrase))
+    if bool(part) != (task == "open_pick"):
+        found = repr(part) if part else "none"
+        raise RobocasError("the task open_pick, and no other, needs a part", where=task, found=found)
     text = template.format(
         object=phrase.format(object=object_word) if phrase else object_word,
         support=support_word,

@@ -33,6 +33,7 @@ _NO_MATTER = (
     "description",
     "support",
     "lights",
+    "robot_start",
     "language",
     "base_motion",
     "static_camera",

@@ -107,7 +107,8 @@ def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
         return
     wrong = [relation for relation in asked if relation in NEED_THREE]
     sets = [resolve_ids(pack, names, key="randomisation.object_sets") for names in random.object_sets or ()] or [ids]
-    most = max(_most_alike(pack, names, layout.copies, config.objects.count) for names in sets)
+    count, repeats = config.objects.count, config.objects.repeats
+    most = max(_most_alike(pack, names, layout.copies, count, repeats=repeats) for names in sets)
     if random.distractors and random.distractors.count[1]:  # may be of the same name
         most += random.distractors.count[1]
     if wrong and most < 3:
@@ -119,8 +120,10 @@ def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
         )
 
 
-def _most_alike(pack: Pack, ids: list[str], copies: int, count: int) -> int:
+def _most_alike(pack: Pack, ids: list[str], copies: int, count: int, *, repeats: bool) -> int:
     """How many objects of one name a layout may have at most."""
+    if repeats:
+        return count
     names = Counter(pack.objects[i].asset.name for i in ids)
     kinds = -(-count // copies)
     rounds = -(-kinds // len(ids))  # kinds are drawn again where there are too few

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes.placement import Array, Placeable, Region, planar_pose
@@ -22,7 +23,9 @@ def sample_orderly(
     row_gap: float,
     column_spacing: float = 1.3,
     yaw_jitter: float = 0.0,
-) -> Array:
+    turn_columns: bool = False,
+    keep_what_fits: bool = False,
+) -> tuple[Array, NDArray[np.bool_]]:
     """Stand objects in columns that begin at the front edge, labels to the front.
 
     All objects stand in their display pose, or, where there is none, in the most probable one. Neighbouring columns
@@ -38,16 +41,21 @@ def sample_orderly(
         row_gap: between objects of a column, m.
         column_spacing: at least 1 (upstream: 1.3).
         yaw_jitter: greatest turn of each object, rad.
+        turn_columns: each column by any angle, all its objects alike.
+        keep_what_fits: leave out the first column that doesn't fit, all after it, and objects behind the region.
 
     Returns:
-        (K, 4, 4) objects in the region's frame, in the order of ``placeables``.
+        (K, 4, 4) objects in the region's frame, in the order of ``placeables``; (K,) which of them there is room for.
 
     Raises:
-        LayoutError: the columns don't fit side by side, or one is too long.
+        LayoutError: the columns don't fit side by side, or one is too long; or nothing fits at all.
     """
     ahead = np.asarray(front, dtype=float)
     along = np.array([-ahead[1], ahead[0]])  # the front edge's own direction
     yaws = np.arctan2(ahead[1], ahead[0]) - _LABEL_YAW + rng.uniform(-yaw_jitter, yaw_jitter, len(placeables))
+    if turn_columns:
+        turns = {column: rng.uniform(-np.pi, np.pi) for column in dict.fromkeys(columns)}
+        yaws += [turns[column] for column in columns]
     choices = [_standing(placeable) for placeable in placeables]
     low, high = np.zeros((len(placeables), 2)), np.zeros((len(placeables), 2))  # extents along the edge, and ahead
     for i, (placeable, choice, yaw) in enumerate(zip(placeables, choices, yaws, strict=True)):
@@ -57,24 +65,28 @@ def sample_orderly(
     members = _ordered(rng, placeables, columns)
     widths = np.array([max(high[i, 0] - low[i, 0] for i in column) for column in members])
     centers = np.concatenate([[0.0], np.cumsum(column_spacing * (widths[1:] + widths[:-1]) / 2)])
-    width = centers[-1] + (widths[0] + widths[-1]) / 2
+    taken = centers + (widths[0] + widths) / 2  # by the columns up to each
     corners = np.array([region.min_xy, region.max_xy]) @ np.column_stack([along, ahead])
     (left, back), (right, edge) = corners.min(axis=0), corners.max(axis=0)
-    if width > right - left:
-        raise _does_not_fit(f"{len(members)} columns side by side", width, right - left)
-    start = left + widths[0] / 2 + rng.uniform() * (right - left - width)
+    count = int((taken <= right - left).sum()) if keep_what_fits else len(members)
+    if count == 0 or taken[count - 1] > right - left:
+        raise _does_not_fit(f"{len(members)} columns side by side", taken[count - 1], right - left)
+    start = left + widths[0] / 2 + rng.uniform() * (right - left - taken[count - 1])
 
-    poses = np.zeros((len(placeables), 4, 4))
-    for column, center in zip(members, start + centers, strict=True):
+    poses, there = np.tile(np.eye(4), (len(placeables), 1, 1)), np.zeros(len(placeables), dtype=bool)
+    for column, center in zip(members[:count], start + centers[:count], strict=True):
         free = edge  # what is left of the column begins here
         for i in column:
             x, y = (center - (low[i, 0] + high[i, 0]) / 2) * along + (free - high[i, 1]) * ahead
             poses[i] = planar_pose(x, y, region.z, yaws[i]) @ placeables[i].resting_poses[choices[i]]
             free -= high[i, 1] - low[i, 1] + row_gap
-        depth = edge - free - row_gap
-        if depth > edge - back:
+            depth = edge - free - row_gap
+            there[i] = depth <= edge - back
+        if not there[column].all() and not keep_what_fits:
             raise _does_not_fit(f"{len(column)} x {placeables[column[0]].name} in a column", depth, edge - back)
-    return poses
+    if not there.any():
+        raise _does_not_fit("even the first objects of the columns", min(high[:, 1] - low[:, 1]), edge - back)
+    return poses, there
 
 
 def _ordered(rng: np.random.Generator, placeables: list[Placeable], columns: list[str]) -> list[list[int]]:

@@ -139,8 +139,13 @@ def _choose_pose(rng: np.random.Generator, placeable: Placeable, areas: Array, d
     return int(drawn[np.argmin(areas[drawn])])
 
 
-def choose_objects(rng: np.random.Generator, ids: list[str], count: int) -> list[str]:
-    """Draw ``count`` ids: each at most once, unless there are fewer ids than that; then as evenly as can be."""
+def choose_objects(rng: np.random.Generator, ids: list[str], count: int, *, repeats: bool = False) -> list[str]:
+    """Draw ``count`` ids: each at most once, unless there are fewer ids than that; then as evenly as can be.
+
+    With ``repeats`` each is drawn from all of them.
+    """
+    if repeats:
+        return [ids[i] for i in rng.integers(len(ids), size=count)]
     chosen: list[str] = []
     while len(chosen) < count:
         order = [ids[i] for i in rng.permutation(len(ids))]

@@ -6,6 +6,7 @@ import logging
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject
 from robocas_ms3.config.task import OrderlyLayout, ScatteredLayout, StackedLayout
@@ -49,7 +50,7 @@ def object_set(model: SceneModel, objects_seed: int, number: int = 0) -> ObjectI
     if isinstance(config.layout, OrderlyLayout):
         chosen = _kinds_that_fit(rng, model, _usable(model, ids, columns=True), config.layout.copies)
     else:
-        chosen = choose_objects(rng, _usable(model, ids), count)
+        chosen = choose_objects(rng, _usable(model, ids), count, repeats=config.objects.repeats)
     distractors = config.randomisation.distractors
     if distractors is not None:
         others = _usable(model, resolve_ids(model.object_pack, distractors.ids, key="randomisation.distractors.ids"))
@@ -92,12 +93,11 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
             unarranged += [error] * _TRIES
             continue
         assets = [model.object_pack.objects[i] for i in ids]
-        present, candidate = _presence(model, len(ids), rng(_COUNT))
-        used = [asset for asset, there in zip(assets, present, strict=True) if there]
+        wanted, candidate = _presence(model, len(ids), rng(_COUNT))
         for _ in range(_TRIES):
             poses = np.stack([_parked(slot, asset) for slot, asset in enumerate(assets)])
             try:
-                arranged = _arrange(layout_rng, model, used)
+                arranged, fits = _arrange(layout_rng, model, [assets[slot] for slot in np.flatnonzero(wanted)])
             except LayoutError as error:
                 if isinstance(config.layout, OrderlyLayout):
                     unarranged.append(error)  # in another order the columns may fit
@@ -106,7 +106,10 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
                     raise  # it has tried often enough
                 unarranged += [error] * _TRIES
                 break
-            placed = model.support_pose @ model.support_motion(opened=False) @ arranged
+            present = wanted.copy()
+            present[wanted] = fits
+            used = [assets[slot] for slot in np.flatnonzero(present)]
+            placed = model.support_pose @ model.support_motion(opened=False) @ arranged[fits]
             if config.randomisation.basket is not None and meets_basket(used, placed, model.basket, basket_pose):
                 basket_pose = place_basket(model, robot_pose, basket_rng)
                 unsettled += 1
@@ -116,7 +119,7 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
                 unsettled += 1
                 continue
             poses[present] = settled.poses
-            scene = Arrangement(model, assets, poses, present, candidate, robot_pose, basket_pose)
+            scene = Arrangement(model, assets, poses, present, candidate & present, robot_pose, basket_pose)
             if (choice := choose_target(target_rng, scene)) is not None:
                 return Layout(
                     ids, poses, robot_pose, basket_pose, choice.slot, choice.relation, present, choice.visible_shares
@@ -158,7 +161,7 @@ def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, u
     fix = f"Raise target.max_distance, lower target.{lower} or min_free_grasps, or use other objects."
     if model.config.task == "select":
         names = ", ".join(model.config.target.relations)
-        fix = f"Give other target.relations than {names}, or more layout.copies. {fix}"
+        fix = (f"Give other target.relations than {names}, or more layout.copies. " if names else "") + fix
     return LayoutError("no object qualifies as the target", where="target", found=found, fix=fix)
 
 
@@ -167,7 +170,7 @@ def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str],
     objects, count = model.object_pack.objects, model.config.objects.count
     failure = LayoutError("no kinds to choose from", where="objects.ids")
     for attempt in range(_KINDS):
-        kinds = choose_objects(rng, ids, -(-count // copies))
+        kinds = choose_objects(rng, ids, -(-count // copies), repeats=model.config.objects.repeats)
         chosen = [kind for kind in kinds for _ in range(copies)][:count]
         try:
             _arrange(np.random.default_rng(attempt), model, [objects[i] for i in chosen])
@@ -222,12 +225,15 @@ def placeable(asset: LoadedObject, headroom: float = np.inf) -> Placeable:
     )
 
 
-def _arrange(rng: np.random.Generator, model: SceneModel, assets: list[LoadedObject]) -> Array:
-    """(K, 4, 4) objects in the support's frame."""
-    layout, region = model.config.layout, model.region
+def _arrange(
+    rng: np.random.Generator, model: SceneModel, assets: list[LoadedObject]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """(K, 4, 4) objects in the support's frame, (K,) which of them there is room for."""
+    layout, region, everything = model.config.layout, model.region, np.ones(len(assets), dtype=bool)
     if isinstance(layout, ScatteredLayout):
         placeables = [placeable(asset, model.headroom) for asset in assets]
-        return sample_scattered(rng, placeables, region, min_gap=layout.min_gap, max_tries=layout.max_tries)
+        poses = sample_scattered(rng, placeables, region, min_gap=layout.min_gap, max_tries=layout.max_tries)
+        return poses, everything
     if isinstance(layout, OrderlyLayout):
         return sample_orderly(
             rng,
@@ -238,15 +244,10 @@ def _arrange(rng: np.random.Generator, model: SceneModel, assets: list[LoadedObj
             row_gap=layout.row_gap,
             column_spacing=layout.column_spacing,
             yaw_jitter=np.deg2rad(layout.yaw_jitter_deg),
+            turn_columns=layout.column_yaw == "random",
+            keep_what_fits=layout.keep_what_fits,
         )
-    return drop_heap(
-        rng,
-        assets,
-        region,
-        headroom=model.headroom,
-        drop_height=layout.drop_height,
-        tumble_probability=layout.tumble_probability,
-    )
+    return drop_heap(rng, assets, region, layout, headroom=model.headroom), everything
 
 
 def _columns(ids: list[str], rows: int) -> list[str]:

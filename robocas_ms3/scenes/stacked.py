@@ -22,14 +22,12 @@ from robocas_ms3.assets.physics import (
     pose_matrix,
     solid_of,
 )
+from robocas_ms3.config.task import StackedLayout
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes.placement import Array, Region, planar_pose, transform
 
-FALL_SECONDS = 0.5  # of simulation before the next object falls; it takes 0.25 to land
 BUCKET_SECONDS = 1.0  # at most, after the last one
 SPREAD_SECONDS, OPEN_SECONDS = 2.0, 0.5  # at most: within a fence along the sides of the region, and without it
-ORDER_NOISE = 0.5  # of the logarithm of an object's size
-BUCKET = 0.8  # of the region's sides: narrower buckets make higher heaps, which spread when the walls are gone
 SPREAD = 0.05  # m that centres of mass may lie outside the region in the end
 WALL = 0.05  # m, half its thickness
 _LOOK_EVERY = 10  # steps between two looks at whether everything lies still
@@ -46,24 +44,22 @@ def drop_heap(
     rng: np.random.Generator,
     assets: Sequence[LoadedObject],
     region: Region,
+    layout: StackedLayout,
     *,
     headroom: float = np.inf,
-    drop_height: float = 0.3,
-    tumble_probability: float = 0.6,
 ) -> Array:
     """Drop objects into a frictionless bucket on a plane, then take the bucket away (upstream's way).
 
-    Other than upstream's, the bucket is a little smaller than the region, and small objects rather fall first: this
-    buries more of them (docs/layouts.md has figures). They fall as one convex hull each, one soon after the other; the
-    heap then spreads as what it really is, at first within a fence, which stops what would roll away.
+    Other than upstream's, by default the bucket is a little smaller than the region, and small objects rather fall
+    first: this buries more of them (docs/layouts.md has figures). They fall as one convex hull each, one soon after the
+    other; the heap then spreads as what it really is, at first within a fence, which stops what would roll away.
 
     Args:
         rng: source of all randomness.
         assets: K objects.
         region: of a horizontal plane.
+        layout: how they fall.
         headroom: that the heap has to stay below, m.
-        drop_height: of the object's lowest point above the plane, or above what lies there, m.
-        tumble_probability: of a random orientation; otherwise a resting pose at a random yaw.
 
     Returns:
         (K, 4, 4) objects at rest in the region's frame, in the order of ``assets``.
@@ -72,7 +68,7 @@ def drop_heap(
         LayoutError: heap after heap fell apart over the region's edges, or was too high.
     """
     for _ in range(_TRIES):
-        poses = _drop(rng, assets, region, drop_height, tumble_probability)
+        poses = _drop(rng, assets, region, layout)
         centers = np.stack(
             [transform(p, np.array([a.asset.center_of_mass]))[0] for a, p in zip(assets, poses, strict=True)]
         )
@@ -90,34 +86,33 @@ def drop_heap(
     )
 
 
-def _drop(
-    rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, height: float, tumble: float
-) -> Array:
+def _drop(rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, layout: StackedLayout) -> Array:
     """A heap (K, 4, 4), at rest as far as it came to."""
     with engine_settings():
-        return _spread(assets, _fill_bucket(rng, assets, region, height, tumble), region)
+        return _spread(assets, _fill_bucket(rng, assets, region, layout), region)
 
 
 def _fill_bucket(
-    rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, height: float, tumble: float
+    rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, layout: StackedLayout
 ) -> Array:
     """Objects (K, 4, 4) that have fallen into the bucket, with their outlines for bodies."""
-    middle, half = _middle(region), BUCKET * np.subtract(region.max_xy, region.min_xy) / 2
+    # narrower buckets make higher heaps, which spread when the walls are gone
+    middle, half = _middle(region), layout.bucket * np.subtract(region.max_xy, region.min_xy) / 2
     scene = new_scene()
     add_ground(scene, np.array([*middle, region.z]))
     _add_walls(scene, middle, half, region.z)
     bodies: dict[int, physx.PhysxRigidDynamicComponent] = {}
     outlines = [outline(asset) for asset in assets]
-    for index in falling_order(rng, assets).tolist():
+    for index in falling_order(rng, assets, layout.order_noise).tolist():
         asset = assets[index]
-        pose = _falling_pose(rng, asset, tumble)
+        pose = _falling_pose(rng, asset, layout.tumble_probability)
         points = transform(pose, outlines[index])
         room = np.maximum(half - np.abs(points[:, :2]).max(axis=0), 0)
-        x, y = middle + rng.uniform(-1, 1, 2) * room
+        x, y = middle + rng.uniform(-1, 1, 2) * room * layout.drop_spread
         top = max((transform(pose_matrix(b), outlines[i])[:, 2].max() for i, b in bodies.items()), default=region.z)
-        pose = planar_pose(x, y, top + height - points[:, 2].min(), 0) @ pose
+        pose = planar_pose(x, y, top + layout.drop_height - points[:, 2].min(), 0) @ pose
         bodies[index] = add_body(scene, replace(solid_of(asset), hulls=[outlines[index]]), pose)
-        _run(scene, FALL_SECONDS, list(bodies.values()))
+        _run(scene, layout.fall_seconds, list(bodies.values()))
     _run(scene, BUCKET_SECONDS, list(bodies.values()))
     return np.stack([pose_matrix(bodies[i]) for i in range(len(assets))])
 
@@ -148,10 +143,15 @@ def _middle(region: Region) -> Array:
     return np.add(region.min_xy, region.max_xy) / 2
 
 
-def falling_order(rng: np.random.Generator, assets: Sequence[LoadedObject]) -> NDArray[np.intp]:
-    """Indices in the order of falling: small ones rather first, each one's size times a random factor."""
+def falling_order(rng: np.random.Generator, assets: Sequence[LoadedObject], noise: float | None) -> NDArray[np.intp]:
+    """Indices in the order of falling: small ones rather first, each one's size times a random factor.
+
+    ``noise`` is the deviation of that factor's logarithm; None: in any order.
+    """
+    if noise is None:
+        return rng.permutation(len(assets))
     sizes = np.array([np.prod(asset.asset.extents) for asset in assets])
-    return np.argsort(np.log(sizes) + rng.normal(scale=ORDER_NOISE, size=len(assets)))
+    return np.argsort(np.log(sizes) + rng.normal(scale=noise, size=len(assets)))
 
 
 def _falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) -> Array:

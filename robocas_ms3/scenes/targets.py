@@ -142,7 +142,9 @@ def _first(rng: np.random.Generator, slots: list[int], test: Callable[[int], boo
 
 
 def _by_relation(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
-    """One of several identical objects, named by where it stands among them."""
+    """One of several identical objects, named by where it stands among them; or by its name alone, the nearest."""
+    if not scene.model.config.target.relations:
+        return _by_name(rng, scene)
     pairs = [(name, relation) for name in sorted(set(scene.names)) for relation in scene.model.config.target.relations]
     for index in rng.permutation(len(pairs)):
         name, relation = pairs[index]
@@ -162,22 +164,25 @@ def selection_camera(model: SceneModel) -> PinholeCamera:
 
 
 def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
-    """A hidden object, near ones more often: weight 1 / distance to the robot (upstream's).
+    """A hidden object, near ones more often: weight 1 / distance to the robot (upstream's when it makes data).
 
     One that can't be grasped as it lies is none, whatever lies on it: a can on its broad side, a screwdriver in a gap.
+    Upstream evaluates with any object, all alike: `max_visible_share` null, `weight` uniform, no grasps asked for.
     """
+    rules = scene.model.config.target
     model, slots = scene.model, np.flatnonzero(scene.present)
     camera = selection_camera(model)
     shares = np.full(len(scene.assets), np.nan)
     shares[slots] = visible_shares(camera, [object_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
     unique = np.array([scene.names.count(name) == 1 for name in scene.names])
-    hidden = scene.eligible & unique & (shares < model.config.target.max_visible_share)
-    weight = np.where(hidden, 1 / np.linalg.norm(scene.xy_in_robot, axis=1), 0)
+    fits = scene.eligible & unique
+    if rules.max_visible_share is not None:
+        fits &= shares < rules.max_visible_share
+    likely = 1 / np.linalg.norm(scene.xy_in_robot, axis=1) if rules.weight == "nearness" else np.ones(len(fits))
+    weight = np.where(fits, likely, 0)
     while weight.any():
         slot = int(rng.choice(len(weight), p=weight / weight.sum()))
-        if scene.has_uncovered_grasps(slot) and (
-            model.config.target.min_free_grasps == 0 or scene.has_free_grasps(slot)
-        ):
+        if scene.has_uncovered_grasps(slot) and (rules.min_free_grasps == 0 or scene.has_free_grasps(slot)):
             return Choice(slot, visible_shares=shares)
         weight[slot] = 0
     return None

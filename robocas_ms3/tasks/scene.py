@@ -174,8 +174,7 @@ class SceneEnv(SeededEnv):
             )
             for slot in range(len(self._object_ids[0]))
         ]
-        random = self.task_config.randomisation
-        if random.count or random.distractors:
+        if self.task_config.leaves_slots_empty:
             build.build_parking(self.scene, len(self.objects))
         facts = [[asset.asset for asset in assets] for assets in self.object_assets]
         self._centers_of_mass = torch.tensor(
@@ -221,8 +220,8 @@ class SceneEnv(SeededEnv):
         starts = self._find_starts(env_idx.cpu().numpy())
         with torch.device(self.device):
             count = len(env_idx)
-            rest = torch.as_tensor(self.agent.keyframes["rest"].qpos, dtype=torch.float32)
-            self.agent.reset(rest.repeat(count, 1))
+            start = self.agent.keyframes[self.task_config.robot_start].qpos
+            self.agent.reset(torch.as_tensor(start, dtype=torch.float32).repeat(count, 1))
             self.agent.reset_only(env_idx)
             self.agent.robot.set_pose(cast("Any", Pose.create(starts.robot_poses)))
             for name, furniture in self.fixtures.furniture.items():

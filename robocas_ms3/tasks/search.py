@@ -23,7 +23,7 @@ ENVS_AT_ONCE = 512  # whose clutter is measured: a quarter of a GB with 15 objec
 
 @register_env(SEARCH.env_id, max_episode_steps=SEARCH.max_episode_steps)
 class RoboCASSearchEnv(LearningEnv):
-    """Search: the target is hidden in part (p_vis from above below ``target.max_visible_share``).
+    """Search: the target is hidden in part (p_vis from above below ``target.max_visible_share``, where one is given).
 
     The stages add ``obstacles_cleared``: to the camera above that p_vis is measured with, at most a fifth of the target
     is hidden, and fewer than two other objects stick out next to it (`occlusion.clutter`). It is looked at five times a

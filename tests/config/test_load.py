@@ -50,7 +50,8 @@ def test_the_scattered_pick_has_upstreams_numbers():
         ("robot.yaw_deg", "90", ["'robot.yaw_deg'", "a number", "'90'"]),
         ("surface.furniture", "desk", ["surface.furniture", "['table']", "'desk'"]),
         ("surface.min_xy", [0.4, 0.0], ["min_xy", "below max_xy"]),
-        ("target.relations", [], ["'target.relations'", "at least 1 item", "[]"]),
+        ("randomisation", {"object_sets": []}, ["'randomisation.object_sets'", "at least 1 item", "[]"]),
+        ("robot_start", "folded", ["'robot_start'", "'rest'", "'evaluation'", "'folded'"]),
         ("task", "juggle", ["'task'", "'pick'", "'juggle'"]),
     ],
 )

@@ -188,8 +188,7 @@ def test_part_names(link, name):
 @pytest.mark.parametrize(
     ("task", "more", "match"),
     [
-        ("select", {"relation": None}, r"select: the task select, and no other, needs a relation \(found none\)"),
-        ("pick", {"relation": "nearest"}, r"pick: the task select, .* \(found 'nearest {object}'\)"),
+        ("pick", {"relation": "nearest"}, r"pick: the task select, and no other, .* \(found 'nearest {object}'\)"),
         ("open_pick", {"part": ""}, "open_pick, and no other, needs a part"),
         ("search", {"part": "door"}, "open_pick, and no other, needs a part"),
     ],
@@ -199,6 +198,14 @@ def test_relation_and_part_where_they_belong(task, more, match):
         choose(0, task, **more)
     with pytest.raises(RobocasError, match=match):
         instruction(task, object="apple", support="table", **{**EXTRA[task], **more})
+
+
+def test_select_without_a_relation_is_upstreams_word_for_word():
+    found = instruction("select", object="mug", support="table")
+    assert found.text == "grasp the mug on the table and move it to the basket"
+    assert found.relation_phrase == ""
+    assert choose(5, "select", "upstream", "mug", relation=None) == found
+    assert "mug" in choose(5, "select", "train", "mug", relation=None, synonyms=False).text
 
 
 @pytest.mark.parametrize("template_id", ["pick/train/21", "pick/train/-1", "search/train/00", "pick/train", "7"])

@@ -74,6 +74,7 @@ def test_a_seed_without_a_layout_leaves_nothing_behind(tmp_path):
     [
         ({"lights": {"ambient": 0.1}}, True),
         ({"description": "other words"}, True),
+        ({"robot_start": "evaluation"}, True),
         ({"randomisation": {"cameras": {}, "room": ["wall"]}}, True),
         ({"randomisation": {"robot": {}}}, False),
         ({"layout": {"kind": "scattered", "min_gap": 0.02}}, False),

@@ -20,9 +20,15 @@ def box(width: float, depth: float, height: float = 0.1) -> Placeable:
     return Placeable("box", np.stack([pose, pose]), np.array([0.1, 0.9]), [outline, outline], display_pose=0)
 
 
-def rows(things, columns, front=(-1.0, 0.0), seed=0, **options):
+def kept(things, columns, front=(-1.0, 0.0), seed=0, **options):
     options = {"row_gap": 0.01, **options}
     return sample_orderly(np.random.default_rng(seed), things, columns, REGION, front=np.array(front), **options)
+
+
+def rows(things, columns, *more, **options):
+    poses, there = kept(things, columns, *more, **options)
+    assert there.all()
+    return poses
 
 
 def test_a_column_begins_at_the_front_edge_and_goes_back():
@@ -75,3 +81,39 @@ def test_everything_stands_inside_and_apart(seed, jitter, columns):
 def test_what_does_not_fit_is_said(things, columns, words):
     with pytest.raises(LayoutError, match=words):
         rows(things, columns)
+
+
+def test_columns_are_kept_as_long_as_they_fit():
+    # 1.3 x 0.2 m apart in 0.8 m: 0.2, 0.46, 0.72, and a fourth would end at 0.98 m
+    poses, there = kept([box(0.2, 0.04)] * 5, list("abcde"), keep_what_fits=True)
+    assert there.sum() == 3
+    ys = np.sort(poses[there, 1, 3])
+    np.testing.assert_allclose(np.diff(ys), 0.26)
+    assert ys[0] >= -0.3 and ys[-1] <= 0.3
+    # a wide one ends it, though a narrow one after it would fit
+    things = [box(0.3, 0.04), box(0.3, 0.04), box(0.6, 0.04), box(0.02, 0.04)]
+    assert kept(things, list("abcd"), keep_what_fits=True)[1].tolist() == [True, True, False, False]
+
+
+def test_objects_behind_the_region_are_left_out():
+    # 0.12 m deep and 1 cm apart: two take 0.25 of 0.3 m, three 0.38
+    _, there = kept([box(0.05, 0.12)] * 6, ["a"] * 3 + ["b"] * 3, keep_what_fits=True)
+    assert there.tolist() == [True, True, False] * 2
+
+
+@pytest.mark.parametrize(("size", "words"), [((0.9, 0.04), "side by side"), ((0.05, 0.31), "even the first objects")])
+def test_nothing_that_fits_is_an_error(size, words):
+    with pytest.raises(LayoutError, match=words):
+        kept([box(*size)] * 2, ["a", "b"], keep_what_fits=True)
+
+
+def test_a_column_is_turned_as_one():
+    things, columns = [box(0.06, 0.04)] * 6, ["a", "a", "b", "b", "c", "c"]
+    yaws = []
+    for seed in range(20):
+        poses = rows(things, columns, seed=seed, turn_columns=True)
+        fronts = poses[:, :2, 1]
+        np.testing.assert_allclose(fronts[::2], fronts[1::2])
+        yaws += np.arctan2(*fronts[::2].T[::-1]).tolist()
+    quarters = np.histogram(yaws, bins=4, range=(-np.pi, np.pi))[0]
+    assert quarters.sum() == 60 and quarters.min() >= 6  # 15 each

@@ -68,6 +68,8 @@ def test_objects_repeat_only_when_there_are_too_few():
     rng = np.random.default_rng(0)
     assert sorted(choose_objects(rng, ["a", "b", "c"], 3)) == ["a", "b", "c"]
     assert sorted(choose_objects(rng, ["a", "b"], 5)).count("a") in (2, 3)
+    counts = {choose_objects(rng, ["a", "b"], 4, repeats=True).count("a") for _ in range(100)}
+    assert counts == {0, 1, 2, 3, 4}
 
 
 def test_where_it_is_tight_objects_are_packed(monkeypatch):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.config import load_task_config
+from robocas_ms3.config import load_task_config, shipped_configs
 from robocas_ms3.errors import ConfigError, LayoutError
 from robocas_ms3.scenes import sample
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
@@ -74,6 +74,48 @@ def test_orderly_objects_come_in_kinds():
     scene = model(layout={"kind": "orderly", "copies": 3}, objects={"ids": "all", "count": 7})
     ids = object_set(scene, 0)
     assert [ids.count(kind) for kind in dict.fromkeys(ids)] == [3, 3, 1]
+
+
+def test_objects_and_kinds_may_be_drawn_again():
+    ids = {"ids": ["mug", "soap_box", "sugar_box"], "count": 4, "repeats": True}
+    scattered = [object_set(model(objects=ids), seed) for seed in range(20)]
+    assert max(chosen.count(i) for chosen in scattered for i in chosen) > 2  # by turns it would be 2
+    layout = {"kind": "orderly", "copies": 2, "rows": 2}
+    for chosen in (object_set(model(objects=ids, layout=layout), seed) for seed in range(20)):
+        assert chosen[0] == chosen[1] and chosen[2] == chosen[3]
+    assert any(len(set(object_set(model(objects=ids, layout=layout), seed))) == 1 for seed in range(20))
+
+
+def test_columns_that_do_not_fit_leave_their_slots_empty():
+    scene = model(
+        layout={"kind": "orderly", "copies": 2, "rows": 2, "keep_what_fits": True},
+        objects={"ids": "all", "count": 24},
+    )
+    layout = sample_layout(scene, 1, 1)
+    assert len(layout.object_ids) == 24
+    assert 6 <= layout.present.sum() <= 20
+    assert layout.present[layout.target]
+    heights = layout.object_poses[:, 2, 3]
+    assert (heights[layout.present] > 0.61).all()
+    assert (heights[~layout.present] < PARKING_HEIGHT + 0.3).all()
+    # which columns come first is of the layout's seed: of the same objects others may be there
+    assert sample_layout(scene, 1, 2).present.tolist() != layout.present.tolist()
+
+
+@pytest.mark.parametrize("name", [name for name in shipped_configs() if "_upstream" in name])
+def test_upstreams_scenes_have_layouts_beside_the_basket(name):
+    scene = model(name)
+    region = np.array([[*scene.region.min_xy, scene.region.z], [*scene.region.max_xy, scene.region.z]])
+    low, high = np.sort(transform(scene.support_pose, region)[:, :2], axis=0)
+    walls = transform(scene.basket_pose, np.concatenate(scene.basket.hulls))[:, :2]
+    apart = np.maximum(low - walls.max(axis=0), walls.min(axis=0) - high).max()
+    assert apart > -1e-6  # of the second versions they touch
+    for seed in range(2):
+        layout = sample_layout(scene, seed, seed)
+        used = [
+            scene.object_pack.objects[i] for i, there in zip(layout.object_ids, layout.present, strict=True) if there
+        ]
+        assert not meets_basket(used, layout.object_poses[layout.present], scene.basket, layout.basket_pose)
 
 
 def test_columns_leave_out_what_has_no_display_pose_and_say_so_once(caplog):
@@ -205,6 +247,7 @@ def test_relations_of_three_need_three(relations):
         rows(3, relations, count=2)
     rows(3, relations)
     rows(2, relations, count=6, ids=["mug", "soap_box"])  # four mugs, or four boxes
+    rows(2, relations, repeats=True)
 
 
 def test_relations_of_two_and_all_of_them_go_with_two_copies():
@@ -223,6 +266,7 @@ def test_layouts_that_come_to_rest_without_a_target_blame_the_target():
     crowded = LayoutError("no room", where="layout")
     assert _failure(scene, [crowded] * 48, 2, 0) is crowded
     assert "relations" not in _failure(model(), [], 0, 50).fix
+    assert "relations" not in _failure(rows(2, []), [], 0, 50).fix
 
 
 def test_no_target_is_an_error_that_says_what_to_change():

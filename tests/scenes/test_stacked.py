@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config.task import StackedLayout
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes import stacked
 from robocas_ms3.scenes.placement import Region, transform
@@ -14,11 +15,20 @@ from robocas_ms3.scenes.visibility import object_mesh, top_down_camera, visible_
 REGION = Region((-0.05, -0.25), (0.25, 0.15), 0.61)
 
 
-def heap(seed: int, count: int = 12):
+LAYOUT = StackedLayout(kind="stacked")
+# Origins of three objects of each of three seeds, m, from before the layout had keys for walls, order and time
+BEFORE = {
+    0: [[0.16646, -0.0009616, 0.6232153], [0.1101041, -0.1502432, 0.6489264], [0.1065183, -0.0054217, 0.6447076]],
+    1: [[0.1871869, 0.0199118, 0.7035184], [0.0779445, -0.0612329, 0.6347642], [0.1049845, 0.0871008, 0.6446248]],
+    2: [[0.0108729, -0.0588102, 0.6356797], [0.0771046, -0.0800256, 0.6525802], [0.1425298, -0.0094603, 0.6278589]],
+}
+
+
+def heap(seed: int, count: int = 12, **keys):
     pack = load_pack("builtin")
     rng = np.random.default_rng(seed)
     assets = [pack.objects[i] for i in rng.choice(sorted(pack.objects), count, replace=False)]
-    return assets, drop_heap(rng, assets, REGION)
+    return assets, drop_heap(rng, assets, REGION, StackedLayout(kind="stacked", **keys))
 
 
 @pytest.mark.slow
@@ -59,11 +69,38 @@ def test_a_heap_that_runs_over_is_an_error():
     with pytest.raises(LayoutError, match="2 objects make no heap here"):
         tiny = Region((0.0, 0.0), (0.001, 0.001), 0.0)
         assets = [pack.objects["power_drill"], pack.objects["sugar_box"]]
-        drop_heap(np.random.default_rng(0), assets, tiny)
+        drop_heap(np.random.default_rng(0), assets, tiny, LAYOUT)
 
 
 def test_small_objects_rather_fall_first():
     assets = [load_pack("builtin").objects[i] for i in ("power_drill", "soap", "padlock")]
-    firsts = [int(stacked.falling_order(np.random.default_rng(seed), assets)[0]) for seed in range(300)]
+    firsts = [int(stacked.falling_order(np.random.default_rng(seed), assets, 0.5)[0]) for seed in range(300)]
     shares = np.bincount(firsts, minlength=3) / 300
     assert shares[2] > 0.6 and shares[1] > 0.02 and shares[0] < 0.02
+
+
+def test_without_noise_small_objects_fall_first_and_with_null_any():
+    assets = [load_pack("builtin").objects[i] for i in ("power_drill", "soap", "padlock")]
+    assert stacked.falling_order(np.random.default_rng(0), assets, 0.0).tolist() == [2, 1, 0]
+    firsts = [int(stacked.falling_order(np.random.default_rng(seed), assets, None)[0]) for seed in range(300)]
+    assert np.bincount(firsts, minlength=3).min() > 70  # of 100 each
+
+
+@pytest.mark.parametrize("seed", BEFORE)
+def test_the_defaults_are_the_heaps_of_before(seed):
+    np.testing.assert_allclose(heap(seed, 3)[1][:, :3, 3], BEFORE[seed], atol=1e-6)
+
+
+def test_objects_fall_into_the_middle_of_the_bucket_or_all_over_it():
+    assets = [load_pack("builtin").objects["rubiks_cube"]]
+    keys = {"tumble_probability": 0.0, "bucket": 1.0}
+
+    def places(**more):
+        layout = StackedLayout(kind="stacked", **keys, **more)
+        return np.array([drop_heap(np.random.default_rng(s), assets, REGION, layout)[0, :2, 3] for s in range(6)])
+
+    np.testing.assert_allclose(places(drop_spread=0.0), np.tile([0.1, -0.05], (6, 1)), atol=2e-3)
+    low, high = np.array(REGION.min_xy), np.array(REGION.max_xy)
+    strewn = places()
+    assert (np.ptp(strewn, axis=0) > 0.3 * (high - low)).all()
+    assert (strewn > low + 0.02).all() and (strewn < high - 0.02).all()  # clear of the walls

@@ -115,6 +115,20 @@ def test_same_named_objects_mean_the_nearest():
     env.close()
 
 
+def test_the_arm_begins_where_the_configuration_says():
+    for start, joints in (
+        ("rest", [0, -1.02, 0, -2.51, 0, 1.35, 0.78]),
+        ("evaluation", [-0.0276, 0.1581, 0, -1.8899, -0.0688, 2.7705, 0.7514]),
+    ):
+        env = gym.make("RoboCASPick-v1", config=changed(robot_start=start), **STATE_ONLY)
+        env.reset(seed=0)
+        robot = env.unwrapped.agent.robot
+        np.testing.assert_allclose(robot.get_qpos()[0], [0, 0, 0, *joints, 0.04, 0.04], atol=1e-6)
+        settle(env, 5)  # it is told to stay there, too
+        np.testing.assert_allclose(robot.get_qpos()[0, 3:10], joints, atol=2e-3)
+        env.close()
+
+
 def test_five_hertz_by_sim_config():
     env = gym.make("RoboCASPick-v1", sim_config={"control_freq": 5}, **STATE_ONLY)
     assert env.unwrapped.control_freq == 5

@@ -44,7 +44,10 @@ def test_every_shipped_configuration_finds_its_assets(name):
     assert model.robot_pose[:2, 0] @ (target - robot) > 0
 
 
-@pytest.mark.parametrize("name", sorted(name for name in shipped_configs() if name.startswith("select_")))
+SELECT = sorted(name for name in shipped_configs() if name.startswith("select_"))
+
+
+@pytest.mark.parametrize("name", [name for name in SELECT if load_task_config(name).target.relations])
 def test_the_named_one_is_told_apart(name):
     model = load(name)
     layout = sample_layout(model, 3, 3)
@@ -58,6 +61,35 @@ def test_the_named_one_is_told_apart(name):
     side = {"nearest": -1, "farthest": 1, "leftmost": 1, "rightmost": -1}.get(layout.relation)
     if side is not None:
         assert np.all(side * (key[layout.target] - key[alike]) > 0)
+
+
+@pytest.mark.parametrize("name", [name for name in SELECT if not load_task_config(name).target.relations])
+def test_without_relations_it_is_the_nearest_of_its_kind(name):
+    model = load(name)
+    for seed in range(3):
+        layout = sample_layout(model, seed, seed)
+        assert layout.relation == "" and len(layout.object_ids) == 20
+        assert 4 <= layout.present.sum() < 20
+        distance = np.linalg.norm((layout.object_poses[:, :2, 3] - layout.robot_pose[:2, 3]), axis=1)
+        kind = np.array(layout.object_ids) == layout.object_ids[layout.target]
+        assert distance[layout.target] == distance[kind & layout.present].min()
+        assert (layout.object_poses[~layout.present, 2, 3] < 0).all()  # they wait
+
+
+def test_slots_that_are_left_out_stand_still_and_are_not_asked_for():
+    settings = {"config": "select_upstream", "render_backend": "none", "obs_mode": "none"}
+    env = gym.make("RoboCASSelect-v1", control_mode="pd_joint_pos", **settings)
+    env.reset(seed=0)
+    base: Any = env.unwrapped
+    action = np.array([*base.agent.robot.qpos[0, 3:10].tolist(), 1.0], np.float32)
+    for _ in range(20):
+        info = env.step(action)[-1]
+    assert (base.object_poses[~base.present][:, 2] < 0).all()
+    torch.testing.assert_close(base.object_poses, base.start_poses, atol=3e-3, rtol=0)
+    assert int(info["disturbed"][0]) == 0
+    name = base.target_asset().asset.name
+    assert base.get_language_instruction() == [f"grasp the {name} on the table and move it to the basket"]
+    env.close()
 
 
 def test_the_wrong_instance_in_the_basket_spoils_it():
