@@ -27,7 +27,8 @@ class Eval:
     words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Tasks; or one of the words above, and what it is about."""
     policy: str = "scripted"
-    """scripted, random, still, replay:TRAJECTORY.h5, or module:Class of your own."""
+    """Of whom: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), random, still, replay:TRAJECTORY.h5, or
+    module:Class of your own."""
     protocol: str = "ms3-v1"
     """Name of a shipped protocol, or its folder."""
     out: Path | None = None

@@ -20,7 +20,7 @@ Stepping = Literal["timed", "upstream"]
 UPSTREAM_HZ = 5
 # evaluation_v0.md: the gripper first, until it stands, 5 control steps at most; then the motion, 2 at most
 _GRIPPER_STEPS, _MOTION_STEPS = 5, 2
-_STANDS = 0.002  # m/s of a finger
+_STANDS = 0.0005  # m that the gripper's width changes in a control step; velocities shiver where fingers press
 _NEAR, _TURNED, _SPIN = 0.02, np.deg2rad(5), np.deg2rad(3)  # m, rad, rad/s: where upstream's motion ends early
 
 
@@ -49,13 +49,15 @@ class PolicyStepping(gym.Wrapper):
         self.single_observation_space = self._base.single_observation_space
         self._tracker = Tracker(self._base)
         self._told = np.ones(count, dtype=bool)  # whether each gripper was told to be open last
+        self._width_change = np.zeros(count)  # m in the last control step
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Reset; see ``BaseEnv``."""
         obs, info = self.env.reset(**kwargs)
         envs = (kwargs.get("options") or {}).get("env_idx", slice(None))
         self._tracker.reset(envs)
-        self._told[envs if isinstance(envs, slice) else np.asarray(torch.as_tensor(envs).cpu())] = True
+        rows = envs if isinstance(envs, slice) else np.asarray(torch.as_tensor(envs).cpu())
+        self._told[rows], self._width_change[rows] = True, 0.0
         return obs, {**info, **self._tracker.read()}
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
@@ -88,7 +90,7 @@ class PolicyStepping(gym.Wrapper):
         result, here = None, self._target()
         turned = motion.open != self._told
         for _ in range(_GRIPPER_STEPS):
-            if not (turned | ~self._fingers_stand()).any():
+            if not (turned | (self._width_change > _STANDS)).any():
                 break
             result, turned = self._go(*here, motion.open), np.zeros_like(turned)
         wanted = _moved(self._tcp() if self._reference == "tcp" else self._target(), motion)
@@ -109,7 +111,9 @@ class PolicyStepping(gym.Wrapper):
         return self._control(np.concatenate([delta, np.where(opened, 1.0, -1.0)[:, None]], axis=1))
 
     def _control(self, actions: np.ndarray) -> tuple:
+        width = self._width()
         result = self.env.step(torch.as_tensor(actions, dtype=torch.float32, device=self._base.device))
+        self._width_change = np.abs(self._width() - width)
         self._tracker.look(result[-1], self._told if self._convention.read else actions[:, 7] > 0)
         return result
 
@@ -120,8 +124,8 @@ class PolicyStepping(gym.Wrapper):
         """Where the last action sent the TCPs."""
         return _pose(self._base.agent.controller.controllers["arm"].reference_pose())
 
-    def _fingers_stand(self) -> np.ndarray:
-        return (self._base.agent.robot.get_qvel()[:, -2:].abs().amax(dim=1) < _STANDS).cpu().numpy()
+    def _width(self) -> np.ndarray:
+        return self._base.agent.gripper_width.cpu().numpy()
 
     def _is_there(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
         at, turn = self._tcp()

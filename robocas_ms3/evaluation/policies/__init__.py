@@ -1,9 +1,10 @@
-"""Policies by name: ``scripted``, ``random``, ``still``, ``replay:DATASET``, ``module:Class``."""
+"""Policies by name: ``scripted``, ``scripted-motions``, ``random``, ``still``, ``replay:DATASET``, ``module:Class``."""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from robocas_ms3.evaluation.policy import Policy
 
 BUILTIN: dict[str, Callable[[], Policy]] = {
     "scripted": ScriptedPolicy,
+    "scripted-motions": partial(ScriptedPolicy, "robocas"),
     "random": RandomPolicy,
     "still": StillPolicy,
 }

@@ -14,7 +14,7 @@ _CHANGE = 0.1  # probability that it opens or shuts the gripper
 class StillPolicy:
     """Stays where it is, gripper open."""
 
-    wants = Wants(language="none")
+    wants = Wants(reference="tcp", language="none")
 
     def reset(self, starts: list[Start]) -> None:
         """Nothing to begin."""
@@ -27,7 +27,7 @@ class StillPolicy:
 class RandomPolicy:
     """Goes anywhere; each episode from its own seed, whatever is played beside it."""
 
-    wants = Wants(language="none")
+    wants = Wants(reference="tcp", language="none")
 
     def __init__(self) -> None:
         self._draws: dict[int, np.random.Generator] = {}

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.demos.record import open_trajectory, read_json
 from robocas_ms3.errors import EvaluationError
-from robocas_ms3.evaluation.policies.tracks import Followers, Track
+from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
-from robocas_ms3.robots.constants import ARM_REST
 
 
 class ReplayPolicy:
@@ -40,7 +39,7 @@ class ReplayPolicy:
             rate_hz=kwargs.get("sim_config", {}).get("control_freq", 20),
             language="none",
         )
-        self._followers = Followers(np.array([*ARM_REST, 1.0]), motions=False)
+        self._followers = Followers()
 
     def describe(self) -> dict[str, Any]:
         """What a result says of it."""
@@ -49,15 +48,16 @@ class ReplayPolicy:
     def reset(self, starts: list[Start]) -> None:
         """Look up the episodes by their seeds."""
         for start in starts:
-            self._followers.begin(start.env, self._track(start.seed))
+            self._followers.begin(start.env, JointTrack(self._actions(start.seed)))
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """(E, 8) joint targets."""
-        return self._followers.next(observations)
+        return self._followers.act(observations)
 
-    def _track(self, seed: int) -> Track | None:
+    def _actions(self, seed: int) -> NDArray[np.floating]:
+        """(S, 8) of a recorded episode; none where there is none."""
         if seed not in self._episodes:
-            return None
+            return np.zeros((0, 8))
         with open_trajectory(self._trajectory) as file:
             group: Any = file[f"traj_{self._episodes[seed]}"]
-            return Track(np.array(group["actions"]))
+            return np.array(group["actions"])

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
-from robocas_ms3.evaluation.policies.tracks import Followers, Track
+from robocas_ms3.demos.sampling import sample_stride
+from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack, PoseTrack, Track
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
-from robocas_ms3.robots.constants import ARM_REST
+from robocas_ms3.robots.constants import ROBOT_UID
+
+_FREQ = 20  # Hz, at which it plans
 
 
 class ScriptedPolicy:
@@ -21,13 +24,15 @@ class ScriptedPolicy:
 
     What it scores is what the scripted policies and their planner can do, in the very loop that learned policies are
     measured in. An episode for which no demonstration is found is played standing still. Its base does not drive.
+
+    Args:
+        speaks: joint targets at 20 Hz, as it planned them; or RoboCAS' motions from where the TCP is, at 5 Hz.
     """
 
-    wants = Wants(convention="joint_positions", rate_hz=20, language="none")
-
-    def __init__(self) -> None:
+    def __init__(self, speaks: Literal["joint_positions", "robocas"] = "joint_positions") -> None:
+        self.wants = Wants(speaks, reference="tcp", rate_hz=20 if speaks == "joint_positions" else 5, language="none")
         self._generators: dict[str, EpisodeGenerator] = {}
-        self._followers = Followers(np.array([*ARM_REST, 1.0]), motions=False)
+        self._followers = Followers()
 
     def reset(self, starts: list[Start]) -> None:
         """Plan the episodes; seconds each."""
@@ -35,23 +40,33 @@ class ScriptedPolicy:
             self._followers.begin(start.env, self._plan(start))
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """(E, 8) joint targets."""
-        return self._followers.next(observations)
+        """(E, A) actions of what it speaks."""
+        return self._followers.act(observations)
 
-    def _plan(self, start: Start) -> Track | None:
+    def _plan(self, start: Start) -> Track:
         generator = self._generators.get(start.config_file)
         if generator is None:
             settings = EpisodeSettings(
-                start.task, start.config_file, start.pack, replay_rate=0, layouts=start.layouts_file
+                start.task,
+                start.config_file,
+                start.pack,
+                control_freq=_FREQ,
+                replay_rate=0,
+                layouts=start.layouts_file,
             )
             generator = self._generators[start.config_file] = EpisodeGenerator(settings)
+        actions, states = np.zeros((0, 8)), np.zeros((1, 37))
         with tempfile.TemporaryDirectory() as folder:
-            result = generator.generate(start.seed, Path(folder), "episode")
-            if not result.success:
-                return None
-            with h5py.File(Path(folder) / "episode.h5") as file:
-                group: Any = file["traj_0"]
-                return Track(np.array(group["actions"])[:, :8])
+            if generator.generate(start.seed, Path(folder), "episode").success:
+                with h5py.File(Path(folder) / "episode.h5") as file:
+                    group: Any = file["traj_0"]
+                    actions = np.array(group["actions"])[:, :8]
+                    states = np.array(group["env_states"]["articulations"][ROBOT_UID])
+        if self.wants.convention == "joint_positions":
+            return JointTrack(actions)
+        if not len(actions):
+            return PoseTrack(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
+        return PoseTrack.of(states, actions[:, 7], sample_stride(_FREQ, 5))
 
     def close(self) -> None:
         """Close the environments that it plans in."""

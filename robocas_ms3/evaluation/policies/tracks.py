@@ -1,52 +1,105 @@
-"""Policies that follow a track: poses of the TCP, or joint targets, that were found or recorded before."""
+"""Policies that follow a track: joint targets, or poses of the TCP, that were found or recorded before."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from robocas_ms3.demos.sampling import gripper_open, invert, sample_states, split_states
 from robocas_ms3.evaluation.policy import Observations
+from robocas_ms3.robots.constants import ARM_SLICE, FINGER_SLICE, FINGER_TARGETS
+from robocas_ms3.robots.forward import link_poses
+
+Array = NDArray[np.floating]
 
 
-@dataclass(frozen=True)
-class Track:
-    """What to do in an episode: an action a policy step.
+class Track(Protocol):
+    """What to do in an episode, a policy step after the other."""
+
+    def next(self, observations: Observations, row: int) -> Array:
+        """(A,) the next action, where row ``row`` shows what is so; after the last one, what holds still."""
+        ...
+
+
+@dataclass
+class JointTrack:
+    """Joint targets.
 
     Attributes:
-        actions: (S, A) of the policy's convention.
+        actions: (S, 8); none: it stays where it is.
+        played: how many of them are over.
     """
 
-    actions: NDArray[np.floating]
+    actions: Array
+    played: int = 0
+
+    def next(self, observations: Observations, row: int) -> Array:
+        """(8,) joint targets; see `Track`."""
+        if not len(self.actions):
+            self.actions = np.append(observations.qpos[row, ARM_SLICE], 1.0)[None]
+        action = self.actions[min(self.played, len(self.actions) - 1)]
+        self.played += 1
+        return action
+
+
+@dataclass
+class PoseTrack:
+    """Poses that the TCP is to be at, one a policy step: each action leads there from where the TCP is by then.
+
+    Attributes:
+        poses: (S, 4, 4) in the arm's base frame; none: it stays where it is.
+        open: (S,) bool, the gripper's commands.
+        played: how many of them are over.
+    """
+
+    poses: Array
+    open: NDArray[np.bool_]
+    played: int = 0
+
+    @classmethod
+    def of(cls, robot_states: Array, gripper: Array, stride: int) -> PoseTrack:
+        """The track of a recording.
+
+        Args:
+            robot_states: (S + 1, 37) after the reset and after each control step.
+            gripper: (S,) commands in [-1, 1].
+            stride: control steps a policy step.
+        """
+        samples = sample_states(len(gripper), stride)
+        root, qpos, _ = split_states(robot_states)
+        tcp, base = link_poses(root[samples], qpos[samples])
+        width = float(qpos[0, FINGER_SLICE].sum())
+        opened = gripper_open(gripper, samples, finger_range=FINGER_TARGETS, initial_width=width)
+        return cls((invert(base) @ tcp)[1:], opened[1:])
+
+    def next(self, observations: Observations, row: int) -> Array:
+        """(7,) a motion in RoboCAS' convention; see `Track`."""
+        place = min(self.played, len(self.poses) - 1)
+        self.played += 1
+        if place < 0:
+            return np.array([0, 0, 0, 0, 0, 0, 1.0])
+        here = observations.tcp_in_base[row].astype(np.float64)
+        turn = Rotation.from_quat(here[[4, 5, 6, 3]]).inv()
+        motion = turn.apply(self.poses[place, :3, 3] - here[:3])
+        angles = (turn * Rotation.from_matrix(self.poses[place, :3, :3])).as_euler("xyz")
+        return np.array([*motion, *angles, float(self.open[place])])
 
 
 class Followers:
-    """Hands out tracks' actions, env by env; where a track ends, or there is none, the last action holds still.
+    """The tracks of all envs."""
 
-    Args:
-        still: (A,) the action where there is no track at all.
-        motions: whether actions are motions, of which all but the gripper's command is over at the end.
-    """
+    def __init__(self) -> None:
+        self._tracks: dict[int, Track] = {}
 
-    def __init__(self, still: NDArray[np.floating], *, motions: bool) -> None:
-        self._still, self._motions = still, motions
-        self._left: dict[int, list[NDArray[np.floating]]] = {}
-        self._last: dict[int, NDArray[np.floating]] = {}
-
-    def begin(self, env: int, track: Track | None) -> None:
+    def begin(self, env: int, track: Track) -> None:
         """Set out on an episode's track in an env."""
-        self._left[env] = list(track.actions) if track is not None else []
-        self._last[env] = self._still
+        self._tracks[env] = track
 
-    def next(self, observations: Observations) -> NDArray[np.floating]:
+    def act(self, observations: Observations) -> Array:
         """(E, A) actions."""
-        return np.stack([self._one(env) for env in observations.envs.tolist()])
-
-    def _one(self, env: int) -> NDArray[np.floating]:
-        if self._left[env]:
-            action = self._left[env].pop(0)
-            self._last[env] = action
-            return action
-        last = self._last[env]
-        return np.append(np.zeros(len(last) - 1), last[-1]) if self._motions else last
+        envs = observations.envs.tolist()
+        return np.stack([self._tracks[env].next(observations, row) for row, env in enumerate(envs)])

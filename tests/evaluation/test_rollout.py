@@ -1,0 +1,104 @@
+"""The loop that plays episodes, with an environment of nothing but numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.rollout import Rollouts, Rules
+
+
+class Counting:
+    """N envs of which each succeeds once the sum of its first action numbers has come to its seed."""
+
+    def __init__(self, num_envs: int) -> None:
+        self.num_envs, self.resets = num_envs, []
+        self.seeds, self.sums = np.zeros(num_envs, int), np.zeros(num_envs)
+        self.elapsed = np.zeros(num_envs, np.int32)
+
+    def reset(self, *, seed: list[int], options: dict[str, Any]) -> tuple[Any, dict]:
+        envs = options.get("env_idx", np.arange(self.num_envs))
+        self.resets.append(list(envs))
+        self.seeds[envs], self.sums[envs], self.elapsed[envs] = seed, 0, 0
+        return self._seen(), self._info()
+
+    def step(self, actions: np.ndarray) -> tuple:
+        self.sums += actions[:, 0]
+        self.elapsed += 1
+        return self._seen(), None, None, None, self._info()
+
+    def _seen(self) -> dict[str, Any]:
+        column = self.sums[:, None].astype(np.float32)
+        agent = {"qpos": np.tile(column, 12), "tcp_in_arm_base": np.tile(column, 7), "gripper_width": column}
+        return {"agent": agent, "extra": {"seed": self.seeds[:, None].astype(np.float32), "tcp_pose": column}}
+
+    def _info(self) -> dict[str, Any]:
+        zero = np.zeros(self.num_envs, np.float32)
+        tracked = dict.fromkeys(("path_length", "contact_impulse", "disturbed_most", "fallen", "v0_steps"), zero)
+        done = self.sums >= self.seeds
+        return {**tracked, "success": done, "fail": ~done & False, "elapsed_steps": self.elapsed.copy()}
+
+
+class Obedient:
+    """Does as many as its instruction says, in chunks; keeps what it was told."""
+
+    wants = Wants(state=True)
+
+    def __init__(self, chunk: int = 1) -> None:
+        self.chunk, self.asked, self.begun = chunk, [], []
+
+    def reset(self, starts: list[Start]) -> None:
+        self.begun += [(start.env, start.episode) for start in starts]
+
+    def act(self, observations: Observations) -> np.ndarray:
+        assert observations.state is not None
+        for env, said, seed in zip(observations.envs, observations.instructions, observations.state[:, 0], strict=True):
+            assert said == f"count to {seed:.0f}", env  # the instruction of its own episode
+        self.asked.append(observations.envs.tolist())
+        actions = np.zeros((len(observations.envs), self.chunk, 7))
+        actions[..., 0] = 1
+        return actions[:, 0] if self.chunk == 1 else actions
+
+
+def starts(seeds: list[int]) -> list[Start]:
+    return [Start(-1, i, "pick", "", "", "", seed, f"count to {seed}") for i, seed in enumerate(seeds)]
+
+
+SEEDS = [3, 9, 2, 5, 4, 1]
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+@pytest.mark.parametrize("refill", [True, False])
+def test_every_episode_is_played_once_with_its_own_instruction(count, refill):
+    env, policy = Counting(count), Obedient()
+    played = list(Rollouts(env, policy, Rules(7), 0.05, refill=refill).play(starts(SEEDS)))
+    assert sorted(one.start.episode for one in played) == list(range(6))
+    for one in played:
+        seed = one.start.seed
+        assert one.steps == min(seed, 7)
+        assert one.seconds == pytest.approx(0.05 * one.steps)
+        assert one.flags["success"] == (seed if seed <= 7 else None)
+        assert one.at_end["success"] == (seed <= 7)
+        assert one.flags["fail"] is None
+    if not refill and count == 4:
+        assert len(env.resets) == 2  # four, then two, in one reset each
+        assert all(len(envs) == 4 for envs in env.resets)
+        assert policy.asked[3] == [1, 3]  # those that are done are masked
+
+
+def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
+    policy = Obedient(chunk=3)
+    played = list(Rollouts(Counting(2), policy, Rules(7), 0.05, refill=True).play(starts([4, 7])))
+    assert {one.start.seed: one.steps for one in played} == {4: 4, 7: 7}
+    assert policy.asked == [[0, 1], [0, 1], [1]]
+
+
+def test_actions_of_another_shape_are_refused():
+    policy = Obedient()
+    policy.act = lambda observations: np.zeros((2, 6))
+    with pytest.raises(EvaluationError, match=r"expected \(1, 7\) or \(1, chunk, 7\), found \(2, 6\)"):
+        list(Rollouts(Counting(1), policy, Rules(7), 0.05, refill=True).play(starts([4])))

@@ -1,0 +1,105 @@
+"""Episodes of a real protocol: the same outcomes however they are played."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.policies import make_policy
+from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.run import Settings, chosen, evaluate
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """The protocol smoke with a second an episode."""
+    folder = tmp_path_factory.mktemp("protocols") / "short"
+    shutil.copytree(load_protocol("smoke").folder, folder)
+    rules = folder / "protocol.yaml"
+    rules.write_text(rules.read_text().replace("max_steps: null", "max_steps: 20"))
+    return folder
+
+
+def play(folder, policy="random", *, protocol="smoke", resume=False, **settings) -> dict[int, dict]:
+    made = make_policy(policy)
+    settings = Settings(backend="processes", **{"tasks": ("pick", "select"), **settings})
+    list(evaluate(load_protocol(protocol), made, policy, folder, settings, resume=resume))
+    return {number: one.without_clock() for number, one in results.read(folder).outcomes.items()}
+
+
+@pytest.fixture(scope="module")
+def alone(short, tmp_path_factory):
+    """What a random policy does, one env at a time."""
+    return play(tmp_path_factory.mktemp("alone"), protocol=short, num_envs=1)
+
+
+@pytest.mark.slow
+def test_outcomes_do_not_depend_on_how_many_envs_there_are_or_on_shards(alone, short, tmp_path):
+    assert sorted(alone) == [0, 1, 2, 3]
+    assert not any(one["success"] for one in alone.values())
+    assert len({one["measures"]["path_length"] for one in alone.values()}) == 4
+    together = play(tmp_path / "two", protocol=short, num_envs=2, workers=1)
+    parts = [play(tmp_path / str(number), protocol=short, num_envs=2, shard=(number, 2)) for number in (0, 1)]
+    assert together == alone
+    assert {**parts[0], **parts[1]} == alone
+    assert [sorted(part) for part in parts] == [[0, 2], [1, 3]]
+
+
+@pytest.mark.slow
+def test_a_run_that_was_cut_off_goes_on_and_ends_the_same(alone, short, tmp_path):
+    protocol, settings = load_protocol(short), Settings(1, "processes", tasks=("pick", "select"))
+    playing = evaluate(protocol, make_policy("random"), "random", tmp_path, settings)
+    assert next(playing)[1] == 3
+    playing.close()
+    path = tmp_path / "episodes.jsonl"
+    path.write_text(path.read_text() + path.read_text()[:100])  # and killed while it wrote
+    with pytest.raises(EvaluationError, match="there is a result already"):
+        play(tmp_path, protocol=short)
+    with pytest.raises(EvaluationError, match="can't go on with another policy"):
+        play(tmp_path, "still", protocol=short, resume=True)
+    assert play(tmp_path, protocol=short, resume=True, num_envs=2) == alone
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["scripted", "scripted-motions"])
+def test_the_demonstrator_succeeds_in_the_same_loop(name, tmp_path):
+    outcomes = play(tmp_path, name, tasks=("pick",), episodes=1)
+    assert outcomes[0]["success"] and outcomes[0]["success_at_end"] and outcomes[0]["success_v0"]
+    flags = outcomes[0]["flags"]
+    assert flags["reached_target"] <= flags["target_lifted"] <= flags["target_in_basket"] <= flags["success"]
+    assert outcomes[0]["failure_stage"] == ""
+
+
+def test_a_policy_that_does_not_fit_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(EvaluationError, match="paper-v1: the policy's convention.*found joint_positions"):
+        play(tmp_path / "out", "scripted", protocol="paper-v1")
+    assert not (tmp_path / "out").exists()
+    rules = load_protocol("paper-v1").rules
+    with pytest.raises(EvaluationError, match=r"another rate \(expected 5 Hz, found 10 Hz\)"):
+        rules.refuse(Wants(reference="tcp", rate_hz=10))
+    with pytest.raises(EvaluationError, match="no episodes"):
+        play(tmp_path / "out", tasks=("nothing",))
+
+
+def test_what_a_policy_can_not_want():
+    for wrong in ({"convention": "words"}, {"language": "loud"}, {"cameras": {"eye": (8, 8)}}, {"reference": "me"}):
+        with pytest.raises(EvaluationError, match=f"{next(iter(wrong))}: a policy can't want that"):
+            Wants(**wrong)
+
+
+def test_episodes_are_chosen_by_task_count_and_shard():
+    episodes = load_protocol("smoke").episodes
+    assert [one.episode for one in chosen(episodes, Settings(tasks=("search", "pick")))] == [0, 1, 4, 5]
+    assert [one.episode for one in chosen(episodes, Settings(episodes=1))] == [0, 2, 4, 6]
+    assert [one.episode for one in chosen(episodes, Settings(shard=(1, 3)))] == [1, 4, 7]
+
+
+def test_policies_by_name():
+    for name in ("nobody", "replay:", "no_such_module:Policy", "json:Nothing"):
+        with pytest.raises(EvaluationError, match="no such policy"):
+            make_policy(name)
+    assert make_policy("robocas_ms3.evaluation.policies.plain:StillPolicy").wants.convention == "robocas"

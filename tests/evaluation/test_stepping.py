@@ -1,0 +1,137 @@
+"""What an action does in the environment that policies act in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import robocas_ms3  # noqa: F401
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
+
+
+def made(convention="robocas", reference="tcp", stepping="timed", rate=5) -> PolicyStepping:
+    env = gym.make(
+        "RoboCASPick-v1",
+        obs_mode="none",
+        reward_mode="none",
+        render_backend="none",
+        control_mode=control_mode(convention),
+        sim_config={"control_freq": rate},
+        max_episode_steps=10_000,
+    )
+    stepped = PolicyStepping(env, convention, reference, stepping)
+    stepped.reset(seed=3)
+    return stepped
+
+
+def tcp(env: PolicyStepping) -> np.ndarray:
+    base: Any = env.unwrapped
+    return base.agent.tcp_in_arm_base.p[0].numpy().copy()
+
+
+def along(z: float, gripper: float = 1.0) -> np.ndarray:
+    return np.array([0, 0, z, 0, 0, 0, gripper])
+
+
+@pytest.mark.parametrize("reference", ["tcp", "target"])
+def test_a_slow_motion_ends_where_it_was_told_to(reference):
+    env = made(reference=reference)
+    before = tcp(env)
+    for _ in range(5):
+        *_, info = env.step(along(0.02))
+    assert np.linalg.norm(tcp(env) - before) == pytest.approx(0.1, abs=0.004)
+    assert float(info["path_length"]) == pytest.approx(0.1, abs=0.004)
+    env.close()
+
+
+def test_from_where_it_is_or_from_where_it_was_sent():
+    gone = {}
+    for reference in ("tcp", "target"):
+        env = made(reference=reference)
+        base: Any = env.unwrapped
+        env.step(along(0.02))
+        sent = tcp(env)
+        qpos = base.agent.robot.get_qpos().clone()
+        qpos[0, 4] += 0.03  # something has pushed the arm
+        base.agent.robot.set_qpos(qpos)
+        pushed = np.linalg.norm(tcp(env) - sent)
+        env.step(along(0.0))
+        gone[reference] = np.linalg.norm(tcp(env) - sent) / pushed
+        env.close()
+    assert gone["tcp"] > 0.8  # stays where it came to
+    assert gone["target"] < 0.2  # goes back
+
+
+def test_joint_targets_are_taken_as_they_are():
+    env = made("joint_positions", rate=20)
+    base: Any = env.unwrapped
+    wanted = base.agent.robot.get_qpos()[0, 3:10].numpy() + 0.05
+    for _ in range(20):
+        env.step(np.append(wanted, 1.0))
+    np.testing.assert_allclose(base.agent.robot.get_qpos()[0, 3:10].numpy(), wanted, atol=0.01)
+    env.close()
+
+
+def test_upstreams_step_waits_for_the_gripper_and_for_the_motion():
+    env = made(stepping="upstream")
+    base: Any = env.unwrapped
+
+    def steps(action: np.ndarray) -> int:
+        before = int(base.elapsed_steps)
+        env.step(action)
+        return int(base.elapsed_steps) - before
+
+    assert steps(along(0.01)) == 1  # there within the first fifth of a second
+    before = tcp(env)
+    assert steps(along(0.15)) == 2  # no control step goes farther than 10 cm
+    assert np.linalg.norm(tcp(env) - before) == pytest.approx(0.15, abs=0.02)
+    shutting = steps(along(0.0, gripper=0.0))
+    assert 2 < shutting <= 7
+    assert float(base.agent.gripper_width) < 0.01
+    assert steps(along(0.0, gripper=0.0)) <= 2  # it stands, though its drives press
+    env.close()
+
+
+def test_what_happened_is_counted_from_the_reset_on():
+    env = made()
+    base: Any = env.unwrapped
+    slot = int(base.target_slot)
+    for _ in range(3):
+        env.step(along(0.02))
+    pose = base.objects[slot].pose.raw_pose.clone()
+    above = torch.cat([base.basket_pose[:, :2], pose[:, 2:3]], dim=1)
+    base.objects[slot].set_pose(robot_pose(above, pose))
+    *_, info = env.step(along(0.0))
+    assert bool(info["success_v0"])  # near the basket in xy, gripper open: upstream's rule asks for no more
+    assert float(info["v0_steps"]) == 1
+    assert not bool(info["success"])
+    other = next(i for i in range(len(base.objects)) if i != slot)
+    pose = base.objects[other].pose.raw_pose.clone()
+    base.objects[other].set_pose(robot_pose(torch.tensor([[3.0, 3.0, 0.05]]), pose))
+    *_, info = env.step(along(0.0, gripper=0.0))
+    assert not bool(info["success_v0"])
+    assert float(info["fallen"]) == 1
+    assert float(info["disturbed_most"]) >= 1
+    env.reset(seed=3)
+    *_, info = env.step(along(0.0))
+    assert [float(info[name]) for name in ("fallen", "disturbed_most", "v0_steps")] == [0, 0, 0]
+    assert float(info["path_length"]) < 0.002
+    env.close()
+
+
+def robot_pose(position: torch.Tensor, raw: torch.Tensor) -> Any:
+    from mani_skill.utils.structs import Pose
+
+    return Pose.create_from_pq(position, raw[:, 3:])
+
+
+def test_an_action_that_is_no_number_is_refused():
+    env = made()
+    with pytest.raises(EvaluationError, match="not finite"):
+        env.step(np.full(7, np.nan))
+    env.close()
