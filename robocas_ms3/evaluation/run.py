@@ -176,7 +176,7 @@ def _looks(wants: Wants) -> dict[str, Any]:
     """Arguments of an environment that shows what a policy wants to see."""
     if not wants.cameras:
         return {"obs_mode": "state_dict", "render_backend": "none"}
-    modes = ["rgb", *(["depth"] if wants.depth else []), *(["state"] if wants.state else [])]
+    modes = ["rgb", *(["depth"] if wants.depth else []), *(["state_dict"] if wants.state else [])]
     sizes = {name: wants.cameras.get(name, (_UNSEEN, _UNSEEN)) for name in CAMERAS}
     return {
         "obs_mode": "+".join(modes),

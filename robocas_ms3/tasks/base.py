@@ -111,7 +111,7 @@ class RoboCASEnv(SceneEnv):
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         """``tcp_pose`` (N, 7) in the world; before it, in state modes, what only a simulator knows."""
-        told = self.obs_mode_struct.state or self.obs_mode in {"state", "state_dict"}
+        told = self.obs_mode_struct.state or self.obs_mode_struct.state_dict
         return {**(self._privileged() if told else {}), "tcp_pose": as_tensor(self._tcp())}
 
     def _privileged(self) -> dict[str, torch.Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 
 import pytest
 
@@ -72,6 +73,26 @@ def test_the_demonstrator_succeeds_in_the_same_loop(name, tmp_path):
     flags = outcomes[0]["flags"]
     assert flags["reached_target"] <= flags["target_lifted"] <= flags["target_in_basket"] <= flags["success"]
     assert outcomes[0]["failure_stage"] == ""
+
+
+@pytest.mark.slow
+def test_the_policy_of_the_docs_sees_what_it_wants(short, tmp_path, monkeypatch, needs_renderer):
+    page = (Path(__file__).resolve().parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
+    program = page.split("```python\n")[1].split("```")[0]
+    program = program.replace("rate_hz=5,", "rate_hz=5, depth=True, state=True, language='text',")
+    program = program.replace(
+        "        return np.tile",
+        """\
+        assert observations.depths["gripper_camera"].shape[1:] == (48, 64, 1)
+        assert observations.state.shape[1] > 90 and observations.tcp_in_base.shape[1:] == (7,)
+        assert all(said.startswith("grasp the ") for said in observations.instructions)
+        return np.tile""",
+    )
+    (tmp_path / "docs_policy.py").write_text(program, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    outcomes = play(tmp_path / "out", "docs_policy:Descend", protocol=short, num_envs=2, episodes=2, tasks=("select",))
+    assert len(outcomes) == 2
+    assert all(one["measures"]["path_length"] == pytest.approx(0.2, abs=0.02) for one in outcomes.values())
 
 
 def test_a_policy_that_does_not_fit_is_refused_before_anything_is_written(tmp_path):

@@ -71,7 +71,7 @@ class ProcessEnv(gym.Env):
         try:
             self._workers += [WorkerHandle(share, memory) for share in shares]
             made: list[Made] = self._ask(orders)
-            if any(one.fields != made[0].fields for one in made):
+            if any(set(one.fields) != set(made[0].fields) for one in made):  # pictures come in any order
                 raise VectorEnvError("environments differ in what they observe", where=env_id)
             self._share(Block(memory, made[0].fields, num_envs))
             self._ask([pickle.dumps(Share(made[0].fields, num_envs))] * workers)
