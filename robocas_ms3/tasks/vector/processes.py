@@ -6,6 +6,7 @@ import os
 import pickle
 import weakref
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any, cast
 
 import gymnasium as gym
@@ -54,7 +55,9 @@ class ProcessEnv(gym.Env):
     ) -> None:
         self.num_envs, self.device = num_envs, torch.device("cpu")
         self.reconfiguration_freq = 0  # of the batch; what a reset builds anew is each env's own affair
-        self.spec = gym.spec(env_id)
+        self.spec = copy(gym.spec(env_id))
+        if kwargs.get("max_episode_steps") is not None:  # which ManiSkill's helpers read here
+            self.spec.max_episode_steps = kwargs["max_episode_steps"]
         self._seed_range: tuple[int, int] | None = kwargs.get("seeds")
         self._must_reset: set[int] = set()  # envs that an interrupted or failed call left in who knows what state
         cuts = [num_envs * worker // workers for worker in range(workers + 1)]
