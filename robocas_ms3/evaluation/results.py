@@ -291,17 +291,14 @@ def _add(outcomes: dict[int, Outcome], outcome: Outcome, where: str) -> None:
     before = outcomes.setdefault(outcome.episode, outcome)
     one, other = before.without_clock(), outcome.without_clock()
     if one != other:
-        raise EvaluationError(
-            f"two outcomes of episode {outcome.episode} disagree",
-            where=where,
-            expected={key: value for key, value in one.items() if other[key] != value},
-            found={key: value for key, value in other.items() if one[key] != value},
-        )
+        expected, found = _differing(one, other)
+        what = f"two outcomes of episode {outcome.episode} disagree"
+        raise EvaluationError(what, where=where, expected=expected, found=found)
 
 
 def _differing(one: Any, other: Any) -> tuple[Any, Any]:
     """What of two values differs: of dictionaries only the entries that do."""
     if not (isinstance(one, dict) and isinstance(other, dict)):
         return one, other
-    keys = [key for key in {**one, **other} if one.get(key) != other.get(key)]
-    return {key: one.get(key) for key in keys}, {key: other.get(key) for key in keys}
+    both = {key: _differing(one.get(key), other.get(key)) for key in {**one, **other} if one.get(key) != other.get(key)}
+    return {key: a for key, (a, _) in both.items()}, {key: b for key, (_, b) in both.items()}
