@@ -21,6 +21,7 @@ class Eval:
     robocas eval merge DIR ... --out DIR                           parts of a result, such as shards, as one
     robocas eval compare DIR DIR ...                               two results over the same episodes, by an exact test
     robocas eval verify DIR ...                                    whether a result is whole, and of this protocol
+    robocas eval videos DIR                                        plays failed episodes again and films them
     robocas eval protocols                                         lists the protocols that are shipped
     robocas eval freeze PLAN.yaml --out DIR                        makes a protocol of your own
     """
@@ -47,9 +48,11 @@ class Eval:
     all parts."""
     episodes: int | None = None
     """Only the first so many of each configuration."""
+    count: int = 8
+    """How many videos, of all kinds of failures in turn."""
 
 
-WORDS = ("report", "merge", "compare", "verify", "protocols", "freeze")
+WORDS = ("report", "merge", "compare", "verify", "videos", "protocols", "freeze")
 
 
 def main(cfg: Eval) -> int:
@@ -70,6 +73,8 @@ def main(cfg: Eval) -> int:
         raise EvaluationError("of what?", where=first, expected="a folder of a result, or those of its parts")
     if first == "merge":
         return merge(about, cfg.out)
+    if first == "videos":
+        return videos(_one(about, first), cfg.protocol, cfg.count)
     return report(about, cfg.out) if first == "report" else verify(about, cfg.protocol)
 
 
@@ -157,13 +162,37 @@ def verify(folders: list[Path], protocol: str) -> int:
     from robocas_ms3.evaluation.verify import problems
 
     result: Result = read(*folders)
-    name = str(result.run.get("protocol", protocol))
+    name = str(result.run["protocol"])
     found = problems(result, load_protocol(protocol if Path(protocol).is_dir() else name))
     for problem in found:
         say(problem)
     where = ", ".join(map(str, folders))
     say(f"{where}: " + (f"{len(found)} problems" if found else f"{len(result.outcomes)} episodes of {name}, all well"))
     return 1 if found else 0
+
+
+def videos(folder: Path, protocol: str, count: int) -> int:
+    """Film failed episodes, and link the videos in the page."""
+    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.demos.checks import check_number
+    from robocas_ms3.evaluation.policies import make_policy
+    from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.videos import failed_of_each_kind, film
+
+    check_number("count", count, 1)
+    result = read(folder)
+    loaded = load_protocol(protocol if Path(protocol).is_dir() else result.run["protocol"])
+    numbers = failed_of_each_kind(result, count)
+    policy = make_policy(result.run["policy"]["name"])
+    with bar("videos") as shown:
+        for done, filmed in enumerate(film(result, loaded, policy, numbers), start=1):
+            say(str(filmed.path) + ("" if filmed.same else ": this time it came out differently"))
+            shown.at(done, len(numbers))
+    if not numbers:
+        say("no episode failed")
+    _write(result, folder)
+    return 0
 
 
 def protocols() -> int:
