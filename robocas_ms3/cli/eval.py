@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 if TYPE_CHECKING:
+    from robocas_ms3.evaluation.protocol import LoadedProtocol
     from robocas_ms3.evaluation.results import Result
 
 
@@ -72,10 +73,10 @@ def main(cfg: Eval) -> int:
     if not about:
         raise EvaluationError("of what?", where=first, expected="a folder of a result, or those of its parts")
     if first == "merge":
-        return merge(about, cfg.out)
+        return merge(about, cfg.out, cfg.protocol)
     if first == "videos":
         return videos(_one(about, first), cfg.protocol, cfg.count)
-    return report(about, cfg.out) if first == "report" else verify(about, cfg.protocol)
+    return report(about, cfg.out, cfg.protocol) if first == "report" else verify(about, cfg.protocol)
 
 
 def run(cfg: Eval) -> int:
@@ -106,11 +107,11 @@ def run(cfg: Eval) -> int:
             shown.at(played, played + left)
     result = read(out)
     say(f"{played} episodes played, {succeeded} succeeded; {out}: {len(result.outcomes)} episodes")
-    _write(result, out)
+    _write(result, out, cfg.protocol)
     return 0
 
 
-def report(folders: list[Path], out: Path | None) -> int:
+def report(folders: list[Path], out: Path | None, protocol: str) -> int:
     """Print a result's tables; write them and its page into its folder, those of several into another one."""
     from robocas_ms3.cli.bars import say
     from robocas_ms3.evaluation.results import read
@@ -121,11 +122,11 @@ def report(folders: list[Path], out: Path | None) -> int:
     if out is None and len(folders) > 1:
         say("Pass --out DIR for the page of several folders.")
     else:
-        _write(result, out or folders[0])
+        _write(result, out or folders[0], protocol)
     return 0
 
 
-def merge(folders: list[Path], out: Path | None) -> int:
+def merge(folders: list[Path], out: Path | None, protocol: str) -> int:
     """Write parts of a result as one."""
     from robocas_ms3.cli.bars import say
     from robocas_ms3.errors import EvaluationError
@@ -135,7 +136,7 @@ def merge(folders: list[Path], out: Path | None) -> int:
         raise EvaluationError("where to?", where="--out", expected="a folder")
     result = write(folders, out)
     say(f"{out}: {len(result.outcomes)} episodes")
-    _write(result, out)
+    _write(result, out, protocol)
     return 0
 
 
@@ -157,13 +158,12 @@ def compare(folders: list[Path]) -> int:
 def verify(folders: list[Path], protocol: str) -> int:
     """See that a result is whole, and of a protocol that is here; 1 where it isn't."""
     from robocas_ms3.cli.bars import say
-    from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.verify import problems
 
     result: Result = read(*folders)
     name = str(result.run["protocol"])
-    found = problems(result, load_protocol(protocol if Path(protocol).is_dir() else name))
+    found = problems(result, _protocol_of(result, protocol))
     for problem in found:
         say(problem)
     where = ", ".join(map(str, folders))
@@ -176,13 +176,12 @@ def videos(folder: Path, protocol: str, count: int) -> int:
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.demos.checks import check_number
     from robocas_ms3.evaluation.policies import make_policy
-    from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.videos import failed_of_each_kind, film
 
     check_number("count", count, 1)
     result = read(folder)
-    loaded = load_protocol(protocol if Path(protocol).is_dir() else result.run["protocol"])
+    loaded = _protocol_of(result, protocol)
     numbers = failed_of_each_kind(result, count)
     policy = make_policy(result.run["policy"]["name"])
     with bar("videos") as shown:
@@ -191,7 +190,7 @@ def videos(folder: Path, protocol: str, count: int) -> int:
             shown.at(done, len(numbers))
     if not numbers:
         say("no episode failed")
-    _write(result, folder)
+    _write(result, folder, protocol)
     return 0
 
 
@@ -253,15 +252,21 @@ def _one(about: list[Path], word: str) -> Path:
     return about[0]
 
 
-def _write(result: Result, out: Path) -> None:
+def _protocol_of(result: Result, given: str) -> LoadedProtocol:
+    """The protocol that a result names, or the folder that was given."""
+    from robocas_ms3.evaluation.protocol import load_protocol
+
+    return load_protocol(given if Path(given).is_dir() else result.run["protocol"])
+
+
+def _write(result: Result, out: Path, given: str) -> None:
     """Write the report, and say where it is."""
     from robocas_ms3.cli.bars import say
     from robocas_ms3.errors import EvaluationError
-    from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.report import write_report
 
     try:
-        protocol = load_protocol(result.run["protocol"])
+        protocol = _protocol_of(result, given)
     except EvaluationError:
         protocol = None  # one of somebody's own, who knows where
     if protocol is not None and protocol.hash != result.run["protocol_hash"]:
