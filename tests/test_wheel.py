@@ -67,6 +67,8 @@ def test_configs_and_builtin_pack_travel_in_the_wheel(wheel):
         assert {f"{folder}/{path.name}" for path in data} <= names
     for path in (ROOT / "robocas_ms3" / "viewer" / "page").iterdir():
         assert f"robocas_ms3/viewer/page/{path.name}" in names
+    for name in ("style.css", "script.js"):
+        assert f"robocas_ms3/evaluation/report/{name}" in names
     manifest = ROOT / "robocas_ms3" / "data" / "packs" / "builtin" / "manifest.json"
     for asset in json.loads(manifest.read_text())["assets"]:
         for file in asset["files"]:

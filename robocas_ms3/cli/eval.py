@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 if TYPE_CHECKING:
+    from robocas_ms3.evaluation.protocol import LoadedProtocol
     from robocas_ms3.evaluation.results import Result
 
 
@@ -17,9 +18,11 @@ class Eval:
     """Measure a policy by a protocol: every episode of its list once, written as it ends.
 
     robocas eval [TASK ...] --policy P --protocol NAME --out DIR   plays the episodes of these tasks, or of all
-    robocas eval report DIR                                        tables of a result
-    robocas eval compare DIR DIR                                   two results over the same episodes, by an exact test
-    robocas eval verify DIR                                        whether a result is whole, and of this protocol
+    robocas eval report DIR ...                                    tables of a result, and its page report.html
+    robocas eval merge DIR ... --out DIR                           parts of a result, such as shards, as one
+    robocas eval compare DIR DIR ...                               two results over the same episodes, by an exact test
+    robocas eval verify DIR ...                                    whether a result is whole, and of this protocol
+    robocas eval videos DIR                                        plays failed episodes again and films them
     robocas eval protocols                                         lists the protocols that are shipped
     robocas eval freeze PLAN.yaml --out DIR                        makes a protocol of your own
     """
@@ -42,16 +45,21 @@ class Eval:
     backend: Literal["auto", "processes", "gpu"] = "auto"
     """Where envs run. Auto: a GPU if there is one."""
     shard: str = "0/1"
-    """Only a part of the episodes, K/N: the K-th of N runs, from 0 on; `report` and `compare` take several folders'."""
+    """Only a part of the episodes, K/N: the K-th of N runs, from 0 on. The words above take the folders of
+    all parts."""
     episodes: int | None = None
     """Only the first so many of each configuration."""
+    count: int = 8
+    """How many videos, of all kinds of failures in turn."""
 
 
-WORDS = ("report", "compare", "verify", "protocols", "freeze")
+WORDS = ("report", "merge", "compare", "verify", "videos", "protocols", "freeze")
 
 
 def main(cfg: Eval) -> int:
     """Run the command; gives the exit code."""
+    from robocas_ms3.errors import EvaluationError
+
     first = cfg.words[0] if cfg.words else ""
     if first not in WORDS:
         return run(cfg)
@@ -62,7 +70,13 @@ def main(cfg: Eval) -> int:
         return freeze(_one(about, first), cfg.out)
     if first == "compare":
         return compare(about)
-    return report(_one(about, first)) if first == "report" else verify(_one(about, first), cfg.protocol)
+    if not about:
+        raise EvaluationError("of what?", where=first, expected="a folder of a result, or those of its parts")
+    if first == "merge":
+        return merge(about, cfg.out, cfg.protocol)
+    if first == "videos":
+        return videos(_one(about, first), cfg.protocol, cfg.count)
+    return report(about, cfg.out, cfg.protocol) if first == "report" else verify(about, cfg.protocol)
 
 
 def run(cfg: Eval) -> int:
@@ -74,7 +88,6 @@ def run(cfg: Eval) -> int:
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.run import Settings, evaluate
-    from robocas_ms3.evaluation.tables import markdown
     from robocas_ms3.tasks.spec import TASKS
 
     for word in cfg.words:
@@ -93,48 +106,92 @@ def run(cfg: Eval) -> int:
             succeeded += outcome.success
             shown.at(played, played + left)
     result = read(out)
-    (out / "report.md").write_text(markdown(result), encoding="utf-8")
-    say(f"{played} episodes played, {succeeded} succeeded; {out}: {len(result.outcomes)} episodes, see report.md")
+    say(f"{played} episodes played, {succeeded} succeeded; {out}: {len(result.outcomes)} episodes")
+    _write(result, out, cfg.protocol)
     return 0
 
 
-def report(folder: Path) -> int:
-    """Print a result's tables."""
+def report(folders: list[Path], out: Path | None, protocol: str) -> int:
+    """Print a result's tables; write them and its page into its folder, those of several into another one."""
     from robocas_ms3.cli.bars import say
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.tables import markdown
 
-    say(markdown(read(folder)))
+    result = read(*folders)
+    say(markdown(result))
+    if out is None and len(folders) > 1:
+        say("Pass --out DIR for the page of several folders.")
+    else:
+        _write(result, out or folders[0], protocol)
+    return 0
+
+
+def merge(folders: list[Path], out: Path | None, protocol: str) -> int:
+    """Write parts of a result as one."""
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.evaluation.results import merge as write
+
+    if out is None:
+        raise EvaluationError("where to?", where="--out", expected="a folder")
+    result = write(folders, out)
+    say(f"{out}: {len(result.outcomes)} episodes")
+    _write(result, out, protocol)
     return 0
 
 
 def compare(folders: list[Path]) -> int:
-    """Compare two results."""
+    """Compare two results; of more folders, those that were measured with the same are parts of one."""
     from robocas_ms3.cli.bars import say
     from robocas_ms3.errors import EvaluationError
-    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.results import parts_of, read
     from robocas_ms3.evaluation.tables import comparison
 
-    if len(folders) != 2:
-        raise EvaluationError("compares two results", where="compare", expected="two folders", found=len(folders))
-    say(comparison(*map(read, folders)))
+    results = [[folder] for folder in folders] if len(folders) == 2 else parts_of(folders)
+    if len(results) != 2:
+        expected = "folders of two results, or of the parts of two"
+        raise EvaluationError("compares two results", where="compare", expected=expected, found=len(results))
+    say(comparison(*(read(*parts) for parts in results)))
     return 0
 
 
-def verify(folder: Path, protocol: str) -> int:
+def verify(folders: list[Path], protocol: str) -> int:
     """See that a result is whole, and of a protocol that is here; 1 where it isn't."""
     from robocas_ms3.cli.bars import say
-    from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.verify import problems
 
-    result: Result = read(folder)
-    name = str(result.run.get("protocol", protocol))
-    found = problems(result, load_protocol(protocol if Path(protocol).is_dir() else name))
+    result: Result = read(*folders)
+    name = str(result.run["protocol"])
+    found = problems(result, _protocol_of(result, protocol))
     for problem in found:
         say(problem)
-    say(f"{folder}: " + (f"{len(found)} problems" if found else f"{len(result.outcomes)} episodes of {name}, all well"))
+    where = ", ".join(map(str, folders))
+    say(f"{where}: " + (f"{len(found)} problems" if found else f"{len(result.outcomes)} episodes of {name}, all well"))
     return 1 if found else 0
+
+
+def videos(folder: Path, protocol: str, count: int) -> int:
+    """Film failed episodes, and link the videos in the page."""
+    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.demos.checks import check_number
+    from robocas_ms3.evaluation.policies import make_policy
+    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.videos import failed_of_each_kind, film
+
+    check_number("count", count, 1)
+    result = read(folder)
+    loaded = _protocol_of(result, protocol)
+    numbers = failed_of_each_kind(result, count)
+    policy = make_policy(result.run["policy"]["name"])
+    with bar("videos") as shown:
+        for done, filmed in enumerate(film(result, loaded, policy, numbers), start=1):
+            say(str(filmed.path) + ("" if filmed.same else ": this time it came out differently"))
+            shown.at(done, len(numbers))
+    if not numbers:
+        say("no episode failed")
+    _write(result, folder, protocol)
+    return 0
 
 
 def protocols() -> int:
@@ -157,7 +214,6 @@ def freeze(plan: Path, out: Path | None) -> int:
     from robocas_ms3.evaluation.freeze import Plan
     from robocas_ms3.evaluation.freeze import freeze as make
     from robocas_ms3.evaluation.protocol import load_protocol
-    from robocas_ms3.files import claim_output
 
     if out is None:
         raise EvaluationError("where to?", where="--out", expected="a folder")
@@ -165,7 +221,8 @@ def freeze(plan: Path, out: Path | None) -> int:
         read = Plan.model_validate(yaml.safe_load(plan.read_text(encoding="utf-8")))
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise EvaluationError("no plan of a protocol", where=plan, found=" ".join(str(error).split())) from error
-    claim_output(out, resume=None)
+    if out.exists():
+        raise EvaluationError("there is something already", where=out, fix="Choose another --out.")
     with bar("episodes") as shown:
         for done, total in make(read, out):
             shown.at(done, total)
@@ -193,3 +250,28 @@ def _one(about: list[Path], word: str) -> Path:
     if len(about) != 1:
         raise EvaluationError("takes one thing", where=word, expected="a folder or file", found=len(about))
     return about[0]
+
+
+def _protocol_of(result: Result, given: str) -> LoadedProtocol:
+    """The protocol that a result names, or the folder that was given."""
+    from robocas_ms3.evaluation.protocol import load_protocol
+
+    return load_protocol(given if Path(given).is_dir() else result.run["protocol"])
+
+
+def _write(result: Result, out: Path, given: str) -> None:
+    """Write the report, and say where it is."""
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.evaluation.report import write_report
+
+    try:
+        protocol = _protocol_of(result, given)
+    except EvaluationError:
+        protocol = None  # one of somebody's own, who knows where
+    if protocol is not None and protocol.hash != result.run["protocol_hash"]:
+        protocol = None
+    written = write_report(result, out, protocol)
+    say(f"{out}: {', '.join(path.name for path in written)}")
+    if not any(path.suffix == ".parquet" for path in written):
+        say('no episodes.parquet without pyarrow: pip install "robocas-ms3[lerobot]" brings it')

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import gymnasium as gym
 import yaml
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.config import load_task_config
 from robocas_ms3.config.task import StrictModel
-from robocas_ms3.errors import LayoutError
+from robocas_ms3.errors import EvaluationError, LayoutError
 from robocas_ms3.evaluation.protocol import CONFIGS, EPISODES, LAYOUTS, RULES, Episode, Protocol
 from robocas_ms3.files import make_folder, replacing, replacing_folder
 from robocas_ms3.scenes.frozen import write_frozen
@@ -48,9 +48,16 @@ def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Ite
 
     Yields:
         How many episodes are drawn, of how many.
+
+    Raises:
+        EvaluationError: the rules are none of a protocol.
     """
     pack = load_pack(str(plan.rules.get("pack", "builtin")))
-    rules = Protocol.model_validate({**plan.rules, "pack_hash": sha256(pack.root / MANIFEST)})
+    try:
+        rules = Protocol.model_validate({**plan.rules, "pack_hash": sha256(pack.root / MANIFEST)})
+    except ValidationError as error:
+        found = " ".join(str(error).split())
+        raise EvaluationError("no rules of a protocol", where="rules", found=found) from error
     total, episodes = sum(part.count for part in plan.parts), []
     with replacing_folder(folder) as tmp:
         for inside in (CONFIGS, LAYOUTS):

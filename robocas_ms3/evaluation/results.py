@@ -4,13 +4,15 @@
 
     run.json            protocol and its hash, policy, versions, backend, packs, machine
     episodes.jsonl      an `Outcome` a line, in any order; a line that a kill left half-written is dropped
+
+Parts of a result, such as shards, are read as one (`read`) or written as one (`merge`).
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import version
 from pathlib import Path
@@ -19,13 +21,14 @@ from typing import Any
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.rollout import Played
 from robocas_ms3.evaluation.statistics import Share, share
-from robocas_ms3.files import make_folder, write_json
+from robocas_ms3.files import make_folder, replacing_folder, write_json
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
+_SAME = ("protocol", "protocol_hash", "policy", "backend", "versions", "pack_hashes")  # of parts of one result
 # evaluation_v0.md and the paper's table: reach, pick, recognise, clear
 STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
-_ORDER = ("reached_any", "furniture_opened", "obstacles_cleared", "reached_target", "target_grasped", "target_lifted")
+_ORDER = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_target", "target_grasped", "target_lifted")
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ class Outcome:
         success_v0: upstream's rule held at the last one.
         steps: policy steps.
         seconds: of the scene.
-        failure_stage: the first stage it did not come to; empty: it succeeded. ``error``: it was broken off.
+        failure_stage: see `failure_stage`; empty: it succeeded.
         error: why.
         flags: by stage or rule, the policy step after which it first held.
         flag_seconds: the same in s of the scene.
@@ -74,21 +77,18 @@ class Outcome:
     def of(cls, played: Played, *, config: str, split: str, p_vis: float | None) -> Outcome:
         """What is kept of an episode that was played."""
         flags, start = played.flags, played.start
-        success = flags.get("success") is not None
-        left = [stage for stage in _ORDER if stage in flags and flags[stage] is None]
-        failed = "error" if played.error else "" if success else (left[0] if left else "placed")
         return cls(
             episode=start.episode,
             task=start.task,
             config=config,
             seed=start.seed,
             split=split,
-            success=success,
+            success=flags.get("success") is not None,
             success_at_end=played.at_end.get("success", False),
             success_v0=played.at_end.get("success_v0", False),
             steps=played.steps,
             seconds=round(played.seconds, 4),
-            failure_stage=failed,
+            failure_stage=failure_stage(flags, played.error),
             error=played.error,
             flags=flags,
             flag_seconds=played.flag_seconds,
@@ -102,13 +102,29 @@ class Outcome:
         return {name: value for name, value in asdict(self).items() if name != "inference_ms"}
 
 
+def failure_stage(flags: dict[str, int | None], error: str = "") -> str:
+    """The stage an episode did not come to, next after the furthest that it did come to.
+
+    A target that is pulled out of its heap was reached though its obstacles were never cleared, so stages that were
+    left out on the way do not count. ``placed``: it was lifted; ``error``: the episode was broken off; empty: success.
+    """
+    if error:
+        return "error"
+    if flags.get("success") is not None:
+        return ""
+    stages = [stage for stage in _ORDER if stage in flags]
+    came = [number for number, stage in enumerate(stages) if flags[stage] is not None]
+    following = came[-1] + 1 if came else 0
+    return stages[following] if following < len(stages) else "placed"
+
+
 @dataclass(frozen=True)
 class Result:
-    """A folder that was written.
+    """A folder that was written, or several that are parts of one result.
 
     Attributes:
-        folder: where it is.
-        run: of ``run.json``.
+        folder: where it is; of several, the first one.
+        run: of ``run.json``; of several, the first one's, with ``parts``: what each is of.
         outcomes: by episode's number, in its order.
     """
 
@@ -117,10 +133,17 @@ class Result:
     outcomes: dict[int, Outcome]
 
     def rate(self, what: str = "success", outcomes: Iterable[Outcome] | None = None) -> Share:
-        """How many episodes a flag ever held in, of all or some, with its interval."""
+        """How many episodes a flag ever held in, of all or some (one at least), with its interval."""
         chosen = list(self.outcomes.values() if outcomes is None else outcomes)
         held = [getattr(one, what) if hasattr(one, what) else one.flags.get(what) is not None for one in chosen]
         return share(sum(held), len(held))
+
+    def by(self, name: str) -> dict[str, list[Outcome]]:
+        """Its outcomes by one of their attributes, such as ``config``; sorted."""
+        found: dict[str, list[Outcome]] = {}
+        for outcome in self.outcomes.values():
+            found.setdefault(getattr(outcome, name), []).append(outcome)
+        return dict(sorted(found.items()))
 
 
 def begin(folder: Path, run: dict[str, Any], *, resume: bool) -> dict[int, Outcome]:
@@ -158,17 +181,63 @@ def append(folder: Path, outcome: Outcome) -> None:
         os.fsync(file.fileno())
 
 
-def read(folder: Path) -> Result:
-    """Read a result.
+def read(*folders: Path) -> Result:
+    """Read a result, or parts of one, in which an episode may be more than once if the outcome is the same.
 
     Raises:
-        EvaluationError: there is none.
+        EvaluationError: there is none, the parts were measured with different things, or they disagree.
     """
-    try:
-        run = json.loads((folder / RUN).read_text(encoding="utf-8"))
-        return Result(folder, run, dict(sorted(_outcomes(folder / OUTCOMES).items())))
-    except (OSError, ValueError) as error:
-        raise EvaluationError("no result of an evaluation", where=folder, found=error) from error
+    parts = [_read(folder) for folder in folders]
+    first = parts[0]
+    outcomes: dict[int, Outcome] = {}
+    for part in parts:
+        for key in _SAME:
+            if part.run.get(key) != first.run.get(key):
+                expected, found = _differing(first.run.get(key), part.run.get(key))
+                raise EvaluationError(
+                    f"no part of one result with {first.folder}: another {key}",
+                    where=part.folder,
+                    expected=expected,
+                    found=found,
+                )
+        for outcome in part.outcomes.values():
+            _add(outcomes, outcome, str(part.folder))
+    said = [
+        {"folder": str(part.folder), "episodes": len(part.outcomes), "machine": part.run.get("machine")}
+        for part in parts
+    ]
+    run = first.run if len(parts) == 1 else {**first.run, "parts": said}
+    return Result(first.folder, run, dict(sorted(outcomes.items())))
+
+
+def parts_of(folders: Iterable[Path]) -> list[list[Path]]:
+    """Folders by what they were measured with: those that `read` takes together."""
+    found: list[tuple[list[Any], list[Path]]] = []
+    for folder in folders:
+        run = _read(folder).run
+        key = [run[name] for name in _SAME]
+        group = next((group for other, group in found if other == key), None)
+        if group is None:
+            found.append((key, [folder]))
+        else:
+            group.append(folder)
+    return [group for _, group in found]
+
+
+def merge(folders: Sequence[Path], out: Path) -> Result:
+    """Write parts of a result as one, into a folder that appears whole.
+
+    Raises:
+        EvaluationError: see `read`; or something is there already.
+    """
+    result = read(*folders)
+    if out.exists():
+        raise EvaluationError("there is something already", where=out, fix="Choose another --out.")
+    with replacing_folder(out) as folder:
+        write_json(folder / RUN, result.run)
+        lines = [json.dumps(asdict(outcome)) + "\n" for outcome in result.outcomes.values()]
+        (folder / OUTCOMES).write_text("".join(lines), encoding="utf-8")
+    return read(out)
 
 
 def versions() -> dict[str, str]:
@@ -188,6 +257,18 @@ def _mended(path: Path) -> dict[int, Outcome]:
     return _outcomes(path)
 
 
+def _read(folder: Path) -> Result:
+    try:
+        run = json.loads((folder / RUN).read_text(encoding="utf-8"))
+        outcomes = dict(sorted(_outcomes(folder / OUTCOMES).items()))
+    except (OSError, ValueError) as error:
+        raise EvaluationError("no result of an evaluation", where=folder, found=error) from error
+    missing = [key for key in _SAME if key not in run] if isinstance(run, dict) else _SAME
+    if missing:
+        raise EvaluationError("no result of an evaluation", where=folder / RUN, expected=", ".join(missing))
+    return Result(folder, run, outcomes)
+
+
 def _outcomes(path: Path) -> dict[int, Outcome]:
     if not path.is_file():
         return {}
@@ -201,5 +282,23 @@ def _outcomes(path: Path) -> dict[int, Outcome]:
             outcome = Outcome(**{name: value for name, value in data.items() if name in known})
         except (ValueError, TypeError, AttributeError) as error:
             raise EvaluationError("no outcome of an episode", where=f"{path}:{number}", found=error) from error
-        found[outcome.episode] = outcome
+        _add(found, outcome, f"{path}:{number}")
     return found
+
+
+def _add(outcomes: dict[int, Outcome], outcome: Outcome, where: str) -> None:
+    """Add an episode, which may be there already if the same came of it."""
+    before = outcomes.setdefault(outcome.episode, outcome)
+    one, other = before.without_clock(), outcome.without_clock()
+    if one != other:
+        expected, found = _differing(one, other)
+        what = f"two outcomes of episode {outcome.episode} disagree"
+        raise EvaluationError(what, where=where, expected=expected, found=found)
+
+
+def _differing(one: Any, other: Any) -> tuple[Any, Any]:
+    """What of two values differs: of dictionaries only the entries that do."""
+    if not (isinstance(one, dict) and isinstance(other, dict)):
+        return one, other
+    both = {key: _differing(one.get(key), other.get(key)) for key in {**one, **other} if one.get(key) != other.get(key)}
+    return {key: a for key, (a, _) in both.items()}, {key: b for key, (_, b) in both.items()}

@@ -25,7 +25,7 @@ def markdown(result: Result) -> str:
         "| configuration | n | success | at the end | upstream's | " + " | ".join(STAGES) + " | steps | s |",
         "|---|---|---|---|---|" + "---|" * (len(STAGES) + 2),
     ]
-    for config, outcomes in _by_config(result).items():
+    for config, outcomes in result.by("config").items():
         cells = [
             config,
             str(len(outcomes)),
@@ -38,7 +38,7 @@ def markdown(result: Result) -> str:
         ]
         lines.append("| " + " | ".join(cells) + " |")
     lines += ["", "## Where episodes failed", "", "| configuration | first stage not reached |", "|---|---|"]
-    for config, outcomes in _by_config(result).items():
+    for config, outcomes in result.by("config").items():
         found = Counter(one.failure_stage for one in outcomes if one.failure_stage)
         said = ", ".join(f"{stage} {count}" for stage, count in found.most_common())
         lines.append(f"| {config} | {said or 'none failed'} |")
@@ -101,13 +101,6 @@ def percent(share: Share, *, interval: bool = True) -> str:
 
 def _stage(result: Result, stage: str, outcomes: list[Outcome]) -> str:
     return percent(result.rate(stage, outcomes), interval=False) if stage in outcomes[0].flags else ""
-
-
-def _by_config(result: Result) -> dict[str, list[Outcome]]:
-    found: dict[str, list[Outcome]] = {}
-    for outcome in result.outcomes.values():
-        found.setdefault(outcome.config, []).append(outcome)
-    return dict(sorted(found.items()))
 
 
 def _mean(values: list[float] | list[int]) -> float:

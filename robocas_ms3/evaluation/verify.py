@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.results import Outcome, Result, failure_stage
 
 
 def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
@@ -20,21 +23,42 @@ def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
     if pack != protocol.rules.pack_hash:
         found.append(f"it was measured with another pack: {pack}")
     for number, outcome in result.outcomes.items():
-        if number >= len(protocol.episodes):
+        if not 0 <= number < len(protocol.episodes):
             found.append(f"episode {number}: the protocol has none of this number")
             continue
         episode = protocol.episodes[number]
-        for name in ("task", "config", "seed", "split"):
+        for name in ("task", "config", "seed", "split", "p_vis"):
             if getattr(outcome, name) != getattr(episode, name):
                 found.append(f"episode {number}: {name} is {getattr(outcome, name)}, not {getattr(episode, name)}")
-        limit = protocol.rules.max_steps
-        if limit is not None and outcome.steps > limit:
-            found.append(f"episode {number}: {outcome.steps} steps, {limit} are allowed")
-        if outcome.success != (outcome.flags.get("success") is not None):
-            found.append(f"episode {number}: success does not agree with its flags")
-        if outcome.success and outcome.failure_stage:
-            found.append(f"episode {number}: succeeded, and failed at {outcome.failure_stage}")
-    missing = len(protocol.episodes) - len(result.outcomes)
-    if missing > 0:
+        said = [*_too_long(outcome, protocol, result.run), *_at_odds(outcome, protocol)]
+        found += [f"episode {number}: {problem}" for problem in said]
+    missing = len(set(range(len(protocol.episodes))) - result.outcomes.keys())
+    if missing:
         found.append(f"{missing} of {len(protocol.episodes)} episodes are missing")
     return found
+
+
+def _too_long(outcome: Outcome, protocol: LoadedProtocol, run: dict[str, Any]) -> Iterator[str]:
+    rules, limit = protocol.rules, protocol.rules.max_steps or 10**9
+    seconds = protocol.max_seconds(outcome.task)
+    if rules.stepping == "timed" and seconds < float("inf"):
+        limit = min(limit, round(seconds * (rules.rate_hz or run["policy"].get("wants", {}).get("rate_hz") or 20)))
+    if outcome.steps > limit:
+        yield f"{outcome.steps} steps, {limit} are allowed"
+
+
+def _at_odds(outcome: Outcome, protocol: LoadedProtocol) -> Iterator[str]:
+    """What an outcome says against itself."""
+    flags = outcome.flags
+    if outcome.success != (flags.get("success") is not None):
+        yield "success does not agree with its flags"
+    stage = failure_stage(flags, outcome.error)
+    if outcome.failure_stage != stage:
+        yield f"failure_stage is {outcome.failure_stage or 'none'}, by its flags {stage or 'none'}"
+    late = [name for name, step in flags.items() if step is not None and step > outcome.steps]
+    if late:
+        yield f"{', '.join(late)} held first after its {outcome.steps} steps"
+    for name in protocol.rules.ends_on:
+        step = flags.get(name)
+        if step is not None and step < outcome.steps:
+            yield f"it went on after {name}, {step} of {outcome.steps} steps"

@@ -1,0 +1,72 @@
+"""The episodes that failed, for the page."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+
+from robocas_ms3.evaluation.report.marks import section, table
+from robocas_ms3.evaluation.report.stages import FAILURES
+from robocas_ms3.evaluation.results import Outcome, Result
+
+VIDEOS = "videos"
+
+
+def video_name(episode: int) -> str:
+    """Of the file in ``videos``."""
+    return f"episode_{episode:05d}.mp4"
+
+
+def failed_episodes(result: Result, folder: Path | None) -> str:
+    """A section of the page, empty where none failed; numbers of episodes that have a video lead to it."""
+    failed = [outcome for outcome in result.outcomes.values() if not outcome.success]
+    if not failed:
+        return ""
+    filters = "".join(
+        f'<label>{said} <select data-column="{column}"><option value="">all</option>'
+        f"{_options(values)}</select></label>\n"
+        for said, column, values in (
+            ("configuration", 1, {outcome.config for outcome in failed}),
+            ("split", 3, {outcome.split for outcome in failed}),
+            ("not come to", 4, {FAILURES.get(outcome.failure_stage, outcome.failure_stage) for outcome in failed}),
+        )
+    )
+    rows = [
+        [
+            _named(outcome, folder),
+            escape(outcome.config),
+            str(outcome.seed),
+            escape(outcome.split),
+            escape(FAILURES.get(outcome.failure_stage, outcome.failure_stage)),
+            _ended_by(outcome),
+            str(outcome.steps),
+            f"{outcome.seconds:.1f}",
+            "" if outcome.p_vis is None else f"{outcome.p_vis:.2f}",
+            f"{outcome.measures.get('disturbed_most', 0):.0f}",
+            escape(outcome.error),
+        ]
+        for outcome in failed
+    ]
+    heads = (
+        *("episode#", "configuration", "seed#", "split", "not come to", "ended by"),
+        *("steps#", "s#", "p_vis#", "disturbed#", "error"),
+    )
+    said = (
+        f'<span id="count">{len(failed)}</span> of {len(result.outcomes)} episodes. Ended by: the time they had, a '
+        "failure such as a target on the floor, or an error. A number that is a link leads to a video."
+    )
+    return section("Failed episodes", said, f'<form class="filters">{filters}</form>\n' + table(heads, rows, "failed"))
+
+
+def _ended_by(outcome: Outcome) -> str:
+    return "error" if outcome.error else "failure" if outcome.flags.get("fail") is not None else "time"
+
+
+def _named(outcome: Outcome, folder: Path | None) -> str:
+    name = f"{VIDEOS}/{video_name(outcome.episode)}"
+    linked = folder is not None and (folder / name).is_file()
+    return f'<a href="{name}">{outcome.episode}</a>' if linked else str(outcome.episode)
+
+
+def _options(values: set[str]) -> str:
+    return "".join(f"<option>{escape(value)}</option>" for value in sorted(values))

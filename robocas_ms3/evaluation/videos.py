@@ -1,0 +1,179 @@
+"""Videos of episodes that failed: they are played again, watched from over the robot's shoulder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import torch
+
+from robocas_ms3.datasets.render import require_renderer
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.policy import Policy, Start
+from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.report.failed import VIDEOS, video_name
+from robocas_ms3.evaluation.results import Outcome, Result
+from robocas_ms3.evaluation.rollout import Rollouts, Rules
+from robocas_ms3.evaluation.run import _looks
+from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, control_mode
+from robocas_ms3.files import make_folder, replacing
+from robocas_ms3.tasks.spec import TASKS
+from robocas_ms3.tasks.vector import make_vec
+
+SIZE = (480, 360)  # pixels
+_FRAMES = 5  # a second of the scene
+_SPEED = 4  # times as fast as the scene
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """A video that was written; ``same``: what came of the episode is what had come of it before."""
+
+    path: Path
+    outcome: Outcome
+    same: bool
+
+
+def failed_of_each_kind(result: Result, count: int) -> list[int]:
+    """Numbers of failed episodes: of every configuration and failure stage in turn, until there are so many."""
+    groups: dict[tuple[str, str], list[int]] = {}
+    for outcome in result.outcomes.values():
+        if not outcome.success:
+            groups.setdefault((outcome.config, outcome.failure_stage), []).append(outcome.episode)
+    ranked = [(rank, at, number) for at, group in enumerate(groups.values()) for rank, number in enumerate(group)]
+    return sorted(number for _, _, number in sorted(ranked)[:count])
+
+
+def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]) -> Iterator[Filmed]:
+    """Play episodes again, in processes, and write a video of each into the result's ``videos``.
+
+    Raises:
+        EvaluationError: the result is of another protocol.
+        DatasetError: there is no render device.
+    """
+    if result.run["protocol_hash"] != protocol.hash:
+        raise EvaluationError(
+            "the result is of another protocol",
+            where=result.folder,
+            expected=result.run["protocol_hash"],
+            found=protocol.hash,
+        )
+    protocol.rules.refuse(policy.wants)
+    require_renderer()
+    make_folder(result.folder / VIDEOS)
+    for config in dict.fromkeys(protocol.episodes[number].config for number in episodes):
+        numbers = [number for number in episodes if protocol.episodes[number].config == config]
+        yield from _film(result, protocol, policy, numbers)
+
+
+def _film(result: Result, protocol: LoadedProtocol, policy: Policy, numbers: list[int]) -> Iterator[Filmed]:
+    rules, first = protocol.rules, protocol.episodes[numbers[0]]
+    rate = UPSTREAM_HZ if rules.stepping == "upstream" else rules.rate(policy.wants)
+    torch.set_num_threads(1)
+    env = _Watched(_env(protocol, policy, first.config, TASKS[first.task].env_id, rate), max(1, round(rate / _FRAMES)))
+    try:
+        for number in numbers:
+            episode, before = protocol.episodes[number], result.outcomes[number]
+            start = Start(
+                env=-1,
+                episode=number,
+                task=episode.task,
+                config_file=str(protocol.config_file(episode.config)),
+                layouts_file=str(protocol.layouts_file(episode.config)),
+                pack=rules.pack,
+                seed=episode.seed,
+                instruction=episode.instruction,
+            )
+            # as long as it was before, so that this is the same episode whatever ended it
+            ends = Rules(before.steps, tuple(rules.ends_on), rules.max_v0_steps)
+            path = result.folder / VIDEOS / video_name(number)
+            with replacing(path) as tmp, _writer(tmp, rate / env.every * _SPEED) as writer:
+                env.writer = writer
+                (played,) = Rollouts(env, policy, ends, 1 / rate, refill=True).play([start])
+            outcome = Outcome.of(played, config=episode.config, split=episode.split, p_vis=episode.p_vis)
+            yield Filmed(path, outcome, outcome.without_clock() == before.without_clock())
+    finally:
+        env.close()
+
+
+@dataclass
+class _Watched:
+    """An environment that adds pictures to a video.
+
+    Attributes:
+        env: one env, as NumPy arrays.
+        every: how many policy steps a picture.
+        writer: of the video.
+    """
+
+    env: Any
+    every: int
+    writer: Any = None
+    num_envs: int = 1
+    _steps: int = field(default=0, init=False)
+
+    def reset(self, **kwargs: Any) -> Any:
+        """Reset, and look."""
+        self._steps = 0
+        result = self.env.reset(**kwargs)
+        self._look()
+        return result
+
+    def step(self, actions: Any) -> Any:
+        """One policy step, and a look every few."""
+        result = self.env.step(actions)
+        self._steps += 1
+        if self._steps % self.every == 0:
+            self._look()
+        return result
+
+    def close(self) -> None:
+        """End its process."""
+        self.env.close()
+
+    def _look(self) -> None:
+        self.writer.append_data(torch.as_tensor(self.env.render())[0].cpu().numpy())
+
+
+def _env(protocol: LoadedProtocol, policy: Policy, config: str, env_id: str, rate: int) -> Any:
+    wants, rules = policy.wants, protocol.rules
+    looks = _looks(wants)
+    looks.pop("render_backend", None)
+    return make_vec(
+        env_id,
+        1,
+        backend="processes",
+        arrays="numpy",
+        auto_reset=False,
+        ignore_terminations=True,
+        record_metrics=False,
+        wrappers=[
+            partial(PolicyStepping, convention=wants.convention, reference=wants.reference, stepping=rules.stepping)
+        ],
+        config=str(protocol.config_file(config)),
+        layouts=str(protocol.layouts_file(config)),
+        pack=rules.pack,
+        control_mode=control_mode(wants.convention),
+        reward_mode="none",
+        render_mode="rgb_array",
+        human_render_camera_configs={"width": SIZE[0], "height": SIZE[1]},
+        sim_config={"control_freq": rate},
+        max_episode_steps=10**9,
+        **looks,
+    )
+
+
+def _writer(path: Path, fps: float) -> Any:
+    return imageio.get_writer(
+        path,
+        fps=fps,
+        codec="libx264",
+        pixelformat="yuv420p",
+        quality=6,
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+    )

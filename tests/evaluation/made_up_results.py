@@ -1,0 +1,67 @@
+"""Results that nobody measured, without a simulator."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.results import OUTCOMES, RUN, Outcome, Result, failure_stage, read
+
+STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
+RUN_OF = {
+    "protocol": "made_up",
+    "protocol_hash": "ab" * 32,
+    "policy": {"name": "mine", "class": "mine:Policy", "wants": {"rate_hz": None}},
+    "backend": "processes",
+    "versions": {"robocas_ms3": "0.1.0", "torch": "2.4"},
+    "pack_hashes": {"builtin": "cd" * 32},
+    "machine": {"processor": "x86_64", "python": "3.11"},
+}
+
+
+def outcome(episode: int, came_to: int = 7, **others: Any) -> Outcome:
+    """An episode of pick that came to so many of the six stages and success, 10 steps of 0.05 s each."""
+    names = (*STAGES, "success")
+    flags = {name: 10 * (at + 1) if at < came_to else None for at, name in enumerate(names)} | {"fail": None}
+    success = flags["success"] is not None
+    made = Outcome(
+        episode=episode,
+        task="pick",
+        config="table",
+        seed=100 + episode,
+        split="test",
+        success=success,
+        success_at_end=success,
+        success_v0=success,
+        steps=70 if success else 800,
+        seconds=3.5 if success else 40.0,
+        failure_stage=failure_stage(flags),
+        flags=flags,
+        flag_seconds={name: None if step is None else step / 20 for name, step in flags.items()},
+        measures={"path_length": 1.5, "contact_impulse": 2.0, "disturbed_most": 1.0, "fallen": 0.0},
+        inference_ms=0.5,
+    )
+    return replace(made, **others)
+
+
+def write(folder: Path, outcomes: Iterable[Outcome], **run: Any) -> Result:
+    """A folder of these episodes; what of ``run.json`` is other than usual by name."""
+    folder.mkdir(parents=True)
+    (folder / RUN).write_text(json.dumps({**RUN_OF, **run}))
+    (folder / OUTCOMES).write_text("".join(json.dumps(asdict(one)) + "\n" for one in outcomes))
+    return read(folder)
+
+
+def of_protocol(folder: Path, protocol: LoadedProtocol) -> Result:
+    """A result with which nothing is wrong: every episode of a protocol succeeded."""
+    outcomes = [
+        outcome(one.episode, task=one.task, config=one.config, seed=one.seed, split=one.split, p_vis=one.p_vis)
+        for one in protocol.episodes
+    ]
+    packs = {protocol.rules.pack: protocol.rules.pack_hash}
+    name = protocol.rules.name
+    return write(folder, outcomes, protocol=name, protocol_hash=protocol.hash, pack_hashes=packs)

@@ -1,0 +1,53 @@
+"""Failed episodes are played again and filmed."""
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+from made_up_results import of_protocol, outcome, write
+
+from robocas_ms3.cli import eval as command
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.freeze import Plan, freeze
+from robocas_ms3.evaluation.policies.plain import RandomPolicy
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.videos import SIZE, failed_of_each_kind, film
+
+
+def test_all_kinds_of_failures_have_their_turn(tmp_path):
+    came_to = [0, 0, 0, 3, 7, 3]
+    table = [outcome(number, came) for number, came in enumerate(came_to)]
+    result = write(tmp_path / "a", [*table, outcome(6, 0, config="heap")])
+    assert failed_of_each_kind(result, 3) == [0, 3, 6]
+    assert failed_of_each_kind(result, 5) == [0, 1, 3, 5, 6]
+    assert failed_of_each_kind(result, 99) == [0, 1, 2, 3, 5, 6]
+
+
+def test_another_protocol_is_refused(tmp_path):
+    result = of_protocol(tmp_path / "a", load_protocol("smoke"))
+    result.run["protocol_hash"] = "0"
+    with pytest.raises(EvaluationError, match="another protocol"):
+        next(film(result, load_protocol("smoke"), RandomPolicy(), [0]))
+
+
+def test_where_none_failed_there_is_nothing_to_film(tmp_path, capsys):
+    result = of_protocol(tmp_path / "b", load_protocol("smoke"))
+    (result.folder / "run.json").write_text((result.folder / "run.json").read_text().replace('"mine"', '"random"'))
+    assert command.main(command.Eval(("videos", str(result.folder)))) == 0
+    assert "no episode failed" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_failure_is_filmed_and_linked(tmp_path, needs_renderer, capsys):
+    rules = {"name": "tiny", "description": "Half a second.", "max_seconds": {"pick": 0.5}}
+    plan = {"rules": rules, "parts": [{"config": "pick_table_scattered", "count": 1, "first_seed": 110000}]}
+    list(freeze(Plan.model_validate(plan), tmp_path / "tiny"))
+    out, protocol = tmp_path / "result", str(tmp_path / "tiny")
+    assert command.main(command.Eval((), policy="random", protocol=protocol, out=out, backend="processes")) == 0
+    assert command.main(command.Eval(("videos", str(out)), protocol=protocol)) == 0
+    said = capsys.readouterr().out
+    assert "episode_00000.mp4" in said and "differently" not in said
+    frames = np.stack([np.asarray(frame) for frame in imageio.get_reader(out / "videos" / "episode_00000.mp4")])
+    assert frames.shape == (3, SIZE[1], SIZE[0], 3)  # at the reset, after 4 of 10 steps, after 8
+    assert frames.std() > 10
+    page = (out / "report.html").read_text()
+    assert 'href="videos/episode_00000.mp4"' in page and "1 of 1 episodes" in page

@@ -1,0 +1,118 @@
+"""Protocols that are shipped, and damaged ones."""
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+
+import pytest
+import yaml
+
+from robocas_ms3.config import load_task_config
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.protocol import EPISODES, RULES, files_of, load_protocol, shipped_protocols
+from robocas_ms3.tasks.spec import TASKS
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A copy that may be damaged."""
+    return shutil.copytree(shipped_protocols()["smoke"], tmp_path / "mine")
+
+
+def change_rules(folder, **values):
+    rules = yaml.safe_load((folder / RULES).read_text())
+    (folder / RULES).write_text(yaml.safe_dump(rules | values))
+
+
+def change_episode(folder, line, **values):
+    lines = (folder / EPISODES).read_text().splitlines()
+    lines[line] = json.dumps(json.loads(lines[line]) | values)
+    (folder / EPISODES).write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.parametrize("name", shipped_protocols())
+def test_shipped_ones_load(name):
+    protocol = load_protocol(name)
+    assert protocol.rules.name == name
+    assert protocol.episodes
+    for episode in protocol.episodes:
+        assert episode.task in TASKS
+        assert episode.instruction
+    for config in {episode.config for episode in protocol.episodes}:
+        tasks = {episode.task for episode in protocol.episodes if episode.config == config}
+        assert tasks == {load_task_config(protocol.config_file(config)).task}
+
+
+@pytest.mark.parametrize("name", shipped_protocols())
+def test_every_scene_is_there_once(name):
+    protocol = load_protocol(name)
+    assert len({(episode.config, episode.seed) for episode in protocol.episodes}) == len(protocol.episodes)
+
+
+@pytest.mark.parametrize("name", shipped_protocols())
+def test_the_hash_is_that_of_the_files(name):
+    protocol = load_protocol(name)
+    digest = hashlib.sha256()
+    for path in sorted(path for path in protocol.folder.rglob("*") if path.is_file()):
+        content = hashlib.sha256(path.read_bytes()).hexdigest()
+        digest.update(f"{path.relative_to(protocol.folder).as_posix()} {content}\n".encode())
+    assert protocol.hash == digest.hexdigest()
+
+
+def test_a_copy_has_the_same_hash_and_a_change_another(folder):
+    mine = load_protocol(folder)
+    before = load_protocol("smoke").hash
+    assert mine.hash == before
+    for path in files_of(folder):
+        content = path.read_bytes()
+        path.write_bytes(content + b"\n")
+        assert replace(mine).hash != before, path
+        path.write_bytes(content)
+    assert replace(mine).hash == before
+
+
+def test_an_unknown_name_gets_the_nearest():
+    with pytest.raises(EvaluationError, match="smoke"):
+        load_protocol("smok")
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda f: (f / RULES).write_text("name: [\n"), "protocol.yaml: no rules"),
+        (lambda f: (f / RULES).write_bytes(b"\xff\xfe"), "protocol.yaml: no rules"),
+        (lambda f: change_rules(f, speed=2), "protocol.yaml: no rules.*speed"),
+        (lambda f: change_rules(f, rate_hz="fast"), "protocol.yaml: no rules.*rate_hz"),
+        (lambda f: (f / EPISODES).unlink(), "episodes.jsonl: can't read"),
+        (lambda f: (f / EPISODES).write_text("{\n"), "episodes.jsonl:1: no episode"),
+        (lambda f: change_episode(f, 1, seed=-1), "episodes.jsonl:2: no episode.*seed"),
+        (lambda f: change_episode(f, 1, speed=1), "episodes.jsonl:2: no episode.*speed"),
+        (lambda f: change_episode(f, 1, episode=0), "episodes.jsonl:2: episodes are not in order.*expected 1, found 0"),
+        (lambda f: change_episode(f, 1, config="../x"), "episodes.jsonl:2: no episode.*config"),
+        (lambda f: (f / "configs" / "open_pick_drawer.yaml").unlink(), "open_pick_drawer.yaml: a protocol's file"),
+        (lambda f: (f / "layouts" / "open_pick_drawer.npy").unlink(), "open_pick_drawer.npy: a protocol's file"),
+        (lambda f: (f / RULES).unlink(), "no such protocol"),
+    ],
+)
+def test_damage_is_said_in_one_line(folder, damage, said):
+    damage(folder)
+    with pytest.raises(EvaluationError, match=said) as caught:
+        load_protocol(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_policies_that_do_not_fit_are_refused():
+    rules = load_protocol("smoke").rules.model_copy(update={"rate_hz": 20, "conventions": ["robocas"]})
+    rules.refuse(Wants(rate_hz=20))
+    for wants, said in ((Wants(rate_hz=10), "another rate"), (Wants(convention="delta_euler"), "convention")):
+        with pytest.raises(EvaluationError, match=said):
+            rules.refuse(wants)
+
+
+def test_rates_are_those_that_physics_can_be_stopped_at():
+    rules = load_protocol("smoke").rules
+    assert [rules.rate(Wants()), rules.rate(Wants(rate_hz=10))] == [20, 10]
+    with pytest.raises(EvaluationError, match="divisor of 100"):
+        rules.rate(Wants(rate_hz=30))

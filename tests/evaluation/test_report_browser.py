@@ -1,0 +1,69 @@
+"""The page of a result in a real browser: nothing overflows, nothing fails, and the list can be narrowed."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+from made_up_results import outcome, write
+
+from robocas_ms3.evaluation.report import PAGE, write_report
+
+pytestmark = pytest.mark.slow
+BROWSER = Path(__file__).resolve().parents[1] / "viewer" / "browser.py"
+SHOWN = (
+    "[...document.querySelectorAll('table.failed tbody tr')].filter(row => !row.hidden)"
+    ".map(row => row.cells[0].textContent).join()"
+)
+
+
+@pytest.fixture(scope="module")
+def driver():
+    if "browser" not in sys.modules:
+        spec = importlib.util.spec_from_file_location("browser", BROWSER)
+        assert spec is not None and spec.loader is not None
+        sys.modules["browser"] = module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    return sys.modules["browser"]
+
+
+@pytest.fixture(scope="module")
+def browser(driver, tmp_path_factory):
+    with driver.Browser(driver.require_chromium(), tmp_path_factory.mktemp("profile")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results") / "result"
+    configs = ["table", "a_configuration_with_a_long_name_as_some_have"]
+    outcomes = [
+        outcome(number, came_to=number % 8, config=configs[number % 2], split=f"split {number % 3}", p_vis=number / 40)
+        for number in range(40)
+    ]
+    write_report(write(folder, outcomes), folder)
+    return f"file://{folder / PAGE}"
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [420, 800, 1440])
+def test_nothing_fails_or_overflows(browser, url, width, dark):
+    browser.resize(width, 900)
+    browser.dark(dark)
+    browser.goto(url)
+    assert browser.errors == []
+    assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+    paper, ink = browser.run("(s => [s.backgroundColor, s.color])(getComputedStyle(document.body))")
+    assert (paper == "rgb(20, 23, 27)") == dark
+    assert paper != ink
+
+
+def test_failed_episodes_are_narrowed_down(browser, url):
+    browser.goto(url)
+    assert len(browser.run(SHOWN).split(",")) == 35
+    browser.choose("select[data-column='1']", "table")
+    browser.choose("select[data-column='4']", "target grasped")  # came to three stages
+    assert browser.run(SHOWN) == ""
+    browser.choose("select[data-column='4']", "target touched")
+    assert browser.run(SHOWN) == "2,10,18,26,34"
+    assert browser.text("#count") == "5"

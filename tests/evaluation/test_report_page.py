@@ -1,0 +1,174 @@
+"""The page of a result: its numbers are there, it is well-formed, and it needs nothing beside it."""
+
+import importlib.util
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from made_up_results import of_protocol, outcome, write
+
+from robocas_ms3.cli import eval as command
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.report import PARQUET, write_report
+from robocas_ms3.evaluation.report.failed import video_name
+from robocas_ms3.evaluation.report.marks import round_up
+from robocas_ms3.evaluation.report.page import page
+
+VOID = {"meta", "rect", "path"}  # of HTML, and those that SVG closes at once
+
+
+class Reader(HTMLParser):
+    """Sees that elements end as they began, and keeps what they say and where they lead to."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.texts: list[str] = []
+        self.links: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.links += [value for name, value in attrs if name in ("href", "src", "action", "data") and value]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        assert tag in VOID
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if data.strip() and self.open[-1] not in ("style", "script"):
+            self.texts.append(data.strip())
+
+    def after(self, text: str, count: int) -> list[str]:
+        at = self.texts.index(text)
+        return self.texts[at + 1 : at + 1 + count]
+
+
+@pytest.fixture
+def result(tmp_path):
+    error = "the policy said <b>no</b> & died"
+    table = [outcome(0), outcome(1), outcome(2, came_to=5), outcome(3, came_to=0, failure_stage="error", error=error)]
+    heap = [outcome(number, config="heap", split="hard", p_vis=0.3) for number in (4, 5)]
+    return write(tmp_path / "result", [*table, *heap])
+
+
+def test_numbers_of_the_headline(result):
+    read = Reader(page(result))
+    # 2 of 4, 6.8 to 93.2; 2 of 2, 0.025 ** (1 / 2) = 15.8
+    assert read.after("table", 4) == ["pick", "4", "50 %", "7 to 93"]
+    assert read.after("heap", 4) == ["pick", "2", "100 %", "16 to 100"]
+    assert "2 of 4: 50.0 %, 6.8 to 93.2" in read.texts  # of the bar
+    assert read.after("all together", 2) == ["6", "67 %"]
+
+
+def test_stages_failures_and_splits(result):
+    text = page(result)
+    read = Reader(text)
+    assert read.after("table, n 4", 3) == ["an object touched (RA)", "3 of 4: 75.0 %, 19.4 to 99.4", "75 %"]
+    assert {"placed, at rest", "broken off", "1 episodes were broken off by an error. They count as failures."} <= set(
+        read.texts
+    )
+    assert "hard, n" in read.texts and "test, n" in read.texts
+    assert "0.2 to 0.4" in read.texts
+
+
+def test_failed_episodes_are_listed_with_their_errors_as_text(result):
+    text = page(result)
+    assert "the policy said &lt;b&gt;no&lt;/b&gt; &amp; died" in text
+    assert Reader(text).after("Failed episodes", 1) == ["2"]
+
+
+def test_it_says_what_it_was_measured_with(result):
+    texts = Reader(page(result)).texts
+    assert {"ab" * 32, "cd" * 32, "robocas_ms3 0.1.0, torch 2.4", "mine:Policy"} <= set(texts)
+
+
+def test_it_leads_nowhere_but_to_its_own_videos(result):
+    text = page(result, result.folder)
+    assert Reader(text).links == []
+    assert not re.search(r"https?:|//[a-z]|@import|url\(", text)
+    (result.folder / "videos").mkdir()
+    (result.folder / "videos" / video_name(3)).touch()
+    assert Reader(page(result, result.folder)).links == ["videos/episode_00003.mp4"]
+
+
+def test_a_result_that_lacks_episodes_says_so(tmp_path):
+    protocol = load_protocol("smoke")
+    whole = of_protocol(tmp_path / "whole", protocol)
+    assert "8 of 8 episodes" in page(whole, protocol=protocol)
+    part = write(tmp_path / "part", list(whole.outcomes.values())[:5])
+    assert "3 episodes of the protocol are missing" in page(part, protocol=protocol)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_small_results(tmp_path, count):
+    Reader(page(write(tmp_path / "a", [outcome(0)][:count])))
+    Reader(page(write(tmp_path / "b", [outcome(0, came_to=0)][:count])))
+
+
+@pytest.mark.parametrize(("value", "end"), [(0.9, 1), (1, 1), (1.1, 2), (33, 40), (41, 80), (81, 100), (100, 100)])
+def test_ends_of_axes(value, end):
+    assert round_up(value) == end
+
+
+def test_files_of_a_report(result, tmp_path):
+    written = write_report(result, tmp_path / "out")
+    assert [path.name for path in written][:2] == ["report.md", "report.html"]
+    assert all(path.stat().st_size for path in written)
+
+
+def test_columns(result, tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
+    write_report(result, tmp_path / "out")
+    table = parquet.read_table(tmp_path / "out" / PARQUET).to_pydict()
+    assert table["episode"] == list(range(6))
+    assert table["flags.target_lifted"] == [50, 50, 50, None, 50, 50]
+    assert table["flag_seconds.success"] == [3.5, 3.5, None, None, 3.5, 3.5]
+    assert np.isclose(table["measures.path_length"], 1.5).all()
+    assert table["p_vis"] == [None] * 4 + [0.3, 0.3]
+
+
+def test_without_pyarrow_there_are_no_columns(result, tmp_path, monkeypatch, capsys):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pyarrow" else find(name))
+    assert command.main(command.Eval(("report", str(result.folder)))) == 0
+    assert not (result.folder / PARQUET).exists()
+    assert "no episodes.parquet without pyarrow" in capsys.readouterr().out
+
+
+def test_commands_on_parts(tmp_path, capsys):
+    parts = [tmp_path / name for name in "abc"]
+    for number, part in enumerate(parts):
+        write(part, [outcome(number)], **({"policy": {"name": "other"}} if part.name == "c" else {}))
+    words = tuple(map(str, parts))
+    assert command.main(command.Eval(("report", *words[:2]))) == 0
+    assert "2 episodes" in capsys.readouterr().out
+    assert command.main(command.Eval(("merge", *words[:2]), out=tmp_path / "all")) == 0
+    assert (tmp_path / "all" / "report.html").is_file()
+    write(tmp_path / "d", [outcome(1)], policy={"name": "other"})
+    assert command.main(command.Eval(("compare", words[0], words[1], words[2], str(tmp_path / "d")))) == 0
+    assert "1 episodes of made_up that both have" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("report",), "of what?"),
+        (("merge", "a"), "where to?"),
+        (("compare", "a"), "no result"),
+        (("compare", "ok", "ok", "ok"), "compares two results"),
+        (("verify", "a"), "no result"),
+    ],
+)
+def test_wrong_words_are_errors(tmp_path, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "ok", [outcome(0)])
+    with pytest.raises(EvaluationError, match=re.escape(said)):
+        command.main(command.Eval(words))

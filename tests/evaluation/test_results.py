@@ -1,0 +1,154 @@
+"""A result is appended to, gone on with, read in parts and merged."""
+
+from dataclasses import replace
+
+import pytest
+from made_up_results import RUN_OF, outcome, write
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.results import OUTCOMES, append, begin, failure_stage, merge, parts_of, read
+
+SEARCH = dict.fromkeys(("obstacles_cleared", "reached_any", "target_grasped", "target_lifted", "success"))
+
+
+def test_what_is_appended_is_read(tmp_path):
+    begin(tmp_path / "a", RUN_OF, resume=False)
+    for number in (3, 1):
+        append(tmp_path / "a", outcome(number))
+    assert read(tmp_path / "a").outcomes == {1: outcome(1), 3: outcome(3)}
+    assert read(tmp_path / "a").run == RUN_OF
+
+
+def test_a_line_that_was_cut_is_dropped_and_written_over(tmp_path):
+    write(tmp_path / "a", [outcome(0), outcome(1)])
+    path = tmp_path / "a" / OUTCOMES
+    path.write_bytes(path.read_bytes()[:-20])
+    assert list(read(tmp_path / "a").outcomes) == [0]
+    assert list(begin(tmp_path / "a", RUN_OF, resume=True)) == [0]
+    append(tmp_path / "a", outcome(2))
+    assert list(read(tmp_path / "a").outcomes) == [0, 2]
+
+
+def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
+    write(tmp_path / "a", [outcome(0)])
+    with (tmp_path / "a" / OUTCOMES).open("a") as file:
+        file.write('{"episode": 1}\n')
+    with pytest.raises(EvaluationError, match=r"episodes.jsonl:2: no outcome"):
+        read(tmp_path / "a")
+
+
+@pytest.mark.parametrize("key", ["protocol_hash", "policy", "versions", "pack_hashes", "backend"])
+def test_resuming_with_something_else_is_refused(tmp_path, key):
+    write(tmp_path / "a", [outcome(0)])
+    with pytest.raises(EvaluationError, match=f"another {key}"):
+        begin(tmp_path / "a", {**RUN_OF, key: "other"}, resume=True)
+
+
+def test_a_result_that_is_there_is_not_gone_on_with_unasked(tmp_path):
+    write(tmp_path / "a", [outcome(0)])
+    with pytest.raises(EvaluationError, match="--resume"):
+        begin(tmp_path / "a", RUN_OF, resume=False)
+
+
+def test_no_result(tmp_path):
+    with pytest.raises(EvaluationError, match="no result"):
+        read(tmp_path)
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(EvaluationError, match="no result.*protocol_hash"):
+        read(tmp_path)
+
+
+def test_parts_are_read_as_one_whatever_the_clock_and_the_machine(tmp_path):
+    write(tmp_path / "a", [outcome(2), outcome(0)])
+    write(tmp_path / "b", [outcome(1), outcome(2, inference_ms=9.0)], machine={"processor": "arm64"})
+    both = read(tmp_path / "a", tmp_path / "b")
+    assert both.outcomes == {0: outcome(0), 1: outcome(1), 2: outcome(2)}
+    assert [part["episodes"] for part in both.run["parts"]] == [2, 2]
+
+
+def test_parts_that_disagree_are_refused(tmp_path):
+    write(tmp_path / "a", [outcome(0)])
+    write(tmp_path / "b", [outcome(0, seconds=3.6)])
+    with pytest.raises(EvaluationError, match=r"two outcomes of episode 0 disagree.*3\.5.*3\.6"):
+        read(tmp_path / "a", tmp_path / "b")
+
+
+def test_the_same_holds_within_a_file(tmp_path):
+    with pytest.raises(EvaluationError, match=r"jsonl:2: two outcomes of episode 0 disagree"):
+        write(tmp_path / "a", [outcome(0), outcome(0, came_to=3)])
+
+
+@pytest.mark.parametrize("key", ["protocol_hash", "policy", "versions", "pack_hashes", "backend"])
+def test_parts_of_different_results_are_refused(tmp_path, key):
+    write(tmp_path / "a", [outcome(0)])
+    write(tmp_path / "b", [outcome(1)], **{key: {"torch": "other"}})
+    with pytest.raises(EvaluationError, match=f"another {key}"):
+        read(tmp_path / "a", tmp_path / "b")
+    assert parts_of([tmp_path / "a", tmp_path / "b"]) == [[tmp_path / "a"], [tmp_path / "b"]]
+
+
+def test_a_difference_of_versions_names_only_what_differs(tmp_path):
+    write(tmp_path / "a", [outcome(0)])
+    write(tmp_path / "b", [outcome(1)], versions={"robocas_ms3": "0.1.0", "torch": "2.5"})
+    with pytest.raises(EvaluationError) as caught:
+        read(tmp_path / "a", tmp_path / "b")
+    assert caught.value.expected == {"torch": "2.4"}
+    assert caught.value.found == {"torch": "2.5"}
+
+
+def test_merged_parts_are_a_result_that_can_be_gone_on_with(tmp_path):
+    folders = [tmp_path / "a", tmp_path / "b"]
+    for number, folder in enumerate(folders):
+        write(folder, [outcome(number)])
+    merged = merge(folders, tmp_path / "all")
+    assert merged.outcomes == read(*folders).outcomes
+    assert list(begin(tmp_path / "all", RUN_OF, resume=True)) == [0, 1]
+    with pytest.raises(EvaluationError, match="something already"):
+        merge(folders, tmp_path / "all")
+
+
+def test_parts_that_do_not_fit_leave_nothing_behind(tmp_path):
+    write(tmp_path / "a", [outcome(0)])
+    write(tmp_path / "b", [outcome(0, came_to=1)])
+    with pytest.raises(EvaluationError):
+        merge([tmp_path / "a", tmp_path / "b"], tmp_path / "all")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+
+
+def test_rates_of_some_and_of_all(tmp_path):
+    result = write(tmp_path / "a", [outcome(0), outcome(1, came_to=5), outcome(2, came_to=0)])
+    assert (result.rate().k, result.rate().n) == (1, 3)
+    assert result.rate("target_lifted").k == 2
+    assert result.rate("target_lifted", [outcome(0)]).n == 1
+
+
+def test_groups_are_sorted(tmp_path):
+    result = write(tmp_path / "a", [outcome(0, config="b"), outcome(1, config="a"), outcome(2, config="b")])
+    groups = result.by("config")
+    assert {name: [one.episode for one in group] for name, group in groups.items()} == {"a": [1], "b": [0, 2]}
+    assert list(groups) == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("reached", "stage"),
+    [
+        ((), "reached_any"),
+        (("reached_any",), "obstacles_cleared"),
+        (("reached_any", "obstacles_cleared"), "target_grasped"),
+        (("reached_any", "target_grasped"), "target_lifted"),  # pulled out of the heap
+        (("reached_any", "target_grasped", "target_lifted"), "placed"),
+        (("reached_any", "success"), ""),
+    ],
+)
+def test_failure_stage(reached, stage):
+    assert failure_stage(SEARCH | dict.fromkeys(reached, 5)) == stage
+
+
+def test_a_door_that_was_never_opened_comes_before_its_objects():
+    assert failure_stage({"reached_any": None, "furniture_opened": None}) == "furniture_opened"
+    assert failure_stage({"reached_any": None, "furniture_opened": 7}) == "reached_any"
+    assert failure_stage({"reached_any": 5}, "policy died") == "error"
+
+
+def test_the_clock_is_no_part_of_an_outcome():
+    assert outcome(0).without_clock() == replace(outcome(0), inference_ms=3.0).without_clock()

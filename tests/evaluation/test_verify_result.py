@@ -1,0 +1,97 @@
+"""What was done to a result afterwards is found, as far as its files can tell."""
+
+import json
+
+import pytest
+from made_up_results import of_protocol
+
+from robocas_ms3.cli import eval as command
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.results import OUTCOMES, RUN, read
+from robocas_ms3.evaluation.verify import problems
+
+
+@pytest.fixture(scope="module")
+def protocol():
+    return load_protocol("smoke")
+
+
+@pytest.fixture
+def folder(tmp_path, protocol):
+    of_protocol(tmp_path / "result", protocol)
+    return tmp_path / "result"
+
+
+def tamper(folder, line, **values):
+    path = folder / OUTCOMES
+    lines = path.read_text().splitlines()
+    lines[line] = json.dumps(json.loads(lines[line]) | values)
+    path.write_text("\n".join(lines) + "\n")
+
+
+def tamper_run(folder, **values):
+    path = folder / RUN
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+def test_nothing_is_wrong_with_a_whole_result(folder, protocol):
+    assert problems(read(folder), protocol) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"seed": 5}, "episode 0: seed is 5, not 110000"),
+        ({"task": "search"}, "episode 0: task is search, not pick"),
+        ({"config": "easier"}, "episode 0: config is easier, not pick_table_scattered"),
+        ({"split": "train"}, "episode 0: split is train, not test"),
+        ({"p_vis": 0.9}, "episode 0: p_vis is 0.9, not None"),
+        ({"success": False}, "episode 0: success does not agree with its flags"),
+        ({"failure_stage": "placed"}, "episode 0: failure_stage is placed, by its flags none"),
+        ({"steps": 801}, "episode 0: 801 steps, 800 are allowed"),  # 40 s at 20 Hz
+        ({"steps": 71}, "episode 0: it went on after success, 70 of 71 steps"),
+        ({"steps": 69}, "episode 0: success held first after its 69 steps"),
+        ({"episode": 99}, "episode 99: the protocol has none of this number"),
+        ({"episode": -1}, "episode -1: the protocol has none of this number"),
+    ],
+)
+def test_a_changed_episode_is_found(folder, protocol, values, said):
+    tamper(folder, 0, **values)
+    assert said in problems(read(folder), protocol)
+
+
+def test_a_failure_made_a_success_is_found(folder, protocol):
+    flags = read(folder).outcomes[0].flags | {"success": None}
+    tamper(folder, 0, flags=flags, success=False, failure_stage="placed")
+    assert problems(read(folder), protocol) == []
+    tamper(folder, 0, success=True, failure_stage="")
+    assert len(problems(read(folder), protocol)) == 2
+
+
+def test_the_policys_rate_is_that_of_its_steps(folder, protocol):
+    flags = {"success": None, "reached_any": None}
+    tamper(folder, 0, steps=401, success=False, failure_stage="reached_any", flags=flags)
+    assert problems(read(folder), protocol) == []
+    tamper_run(folder, policy={"name": "mine", "wants": {"rate_hz": 10}})
+    assert "episode 0: 401 steps, 400 are allowed" in problems(read(folder), protocol)
+
+
+def test_missing_episodes_are_counted_even_if_others_take_their_place(folder, protocol):
+    tamper(folder, 0, episode=99)
+    assert "1 of 8 episodes are missing" in problems(read(folder), protocol)
+
+
+def test_another_protocol_or_pack_is_found(folder, protocol):
+    tamper_run(folder, protocol_hash="ef" * 32, pack_hashes={"builtin": "00"})
+    assert [problem.split(":")[0].split(" than")[0] for problem in problems(read(folder), protocol)] == [
+        "it is of another protocol",
+        "it was measured with another pack",
+    ]
+
+
+def test_the_command_fails_where_something_is_wrong(folder, capsys):
+    assert command.main(command.Eval(("verify", str(folder)))) == 0
+    assert "8 episodes of smoke, all well" in capsys.readouterr().out
+    tamper(folder, 3, seed=5)
+    assert command.main(command.Eval(("verify", str(folder)))) == 1
+    assert "episode 3: seed is 5, not 110001" in capsys.readouterr().out
