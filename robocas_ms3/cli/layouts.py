@@ -36,7 +36,7 @@ class Build:
     furniture_pack: str = "builtin"
     """Pack of the furniture: its name, or its folder."""
     seeds: str = "0:100"
-    """First seed, and the one after the last."""
+    """First seed, and the one after the last: 0:100. Each set of --objects also has its own seed's layout."""
     objects: str | None = None
     """Seeds of objects of several envs, 0:4 or 3,7. Default: those of one env."""
     engine: Literal["auto", "cpu", "gpu"] = "auto"
@@ -122,6 +122,9 @@ def build(command: Build) -> int:
     console = Console(highlight=False, soft_wrap=True)
     made = len(pairs) - there - failures
     console.print(f"{made} layouts made, {there} were there already, {failures} seeds have none")
+    if engine is not None and (table := bank.table(engine)) is not None:
+        sets, seeds = table.rows.shape
+        console.print(f"table: {bank.table_path(engine)}, {sets} sets of objects by {seeds} seeds")
     if engine == "gpu":
         console.print(f"objects of {moving} move when the GPU lets go of them: no reset takes these")
     console.print(f"bank: {bank.folder}")

@@ -87,6 +87,14 @@ class SceneEnv(SeededEnv):
         self.task_config = self.SPEC.load_config(config)
         if visual_level not in VISUALS:
             raise ConfigError("no such visual_level", expected=f"one of {list(VISUALS)}", found=visual_level)
+        sees_nothing = kwargs.get("obs_mode") in {None, "none", "state", "state_dict"}
+        if kwargs.get("render_backend") == "none" and not sees_nothing:
+            raise ConfigError(
+                "pictures need a renderer",
+                where="render_backend",
+                found=f'"none", with obs_mode={kwargs["obs_mode"]!r}',
+                fix="Leave render_backend out.",
+            )
         self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack))
         self._visual_level: VisualLevel = visual_level
         self._resets = 0

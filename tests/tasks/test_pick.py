@@ -176,3 +176,8 @@ def test_only_what_moved_is_evaluated_anew(env, monkeypatch):
     base._stages["target_lifted"][:] = True  # what was reached counts too
     assert bool(base.evaluate()["target_lifted"][0])
     assert not flags["target_lifted"]
+
+
+def test_pictures_without_a_renderer_are_refused_in_words():
+    with pytest.raises(ConfigError, match="render_backend: pictures need a renderer.*obs_mode='rgb'"):
+        gym.make("RoboCASPick-v1", obs_mode="rgb", render_backend="none")
