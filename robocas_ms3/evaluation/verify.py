@@ -60,5 +60,5 @@ def _at_odds(outcome: Outcome, protocol: LoadedProtocol) -> Iterator[str]:
         yield f"{', '.join(late)} held first after its {outcome.steps} steps"
     for name in protocol.rules.ends_on:
         step = flags.get(name)
-        if step is not None and step < outcome.steps:
+        if step is not None and 0 < step < outcome.steps:  # what held before the first step ended nothing
             yield f"it went on after {name}, {step} of {outcome.steps} steps"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -39,13 +40,16 @@ class Filmed:
 
 
 def failed_of_each_kind(result: Result, count: int) -> list[int]:
-    """Numbers of failed episodes: of every configuration and failure stage in turn, until there are so many."""
-    groups: dict[tuple[str, str], list[int]] = {}
+    """Numbers of failed episodes: of each configuration in turn, and there of each failure stage in turn."""
+    groups: dict[str, dict[str, list[int]]] = {}
     for outcome in result.outcomes.values():
         if not outcome.success:
-            groups.setdefault((outcome.config, outcome.failure_stage), []).append(outcome.episode)
-    ranked = [(rank, at, number) for at, group in enumerate(groups.values()) for rank, number in enumerate(group)]
-    return sorted(number for _, _, number in sorted(ranked)[:count])
+            groups.setdefault(outcome.config, {}).setdefault(outcome.failure_stage, []).append(outcome.episode)
+    return sorted(_in_turn([_in_turn(list(stages.values())) for stages in groups.values()])[:count])
+
+
+def _in_turn(lists: list[list[int]]) -> list[int]:
+    return [number for row in zip_longest(*lists) for number in row if number is not None]
 
 
 def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]) -> Iterator[Filmed]:

@@ -17,6 +17,7 @@ def test_all_kinds_of_failures_have_their_turn(tmp_path):
     came_to = [0, 0, 0, 3, 7, 3]
     table = [outcome(number, came) for number, came in enumerate(came_to)]
     result = write(tmp_path / "a", [*table, outcome(6, 0, config="heap")])
+    assert failed_of_each_kind(result, 2) == [0, 6]
     assert failed_of_each_kind(result, 3) == [0, 3, 6]
     assert failed_of_each_kind(result, 5) == [0, 1, 3, 5, 6]
     assert failed_of_each_kind(result, 99) == [0, 1, 2, 3, 5, 6]

@@ -93,6 +93,7 @@ def test_it_says_what_it_was_measured_with(result):
 def test_it_leads_nowhere_but_to_its_own_videos(result):
     text = page(result, result.folder)
     assert Reader(text).links == []
+    assert "robocas eval videos" in text
     assert not re.search(r"https?:|//[a-z]|@import|url\(", text)
     (result.folder / "videos").mkdir()
     (result.folder / "videos" / video_name(3)).touch()

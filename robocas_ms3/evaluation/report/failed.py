@@ -51,9 +51,13 @@ def failed_episodes(result: Result, folder: Path | None) -> str:
         *("episode#", "configuration", "seed#", "split", "not come to", "ended by"),
         *("steps#", "s#", "p_vis#", "disturbed#", "error"),
     )
+    linked = any("<a " in row[0] for row in rows)
+    films = (
+        "Numbers that are links lead to videos." if linked else "<code>robocas eval videos</code> films some of them."
+    )
     said = (
         f'<span id="count">{len(failed)}</span> of {len(result.outcomes)} episodes. Ended by: the time they had, a '
-        "failure such as a target on the floor, or an error. A number that is a link leads to a video."
+        "failure such as a target on the floor, or an error. " + films
     )
     return section("Failed episodes", said, f'<form class="filters">{filters}</form>\n' + table(heads, rows, "failed"))
 
