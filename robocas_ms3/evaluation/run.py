@@ -5,25 +5,18 @@ from __future__ import annotations
 import platform
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.policy import CAMERAS, Policy, Start, Wants, describe
+from robocas_ms3.evaluation.policy import Policy, describe
 from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
 from robocas_ms3.evaluation.results import Outcome
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
-from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, control_mode
-from robocas_ms3.tasks.spec import TASKS
-from robocas_ms3.tasks.vector import make_vec
+from robocas_ms3.evaluation.stage import make_env, rate_of, start_of
 from robocas_ms3.tasks.vector.backend import Backend, choose_backend
-
-_UNSEEN = 8  # pixels a side of cameras that nobody asked for, which are rendered all the same
 
 
 @dataclass(frozen=True)
@@ -120,44 +113,10 @@ def about(protocol: LoadedProtocol, policy: Policy, name: str, settings: Setting
 
 
 def _play(protocol: LoadedProtocol, policy: Policy, episodes: list[Episode], settings: Settings) -> Iterator[Outcome]:
-    rules, wants, first = protocol.rules, policy.wants, episodes[0]
-    rate = UPSTREAM_HZ if rules.stepping == "upstream" else rules.rate(wants)
-    files = {"config_file": protocol.config_file(first.config), "layouts_file": protocol.layouts_file(first.config)}
-    starts = [
-        Start(
-            env=-1,
-            episode=one.episode,
-            task=one.task,
-            **{name: str(path) for name, path in files.items()},
-            pack=rules.pack,
-            seed=one.seed,
-            instruction=one.instruction,
-        )
-        for one in episodes
-    ]
-    gpu = choose_backend(settings.backend) == "gpu"
-    torch.set_num_threads(1)
-    env = make_vec(
-        TASKS[first.task].env_id,
-        min(settings.num_envs, len(episodes)),
-        backend=settings.backend,
-        workers=settings.workers,
-        arrays="numpy",
-        auto_reset=False,
-        ignore_terminations=True,
-        record_metrics=False,
-        wrappers=[
-            partial(PolicyStepping, convention=wants.convention, reference=wants.reference, stepping=rules.stepping)
-        ],
-        config=str(files["config_file"]),
-        layouts=str(files["layouts_file"]),
-        pack=rules.pack,
-        control_mode=control_mode(wants.convention),
-        reward_mode="none",
-        sim_config={"control_freq": rate},
-        max_episode_steps=10**9,
-        **_looks(wants),
-    )
+    rules, first = protocol.rules, episodes[0]
+    rate, gpu = rate_of(protocol, policy.wants), choose_backend(settings.backend) == "gpu"
+    count = min(settings.num_envs, len(episodes))
+    env = make_env(protocol, policy.wants, first, count, backend=settings.backend, workers=settings.workers)
     try:
         steps = rules.max_steps or 10**9
         seconds = protocol.max_seconds(first.task)
@@ -165,20 +124,10 @@ def _play(protocol: LoadedProtocol, policy: Policy, episodes: list[Episode], set
             steps = min(steps, round(seconds * rate))
         ends = Rules(steps, tuple(rules.ends_on), rules.max_v0_steps)
         known = {one.episode: one for one in episodes}
-        for played in Rollouts(env, policy, ends, 1 / rate, refill=not gpu).play(starts):
+        for played in Rollouts(env, policy, ends, 1 / rate, refill=not gpu).play(
+            [start_of(protocol, one) for one in episodes]
+        ):
             one = known[played.start.episode]
             yield Outcome.of(played, config=one.config, split=one.split, p_vis=one.p_vis)
     finally:
         env.close()
-
-
-def _looks(wants: Wants) -> dict[str, Any]:
-    """Arguments of an environment that shows what a policy wants to see."""
-    if not wants.cameras:
-        return {"obs_mode": "state_dict", "render_backend": "none"}
-    modes = ["rgb", *(["depth"] if wants.depth else []), *(["state_dict"] if wants.state else [])]
-    sizes = {name: wants.cameras.get(name, (_UNSEEN, _UNSEEN)) for name in CAMERAS}
-    return {
-        "obs_mode": "+".join(modes),
-        "sensor_configs": {name: dict(width=width, height=height) for name, (width, height) in sizes.items()},
-    }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -14,16 +13,13 @@ import torch
 
 from robocas_ms3.datasets.render import require_renderer
 from robocas_ms3.errors import EvaluationError
-from robocas_ms3.evaluation.policy import Policy, Start
+from robocas_ms3.evaluation.policy import Policy
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.failed import VIDEOS, video_name
 from robocas_ms3.evaluation.results import Outcome, Result
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
-from robocas_ms3.evaluation.run import _looks
-from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, control_mode
+from robocas_ms3.evaluation.stage import make_env, rate_of, start_of
 from robocas_ms3.files import make_folder, replacing
-from robocas_ms3.tasks.spec import TASKS
-from robocas_ms3.tasks.vector import make_vec
 
 SIZE = (480, 360)  # pixels
 _FRAMES = 5  # a second of the scene
@@ -76,28 +72,20 @@ def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Seq
 
 def _film(result: Result, protocol: LoadedProtocol, policy: Policy, numbers: list[int]) -> Iterator[Filmed]:
     rules, first = protocol.rules, protocol.episodes[numbers[0]]
-    rate = UPSTREAM_HZ if rules.stepping == "upstream" else rules.rate(policy.wants)
-    torch.set_num_threads(1)
-    env = _Watched(_env(protocol, policy, first.config, TASKS[first.task].env_id, rate), max(1, round(rate / _FRAMES)))
+    rate = rate_of(protocol, policy.wants)
+    size = {"width": SIZE[0], "height": SIZE[1]}
+    watched = {"render_mode": "rgb_array", "human_render_camera_configs": size}
+    made = make_env(protocol, policy.wants, first, 1, backend="processes", **watched)
+    env = _Watched(made, max(1, round(rate / _FRAMES)))
     try:
         for number in numbers:
             episode, before = protocol.episodes[number], result.outcomes[number]
-            start = Start(
-                env=-1,
-                episode=number,
-                task=episode.task,
-                config_file=str(protocol.config_file(episode.config)),
-                layouts_file=str(protocol.layouts_file(episode.config)),
-                pack=rules.pack,
-                seed=episode.seed,
-                instruction=episode.instruction,
-            )
             # as long as it was before, so that this is the same episode whatever ended it
             ends = Rules(before.steps, tuple(rules.ends_on), rules.max_v0_steps)
             path = result.folder / VIDEOS / video_name(number)
             with replacing(path) as tmp, _writer(tmp, rate / env.every * _SPEED) as writer:
                 env.writer = writer
-                (played,) = Rollouts(env, policy, ends, 1 / rate, refill=True).play([start])
+                (played,) = Rollouts(env, policy, ends, 1 / rate, refill=True).play([start_of(protocol, episode)])
             outcome = Outcome.of(played, config=episode.config, split=episode.split, p_vis=episode.p_vis)
             yield Filmed(path, outcome, outcome.without_clock() == before.without_clock())
     finally:
@@ -141,34 +129,6 @@ class _Watched:
 
     def _look(self) -> None:
         self.writer.append_data(torch.as_tensor(self.env.render())[0].cpu().numpy())
-
-
-def _env(protocol: LoadedProtocol, policy: Policy, config: str, env_id: str, rate: int) -> Any:
-    wants, rules = policy.wants, protocol.rules
-    looks = _looks(wants)
-    looks.pop("render_backend", None)
-    return make_vec(
-        env_id,
-        1,
-        backend="processes",
-        arrays="numpy",
-        auto_reset=False,
-        ignore_terminations=True,
-        record_metrics=False,
-        wrappers=[
-            partial(PolicyStepping, convention=wants.convention, reference=wants.reference, stepping=rules.stepping)
-        ],
-        config=str(protocol.config_file(config)),
-        layouts=str(protocol.layouts_file(config)),
-        pack=rules.pack,
-        control_mode=control_mode(wants.convention),
-        reward_mode="none",
-        render_mode="rgb_array",
-        human_render_camera_configs={"width": SIZE[0], "height": SIZE[1]},
-        sim_config={"control_freq": rate},
-        max_episode_steps=10**9,
-        **looks,
-    )
 
 
 def _writer(path: Path, fps: float) -> Any:

@@ -1,0 +1,78 @@
+"""The environment that a protocol's episodes are played in, and the episodes as a policy is told of them."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import torch
+
+from robocas_ms3.evaluation.policy import CAMERAS, Start, Wants
+from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
+from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, control_mode
+from robocas_ms3.tasks.spec import TASKS
+from robocas_ms3.tasks.vector import make_vec
+
+_UNSEEN = 8  # pixels a side of cameras that nobody asked for, which are rendered all the same
+
+
+def rate_of(protocol: LoadedProtocol, wants: Wants) -> int:
+    """Control steps a second."""
+    return UPSTREAM_HZ if protocol.rules.stepping == "upstream" else protocol.rules.rate(wants)
+
+
+def make_env(protocol: LoadedProtocol, wants: Wants, episode: Episode, num_envs: int, **kwargs: Any) -> Any:
+    """Make envs for a configuration's episodes.
+
+    Args:
+        protocol: whose rules they follow.
+        wants: what the policy wants to see, and speaks.
+        episode: any of that configuration.
+        num_envs: how many.
+        kwargs: further ones of `make_vec`.
+    """
+    torch.set_num_threads(1)
+    stepping = protocol.rules.stepping
+    return make_vec(
+        TASKS[episode.task].env_id,
+        num_envs,
+        arrays="numpy",
+        auto_reset=False,
+        ignore_terminations=True,
+        record_metrics=False,
+        wrappers=[partial(PolicyStepping, convention=wants.convention, reference=wants.reference, stepping=stepping)],
+        config=str(protocol.config_file(episode.config)),
+        layouts=str(protocol.layouts_file(episode.config)),
+        pack=protocol.rules.pack,
+        control_mode=control_mode(wants.convention),
+        reward_mode="none",
+        sim_config={"control_freq": rate_of(protocol, wants)},
+        max_episode_steps=10**9,  # the protocol's rules end episodes
+        **{**_looks(wants, renders="render_mode" in kwargs), **kwargs},
+    )
+
+
+def start_of(protocol: LoadedProtocol, episode: Episode) -> Start:
+    """An episode as a policy is told of it; its env is not known yet."""
+    return Start(
+        env=-1,
+        episode=episode.episode,
+        task=episode.task,
+        config_file=str(protocol.config_file(episode.config)),
+        layouts_file=str(protocol.layouts_file(episode.config)),
+        pack=protocol.rules.pack,
+        seed=episode.seed,
+        instruction=episode.instruction,
+    )
+
+
+def _looks(wants: Wants, *, renders: bool) -> dict[str, Any]:
+    """Arguments of an environment that shows what a policy wants to see."""
+    if not wants.cameras:
+        return {"obs_mode": "state_dict", **({} if renders else {"render_backend": "none"})}
+    modes = ["rgb", *(["depth"] if wants.depth else []), *(["state_dict"] if wants.state else [])]
+    sizes = {name: wants.cameras.get(name, (_UNSEEN, _UNSEEN)) for name in CAMERAS}
+    return {
+        "obs_mode": "+".join(modes),
+        "sensor_configs": {name: dict(width=width, height=height) for name, (width, height) in sizes.items()},
+    }
