@@ -30,8 +30,8 @@ class Eval:
     words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Tasks; or one of the words above, and what it is about."""
     policy: str = "scripted"
-    """Of whom: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), random, still, replay:TRAJECTORY.h5, or
-    module:Class of your own."""
+    """Of whom: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), random, still, replay:TRAJECTORY.h5,
+    module:Class of your own, or ws://HOST:PORT, a server's (`robocas serve-policy`)."""
     protocol: str = "ms3-v1"
     """Name of a shipped protocol, or its folder."""
     out: Path | None = None

@@ -1,4 +1,4 @@
-"""Policies by name: ``scripted``, ``scripted-motions``, ``random``, ``still``, ``replay:DATASET``, ``module:Class``."""
+"""Policies by name: builtin ones, ``replay:DATASET``, ``module:Class``, or ``ws://host:port`` of a server."""
 
 from __future__ import annotations
 
@@ -26,18 +26,24 @@ def make_policy(name: str) -> Policy:
     """Make a policy.
 
     Args:
-        name: of a builtin one; ``replay:TRAJECTORY.h5``; or ``module:Class`` of your own, called without arguments.
+        name: of a builtin one; ``replay:TRAJECTORY.h5``; ``module:Class`` of your own, called without arguments;
+            or the address of a server (`remote.address.read_address`).
 
     Raises:
         EvaluationError: there is no such policy.
+        MissingExtraError: it is elsewhere, and the ``remote`` extra is not installed.
     """
     if name in BUILTIN:
         return BUILTIN[name]()
     kind, _, rest = name.partition(":")
+    if kind in ("ws", "wss") and rest:
+        from robocas_ms3.evaluation.remote.client import RemotePolicy
+
+        return RemotePolicy(name)
     if kind == "replay" and rest:
         return ReplayPolicy(Path(rest))
     if not kind or not rest:
-        expected = f"{', '.join(BUILTIN)}, replay:TRAJECTORY.h5 or module:Class"
+        expected = f"{', '.join(BUILTIN)}, replay:TRAJECTORY.h5, module:Class or ws://host:port"
         raise EvaluationError("no such policy", where=name, expected=expected)
     try:
         made: Any = getattr(importlib.import_module(kind), rest)
