@@ -17,7 +17,7 @@ class ServePolicy:
     """
 
     policy: Annotated[str, tyro.conf.Positional]
-    """scripted, random, still, replay:TRAJECTORY.h5, or module:Class of your own."""
+    """As robocas eval has it: scripted, random, still, replay:TRAJECTORY.h5, or module:Class of your own."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0: all of this machine's."""
     port: int = 8000
@@ -28,15 +28,15 @@ def main(cfg: ServePolicy) -> int:
     """Run the command; gives the exit code."""
     from robocas_ms3.cli.bars import say
     from robocas_ms3.errors import EvaluationError
-    from robocas_ms3.evaluation.policies import make_policy
+    from robocas_ms3.evaluation.policies import open_policy
     from robocas_ms3.evaluation.remote.server import PolicyServer
 
     if not 0 <= cfg.port < 2**16:
         raise EvaluationError("no such port", where="--port", expected="0 to 65535", found=cfg.port)
-    server = PolicyServer(make_policy(cfg.policy), cfg.host, cfg.port)
     if not _is_loopback(cfg.host):
         say(f"{cfg.host} is no loopback address: whoever can reach it can ask this policy")
-    server.run(lambda url: say(f"{cfg.policy} at {url}"))
+    with open_policy(cfg.policy) as policy:
+        PolicyServer(policy, cfg.host, cfg.port).run(lambda url: say(f"{cfg.policy} at {url}"))
     return 0
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,3 +51,15 @@ def make_policy(name: str) -> Policy:
     except (ImportError, AttributeError) as error:
         raise EvaluationError("no such policy", where=name, found=error) from error
     return made()
+
+
+@contextmanager
+def open_policy(name: str) -> Iterator[Policy]:
+    """Make a policy, and close it in the end if it can be closed."""
+    policy = make_policy(name)
+    try:
+        yield policy
+    finally:
+        close = getattr(policy, "close", None)
+        if close is not None:
+            close()

@@ -89,10 +89,10 @@ class RemotePolicy:
 
     def close(self) -> None:
         """Hang up."""
-        for env in list(self._links):
-            self._hang_up(env)
-        while self._spare:
-            self._spare.pop().close()
+        for link in [*self._spare, *self._links.values()]:
+            link.close(wait_s=1)
+        self._spare.clear()
+        self._links.clear()
 
     def _chunk(self, env: int, observations: Observations, row: int) -> NDArray[np.float32]:
         start = self._starts.pop(env, None)

@@ -6,7 +6,7 @@ import asyncio
 import threading
 import time
 from collections.abc import Coroutine
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from functools import cache
 from typing import Any
 
@@ -77,9 +77,11 @@ class Link:
         except _BROKEN as error:
             raise LinkBroken(f"the connection is lost: {_words(error)}", gone=True) from error
 
-    def close(self) -> None:
-        """Hang up; who is at the other end may not even notice."""
-        _later(self._socket.close())
+    def close(self, wait_s: float = 0.0) -> None:
+        """Hang up, and wait a while for the other end to notice; it may not."""
+        closing = _later(self._socket.close())
+        if wait_s:
+            wait([closing], wait_s)
 
     async def _exchange(self, data: bytes) -> str | bytes:
         await self._socket.send(data)
