@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 
 class RobocasError(Exception):
     """Base of all errors this package raises on purpose; the command line prints them in one line.
@@ -62,6 +65,24 @@ class WorkerDied(VectorEnvError):
 
 class EvaluationError(RobocasError):
     """A protocol, policy, result or figure of an evaluation is not what it should be."""
+
+
+class WireError(EvaluationError):
+    """A message to or from a remote policy can't be written or read."""
+
+
+class PolicyFailed(EvaluationError):
+    """A policy could not act in some envs: their episodes end there, those of others go on.
+
+    Args:
+        reasons: why, by number of env.
+        actions: (E, A) or (E, H, A) as `Policy.act` gives them, for all envs it was asked about; rows of those that
+            failed are not looked at. None: all failed.
+    """
+
+    def __init__(self, reasons: Mapping[int, str], actions: Any = None) -> None:
+        self.reasons, self.actions = dict(reasons), actions
+        super().__init__("a policy failed", found="; ".join(f"env {env}: {why}" for env, why in reasons.items()))
 
 
 class PlanningFailed(RobocasError):

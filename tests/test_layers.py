@@ -41,6 +41,7 @@ SIMULATOR_FREE = (
     "datasets.schema",
     "evaluation.statistics",
     "evaluation.power",
+    "evaluation.remote",
     "planning.protocol",
     "language",
 )

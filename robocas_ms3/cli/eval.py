@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -30,8 +31,8 @@ class Eval:
     words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Tasks; or one of the words above, and what it is about."""
     policy: str = "scripted"
-    """Of whom: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), random, still, replay:TRAJECTORY.h5, or
-    module:Class of your own."""
+    """Of whom: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), random, still, replay:TRAJECTORY.h5,
+    module:Class of your own, or ws://HOST:PORT, a server's (`robocas serve-policy`)."""
     protocol: str = "ms3-v1"
     """Name of a shipped protocol, or its folder."""
     out: Path | None = None
@@ -84,7 +85,7 @@ def run(cfg: Eval) -> int:
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.demos.checks import check_number
     from robocas_ms3.errors import EvaluationError
-    from robocas_ms3.evaluation.policies import make_policy
+    from robocas_ms3.evaluation.policies import open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.run import Settings, evaluate
@@ -96,11 +97,10 @@ def run(cfg: Eval) -> int:
             raise EvaluationError("no such task", where=word, expected=expected)
     check_number("envs", cfg.envs, 1)
     protocol = load_protocol(cfg.protocol)
-    policy = make_policy(cfg.policy)
-    out = cfg.out or Path("eval") / protocol.rules.name / cfg.policy.replace(":", "_").replace("/", "_")
+    out = cfg.out or Path("eval") / protocol.rules.name / re.sub(r"[^\w.-]+", "_", cfg.policy)
     settings = Settings(cfg.envs, cfg.backend, cfg.workers, shard_of(cfg.shard), cfg.words, cfg.episodes)
     succeeded = played = 0
-    with bar("episodes") as shown:
+    with open_policy(cfg.policy) as policy, bar("episodes") as shown:
         for outcome, left in evaluate(protocol, policy, cfg.policy, out, settings, resume=cfg.resume):
             played += 1
             succeeded += outcome.success

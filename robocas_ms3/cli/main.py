@@ -38,6 +38,7 @@ COMMANDS = (
     "assets",
     "layouts",
     "eval",
+    "serve-policy",
 )
 DESCRIPTION = (
     "RoboCAS for ManiSkill3: demonstrations and datasets of manipulation in complex object arrangements. "

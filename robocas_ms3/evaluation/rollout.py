@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Observations, Policy, Start
 from robocas_ms3.language.embed import TextEmbedder
@@ -109,6 +109,12 @@ class Rollouts:
 
     def _step(self) -> Iterator[Played]:
         self._ask()
+        for env, played in list(self._playing.items()):
+            if played.error:
+                del self._playing[env]
+                yield played
+        if not self._playing:
+            return
         actions = np.zeros((self._count, self._size), np.float32)  # of envs that are done; nobody looks
         for env in self._playing:
             actions[env] = self._chunks[env].pop(0)
@@ -127,7 +133,15 @@ class Rollouts:
             return
         seen = self._observed(envs)
         begun = time.perf_counter()
-        actions = np.asarray(self._policy.act(seen), np.float32)
+        try:
+            acted: Any = self._policy.act(seen)
+        except PolicyFailed as failed:
+            acted = failed.actions
+            for env in envs if acted is None else failed.reasons:
+                self._playing[env].error = failed.reasons.get(env, str(failed))
+            if acted is None:
+                return
+        actions = np.asarray(acted, np.float32)
         spent = (time.perf_counter() - begun) / len(envs)
         chunks = actions[:, None] if actions.ndim == 2 else actions
         if chunks.ndim != 3 or chunks.shape[0] != len(envs) or chunks.shape[1] < 1 or chunks.shape[2] != self._size:

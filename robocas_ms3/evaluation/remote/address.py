@@ -1,0 +1,104 @@
+"""Addresses of remote policies: ``ws://host:port``, and after a ``?`` what an openpi server can't say of itself."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import parse_qsl, urlsplit, urlunsplit
+
+from robocas_ms3.errors import EvaluationError
+
+SCHEMES = ("ws", "wss")
+_FLAGS = {"0": False, "1": True}
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a remote policy is, and how to talk to it.
+
+    Attributes:
+        url: without options.
+        wants: what the policy wants, as its metadata would say; empty: its metadata do.
+        rename: other keys of an observation, by name: of a camera, ``qpos``, ``prompt``, ...
+        play: of a chunk, how many actions are played before the server is asked again; None: all.
+        timeout_s: clock time an answer may take.
+        connect_s: clock time in which a server has to be there, from an episode's begin on.
+    """
+
+    url: str
+    wants: dict[str, Any] = field(default_factory=dict)
+    rename: dict[str, str] = field(default_factory=dict)
+    play: int | None = None
+    timeout_s: float = 120.0
+    connect_s: float = 30.0
+
+
+def read_address(text: str) -> Address:
+    """Read an address with its options.
+
+    ``convention``, ``reference``, ``rate_hz``, ``language``, ``depth=1``, ``state=1`` and
+    ``cameras=base_camera:224x224,gripper_camera:224x224`` (width x height) are what a policy wants;
+    ``rename=base_camera:observation/image,qpos:observation/state``, ``play=5``, ``timeout_s`` and ``connect_s`` are the
+    client's.
+
+    Raises:
+        EvaluationError: it is no address, or has an option that is none.
+    """
+    parts = urlsplit(text)
+    try:
+        port_or_none = parts.port
+    except ValueError:
+        port_or_none = -1
+    if parts.scheme not in SCHEMES or not parts.hostname or port_or_none == -1:
+        raise EvaluationError("no address of a policy", where=text, expected="ws://host:port")
+    wants: dict[str, Any] = {}
+    options: dict[str, Any] = {}
+    for name, value in parse_qsl(parts.query, keep_blank_values=True):
+        if name in ("convention", "reference", "language"):
+            wants[name] = value
+        elif name == "rate_hz":
+            wants[name] = _number(name, value)
+        elif name in ("depth", "state") and value in _FLAGS:
+            wants[name] = _FLAGS[value]
+        elif name == "cameras":
+            wants[name] = {camera: _size(name, size) for camera, size in _pairs(name, value).items()}
+        elif name == "rename":
+            options[name] = _pairs(name, value)
+        elif name == "play" and value.isdecimal() and int(value) > 0:
+            options[name] = int(value)
+        elif name in ("timeout_s", "connect_s"):
+            options[name] = _number(name, value)
+        else:
+            raise EvaluationError("no such option of an address", where=f"{name}={value}", fix=_HELP)
+    return Address(urlunsplit((parts.scheme, parts.netloc, parts.path, "", "")), wants, **options)
+
+
+_HELP = (
+    "There are convention, reference, language, rate_hz, depth=1, state=1, cameras=NAME:WxH,..., "
+    "rename=NAME:KEY,..., play=N, timeout_s and connect_s."
+)
+
+
+def _pairs(name: str, text: str) -> dict[str, str]:
+    pairs = [pair.partition(":") for pair in text.split(",")]
+    if not all(key and value for key, _, value in pairs):
+        raise EvaluationError("no list of pairs", where=name, expected="A:B,C:D", found=text)
+    return {key: value for key, _, value in pairs}
+
+
+def _size(name: str, text: str) -> list[int]:
+    sides = text.split("x")
+    if len(sides) != 2 or not all(side.isdecimal() for side in sides):
+        raise EvaluationError("no size of pictures", where=name, expected="WIDTHxHEIGHT", found=text)
+    return [int(side) for side in sides]
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise EvaluationError("no number above 0", where=name, found=text)
+    return number

@@ -1,0 +1,118 @@
+"""A fake observation, servers in threads that are over with their test, and a vector environment without physics."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from robocas_ms3.evaluation.policy import Observations, Start, Wants
+
+CAMERA = (6, 4)  # width, height
+
+
+def a_start(env: int = 0, episode: int = 3, seed: int = 7) -> Start:
+    return Start(env, episode, "pick", "a.yaml", "a.npy", "builtin", seed, "take the apple")
+
+
+def some_observations(*envs: int, seed: int = 0, cameras: bool = False) -> Observations:
+    rng, count = np.random.default_rng(seed), len(envs)
+    width, height = CAMERA
+    shape = (count, height, width)
+    return Observations(
+        envs=np.array(envs),
+        instructions=["take the apple"] * count,
+        embeddings=None,
+        images={"base_camera": rng.integers(0, 256, (*shape, 3), np.uint8)} if cameras else {},
+        depths={"base_camera": rng.integers(0, 999, (*shape, 1), np.int16)} if cameras else {},
+        qpos=rng.normal(size=(count, 12)).astype(np.float32),
+        tcp_in_base=rng.normal(size=(count, 7)).astype(np.float32),
+        gripper_width=rng.normal(size=(count, 1)).astype(np.float32),
+        state=rng.normal(size=(count, 9)).astype(np.float32) if cameras else None,
+    )
+
+
+class Told:
+    """A policy that keeps what it is told, and acts by what it sees."""
+
+    def __init__(self, wants: Wants | None = None, chunk: int = 3) -> None:
+        self.wants = wants or Wants()
+        self.chunk = chunk
+        self.starts: list[Start] = []
+        self.seen: list[Observations] = []
+
+    def reset(self, starts: list[Start]) -> None:
+        self.starts += starts
+
+    def act(self, observations: Observations) -> np.ndarray:
+        self.seen.append(observations)
+        return np.repeat(observations.tcp_in_base[:, None, :7].astype(float), self.chunk, axis=1)
+
+
+@contextmanager
+def serving(policy: Any, port: int = 0) -> Iterator[str]:
+    """Serve a policy of ours; gives the address."""
+    from robocas_ms3.evaluation.remote.server import PolicyServer
+
+    server, addresses, ready = PolicyServer(policy, port=port), [], threading.Event()
+
+    def listening(url: str) -> None:
+        addresses.append(url)
+        ready.set()
+
+    thread = threading.Thread(target=server.run, args=(listening,), daemon=True)
+    thread.start()
+    assert ready.wait(20)
+    try:
+        yield addresses[0]
+    finally:
+        server.stop()
+        thread.join(20)
+
+
+@contextmanager
+def talking(talk: Callable[[Any], None], port: int = 0) -> Iterator[str]:
+    """A server that does anything; gives the address."""
+    from websockets.sync.server import serve
+
+    with serve(talk, "127.0.0.1", port, compression=None, max_size=None, close_timeout=0.1) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        finally:
+            server.shutdown()
+
+
+class StandIn:
+    """A vector environment in which an episode succeeds after so many steps."""
+
+    def __init__(self, num_envs: int, steps: int = 4) -> None:
+        self.num_envs, self._needed = num_envs, steps
+        self._steps = np.zeros(num_envs, int)
+
+    def reset(self, seed: Any, options: dict[str, Any]) -> tuple[dict, dict]:
+        self._steps[options["env_idx"]] = 0
+        return self._now()
+
+    def step(self, actions: np.ndarray) -> tuple[dict, None, None, None, dict]:
+        self._steps += 1
+        obs, info = self._now()
+        return obs, None, None, None, info
+
+    def _now(self) -> tuple[dict, dict]:
+        count = self.num_envs
+        agent = {
+            "qpos": np.zeros((count, 12)),
+            "tcp_in_arm_base": np.ones((count, 7)),
+            "gripper_width": np.ones((count, 1)),
+        }
+        zeros = {name: np.zeros(count) for name in ("path_length", "contact_impulse", "disturbed_most", "fallen")}
+        info = {"success": self._steps >= self._needed, "elapsed_steps": self._steps.copy(), **zeros}
+        return {"agent": agent, "extra": {}}, info
+
+
+IN_A_HURRY = "timeout_s=0.5&connect_s=0.5"  # options of an address: as long as a test can wait

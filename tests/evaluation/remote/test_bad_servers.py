@@ -1,0 +1,200 @@
+"""Servers that are not what they should be: an episode fails, with a reason, and the run goes on."""
+
+import socket as sockets
+import threading
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("websockets")
+pytest.importorskip("msgpack")
+
+from remote_ends import IN_A_HURRY, StandIn, Told, a_start, serving, some_observations, talking
+
+from robocas_ms3.errors import EvaluationError, PolicyFailed
+from robocas_ms3.evaluation.remote.client import RemotePolicy
+from robocas_ms3.evaluation.remote.link import MAX_REPLY
+from robocas_ms3.evaluation.remote.wire import pack
+from robocas_ms3.evaluation.results import Outcome
+from robocas_ms3.evaluation.rollout import Rollouts, Rules
+
+GOOD = pack({"actions": np.zeros((1, 7))})
+
+
+def answering(reply):
+    """A server with this answer; a callable does what it likes with the connection."""
+
+    def talk(socket):
+        socket.send(pack({}))
+        for _ in socket:
+            if callable(reply):
+                reply(socket)
+            else:
+                socket.send(reply)
+
+    return talking(talk)
+
+
+@pytest.mark.parametrize(
+    ("reply", "reason"),
+    [
+        ("Traceback (most recent call last):\n  ...\nValueError: no cuda\n", "server failed: ValueError: no cuda"),
+        (b"\xc1garbage", "garbage"),
+        (b"", "garbage"),
+        (pack(7), "no actions"),
+        (pack({}), "no actions"),
+        (pack({"actions": None}), "no actions"),
+        (pack({"actions": "up"}), "no actions"),
+        (pack({"actions": [[1.0], [1.0, 2.0]]}), "no actions"),
+        (pack({"actions": np.zeros((1, 8))}), r"expected \(chunk, 7\) numbers, found \(1, 8\)"),
+        (pack({"actions": np.zeros((0, 7))}), "no actions"),
+        (pack({"actions": np.zeros((1, 2, 7))}), "no actions"),
+        (pack({"actions": np.full((1, 7), np.nan)}), "beyond all measure"),
+        (pack({"actions": np.full((1, 7), 1e30)}), "beyond all measure"),
+        (pack({"x": bytes(MAX_REPLY)}), "connection is lost"),
+        (lambda socket: time.sleep(1), "no answer within 0.5 s"),
+        (lambda socket: socket.close(), "connection is lost"),
+        (lambda socket: socket.socket.shutdown(sockets.SHUT_RDWR), "connection is lost"),
+    ],
+    ids=range(17),
+)
+def test_a_bad_answer_fails_the_episode(reply, reason):
+    with answering(reply) as url:
+        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
+        remote.reset([a_start(0)])
+        begun = time.monotonic()
+        with pytest.raises(PolicyFailed, match=reason):
+            remote.act(some_observations(0))
+        assert time.monotonic() - begun < 5
+
+
+@pytest.mark.parametrize(
+    "talk",
+    [
+        lambda socket: socket.send("Traceback: no"),
+        lambda socket: socket.send(b"\xc1"),
+        lambda socket: socket.send(pack({"robocas_wants": {"convention": "telepathy"}})),
+        lambda socket: socket.send(pack({"robocas_wants": {"cameras": {"base_camera": [0, 10**9]}}})),
+        lambda socket: socket.send(pack({"robocas_wants": {"rate_hz": float("nan")}})),
+        lambda socket: socket.send(pack({"robocas_wants": {"depth": 1}})),
+        lambda socket: socket.send(pack({"robocas_wants": {"more": 1}})),
+        lambda socket: socket.send(pack({"robocas_wants": np.zeros(3)})),
+        lambda socket: time.sleep(1),
+        lambda socket: socket.close(),
+    ],
+    ids=range(10),
+)
+def test_bad_metadata_are_an_error_before_anything_is_played(talk):
+    with talking(talk) as url, pytest.raises(EvaluationError):
+        RemotePolicy(f"{url}?{IN_A_HURRY}")
+
+
+@pytest.mark.parametrize("said", [b"SSH-2.0-OpenSSH_9.6\r\n", b"HTTP/1.1 200 OK\r\n\r\nhello", b"\x00" * 99999, b""])
+def test_something_else_listens(said):
+    with sockets.create_server(("127.0.0.1", 0)) as server:
+
+        def talk():
+            while True:
+                try:
+                    client, _ = server.accept()
+                except OSError:
+                    return
+                client.sendall(said)
+                client.close()
+
+        threading.Thread(target=talk, daemon=True).start()
+        with pytest.raises(EvaluationError, match="no server at"):
+            RemotePolicy(f"ws://127.0.0.1:{server.getsockname()[1]}?{IN_A_HURRY}")
+        server.shutdown(sockets.SHUT_RDWR)
+
+
+def test_a_server_that_does_not_read_is_not_waited_for():
+    def talk(socket):
+        socket.send(pack({}))
+        time.sleep(2)
+
+    with talking(talk) as url:
+        remote = RemotePolicy(f"{url}?timeout_s=0.5&cameras=base_camera:6x4")
+        remote.reset([a_start(0)])
+        seen = some_observations(0)
+        seen.images["base_camera"] = np.zeros((1, 4096, 4096, 3), np.uint8)  # more than a socket holds
+        with pytest.raises(PolicyFailed, match="no answer within"):
+            remote.act(seen)
+
+
+def test_the_next_episode_finds_a_server_that_came_back():
+    with serving(Told()) as url:
+        port = int(url.rpartition(":")[2])
+        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
+        remote.reset([a_start(0)])
+        remote.act(some_observations(0))
+    with pytest.raises(PolicyFailed, match="connection is lost"):
+        remote.act(some_observations(0))
+    remote.reset([a_start(0)])
+    with pytest.raises(PolicyFailed, match="no server at"):
+        remote.act(some_observations(0))
+    policy = Told()
+    with serving(policy, port):
+        remote.reset([a_start(0, episode=9)])
+        remote.act(some_observations(0))
+        assert policy.starts == [a_start(0, episode=9)]
+
+
+def test_another_policy_in_its_place_is_noticed():
+    from robocas_ms3.evaluation.policy import Wants
+
+    with serving(Told()) as url:
+        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
+    with serving(Told(Wants(convention="delta_euler")), int(url.rpartition(":")[2])):
+        remote.reset([a_start(0)])
+        with pytest.raises(PolicyFailed, match="another policy"):
+            remote.act(some_observations(0))
+
+
+class Stumbling(Told):
+    """Raises in every third episode."""
+
+    def act(self, observations):
+        if self.starts[-1].episode % 3 == 2:
+            raise RuntimeError("out of memory")
+        return super().act(observations)
+
+
+def play(policy, count=7, envs=2):
+    rules = Rules(max_steps=10)
+    starts = [a_start(-1, episode=number) for number in range(count)]
+    return {one.start.episode: one for one in Rollouts(StandIn(envs), policy, rules, 0.05, refill=True).play(starts)}
+
+
+def test_a_run_goes_on_where_a_policy_fails():
+    with serving(Stumbling()) as url:
+        played = play(RemotePolicy(url), envs=1)
+    assert sorted(played) == list(range(7))
+    assert {number for number, one in played.items() if one.error} == {2, 5}
+    assert played[2].error == "the server failed: RuntimeError: out of memory"
+    assert [one.steps for one in played.values()] == [4, 4, 0, 4, 4, 0, 4]
+    outcome = Outcome.of(played[2], config="x", split="test", p_vis=None)
+    assert (outcome.failure_stage, outcome.error, outcome.success) == ("error", played[2].error, False)
+
+
+def test_a_run_ends_where_the_server_is_dead():
+    with serving(Told()) as url:
+        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
+    played = play(remote, count=3)
+    assert all("no server at" in one.error for one in played.values())
+
+
+class Hopeless(Told):
+    def act(self, observations):
+        failed = [env for env in observations.envs.tolist() if env == 0]
+        if failed:
+            raise PolicyFailed({0: "zero"}, super().act(observations) if len(observations.envs) > 1 else None)
+        return super().act(observations)
+
+
+def test_others_act_where_one_fails():
+    played = play(Hopeless(), count=5, envs=2)
+    assert len(played) == 5
+    assert {one.error for one in played.values() if one.start.env == 0} == {"zero"}
+    assert {one.steps for one in played.values() if one.start.env == 1} == {4}
