@@ -43,6 +43,7 @@ EXTRAS = {  # files that may import what an extra brings
     "robocas_ms3/viewer/lerobot.py": "lerobot",
     "robocas_ms3/datasets/stats_plots.py": "plots",
     "robocas_ms3/evaluation/remote/": "remote",
+    "robocas_ms3/evaluation/report/columns.py": "lerobot",
     "asset_tools/": "assets",
 }
 
