@@ -116,13 +116,12 @@ def test_layouts_are_settled_and_as_their_kind_says(env, seed):
 
 
 def test_visual_modes_hold_nothing_only_a_simulator_knows(monkeypatch):
+    from mani_skill.envs.utils.observations import parse_obs_mode_to_struct
+
     from robocas_ms3.tasks.pick import RoboCASPickEnv
 
-    class Mode:
-        state = False
-
     env = RoboCASPickEnv.__new__(RoboCASPickEnv)
-    env.obs_mode_struct, env._obs_mode = Mode(), "rgb+depth"
+    env.obs_mode_struct, env._obs_mode = parse_obs_mode_to_struct("rgb+depth"), "rgb+depth"
     monkeypatch.setattr(RoboCASPickEnv, "_tcp", lambda env: np.zeros((1, 7), np.float32))
     assert list(env._get_obs_extra({})) == ["tcp_pose"]
 
