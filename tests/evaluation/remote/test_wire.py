@@ -63,7 +63,7 @@ def test_openpi_reads_what_we_write_and_we_what_it_writes(array):
         object(),
         2**70,
     ],
-    ids=str,
+    ids=lambda value: type(value).__name__,
 )
 def test_what_can_not_be_sent(value):
     with pytest.raises(WireError, match="can't be sent"):
