@@ -180,15 +180,15 @@ def _make(jobs: list[Job], command: _Making, name: str, what: str) -> int:
 
 def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, record: bool = True) -> int:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress
 
     from asset_tools.pipeline import Made, write_pack
     from robocas_ms3.cli.assets_show import Info, info
+    from robocas_ms3.cli.bars import columns
     from robocas_ms3.paths import cache_dir
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     console = Console(highlight=False, soft_wrap=True)
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with Progress(*columns(), console=Console(stderr=True)) as progress:
         bar = progress.add_task(out.name, total=len(jobs))
 
         def on_made(made: Made) -> None:

@@ -40,15 +40,27 @@ class Bar:
         self.advance()
 
 
+def columns() -> tuple[Any, ...]:
+    """Columns of a bar: of what, how many, how long it has taken and will take."""
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    return (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+
+
 @contextmanager
 def bar(description: str, *, transient: bool = False) -> Iterator[Bar]:
     """Yield a bar, and end it; a transient one goes when it is done."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     console = Console(stderr=True)
-    progress = Progress(*columns, console=console, transient=transient, disable=not console.is_interactive)
+    progress = Progress(*columns(), console=console, transient=transient, disable=not console.is_interactive)
     try:
         yield Bar(progress, description)
     finally:

@@ -56,15 +56,9 @@ class Generate:
 def main(cfg: Generate) -> int:
     """Run the command."""
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import Progress
 
+    from robocas_ms3.cli.bars import columns
     from robocas_ms3.config import load_task_config, shipped_configs
     from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, recordable_config
     from robocas_ms3.demos.generate import generate
@@ -88,14 +82,7 @@ def main(cfg: Generate) -> int:
         cfg.noisy_failures,
         *cfg.noise,
     )
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    progress = Progress(*columns, console=Console(stderr=True))  # shown once there is something to do
+    progress = Progress(*columns(), console=Console(stderr=True))  # shown once there is something to do
 
     def on_start() -> None:
         progress.add_task(f"{cfg.task}: recording", total=cfg.episodes)

@@ -71,16 +71,10 @@ def main(cfg: Layouts) -> int:
 def build(command: Build) -> int:
     """Run ``build``."""
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import Progress
 
     from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.cli.bars import columns
     from robocas_ms3.config import load_task_config
     from robocas_ms3.demos.checks import check_number
     from robocas_ms3.scenes.bank import LayoutBank
@@ -98,14 +92,7 @@ def build(command: Build) -> int:
     engine = choose_engine(command.engine) if objects is not None else None
     there = len(pairs) - len(bank.missing(pairs))
     failures = moving = 0
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with Progress(*columns(), console=Console(stderr=True)) as progress:
         bar = progress.add_task("layouts", total=len(pairs), completed=there)
         for (chosen, seed), problem in fill(bank, pairs, command.jobs or os.cpu_count() or 1):
             progress.advance(bar)
