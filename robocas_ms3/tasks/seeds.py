@@ -127,12 +127,15 @@ class SeededEnv(BaseEnv):
             elif seed is not None and np.ndim(seed) == 0:
                 self._asked_for = set(list(envs)[:1])
                 seed = following_seeds(int(np.asarray(seed)), len(envs), within)  # ManiSkill's own would lie outside
-            before = self._layout_seeds.copy(), dict(self._found)
-            try:
-                return super().reset(seed, options)
-            except LayoutError:  # the envs are where they were
-                self._layout_seeds[:], self._found = before
-                raise
+        before = self._layout_seeds.copy(), dict(self._found)
+        try:
+            return super().reset(seed, options) if self.num_envs > 1 else self._reset_one(seed, options)
+        except LayoutError:  # the envs are where they were
+            self._layout_seeds[:], self._found = before
+            raise
+
+    def _reset_one(self, seed: int | list[int] | None, options: dict | None) -> tuple[Any, dict]:
+        """Reset the only env; without a seed, one without a layout gives way to another."""
         for _ in range(self._other_seeds):
             try:
                 return super().reset(seed, options)

@@ -1,0 +1,48 @@
+"""Several envs of a GPU's batch, without a simulator."""
+
+from typing import NamedTuple
+from unittest.mock import Mock
+
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+
+from robocas_ms3.tasks import RoboCASPickEnv
+
+
+def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEnv, list]:
+    """An environment of several envs, made as `gym.make` does, but for the simulator; and the layouts it asked for."""
+    asked = []
+
+    def resets(env, seed=None, options=None):
+        index = torch.as_tensor((options or {}).get("env_idx", range(num_envs)))
+        env._set_episode_rng(seed, index)
+        if (options or {}).get("reconfigure"):
+            env._choose_objects()
+            env._set_episode_rng(env._episode_seed, index)
+        env._found.clear()
+        env.layouts = [env.layout(i) for i in index.tolist()]
+        asked.append([(int(env._objects_seeds[i]), int(env._layout_seeds[i])) for i in index])
+        return {}, {}
+
+    def makes(env, *args, num_envs, **rest):
+        env.num_envs, env._enhanced_determinism, env._batched_rng_backend = num_envs, False, "numpy:random_state"
+        env._episode_seed, env._batched_episode_rng = None, None
+        env.reset([2022 + i for i in range(num_envs)], {"reconfigure": True})  # as ManiSkill does
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(BaseEnv, "_sim_device", Mock(is_cuda=lambda: True), raising=False)
+    monkeypatch.setattr(BaseEnv, "device", torch.device("cpu"), raising=False)
+    monkeypatch.setattr(BaseEnv, "__init__", makes)
+    monkeypatch.setattr(BaseEnv, "reset", resets)
+    return RoboCASPickEnv(num_envs=num_envs, layouts=folder, **arguments), asked
+
+
+class Thing(NamedTuple):
+    """What stands for a layout."""
+
+    objects: int
+    seed: int
+
+    @property
+    def object_ids(self) -> tuple[str, ...]:
+        return (f"thing {self.objects}",)
