@@ -76,7 +76,7 @@ def main(cfg: Eval) -> int:
     if first == "merge":
         return merge(about, cfg.out, cfg.protocol)
     if first == "videos":
-        return videos(_one(about, first), cfg.protocol, cfg.count)
+        return videos(_one(about, first), cfg.protocol, cfg.policy, cfg.count)
     return report(about, cfg.out, cfg.protocol) if first == "report" else verify(about, cfg.protocol)
 
 
@@ -101,10 +101,13 @@ def run(cfg: Eval) -> int:
     settings = Settings(cfg.envs, cfg.backend, cfg.workers, shard_of(cfg.shard), cfg.words, cfg.episodes)
     succeeded = played = 0
     with open_policy(cfg.policy) as policy, bar("episodes") as shown:
-        for outcome, left in evaluate(protocol, policy, cfg.policy, out, settings, resume=cfg.resume):
-            played += 1
-            succeeded += outcome.success
-            shown.at(played, played + left)
+        try:
+            for outcome, left in evaluate(protocol, policy, cfg.policy, out, settings, resume=cfg.resume):
+                played += 1
+                succeeded += outcome.success
+                shown.at(played, played + left)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("the same command with --resume goes on") from None
     result = read(out)
     say(f"{played} episodes played, {succeeded} succeeded; {out}: {len(result.outcomes)} episodes")
     _write(result, out, cfg.protocol)
@@ -171,11 +174,16 @@ def verify(folders: list[Path], protocol: str) -> int:
     return 1 if found else 0
 
 
-def videos(folder: Path, protocol: str, count: int) -> int:
-    """Film failed episodes, and link the videos in the page."""
+def videos(folder: Path, protocol: str, policy: str, count: int) -> int:
+    """Film failed episodes, and link the videos in the page.
+
+    Raises:
+        EvaluationError: it is of a policy that is not builtin, and was not named again: a file chooses no code.
+    """
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.demos.checks import check_number
-    from robocas_ms3.evaluation.policies import make_policy
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.evaluation.policies import BUILTIN, open_policy
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.videos import failed_of_each_kind, film
 
@@ -183,9 +191,12 @@ def videos(folder: Path, protocol: str, count: int) -> int:
     result = read(folder)
     loaded = _protocol_of(result, protocol)
     numbers = failed_of_each_kind(result, count)
-    policy = make_policy(result.run["policy"]["name"])
-    with bar("videos") as shown:
-        for done, filmed in enumerate(film(result, loaded, policy, numbers), start=1):
+    name = str(result.run["policy"]["name"])
+    if name not in BUILTIN and policy != name:
+        fix = f"Name it yourself, if you trust it: --policy {name}"
+        raise EvaluationError("this result is of a policy of somebody's own", where=folder, found=name, fix=fix)
+    with open_policy(name) as played, bar("videos") as shown:
+        for done, filmed in enumerate(film(result, loaded, played, numbers), start=1):
             say(str(filmed.path) + ("" if filmed.same else ": this time it came out differently"))
             shown.at(done, len(numbers))
     if not numbers:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from robocas_ms3.config.load import nearest
 from robocas_ms3.config.task import StrictModel
@@ -29,7 +29,9 @@ from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.paths import protocols_dir
+from robocas_ms3.tasks.spec import TASKS
 
+DEFAULT_HZ = 20  # where neither protocol nor policy says
 RULES, EPISODES, CONFIGS, LAYOUTS = "protocol.yaml", "episodes.jsonl", "configs", "layouts"
 
 
@@ -52,12 +54,31 @@ class Protocol(StrictModel):
     references: list[Literal["tcp", "target"]] = Field(
         default=["tcp", "target"], description="that its motions may be relative to"
     )
-    ends_on: list[str] = Field(default=["success", "fail"], description="flags at which an episode ends")
+    ends_on: list[Literal["success", "fail", "success_v0"]] = Field(
+        default=["success", "fail"], description="flags at which an episode ends"
+    )
     max_v0_steps: Annotated[int, Field(ge=1)] | None = Field(
         default=None, description="it also ends when upstream's success has held after so many actions"
     )
     pack: str = Field(default="builtin", description="object pack")
     pack_hash: str = Field(description="sha256 of its manifest")
+
+    @model_validator(mode="after")
+    def _known(self) -> Protocol:
+        named = (("conventions", self.conventions, CONVENTIONS), ("max_seconds", self.max_seconds, TASKS))
+        for key, found, known in named:
+            unknown = sorted(set(found) - set(known))
+            if unknown:
+                raise ValueError(f"{key}: expected some of {', '.join(known)}, found {', '.join(unknown)}")
+        if self.stepping == "upstream" and self.max_steps is None:
+            raise ValueError("stepping upstream needs max_steps: its steps take any time")
+        return self
+
+    def steps(self, task: str, rate: int) -> int | None:
+        """Actions that an episode of a task may have, at so many a second; None: no end to it."""
+        seconds = self.max_seconds.get(task) if self.stepping == "timed" else None
+        ends = [self.max_steps, None if seconds is None else round(seconds * rate)]
+        return min((steps for steps in ends if steps is not None), default=None)
 
     def refuse(self, wants: Wants) -> None:
         """See that a policy can be evaluated by this.
@@ -90,7 +111,7 @@ class Protocol(StrictModel):
         Raises:
             EvaluationError: physics at 100 Hz can't be stopped at that rate.
         """
-        rate = self.rate_hz or wants.rate_hz or 20
+        rate = self.rate_hz or wants.rate_hz or DEFAULT_HZ
         if rate < 1 or rate != int(rate) or 100 % int(rate):
             raise EvaluationError("no such rate", where="rate_hz", expected="a divisor of 100", found=f"{rate:g}")
         return int(rate)
@@ -140,10 +161,6 @@ class LoadedProtocol:
         """Of the scenes of a configuration's episodes."""
         return self.folder / LAYOUTS / f"{config}.npy"
 
-    def max_seconds(self, task: str) -> float:
-        """How long an episode may take, s of the scene."""
-        return self.rules.max_seconds.get(task, float("inf"))
-
 
 def files_of(folder: Path) -> list[Path]:
     """The files that a protocol is made of, sorted."""
@@ -174,6 +191,12 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
     rules = _rules(folder / RULES)
     episodes = tuple(_episodes(folder / EPISODES))
     loaded = LoadedProtocol(folder, rules, episodes)
+    for task in {episode.task for episode in episodes}:
+        if task not in TASKS:
+            raise EvaluationError("no such task", where=folder / EPISODES, expected=", ".join(TASKS), found=task)
+        if rules.steps(task, 1) is None:
+            fix = f"Give max_seconds.{task}, or max_steps."
+            raise EvaluationError("episodes of this task would never end", where=folder / RULES, found=task, fix=fix)
     for config in {episode.config for episode in episodes}:
         for path in (loaded.config_file(config), loaded.layouts_file(config)):
             if not path.is_file():

@@ -152,6 +152,8 @@ class Rollouts:
                 found=actions.shape,
             )
         for env, chunk in zip(envs, chunks, strict=True):
+            if not np.isfinite(chunk).all():
+                self._playing[env].error = self._playing[env].error or "the policy's action is not finite"
             self._chunks[env] = list(chunk)
             self._playing[env].inference_seconds += spent
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
+from robocas_ms3.datasets.render import require_renderer
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.policy import Policy, describe
@@ -57,12 +58,15 @@ def evaluate(
         What came of an episode, and how many are still to come.
 
     Raises:
+        DatasetError: the policy wants to see, and there is no render device.
         EvaluationError: the policy does not fit the protocol, the pack is another, or the result is of another run.
     """
     protocol.rules.refuse(policy.wants)
     wanted = chosen(protocol.episodes, settings)
     if not wanted:
         raise EvaluationError("no episodes", where=protocol.rules.name, found=f"tasks {list(settings.tasks)}")
+    if policy.wants.cameras:
+        require_renderer()
     done = results.begin(folder, about(protocol, policy, name, settings), resume=resume)
     left = [episode for episode in wanted if episode.episode not in done]
     count = len(left)
@@ -118,10 +122,8 @@ def _play(protocol: LoadedProtocol, policy: Policy, episodes: list[Episode], set
     count = min(settings.num_envs, len(episodes))
     env = make_env(protocol, policy.wants, first, count, backend=settings.backend, workers=settings.workers)
     try:
-        steps = rules.max_steps or 10**9
-        seconds = protocol.max_seconds(first.task)
-        if rules.stepping == "timed" and seconds < float("inf"):
-            steps = min(steps, round(seconds * rate))
+        steps = rules.steps(first.task, rate)
+        assert steps is not None  # `load_protocol` saw to it
         ends = Rules(steps, tuple(rules.ends_on), rules.max_v0_steps)
         known = {one.episode: one for one in episodes}
         for played in Rollouts(env, policy, ends, 1 / rate, refill=not gpu).play(

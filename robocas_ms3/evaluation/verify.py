@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol
 from robocas_ms3.evaluation.results import Outcome, Result, failure_stage
 
 
@@ -39,11 +39,9 @@ def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
 
 
 def _too_long(outcome: Outcome, protocol: LoadedProtocol, run: dict[str, Any]) -> Iterator[str]:
-    rules, limit = protocol.rules, protocol.rules.max_steps or 10**9
-    seconds = protocol.max_seconds(outcome.task)
-    if rules.stepping == "timed" and seconds < float("inf"):
-        limit = min(limit, round(seconds * (rules.rate_hz or run["policy"].get("wants", {}).get("rate_hz") or 20)))
-    if outcome.steps > limit:
+    rules = protocol.rules
+    limit = rules.steps(outcome.task, rules.rate_hz or run["policy"].get("wants", {}).get("rate_hz") or DEFAULT_HZ)
+    if limit is not None and outcome.steps > limit:
         yield f"{outcome.steps} steps, {limit} are allowed"
 
 

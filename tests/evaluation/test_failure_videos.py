@@ -37,6 +37,14 @@ def test_where_none_failed_there_is_nothing_to_film(tmp_path, capsys):
     assert "no episode failed" in capsys.readouterr().out
 
 
+def test_a_result_chooses_no_code(tmp_path, capsys):
+    result = of_protocol(tmp_path / "b", load_protocol("smoke"))
+    with pytest.raises(EvaluationError, match=r"a policy of somebody's own \(found mine\).*--policy mine"):
+        command.main(command.Eval(("videos", str(result.folder))))
+    with pytest.raises(EvaluationError, match="mine: no such policy"):  # now it is asked for
+        command.main(command.Eval(("videos", str(result.folder)), policy="mine"))
+
+
 @pytest.mark.slow
 def test_a_failure_is_filmed_and_linked(tmp_path, needs_renderer, capsys):
     rules = {"name": "tiny", "description": "Half a second.", "max_seconds": {"pick": 0.5}}

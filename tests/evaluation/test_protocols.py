@@ -85,6 +85,12 @@ def test_an_unknown_name_gets_the_nearest():
         (lambda f: (f / RULES).write_bytes(b"\xff\xfe"), "protocol.yaml: no rules"),
         (lambda f: change_rules(f, speed=2), "protocol.yaml: no rules.*speed"),
         (lambda f: change_rules(f, rate_hz="fast"), "protocol.yaml: no rules.*rate_hz"),
+        (lambda f: change_rules(f, ends_on=["sucess"]), "protocol.yaml: no rules.*ends_on"),
+        (lambda f: change_rules(f, conventions=["robocas", "words"]), "no rules.*conventions: expected.*found words"),
+        (lambda f: change_rules(f, max_seconds={"pik": 3}), "no rules.*max_seconds: expected.*found pik"),
+        (lambda f: change_rules(f, max_seconds={"pick": 3}), "episodes of this task would never end.*max_seconds"),
+        (lambda f: change_rules(f, stepping="upstream"), "no rules.*upstream needs max_steps"),
+        (lambda f: change_episode(f, 1, task="tidy"), "episodes.jsonl: no such task.*found tidy"),
         (lambda f: (f / EPISODES).unlink(), "episodes.jsonl: can't read"),
         (lambda f: (f / EPISODES).write_text("{\n"), "episodes.jsonl:1: no episode"),
         (lambda f: change_episode(f, 1, seed=-1), "episodes.jsonl:2: no episode.*seed"),
@@ -101,6 +107,15 @@ def test_damage_is_said_in_one_line(folder, damage, said):
     with pytest.raises(EvaluationError, match=said) as caught:
         load_protocol(folder)
     assert "\n" not in str(caught.value)
+
+
+def test_an_episode_ends_by_actions_or_by_seconds_whichever_comes_first():
+    rules = load_protocol("smoke").rules
+    assert rules.steps("pick", 20) == 800
+    assert rules.model_copy(update={"max_steps": 30}).steps("pick", 5) == 30
+    assert rules.model_copy(update={"max_steps": 300}).steps("pick", 5) == 200
+    upstream = load_protocol("paper-v1").rules
+    assert upstream.steps("pick", 5) == upstream.steps("search", 5) == 150
 
 
 def test_policies_that_do_not_fit_are_refused():

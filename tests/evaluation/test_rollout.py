@@ -102,3 +102,19 @@ def test_actions_of_another_shape_are_refused():
     policy.act = lambda observations: np.zeros((2, 6))
     with pytest.raises(EvaluationError, match=r"expected \(1, 7\) or \(1, chunk, 7\), found \(2, 6\)"):
         list(Rollouts(Counting(1), policy, Rules(7), 0.05, refill=True).play(starts([4])))
+
+
+def test_an_action_that_is_no_number_ends_its_own_episode_alone():
+    policy = Obedient()
+    act = policy.act
+
+    def sick(observations: Observations) -> np.ndarray:
+        actions = act(observations)
+        actions[np.array(observations.instructions) == "count to 4"] = np.nan
+        return actions
+
+    policy.act = sick
+    played = list(Rollouts(Counting(2), policy, Rules(7), 0.05, refill=True).play(starts([4, 5, 3])))
+    errors = {one.start.seed: one.error for one in played}
+    assert errors == {4: "the policy's action is not finite", 5: "", 3: ""}
+    assert [one.flags["success"] for one in sorted(played, key=lambda one: one.start.seed)] == [3, None, 5]

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from robocas_ms3.errors import EvaluationError
-from robocas_ms3.evaluation import results
+from robocas_ms3.cli.main import run as cli
+from robocas_ms3.errors import DatasetError, EvaluationError
+from robocas_ms3.evaluation import results, run
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.protocol import load_protocol
@@ -104,6 +105,28 @@ def test_a_policy_that_does_not_fit_is_refused_before_anything_is_written(tmp_pa
         rules.refuse(Wants(reference="tcp", rate_hz=10))
     with pytest.raises(EvaluationError, match="no episodes"):
         play(tmp_path / "out", tasks=("nothing",))
+
+
+def test_who_wants_to_see_needs_a_renderer(tmp_path, monkeypatch):
+    def none() -> None:
+        raise DatasetError("no render device")
+
+    monkeypatch.setattr(run, "require_renderer", none)
+    policy = make_policy("random")
+    policy.wants = Wants(reference="tcp", cameras={"base_camera": (8, 8)})
+    with pytest.raises(DatasetError, match="no render device"):
+        next(evaluate(load_protocol("smoke"), policy, "random", tmp_path / "out", Settings(backend="processes")))
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_interrupted_run_says_how_it_goes_on(tmp_path, monkeypatch, capsys):
+    def interrupted(*args, **kwargs):
+        raise KeyboardInterrupt
+        yield
+
+    monkeypatch.setattr(run, "evaluate", interrupted)
+    assert cli(["eval", "--protocol", "smoke", "--policy", "still", "--out", str(tmp_path)]) == 130
+    assert capsys.readouterr().err == "interrupted; the same command with --resume goes on\n"
 
 
 def test_what_a_policy_can_not_want():
