@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation import retrieval
+from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.evaluation.rollout import Played
 from robocas_ms3.evaluation.statistics import Share, share
 from robocas_ms3.files import make_folder, replacing_folder, write_json
@@ -53,6 +55,7 @@ class Outcome:
         measures: ``path_length`` m, ``contact_impulse`` N s, ``disturbed_most``, ``fallen``.
         inference_ms: clock time of the policy a step.
         p_vis: share of the target that is seen from above.
+        retrieval: search: what was moved before the target, see `retrieval.outcome`.
     """
 
     episode: int
@@ -72,17 +75,21 @@ class Outcome:
     measures: dict[str, float] = field(default_factory=dict)
     inference_ms: float = 0.0
     p_vis: float | None = None
+    retrieval: dict[str, Any] | None = None
 
     @classmethod
-    def of(cls, played: Played, *, config: str, split: str, p_vis: float | None) -> Outcome:
-        """What is kept of an episode that was played."""
-        flags, start = played.flags, played.start
+    def of(cls, played: Played, episode: Episode, objects: Sequence[str]) -> Outcome:
+        """What is kept of an episode that was played, with objects of these ids."""
+        flags, held_at, order = played.flags, played.flags.get("target_grasped"), None
+        if played.retrieval is not None:
+            cleared = flags.get("obstacles_cleared") is not None
+            order = retrieval.outcome(played.retrieval, objects, held_at, cleared=cleared)
         return cls(
-            episode=start.episode,
-            task=start.task,
-            config=config,
-            seed=start.seed,
-            split=split,
+            episode=episode.episode,
+            task=episode.task,
+            config=episode.config,
+            seed=episode.seed,
+            split=episode.split,
             success=flags.get("success") is not None,
             success_at_end=played.at_end.get("success", False),
             success_v0=played.at_end.get("success_v0", False),
@@ -94,7 +101,8 @@ class Outcome:
             flag_seconds=played.flag_seconds,
             measures=played.measures,
             inference_ms=round(1000 * played.inference_seconds / max(played.steps, 1), 3),
-            p_vis=p_vis,
+            p_vis=episode.p_vis,
+            retrieval=order,
         )
 
     def without_clock(self) -> dict[str, Any]:

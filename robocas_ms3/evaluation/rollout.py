@@ -30,6 +30,7 @@ class Played:
         flag_seconds: the same in the scene's seconds.
         at_end: whether it held after the last step.
         measures: sums and extremes (`tracking`).
+        retrieval: (K, 3) of search, see `retrieval.Retrieval.read`.
         inference_seconds: clock time the policy took, its share of each batch.
         error: why it was broken off, as by a policy that failed; empty: it was not.
     """
@@ -41,6 +42,7 @@ class Played:
     flag_seconds: dict[str, float | None] = field(default_factory=dict)
     at_end: dict[str, bool] = field(default_factory=dict)
     measures: dict[str, float] = field(default_factory=dict)
+    retrieval: NDArray[np.integer] | None = None
     inference_seconds: float = 0.0
     error: str = ""
 
@@ -187,6 +189,8 @@ class Rollouts:
                 played.flags.setdefault(name, None)
                 played.flag_seconds.setdefault(name, None)
         played.measures = {name: round(float(info[name][env]), 4) for name in TRACKED}
+        if "retrieval" in info:
+            played.retrieval = info["retrieval"][env]
 
     def _is_over(self, played: Played, info: dict[str, Any]) -> bool:
         rules, env = self._rules, played.start.env

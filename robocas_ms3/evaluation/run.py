@@ -16,7 +16,7 @@ from robocas_ms3.evaluation.policy import Policy, describe
 from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
 from robocas_ms3.evaluation.results import Outcome
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
-from robocas_ms3.evaluation.stage import make_env, rate_of, start_of
+from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
 from robocas_ms3.tasks.vector.backend import Backend, choose_backend
 
 
@@ -130,6 +130,6 @@ def _play(protocol: LoadedProtocol, policy: Policy, episodes: list[Episode], set
             [start_of(protocol, one) for one in episodes]
         ):
             one = known[played.start.episode]
-            yield Outcome.of(played, config=one.config, split=one.split, p_vis=one.p_vis)
+            yield Outcome.of(played, one, object_ids(protocol, one))
     finally:
         env.close()

@@ -7,9 +7,11 @@ from typing import Any
 
 import torch
 
+from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.evaluation.policy import CAMERAS, Start, Wants
 from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
 from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, control_mode
+from robocas_ms3.scenes.frozen import FrozenLayouts
 from robocas_ms3.tasks.spec import TASKS
 from robocas_ms3.tasks.vector import make_vec
 
@@ -50,6 +52,12 @@ def make_env(protocol: LoadedProtocol, wants: Wants, episode: Episode, num_envs:
         max_episode_steps=10**9,  # the protocol's rules end episodes
         **{**_looks(wants, renders="render_mode" in kwargs), **kwargs},
     )
+
+
+def object_ids(protocol: LoadedProtocol, episode: Episode) -> tuple[str, ...]:
+    """What stands in an episode's scene, by slot."""
+    layouts = FrozenLayouts(protocol.layouts_file(episode.config), load_pack(protocol.rules.pack).objects)
+    return layouts(episode.seed, episode.seed).object_ids
 
 
 def start_of(protocol: LoadedProtocol, episode: Episode) -> Start:

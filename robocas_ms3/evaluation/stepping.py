@@ -79,6 +79,7 @@ class PolicyStepping(gym.Wrapper):
             motion = self._convention.read(actions)
             result = self._timed(motion) if self._stepping == "timed" else self._upstream(motion)
         *others, info = result
+        self._tracker.end_step()
         return (*others, {**info, **self._tracker.read()})
 
     def _timed(self, motion: Motion) -> tuple:

@@ -7,6 +7,7 @@ from collections import Counter
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.power import too_few
 from robocas_ms3.evaluation.results import STAGES, Outcome, Result
+from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, compare, success_by
 
 P_VIS_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -50,7 +51,23 @@ def markdown(result: Result) -> str:
             lines.append(
                 f"| {found.low:g} to {found.high:g} | {0 if found.share is None else found.share.n} | {rate} |"
             )
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_retrieval(result)]) + "\n"
+
+
+def _retrieval(result: Result) -> list[str]:
+    found = {config: orders(one.retrieval for one in group) for config, group in result.by("config").items()}
+    if not any(found.values()):
+        return []
+    lines = ["", "## What was moved before the target", ""]
+    lines += [
+        "| configuration | target held | order score | moved | needed of these | left |",
+        "|---|---|---|---|---|---|",
+    ]
+    for config, one in found.items():
+        if one is not None:
+            shares = f"{one.score:.2f} | {one.moved:.1f} | {100 * one.needed:.0f} %"
+            lines.append(f"| {config} | {one.held} | {shares} | {one.left:.1f} |")
+    return lines
 
 
 def comparison(one: Result, other: Result) -> str:

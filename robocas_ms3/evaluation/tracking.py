@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from robocas_ms3.evaluation.retrieval import Retrieval
+from robocas_ms3.tasks.search import RoboCASSearchEnv
+
 V0_RADIUS = 0.1  # m between the origins of target and basket in xy: upstream's success
 V0_STEPS = 5  # policy steps like that after which upstream's episode ends
 
@@ -27,6 +30,8 @@ class Tracker:
         self._kept = {name: torch.zeros(env.num_envs, device=env.device) for name in names}
         self._in_v0 = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
         self._tcp: torch.Tensor | None = None
+        self._searches = isinstance(env, RoboCASSearchEnv)
+        self._retrieval: Retrieval | None = None
 
     def reset(self, envs: Any) -> None:
         """Begin anew in some envs."""
@@ -37,6 +42,10 @@ class Tracker:
         before = now.clone() if self._tcp is None else self._tcp
         before[envs] = now[envs]
         self._tcp = before
+        if self._searches:
+            if self._retrieval is None:
+                self._retrieval = Retrieval(self._env)
+            self._retrieval.reset(envs)
 
     def look(self, info: dict[str, Any], opened: np.ndarray) -> None:
         """Count on after a control step.
@@ -57,14 +66,22 @@ class Tracker:
         target, basket = env.object_poses[slots, env.target_slot, :2], env.basket_pose[:, :2]
         near = torch.linalg.vector_norm(target - basket, dim=1) <= V0_RADIUS
         self._in_v0 = near & torch.as_tensor(opened, device=env.device)
+        if self._retrieval is not None:
+            self._retrieval.look(info)
+
+    def end_step(self) -> None:
+        """Count a policy step, after its last control step."""
+        self._kept["v0_steps"] += self._in_v0
+        if self._retrieval is not None:
+            self._retrieval.end_step()
 
     def read(self) -> dict[str, torch.Tensor]:
-        """(N,) each, for an info: what was kept, since the reset; to be called once a policy step.
+        """(N,) each, for an info: what was kept, since the reset.
 
         ``path_length`` m of the TCP; ``contact_impulse`` N s between gripper and objects; ``disturbed_most`` and
         ``fallen``, numbers of objects; ``success_v0`` bool, upstream's rule at this moment, and ``v0_steps``, how many
-        policy steps it has held.
+        policy steps it has held. Of search also ``retrieval``, `Retrieval.read`.
         """
-        self._kept["v0_steps"] += self._in_v0
         kept = {name: value.clone() for name, value in self._kept.items()}
-        return {**kept, "success_v0": self._in_v0.clone()}
+        order = {} if self._retrieval is None else {"retrieval": self._retrieval.read()}
+        return {**kept, "success_v0": self._in_v0.clone(), **order}

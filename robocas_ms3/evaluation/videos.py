@@ -18,7 +18,7 @@ from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.failed import VIDEOS, video_name
 from robocas_ms3.evaluation.results import Outcome, Result
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
-from robocas_ms3.evaluation.stage import make_env, rate_of, start_of
+from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
 from robocas_ms3.files import make_folder, replacing
 
 SIZE = (480, 360)  # pixels
@@ -86,7 +86,7 @@ def _film(result: Result, protocol: LoadedProtocol, policy: Policy, numbers: lis
             with replacing(path) as tmp, _writer(tmp, rate / env.every * _SPEED) as writer:
                 env.writer = writer
                 (played,) = Rollouts(env, policy, ends, 1 / rate, refill=True).play([start_of(protocol, episode)])
-            outcome = Outcome.of(played, config=episode.config, split=episode.split, p_vis=episode.p_vis)
+            outcome = Outcome.of(played, episode, object_ids(protocol, episode))
             yield Filmed(path, outcome, outcome.without_clock() == before.without_clock())
     finally:
         env.close()

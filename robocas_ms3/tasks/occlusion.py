@@ -146,6 +146,32 @@ def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clu
     return Clutter(hidden_share, highest.any(dim=-1))
 
 
+def covering(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
+    """How much of each object every other one would hide from the camera, if there were but these two.
+
+    Args:
+        points: (N, K, 3, P) on the objects' surfaces, world.
+        present: (N, K) bool, slots that take part.
+        eye: (3,) the camera, world.
+
+    Returns:
+        (N, K, K) share, by row of the object that covers, by column of the one that is covered.
+    """
+    count, slots = present.shape
+    heights, shares = points[:, :, 2], []
+    for slot in range(slots):
+        own = points[:, slot]
+        seen = seen_from(points, eye, (eye[2] - own[:, 2].mean(dim=-1)).clamp(min=NEAREST))
+        outline = seen[:, slot]
+        cells = _cells(seen, (outline.amin(dim=-1) + outline.amax(dim=-1)) / 2)
+        maps = _closed(_height_map(cells.flatten(0, 1), heights.flatten(0, 1)).unflatten(0, (count, slots)))
+        at_it = maps[:, slot : slot + 1]
+        filled = at_it > _NOTHING
+        shares.append((filled & (maps > at_it)).sum(dim=(2, 3)) / filled.sum(dim=(2, 3)).clamp(min=1))
+    both = present[:, :, None] & present[:, None]
+    return torch.stack(shares, dim=2) * both
+
+
 def push_point(points: Tensor, obstacles: Tensor, target: Tensor, *, stand_off: float = 0.02) -> Tensor:
     """Where the paper's push of the highest obstacle begins: clear of it, on the target's side, level with its middle.
 

@@ -84,6 +84,11 @@ class RoboCASSearchEnv(LearningEnv):
         points = occlusion.surface_points(self.object_states[envs, :, :7], self._surface_points[envs])
         return occlusion.clutter(points, self.present[envs], self.target_slot[envs], self._eye)
 
+    def covering(self, envs: Any = slice(None)) -> torch.Tensor:
+        """(E, K, K) share of each object (column) that each other one (row) hides, as `occlusion.covering`."""
+        points = occlusion.surface_points(self.object_states[envs, :, :7], self._surface_points[envs])
+        return occlusion.covering(points, self.present[envs], self._eye)
+
     def evaluate(self) -> dict[str, torch.Tensor]:
         """See `TransferEnv`; ``cleared_at_reset`` besides."""
         found = super().evaluate()

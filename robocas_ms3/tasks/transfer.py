@@ -154,7 +154,7 @@ class TransferEnv(RoboCASEnv):
         success = native(self._stages["target_lifted"]) & reduce(and_, measures.values())
         fail = self._has_failed(measures, objects, basket)
         stages = dict(zip(self.STAGES, self._reached.clone(), strict=True))
-        disturbed = self._disturbed(objects[..., :7])
+        disturbed = self._disturbed(objects[..., :7]).sum(1)
         self._moment = Moment(objects, basket, held, now["reached_target"], measures["in_basket"], disturbed)
         flags = {"success": as_tensor(success), "fail": as_tensor(fail)}
         return {**stages, **flags, "disturbed": as_tensor(disturbed)}
@@ -227,8 +227,13 @@ class TransferEnv(RoboCASEnv):
         low, high = native(self._basket_low), native(self._basket_high)
         return terms.inside_box(centers, basket[:, :3], basket[:, 3:], low, high)
 
+    @property
+    def disturbed(self) -> torch.Tensor:
+        """(N, K) bool: which objects other than the target no longer stand as they stood; don't write to it."""
+        return as_tensor(self._disturbed(native(self.object_states)[..., :7]))
+
     def _disturbed(self, poses: Any) -> Any:
-        """(N,) how many objects other than the target no longer stand as they stood, from poses (N, K, 7)."""
+        """`disturbed`, native, from poses (N, K, 7)."""
         support, undo = self.fixtures.furniture[self.task_config.surface.furniture], None
         if isinstance(support, Articulation) and self.model.support_link:
             links = [support.links_map[name] for name in (BODY, self.model.support_link)]
@@ -236,7 +241,7 @@ class TransferEnv(RoboCASEnv):
             undo = terms.way_back(body, part, native(self._support_shut))
         moved = terms.disturbed(poses, native(self.start_poses), undo) & native(self.present)
         slots = count_up(moved.shape[1], moved)
-        return (moved & (slots != native(self.target_slot)[:, None])).sum(1)
+        return moved & (slots != native(self.target_slot)[:, None])
 
     def get_language_instruction(self) -> list[str]:
         """The instruction of each env."""

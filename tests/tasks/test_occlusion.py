@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robocas_ms3.scenes.table import raw_poses
-from robocas_ms3.tasks.occlusion import Clutter, clutter, moved_near, push_point, seen_from, surface_points
+from robocas_ms3.tasks.occlusion import Clutter, clutter, covering, moved_near, push_point, seen_from, surface_points
 
 
 def plate(x: tuple[float, float], y: tuple[float, float], z: float) -> torch.Tensor:
@@ -206,3 +206,17 @@ def test_hidden_shares_are_what_rays_say():
     assert len(differences) > 30
     assert np.nanmean(differences) < 0.04
     assert np.nanpercentile(differences, 95) < 0.12
+
+
+def test_how_much_of_each_object_every_other_one_covers():
+    """A plate of 10 cm, half of it under one that is higher, which is itself under a small one; another one aside."""
+    target, lid = plate((0, 0.1), (0, 0.1), 0.5), plate((0.05, 0.15), (0, 0.1), 0.55)
+    small, aside = plate((0.1, 0.15), (0, 0.05), 0.6), plate((0.4, 0.5), (0, 0.1), 0.9)
+    points = torch.stack([target, lid, small, aside])[None].expand(2, -1, -1, -1)
+    present = torch.tensor([[True] * 4, [True, True, False, True]])
+    shares = covering(points, present, HIGH_ABOVE)
+    wanted = torch.zeros(4, 4)
+    wanted[1, 0], wanted[2, 1] = 0.5, 0.25
+    torch.testing.assert_close(shares[0], wanted, atol=0.06, rtol=0)
+    wanted[2, 1] = 0.0
+    torch.testing.assert_close(shares[1], wanted, atol=0.06, rtol=0)

@@ -33,4 +33,10 @@ def write_parquet(result: Result, path: Path) -> None:
     for outer, kind in _INSIDE.items():
         for name in dict.fromkeys(name for row in rows for name in row[outer]):
             columns[f"{outer}.{name}"] = pa.array([row[outer].get(name) for row in rows], kind)
+    orders = [row["retrieval"] or {} for row in rows]
+    if any(orders):
+        moved = [None if not order else len(order["moved"]) for order in orders]
+        columns["retrieval.score"] = pa.array([order.get("score") for order in orders], pa.float64())
+        columns["retrieval.moved"] = pa.array(moved, pa.int64())
+        columns["retrieval.left"] = pa.array([order.get("left") for order in orders], pa.int64())
     pq.write_table(pa.table(columns), path)

@@ -15,6 +15,7 @@ from robocas_ms3.evaluation.report.failed import failed_episodes
 from robocas_ms3.evaluation.report.marks import axis, bar, rate, round_up, section, spread, table
 from robocas_ms3.evaluation.report.stages import FAILURES, STAGES
 from robocas_ms3.evaluation.results import Outcome, Result
+from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, share, success_by
 from robocas_ms3.evaluation.tables import P_VIS_EDGES
 
@@ -32,7 +33,14 @@ def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | 
     title = escape(f"{result.run['policy']['name']} by {result.run['protocol']}")
     parts = [_lead(result, protocol)]
     if result.outcomes:
-        parts += [_headline(result), _splits(result), _funnels(result), _failures(result), _hidden(result)]
+        parts += [
+            _headline(result),
+            _splits(result),
+            _funnels(result),
+            _failures(result),
+            _hidden(result),
+            _retrieval(result),
+        ]
         parts += [_seconds(result), _care(result)]
     parts += [measured_with(result, protocol), failed_episodes(result, folder)]
     return (
@@ -142,6 +150,33 @@ def _hidden(result: Result) -> str:
     configs = ", ".join(sorted({outcome.config for outcome in hidden}))
     said = f"By p_vis, the share of the target that is seen from above at the beginning; episodes of {escape(configs)}."
     return section("Success by occlusion", said, table(("p_vis", "n#", "success#", "0 to 100 %"), rows, "bars"))
+
+
+def _retrieval(result: Result) -> str:
+    rows = []
+    for config, outcomes in result.by("config").items():
+        found = orders(outcome.retrieval for outcome in outcomes)
+        if found is not None:
+            needed = f"{100 * found.needed:.0f} %"
+            rows.append(
+                [
+                    escape(config),
+                    str(found.held),
+                    f"{found.score:.2f}",
+                    f"{found.moved:.1f}",
+                    needed,
+                    f"{found.left:.1f}",
+                ]
+            )
+    if not rows:
+        return ""
+    heads = ("configuration", "target held#", "order score#", "moved, mean#", "needed of these#", "left, mean#")
+    said = (
+        "Objects that were moved before the target was first held. Needed: they hid or hemmed it in, or lay over one "
+        "that did. The score is the share, of what was moved or left in the way, that was needed and moved from the "
+        "top down."
+    )
+    return section("Retrieval order", said, table(heads, rows))
 
 
 def _seconds(result: Result) -> str:

@@ -1,0 +1,120 @@
+"""What was moved before the target of a heap: a target, a lid on it, a cup on the lid, a pear aside."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from robocas_ms3.evaluation.retrieval import Retrieval, needed, orders, outcome
+
+TARGET, LID, CUP, PEAR = range(4)
+NAMES = ("target", "lid", "cup", "pear")
+OVER = torch.zeros(1, 4, 4)
+OVER[0, LID, TARGET], OVER[0, CUP, LID], OVER[0, PEAR, CUP] = 0.5, 0.3, 0.05
+
+
+class Heap:
+    """What `Retrieval` asks of search's environment, for one env at 20 Hz."""
+
+    device, control_timestep = torch.device("cpu"), 0.05
+
+    def __init__(self) -> None:
+        self.present, self.target_slot = torch.ones(1, 4, dtype=torch.bool), torch.tensor([TARGET])
+        self.disturbed, self.elapsed_steps = torch.zeros(1, 4, dtype=torch.bool), torch.zeros(1, dtype=torch.int32)
+
+    def covering(self, envs):
+        return OVER
+
+    def clutter(self, envs):
+        return SimpleNamespace(obstacles=torch.zeros(1, 4, dtype=torch.bool))
+
+
+def kept_of(moves: dict[int, int], held_at: int = 1000, steps: int = 200) -> np.ndarray:
+    """What is kept when objects move at these control steps, two of them a policy step."""
+    heap: Any = Heap()
+    retrieval = Retrieval(heap)
+    retrieval.reset(torch.tensor([0]))
+    for step in range(1, steps + 1):
+        heap.elapsed_steps += 1
+        for slot, at in moves.items():
+            heap.disturbed[0, slot] |= step == at
+        retrieval.look({"target_grasped": torch.tensor([step >= held_at])})
+        if step % 2 == 0:
+            retrieval.end_step()
+    return retrieval.read()[0].numpy()
+
+
+def test_what_lies_on_what_lies_on_the_target_is_needed():
+    assert needed(OVER[:, :, TARGET] >= 0.1, OVER >= 0.1).tolist() == [[False, True, True, False]]
+    hemmed_in = torch.tensor([[False, False, False, True]])
+    assert needed(hemmed_in, OVER >= 0.1).tolist() == [[False, False, False, True]]
+
+
+def test_from_the_top_down():
+    kept = kept_of({CUP: 10, LID: 60, PEAR: 81})
+    assert kept.tolist() == [[0, 0, 0], [30, 1, 1], [5, 1, 1], [41, 0, 0]]
+    found = outcome(kept, NAMES, held_at=90, cleared=True)
+    assert [move["object"] for move in found["moved"]] == ["cup", "lid", "pear"]
+    assert [move["needed"] for move in found["moved"]] == [True, True, False]
+    assert (found["needed"], found["left"], found["score"]) == (["lid", "cup"], 0, 0.6667)
+
+
+@pytest.mark.parametrize(("cup", "in_order"), [(40, True), (41, False)])
+def test_what_is_pushed_as_one_moves_within_a_second(cup, in_order):
+    assert kept_of({LID: 20, CUP: cup})[LID].tolist() == [10, 1, in_order]
+
+
+def test_from_below_or_not_at_all():
+    assert kept_of({LID: 20}).tolist()[LID] == [10, 1, 0]
+    found = outcome(kept_of({LID: 20}), NAMES, held_at=50, cleared=False)
+    assert (found["left"], found["score"]) == (1, 0.0)
+    assert outcome(kept_of({LID: 20}), NAMES, held_at=50, cleared=True)["left"] == 0
+
+
+def test_what_moves_once_the_target_is_held_does_not_count():
+    found = outcome(kept_of({CUP: 10, LID: 60}, held_at=60), NAMES, held_at=30, cleared=True)
+    assert [move["object"] for move in found["moved"]] == ["cup"]
+
+
+def test_a_target_that_was_never_held_has_no_order():
+    found = outcome(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False)
+    assert (found["score"], found["left"], len(found["moved"])) == (None, 0, 1)
+    nothing = np.zeros((4, 3), np.int16)
+    assert outcome(nothing, NAMES, held_at=5, cleared=True)["score"] == 1.0
+
+
+def test_several_episodes_are_summed_up_where_the_target_was_held():
+    episodes = [
+        outcome(kept_of({CUP: 10, LID: 60, PEAR: 81}), NAMES, held_at=90, cleared=True),
+        outcome(kept_of({LID: 20}), NAMES, held_at=50, cleared=False),
+        outcome(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False),
+        None,
+    ]
+    found = orders(episodes)
+    assert found == (2, pytest.approx(0.33335), 2.0, 0.75, 0.5)
+    assert orders(episodes[2:]) is None
+
+
+def test_envs_begin_anew_on_their_own():
+    class Two(Heap):
+        def __init__(self) -> None:
+            super().__init__()
+            self.present, self.target_slot = self.present.repeat(2, 1), self.target_slot.repeat(2)
+            self.disturbed, self.elapsed_steps = self.disturbed.repeat(2, 1), self.elapsed_steps.repeat(2)
+
+        def covering(self, envs):
+            return OVER.repeat(len(envs), 1, 1)
+
+        def clutter(self, envs):
+            return SimpleNamespace(obstacles=torch.zeros(len(envs), 4, dtype=torch.bool))
+
+    heap: Any = Two()
+    retrieval = Retrieval(heap)
+    retrieval.reset(torch.tensor([0, 1]))
+    heap.disturbed[:, CUP], heap.elapsed_steps[:] = True, 1
+    retrieval.look({"target_grasped": torch.tensor([False, False])})
+    retrieval.end_step()
+    retrieval.reset(torch.tensor([1]))
+    assert retrieval.read()[:, CUP].tolist() == [[1, 1, 1], [0, 1, 0]]
