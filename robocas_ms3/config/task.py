@@ -221,6 +221,16 @@ class CameraRandomisation(StrictModel):
 
     position: Annotated[float, Field(ge=0, le=0.2)] = Field(default=0.02, description="greatest shift an axis, m")
     rotation_deg: Annotated[float, Field(ge=0, le=20)] = Field(default=2.0, description="greatest turn an axis")
+    min_position: Annotated[float, Field(ge=0)] = Field(default=0.0, description="least shift an axis, m")
+    min_rotation_deg: Annotated[float, Field(ge=0)] = Field(default=0.0, description="least turn an axis")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> CameraRandomisation:
+        for key in ("position", "rotation_deg"):
+            least, most = getattr(self, f"min_{key}"), getattr(self, key)
+            if least > most:
+                raise ValueError(f"min_{key} {least:g} must not be above {key} {most:g}")
+        return self
 
 
 class PoseRandomisation(StrictModel):
@@ -244,6 +254,9 @@ class RandomisationConfig(StrictModel):
 
     room: list[str] | None = Field(
         default=None, description="parts of the room whose finish is drawn: wall, floor, ..."
+    )
+    finishes: dict[str, Annotated[list[str], Field(min_length=1)]] = Field(
+        default={}, description="part of `room` -> finishes it is drawn from; others: all that there are"
     )
     lights: LightRandomisation | None = None
     cameras: CameraRandomisation | None = None
@@ -297,6 +310,9 @@ class TaskConfig(StrictModel):
             raise ValueError("`opening` goes with task open_pick, and only with it")
         if self.task == "select" and not (isinstance(self.layout, OrderlyLayout) and self.layout.copies > 1):
             raise ValueError("task select needs layout.kind orderly with layout.copies > 1")
+        undrawn = sorted(set(self.randomisation.finishes) - set(self.randomisation.room or ()))
+        if undrawn:
+            raise ValueError(f"randomisation.finishes: {undrawn} must be among randomisation.room")
         count = self.randomisation.count
         if count is not None and not count[0] <= count[1] <= self.objects.count:
             raise ValueError(

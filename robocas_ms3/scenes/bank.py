@@ -170,7 +170,7 @@ def about(model: SceneModel) -> dict[str, Any]:
     """Everything that layouts depend on besides their seeds."""
     config = model.config.model_dump(mode="json", exclude=set(_NO_MATTER))
     config["randomisation"] = {
-        k: v for k, v in config["randomisation"].items() if k not in {"room", "lights", "cameras"}
+        k: v for k, v in config["randomisation"].items() if k not in {"room", "finishes", "lights", "cameras"}
     }
     config.pop("room")
     parts: dict[str, LoadedFurniture] = {**model.furniture, "basket": model.basket}

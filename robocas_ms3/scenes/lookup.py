@@ -57,6 +57,11 @@ def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
         if finish not in known:
             expected = f"one of {list(known)}" if known else f"a part among {sorted(room.asset.finishes)}"
             raise ConfigError(f"room.finishes.{part}: no such finish", expected=expected, found=finish)
+    for part, finishes in config.randomisation.finishes.items():
+        unknown = sorted(set(finishes) - set(room.asset.finishes.get(part, finishes)))
+        if unknown:
+            expected = f"some of {list(room.asset.finishes[part])}"
+            raise ConfigError(f"randomisation.finishes.{part}: no such finish", expected=expected, found=unknown)
     for part in config.randomisation.room or ():
         if part not in room.asset.finishes:
             expected = f"one of {sorted(room.asset.finishes)}"

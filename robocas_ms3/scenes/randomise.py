@@ -32,7 +32,7 @@ def draw_finishes(config: TaskConfig, room: LoadedFurniture, seed: int) -> dict[
     finishes = dict(config.room.finishes)
     rng = np.random.default_rng([seed, _ROOM])
     for part in sorted(config.randomisation.room or ()):
-        known = room.asset.finishes[part]
+        known = config.randomisation.finishes.get(part, room.asset.finishes[part])
         finishes[part] = known[int(rng.integers(len(known)))]
     return finishes
 
@@ -59,10 +59,15 @@ def draw_camera_shift(by: CameraRandomisation, camera: int, seed: int) -> Array:
     """
     rng = np.random.default_rng([seed, _CAMERAS, camera])
     shift = np.eye(4)
-    shift[:3, 3] = rng.uniform(-by.position, by.position, 3)
-    angles = np.deg2rad(rng.uniform(-by.rotation_deg, by.rotation_deg, 3))
-    shift[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+    shift[:3, 3] = _either_way(rng.uniform(-by.position, by.position, 3), by.min_position, by.position)
+    angles = _either_way(rng.uniform(-by.rotation_deg, by.rotation_deg, 3), by.min_rotation_deg, by.rotation_deg)
+    shift[:3, :3] = Rotation.from_euler("xyz", np.deg2rad(angles)).as_matrix()
     return shift
+
+
+def _either_way(drawn: Array, least: float, most: float) -> Array:
+    """Numbers of at most a size, whichever sign, as numbers between that and a least size."""
+    return drawn if least == 0 else np.copysign(least + np.abs(drawn) * (1 - least / most), drawn)
 
 
 def _in_ball(rng: np.random.Generator) -> Array:

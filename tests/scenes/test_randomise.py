@@ -3,6 +3,7 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import TaskConfig, load_task_config
@@ -33,6 +34,14 @@ def test_finishes_of_the_named_parts_vary_with_the_seed():
     assert drawn[3] == draw_finishes(config(room=["floor"], lights={}), room, 3)  # other blocks change nothing
 
 
+def test_finishes_may_be_some_of_those_there_are():
+    room = load_pack("builtin").furniture["room"]
+    asked = config(room=["floor", "wall"], finishes={"floor": ["carpet", "checker"]})
+    drawn = [draw_finishes(asked, room, seed) for seed in range(40)]
+    assert {d["floor"] for d in drawn} == {"carpet", "checker"}
+    assert {d["wall"] for d in drawn} == set(room.asset.finishes["wall"])
+
+
 @settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 2**31 - 1))
 def test_lights_stay_within_bounds(seed):
@@ -53,3 +62,16 @@ def test_camera_shifts_are_rigid_and_small(seed, camera):
     angle = np.arccos(np.clip((np.trace(shift[:3, :3]) - 1) / 2, -1, 1))
     assert np.rad2deg(angle) <= 3 * np.sqrt(3) + 1e-6
     assert not np.allclose(shift, draw_camera_shift(CameraRandomisation(), camera + 1, seed))
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=st.integers(0, 2**31 - 1))
+def test_camera_shifts_are_no_smaller_than_the_least_and_go_both_ways(seed):
+    far = CameraRandomisation(position=0.1, rotation_deg=8, min_position=0.05, min_rotation_deg=4)
+    shift, near = draw_camera_shift(far, 1, seed), draw_camera_shift(CameraRandomisation(position=0.1), 1, seed)
+    assert (np.abs(shift[:3, 3]) >= 0.05).all()
+    assert (np.abs(shift[:3, 3]) <= 0.1).all()
+    np.testing.assert_array_equal(np.sign(shift[:3, 3]), np.sign(near[:3, 3]))
+    angles = Rotation.from_matrix(shift[:3, :3]).as_euler("xyz", degrees=True)
+    assert (np.abs(angles) >= 4 - 1e-9).all()
+    assert (np.abs(angles) <= 8 + 1e-9).all()

@@ -278,6 +278,12 @@ def test_no_target_is_an_error_that_says_what_to_change():
     ("changes", "words"),
     [
         ({"randomisation": {"room": ["roof"]}}, r"randomisation.room: no such part.*found roof"),
+        ({"randomisation": {"finishes": {"wall": ["tiles"]}}}, r"randomisation.finishes: \['wall'\] must be among"),
+        (
+            {"randomisation": {"room": ["wall"], "finishes": {"wall": ["tiles", "gold"]}}},
+            r"randomisation.finishes.wall: no such finish.*found \['gold'\]",
+        ),
+        ({"randomisation": {"cameras": {"min_position": 0.05}}}, "min_position 0.05 must not be above position 0.02"),
         ({"randomisation": {"object_sets": [["spam"]]}}, r"randomisation.object_sets.0.*found spam"),
         ({"randomisation": {"distractors": {"ids": ["spam"]}}}, r"distractors.ids.*found spam"),
         ({"randomisation": {"distractors": {"ids": []}}}, r"randomisation.distractors.ids"),
