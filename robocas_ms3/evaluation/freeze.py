@@ -4,31 +4,59 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, Literal
 
 import gymnasium as gym
+import numpy as np
 import yaml
 from pydantic import Field, ValidationError
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
-from robocas_ms3.config import load_task_config
+from robocas_ms3.config import TaskConfig, load_task_config
 from robocas_ms3.config.task import StrictModel
 from robocas_ms3.errors import EvaluationError, LayoutError
-from robocas_ms3.evaluation.protocol import CONFIGS, EPISODES, LAYOUTS, RULES, Episode, Protocol
+from robocas_ms3.evaluation.protocol import CONFIGS, EPISODES, LAYOUTS, RULES, TRAIN, Episode, Protocol
 from robocas_ms3.files import make_folder, replacing, replacing_folder
 from robocas_ms3.scenes.frozen import write_frozen
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.tasks.spec import TASKS
 from robocas_ms3.tasks.transfer import TransferEnv
 
+_WRONG = 300  # stream of the object that a wrong instruction names
 
-class Part(StrictModel):
-    """Episodes of one configuration."""
+
+class Scene(StrictModel):
+    """A configuration, and what of it is changed."""
 
     config: str = Field(description="name of a shipped configuration, or a YAML file")
+    name: str = Field(default="", description="of the file it becomes; default: the configuration's, and the split's")
+    change: dict[str, Any] = Field(default={}, description="keys that have other values, in the configuration's form")
+
+    def changed(self) -> TaskConfig:
+        """The configuration as it is to be.
+
+        Raises:
+            ConfigError: there is none, or it can't be changed so.
+        """
+        config = load_task_config(self.config)
+        return load_task_config(_merged(config.model_dump(mode="json"), self.change)) if self.change else config
+
+
+class Part(Scene):
+    """Episodes of one configuration."""
+
     count: int = Field(ge=1, description="how many episodes")
     first_seed: int = Field(ge=0, description="of which seeds; those without a layout are left out, and more taken")
     split: str = "test"
+    words: Literal["asked", "wrong", "empty"] = Field(
+        default="asked", description="what the policy is told: what is meant, another object's name, or nothing"
+    )
+
+    @property
+    def file(self) -> str:
+        """Name of its configuration in the protocol."""
+        return self.name or Path(self.config).stem + ("" if self.split == "test" else f"-{self.split}")
 
 
 class Plan(StrictModel):
@@ -36,6 +64,8 @@ class Plan(StrictModel):
 
     rules: dict[str, object] = Field(description="of `Protocol`, but for the pack's hash")
     parts: list[Part]
+    train: list[Scene] = Field(default=[], description="configurations to train on")
+    lists: dict[str, Any] = Field(default={}, description="what is left to YAML's anchors: lists that changes refer to")
 
 
 def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Iterator[tuple[int, int]]:
@@ -50,7 +80,7 @@ def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Ite
         How many episodes are drawn, of how many.
 
     Raises:
-        EvaluationError: the rules are none of a protocol.
+        EvaluationError: the rules are none of a protocol, or two parts are of one name and another configuration.
     """
     pack = load_pack(str(plan.rules.get("pack", "builtin")))
     try:
@@ -58,20 +88,21 @@ def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Ite
     except ValidationError as error:
         found = " ".join(str(error).split())
         raise EvaluationError("no rules of a protocol", where="rules", found=found) from error
+    configs = _configs(plan.parts)
     total, episodes = sum(part.count for part in plan.parts), []
     with replacing_folder(folder) as tmp:
-        for inside in (CONFIGS, LAYOUTS):
+        for inside in (CONFIGS, LAYOUTS, *([TRAIN] if plan.train else [])):
             make_folder(tmp / inside)
+        for scene in plan.train:
+            _write_config(scene.changed(), tmp / TRAIN / f"{scene.name or Path(scene.config).stem}.yaml")
+        for name, config in configs.items():
+            _write_config(config, tmp / CONFIGS / f"{name}.yaml")
         scenes: dict[str, dict[int, Layout]] = {}
         for part in plan.parts:
-            config = load_task_config(part.config)
-            name = Path(part.config).stem
-            for seed, layout, env in _scenes(part, str(rules.pack), layouts):
-                scenes.setdefault(name, {})[seed] = layout
-                episodes.append(_episode(len(episodes), name, part, seed, layout, env))
+            for seed, layout, env in _scenes(part, configs[part.file], str(rules.pack), layouts):
+                scenes.setdefault(part.file, {})[seed] = layout
+                episodes.append(_episode(len(episodes), part, seed, layout, env))
                 yield len(episodes), total
-            text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-            (tmp / CONFIGS / f"{name}.yaml").write_text(text, encoding="utf-8")
         for name, found in scenes.items():
             write_frozen(tmp / LAYOUTS / f"{name}.npy", pack.objects, found)
         with replacing(tmp / EPISODES) as file:
@@ -80,8 +111,34 @@ def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Ite
         (tmp / RULES).write_text(said, encoding="utf-8")
 
 
-def _scenes(part: Part, pack: str, layouts: str | Path | None) -> Iterator[tuple[int, Layout, TransferEnv]]:
-    config = load_task_config(part.config)
+def _configs(parts: list[Part]) -> dict[str, TaskConfig]:
+    """Configurations by name."""
+    found: dict[str, TaskConfig] = {}
+    for part in parts:
+        config = part.changed()
+        if found.setdefault(part.file, config) != config:
+            raise EvaluationError("two configurations of one name", where=part.file, fix="Give one of them a `name`.")
+    return found
+
+
+def _merged(values: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+    """Values with some changed; a block that becomes another kind is replaced."""
+    result = dict(values)
+    for key, new in change.items():
+        old = values.get(key)
+        same = isinstance(old, dict) and isinstance(new, dict) and new.get("kind", old.get("kind")) == old.get("kind")
+        result[key] = _merged(old, new) if same else new  # pyright: ignore[reportArgumentType]
+    return result
+
+
+def _write_config(config: TaskConfig, path: Path) -> None:
+    text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    path.write_text(text, encoding="utf-8")
+
+
+def _scenes(
+    part: Part, config: TaskConfig, pack: str, layouts: str | Path | None
+) -> Iterator[tuple[int, Layout, TransferEnv]]:
     env = gym.make(
         TASKS[config.task].env_id,
         config=config,
@@ -107,15 +164,25 @@ def _scenes(part: Part, pack: str, layouts: str | Path | None) -> Iterator[tuple
         env.close()
 
 
-def _episode(number: int, name: str, part: Part, seed: int, layout: Layout, env: TransferEnv) -> Episode:
+def _episode(number: int, part: Part, seed: int, layout: Layout, env: TransferEnv) -> Episode:
     share = float(layout.visible_shares[layout.target])
     return Episode(
         episode=number,
         task=env.SPEC.name,
-        config=name,
+        config=part.file,
         seed=seed,
         split=part.split,
-        instruction=env.instruction().text,
+        instruction=_said(part, env, seed),
         target=layout.object_ids[layout.target],
         p_vis=None if share != share else round(share, 4),  # noqa: PLR0124  (NaN: it was not asked for)
     )
+
+
+def _said(part: Part, env: TransferEnv, seed: int) -> str:
+    if part.words == "empty":
+        return ""
+    if part.words == "asked":
+        return env.instruction().text
+    others = sorted(env.names() - {env.target_asset().asset.name})
+    rng = np.random.default_rng([seed, _WRONG])
+    return env.instruction(name=others[int(rng.integers(len(others)))]).text

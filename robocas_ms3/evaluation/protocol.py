@@ -6,6 +6,7 @@
     episodes.jsonl           an episode a line, see `Episode`
     configs/NAME.yaml        the configurations that episodes name, whole
     layouts/NAME.npy         the scenes of a configuration's episodes (`scenes.frozen`)
+    train/NAME.yaml          of a suite that holds something out: configurations that don't have it, to train on
 
 Its hash is that of all these files, so two results of one hash were measured by the same thing.
 """
@@ -32,7 +33,7 @@ from robocas_ms3.paths import protocols_dir
 from robocas_ms3.tasks.spec import TASKS
 
 DEFAULT_HZ = 20  # where neither protocol nor policy says
-RULES, EPISODES, CONFIGS, LAYOUTS = "protocol.yaml", "episodes.jsonl", "configs", "layouts"
+RULES, EPISODES, CONFIGS, LAYOUTS, TRAIN = "protocol.yaml", "episodes.jsonl", "configs", "layouts", "train"
 
 
 class Protocol(StrictModel):
@@ -157,6 +158,10 @@ class LoadedProtocol:
         """Of a configuration that episodes name."""
         return self.folder / CONFIGS / f"{config}.yaml"
 
+    def train_files(self) -> list[Path]:
+        """Configurations to train on, where something is held out."""
+        return sorted(self.folder.glob(f"{TRAIN}/*.yaml"))
+
     def layouts_file(self, config: str) -> Path:
         """Of the scenes of a configuration's episodes."""
         return self.folder / LAYOUTS / f"{config}.npy"
@@ -164,8 +169,8 @@ class LoadedProtocol:
 
 def files_of(folder: Path) -> list[Path]:
     """The files that a protocol is made of, sorted."""
-    found = [folder / RULES, folder / EPISODES, *folder.glob(f"{CONFIGS}/*.yaml"), *folder.glob(f"{LAYOUTS}/*.npy")]
-    return sorted(found)
+    inside = [path for name in (f"{CONFIGS}/*.yaml", f"{LAYOUTS}/*.npy", f"{TRAIN}/*.yaml") for path in folder.glob(name)]
+    return sorted([folder / RULES, folder / EPISODES, *inside])
 
 
 def shipped_protocols() -> dict[str, Path]:

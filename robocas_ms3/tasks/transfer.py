@@ -78,16 +78,21 @@ class TransferEnv(RoboCASEnv):
         for env in env_idx.tolist():
             self._said.pop(env, None)
 
-    def instruction(self, env: int = 0) -> Instruction:
-        """What is asked of an env's robot."""
+    def instruction(self, env: int = 0, *, name: str = "") -> Instruction:
+        """What is asked of an env's robot; with a name, what would be if that object were meant."""
+        if name:
+            return self._instruct(env, name)
         if env not in self._said:
-            self._said[env] = self._instruct(env)
+            self._said[env] = self._instruct(env, self.target_asset(env).asset.name)
         return self._said[env]
 
-    def _instruct(self, env: int) -> Instruction:
+    def names(self, env: int = 0) -> set[str]:
+        """Names of the objects in an env."""
+        present = self.layout(env).present
+        return {asset.asset.name for asset, used in zip(self.object_assets[env], present, strict=True) if used}
+
+    def _instruct(self, env: int, name: str) -> Instruction:
         config, layout = self.task_config, self.layout(env)
-        name = self.target_asset(env).asset.name
-        names = {asset.asset.name for asset, used in zip(self.object_assets[env], layout.present, strict=True) if used}
         return choose_instruction(
             np.random.default_rng([int(self._layout_seeds[env]), _LANGUAGE]),
             config.task,
@@ -96,7 +101,7 @@ class TransferEnv(RoboCASEnv):
             support=config.support,
             relation=cast("Relation | None", layout.relation or None),
             part=config.opening.part or part_name(config.opening.handle) if config.opening else "",
-            others=sorted(names - {name}),
+            others=sorted(self.names(env) - {name}),
             synonyms=config.language.synonyms,
         )
 
