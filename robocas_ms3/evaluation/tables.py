@@ -10,14 +10,25 @@ from robocas_ms3.evaluation.results import STAGES, Outcome, Result
 from robocas_ms3.evaluation.statistics import Share, compare, success_by
 
 P_VIS_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+WELDED = (
+    "With upstream's weld: what closed fingers had lifted hung on the hand until the gripper was told to open. "
+    "Never compare this with results without it."
+)
+
+
+def title(result: Result) -> str:
+    """What a result is of, in a line."""
+    how = " with upstream's weld" if result.run["weld"] else ""
+    return f"{result.run['policy']['name']} by {result.run['protocol']}{how}"
 
 
 def markdown(result: Result) -> str:
     """The tables of a result."""
     run = result.run
     lines = [
-        f"# {run['policy']['name']} by {run['protocol']}",
+        f"# {title(result)}",
         "",
+        *([f"**{WELDED}**", ""] if run["weld"] else []),
         f"Protocol hash `{run['protocol_hash'][:16]}`, {len(result.outcomes)} episodes, {run['backend']}; "
         + ", ".join(f"{name} {number}" for name, number in run["versions"].items())
         + ". Intervals are Clopper-Pearson's, 95 %.",
@@ -57,7 +68,7 @@ def comparison(one: Result, other: Result) -> str:
     """Two results over the same episodes.
 
     Raises:
-        EvaluationError: they are of different protocols, or have no episodes in common.
+        EvaluationError: they are of different protocols, one is with the weld, or they have no episodes in common.
     """
     if one.run["protocol_hash"] != other.run["protocol_hash"]:
         raise EvaluationError(
@@ -66,12 +77,16 @@ def comparison(one: Result, other: Result) -> str:
             expected=one.run["protocol_hash"][:16],
             found=other.run["protocol_hash"][:16],
         )
+    if one.run["weld"] != other.run["weld"]:
+        welded = (one if one.run["weld"] else other).folder
+        raise EvaluationError("a result with upstream's weld can't be compared with one without", where=welded)
     both = sorted(one.outcomes.keys() & other.outcomes.keys())
     if not both:
         raise EvaluationError("these results have no episodes in common", where=other.folder)
     names = [result.run["policy"]["name"] for result in (one, other)]
+    measured = one.run["protocol"] + (" with upstream's weld" if one.run["weld"] else "")
     lines = [
-        f"A: {names[0]} ({one.folder}), B: {names[1]} ({other.folder}); {len(both)} episodes of {one.run['protocol']} "
+        f"A: {names[0]} ({one.folder}), B: {names[1]} ({other.folder}); {len(both)} episodes of {measured} "
         "that both have. McNemar's exact test, Tango's interval; claims go by the p-value.",
         "",
         "| configuration | n | A | B | only A | only B | B - A | p |",

@@ -16,7 +16,8 @@ from robocas_ms3.evaluation.report.marks import axis, bar, rate, round_up, secti
 from robocas_ms3.evaluation.report.stages import FAILURES, STAGES
 from robocas_ms3.evaluation.results import Outcome, Result
 from robocas_ms3.evaluation.statistics import Share, share, success_by
-from robocas_ms3.evaluation.tables import P_VIS_EDGES
+from robocas_ms3.evaluation.tables import P_VIS_EDGES, WELDED
+from robocas_ms3.evaluation.tables import title as title_of
 
 
 def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | None = None) -> str:
@@ -29,7 +30,7 @@ def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | 
     """
     here = files("robocas_ms3.evaluation.report")
     style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "script.js"))
-    title = escape(f"{result.run['policy']['name']} by {result.run['protocol']}")
+    title = escape(title_of(result))
     parts = [_lead(result, protocol)]
     if result.outcomes:
         parts += [_headline(result), _splits(result), _funnels(result), _failures(result), _hidden(result)]
@@ -46,7 +47,7 @@ def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | 
 def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
     count, of = len(result.outcomes), "" if protocol is None else f" of {len(protocol.episodes)}"
     said = f"{count}{of} episodes, protocol hash <code>{escape(result.run['protocol_hash'][:16])}</code>."
-    notes = []
+    notes = [WELDED] if result.run["weld"] else []
     if protocol is not None and count < len(protocol.episodes):
         notes.append(f"{len(protocol.episodes) - count} episodes of the protocol are missing: this is no whole result.")
     broken = sum(bool(outcome.error) for outcome in result.outcomes.values())
