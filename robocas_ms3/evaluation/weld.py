@@ -1,7 +1,8 @@
 """Upstream's weld: an object that closed fingers have lifted is fixed to the hand until the gripper is told to open.
 
-Its evaluator does this, the paper's figures were measured with it, and a policy scores higher with it. So it is an
-option (`robocas eval --weld`), off by default, that a result names.
+The evaluator that the paper's figures come from does this, and it helps a policy that drops what it has lifted. So it
+is an option (`robocas eval --weld`), off by default, that a result names. Upstream lets go at the end of the step in
+which the gripper was told to open; here that is when it begins to open.
 """
 
 from __future__ import annotations
