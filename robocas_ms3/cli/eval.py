@@ -36,7 +36,7 @@ class Eval:
     protocol: str = "ms3-v1"
     """Name of a shipped protocol, or its folder."""
     out: Path | None = None
-    """Folder to write to. Default: eval/PROTOCOL/POLICY."""
+    """Folder to write to. Default: eval/PROTOCOL/POLICY, with the weld eval/PROTOCOL/POLICY_weld."""
     resume: bool = False
     """Go on with a result that is there."""
     envs: int = 2
@@ -50,6 +50,9 @@ class Eval:
     all parts."""
     episodes: int | None = None
     """Only the first so many of each configuration."""
+    weld: bool = False
+    """Weld what closed fingers have lifted to the hand, as upstream does, until the gripper is told to open. Only in
+    protocols with upstream's steps (paper-v1), in processes; never to be compared with results without."""
     count: int = 8
     """How many videos, of all kinds of failures in turn."""
 
@@ -97,8 +100,9 @@ def run(cfg: Eval) -> int:
             raise EvaluationError("no such task", where=word, expected=expected)
     check_number("envs", cfg.envs, 1)
     protocol = load_protocol(cfg.protocol)
-    out = cfg.out or Path("eval") / protocol.rules.name / re.sub(r"[^\w.-]+", "_", cfg.policy)
-    settings = Settings(cfg.envs, cfg.backend, cfg.workers, shard_of(cfg.shard), cfg.words, cfg.episodes)
+    name = re.sub(r"[^\w.-]+", "_", cfg.policy) + ("_weld" if cfg.weld else "")
+    out = cfg.out or Path("eval") / protocol.rules.name / name
+    settings = Settings(cfg.envs, cfg.backend, cfg.workers, shard_of(cfg.shard), cfg.words, cfg.episodes, cfg.weld)
     succeeded = played = 0
     with open_policy(cfg.policy) as policy, bar("episodes") as shown:
         try:

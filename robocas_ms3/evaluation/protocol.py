@@ -169,7 +169,9 @@ class LoadedProtocol:
 
 def files_of(folder: Path) -> list[Path]:
     """The files that a protocol is made of, sorted."""
-    inside = [path for name in (f"{CONFIGS}/*.yaml", f"{LAYOUTS}/*.npy", f"{TRAIN}/*.yaml") for path in folder.glob(name)]
+    inside = [
+        path for name in (f"{CONFIGS}/*.yaml", f"{LAYOUTS}/*.npy", f"{TRAIN}/*.yaml") for path in folder.glob(name)
+    ]
     return sorted([folder / RULES, folder / EPISODES, *inside])
 
 

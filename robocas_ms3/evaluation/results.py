@@ -27,7 +27,8 @@ from robocas_ms3.files import make_folder, replacing_folder, write_json
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
-_SAME = ("protocol", "protocol_hash", "policy", "backend", "versions", "pack_hashes")  # of parts of one result
+_SAME = ("protocol", "protocol_hash", "policy", "weld", "backend", "versions", "pack_hashes")  # of parts of one result
+_BEFORE = {"weld": False}  # of results that were written before there was one
 # evaluation_v0.md and the paper's table: reach, pick, recognise, clear
 STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
 _ORDER = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_target", "target_grasped", "target_lifted")
@@ -52,7 +53,7 @@ class Outcome:
         error: why.
         flags: by stage or rule, the policy step after which it first held.
         flag_seconds: the same in s of the scene.
-        measures: ``path_length`` m, ``contact_impulse`` N s, ``disturbed_most``, ``fallen``.
+        measures: ``path_length`` m, ``contact_impulse`` N s, ``disturbed_most``, ``fallen``; ``welds`` with the weld.
         inference_ms: clock time of the policy a step.
         p_vis: share of the target that is seen from above.
         retrieval: search: what was moved before the target, see `retrieval.outcome`.
@@ -168,7 +169,7 @@ def begin(folder: Path, run: dict[str, Any], *, resume: bool) -> dict[int, Outco
     if not path.is_file():
         write_json(path, run)
         return {}
-    before = json.loads(path.read_text(encoding="utf-8"))
+    before = {**_BEFORE, **json.loads(path.read_text(encoding="utf-8"))}
     if not resume and (folder / OUTCOMES).is_file():
         raise EvaluationError(
             "there is a result already", where=folder, fix="Pass --resume to go on, or another --out."
@@ -271,7 +272,8 @@ def _read(folder: Path) -> Result:
         outcomes = dict(sorted(_outcomes(folder / OUTCOMES).items()))
     except (OSError, ValueError) as error:
         raise EvaluationError("no result of an evaluation", where=folder, found=error) from error
-    missing = [key for key in _SAME if key not in run] if isinstance(run, dict) else _SAME
+    run = {**_BEFORE, **run} if isinstance(run, dict) else {}
+    missing = [key for key in _SAME if key not in run]
     if missing:
         raise EvaluationError("no result of an evaluation", where=folder / RUN, expected=", ".join(missing))
     return Result(folder, run, outcomes)

@@ -16,6 +16,7 @@ from robocas_ms3.evaluation.policy import Observations, Policy, Start
 from robocas_ms3.language.embed import TextEmbedder
 
 TRACKED = ("path_length", "contact_impulse", "disturbed_most", "fallen")  # of `tracking`, as they end
+_WELDS = "welds"  # of `weld`, where there is one
 
 
 @dataclass
@@ -188,7 +189,8 @@ class Rollouts:
                     played.flags[name], played.flag_seconds[name] = played.steps, round(played.seconds, 4)
                 played.flags.setdefault(name, None)
                 played.flag_seconds.setdefault(name, None)
-        played.measures = {name: round(float(info[name][env]), 4) for name in TRACKED}
+        measured = (*TRACKED, _WELDS) if _WELDS in info else TRACKED
+        played.measures = {name: round(float(info[name][env]), 4) for name in measured}
         if "retrieval" in info:
             played.retrieval = info["retrieval"][env]
 

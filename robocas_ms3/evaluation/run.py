@@ -17,12 +17,13 @@ from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
 from robocas_ms3.evaluation.results import Outcome
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
+from robocas_ms3.evaluation.weld import refuse
 from robocas_ms3.tasks.vector.backend import Backend, choose_backend
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How an evaluation runs; nothing of it changes what comes out.
+    """How an evaluation runs; nothing of it but ``weld`` changes what comes out.
 
     Attributes:
         num_envs: envs at a time.
@@ -31,6 +32,7 @@ class Settings:
         shard: (number, of how many): only these episodes, every n-th.
         tasks: only these; empty: all of the protocol's.
         episodes: only the first so many of each configuration.
+        weld: whether what is lifted is welded to the hand, as upstream does (`weld`).
     """
 
     num_envs: int = 2
@@ -39,6 +41,7 @@ class Settings:
     shard: tuple[int, int] = (0, 1)
     tasks: tuple[str, ...] = ()
     episodes: int | None = None
+    weld: bool = False
 
 
 def evaluate(
@@ -59,9 +62,12 @@ def evaluate(
 
     Raises:
         DatasetError: the policy wants to see, and there is no render device.
-        EvaluationError: the policy does not fit the protocol, the pack is another, or the result is of another run.
+        EvaluationError: the policy or the weld does not fit the protocol, the pack is another, or the result is of
+            another run.
     """
     protocol.rules.refuse(policy.wants)
+    if settings.weld:
+        refuse(protocol.rules.stepping, choose_backend(settings.backend))
     wanted = chosen(protocol.episodes, settings)
     if not wanted:
         raise EvaluationError("no episodes", where=protocol.rules.name, found=f"tasks {list(settings.tasks)}")
@@ -109,6 +115,7 @@ def about(protocol: LoadedProtocol, policy: Policy, name: str, settings: Setting
         "protocol": protocol.rules.name,
         "protocol_hash": protocol.hash,
         "policy": {"name": name, **describe(policy)},
+        "weld": settings.weld,
         "backend": choose_backend(settings.backend),
         "versions": results.versions(),
         "pack_hashes": {protocol.rules.pack: pack},
@@ -120,7 +127,8 @@ def _play(protocol: LoadedProtocol, policy: Policy, episodes: list[Episode], set
     rules, first = protocol.rules, episodes[0]
     rate, gpu = rate_of(protocol, policy.wants), choose_backend(settings.backend) == "gpu"
     count = min(settings.num_envs, len(episodes))
-    env = make_env(protocol, policy.wants, first, count, backend=settings.backend, workers=settings.workers)
+    runs = {"backend": settings.backend, "workers": settings.workers, "weld": settings.weld}
+    env = make_env(protocol, policy.wants, first, count, **runs)
     try:
         steps = rules.steps(first.task, rate)
         assert steps is not None  # `load_protocol` saw to it

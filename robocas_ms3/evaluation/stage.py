@@ -23,7 +23,9 @@ def rate_of(protocol: LoadedProtocol, wants: Wants) -> int:
     return UPSTREAM_HZ if protocol.rules.stepping == "upstream" else protocol.rules.rate(wants)
 
 
-def make_env(protocol: LoadedProtocol, wants: Wants, episode: Episode, num_envs: int, **kwargs: Any) -> Any:
+def make_env(
+    protocol: LoadedProtocol, wants: Wants, episode: Episode, num_envs: int, *, weld: bool = False, **kwargs: Any
+) -> Any:
     """Make envs for a configuration's episodes.
 
     Args:
@@ -31,10 +33,17 @@ def make_env(protocol: LoadedProtocol, wants: Wants, episode: Episode, num_envs:
         wants: what the policy wants to see, and speaks.
         episode: any of that configuration.
         num_envs: how many.
+        weld: whether what is lifted is welded to the hand (`weld`).
         kwargs: further ones of `make_vec`.
     """
     torch.set_num_threads(1)
-    stepping = protocol.rules.stepping
+    stepped = partial(
+        PolicyStepping,
+        convention=wants.convention,
+        reference=wants.reference,
+        stepping=protocol.rules.stepping,
+        weld=weld,
+    )
     return make_vec(
         TASKS[episode.task].env_id,
         num_envs,
@@ -42,7 +51,7 @@ def make_env(protocol: LoadedProtocol, wants: Wants, episode: Episode, num_envs:
         auto_reset=False,
         ignore_terminations=True,
         record_metrics=False,
-        wrappers=[partial(PolicyStepping, convention=wants.convention, reference=wants.reference, stepping=stepping)],
+        wrappers=[stepped],
         config=str(protocol.config_file(episode.config)),
         layouts=str(protocol.layouts_file(episode.config)),
         pack=protocol.rules.pack,

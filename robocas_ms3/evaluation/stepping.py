@@ -14,6 +14,7 @@ from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS, Motion
 from robocas_ms3.evaluation.policy import Reference
 from robocas_ms3.evaluation.tracking import Tracker
+from robocas_ms3.evaluation.weld import Weld
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 
 Stepping = Literal["timed", "upstream"]
@@ -35,9 +36,12 @@ class PolicyStepping(gym.Wrapper):
         reference: what motions are relative to.
         stepping: ``timed``: a step is one control step. ``upstream``: a step moves the gripper until it stands, then
             the TCP, on a straight line, until it is there or 0.4 s are over. Envs of a batch that are there wait.
+        weld: whether what is lifted is welded to the hand (`weld`); one env on a CPU.
     """
 
-    def __init__(self, env: gym.Env, convention: str, reference: Reference, stepping: Stepping) -> None:
+    def __init__(
+        self, env: gym.Env, convention: str, reference: Reference, stepping: Stepping, *, weld: bool = False
+    ) -> None:
         super().__init__(env)
         self._convention, self._reference, self._stepping = CONVENTIONS[convention], reference, stepping
         self._base: Any = env.unwrapped
@@ -48,17 +52,20 @@ class PolicyStepping(gym.Wrapper):
         self.action_space = gym.spaces.Box(-batched, batched) if count > 1 else self.single_action_space
         self.single_observation_space = self._base.single_observation_space
         self._tracker = Tracker(self._base)
+        self._weld = Weld(self._base) if weld else None
         self._told = np.ones(count, dtype=bool)  # whether each gripper was told to be open last
         self._width_change = np.zeros(count)  # m in the last control step
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Reset; see ``BaseEnv``."""
+        if self._weld:
+            self._weld.reset()
         obs, info = self.env.reset(**kwargs)
         envs = (kwargs.get("options") or {}).get("env_idx", slice(None))
         self._tracker.reset(envs)
         rows = envs if isinstance(envs, slice) else np.asarray(torch.as_tensor(envs).cpu())
         self._told[rows], self._width_change[rows] = True, 0.0
-        return obs, {**info, **self._tracker.read()}
+        return obs, {**info, **self._happened(info)}
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """One policy step.
@@ -74,13 +81,20 @@ class PolicyStepping(gym.Wrapper):
         if not np.isfinite(actions).all():
             raise EvaluationError("an action is not finite", where="action", found=actions.tolist())
         if self._convention.read is None:
+            self._told = actions[:, 7] > 0
             result = self._control(actions)
         else:
             motion = self._convention.read(actions)
             result = self._timed(motion) if self._stepping == "timed" else self._upstream(motion)
+        if self._weld and not self._told[0]:
+            self._weld.look()
         *others, info = result
         self._tracker.end_step()
-        return (*others, {**info, **self._tracker.read()})
+        return (*others, {**info, **self._happened(info)})
+
+    def _happened(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """What an info says besides, or otherwise."""
+        return {**self._tracker.read(), **(self._weld.read(info) if self._weld else {})}
 
     def _timed(self, motion: Motion) -> tuple:
         start = self._tcp() if self._reference == "tcp" else self._target()
@@ -112,10 +126,12 @@ class PolicyStepping(gym.Wrapper):
         return self._control(np.concatenate([delta, np.where(opened, 1.0, -1.0)[:, None]], axis=1))
 
     def _control(self, actions: np.ndarray) -> tuple:
+        if self._weld and self._told[0]:
+            self._weld.open()
         width = self._width()
         result = self.env.step(torch.as_tensor(actions, dtype=torch.float32, device=self._base.device))
         self._width_change = np.abs(self._width() - width)
-        self._tracker.look(result[-1], self._told if self._convention.read else actions[:, 7] > 0)
+        self._tracker.look(result[-1], self._told)
         return result
 
     def _tcp(self) -> tuple[np.ndarray, Rotation]:

@@ -11,14 +11,25 @@ from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, compare, success_by
 
 P_VIS_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+WELDED = (
+    "With upstream's weld: what closed fingers had lifted hung on the hand until the gripper was told to open. "
+    "Never compare this with results without it."
+)
+
+
+def title(result: Result) -> str:
+    """What a result is of, in a line."""
+    how = " with upstream's weld" if result.run["weld"] else ""
+    return f"{result.run['policy']['name']} by {result.run['protocol']}{how}"
 
 
 def markdown(result: Result) -> str:
     """The tables of a result."""
     run = result.run
     lines = [
-        f"# {run['policy']['name']} by {run['protocol']}",
+        f"# {title(result)}",
         "",
+        *([f"**{WELDED}**", ""] if run["weld"] else []),
         f"Protocol hash `{run['protocol_hash'][:16]}`, {len(result.outcomes)} episodes, {run['backend']}; "
         + ", ".join(f"{name} {number}" for name, number in run["versions"].items())
         + ". Intervals are Clopper-Pearson's, 95 %.",
@@ -38,6 +49,7 @@ def markdown(result: Result) -> str:
             f"{_mean([one.seconds for one in outcomes]):.1f}",
         ]
         lines.append("| " + " | ".join(cells) + " |")
+    lines += _splits(result)
     lines += ["", "## Where episodes failed", "", "| configuration | first stage not reached |", "|---|---|"]
     for config, outcomes in result.by("config").items():
         found = Counter(one.failure_stage for one in outcomes if one.failure_stage)
@@ -52,6 +64,20 @@ def markdown(result: Result) -> str:
                 f"| {found.low:g} to {found.high:g} | {0 if found.share is None else found.share.n} | {rate} |"
             )
     return "\n".join([*lines, *_retrieval(result)]) + "\n"
+
+
+def _splits(result: Result) -> list[str]:
+    splits = result.by("split")
+    if len(splits) < 2:
+        return []
+    lines = ["", "## By split", "", f"| task | {' | '.join(splits)} |", "|---|" + "---|" * len(splits)]
+    for task in result.by("task"):
+        cells = []
+        for outcomes in splits.values():
+            of_task = [one for one in outcomes if one.task == task]
+            cells.append(f"{percent(result.rate('success', of_task))} of {len(of_task)}" if of_task else "")
+        lines.append(f"| {task} | {' | '.join(cells)} |")
+    return lines
 
 
 def _retrieval(result: Result) -> list[str]:
@@ -74,7 +100,7 @@ def comparison(one: Result, other: Result) -> str:
     """Two results over the same episodes.
 
     Raises:
-        EvaluationError: they are of different protocols, or have no episodes in common.
+        EvaluationError: they are of different protocols, one is with the weld, or they have no episodes in common.
     """
     if one.run["protocol_hash"] != other.run["protocol_hash"]:
         raise EvaluationError(
@@ -83,12 +109,16 @@ def comparison(one: Result, other: Result) -> str:
             expected=one.run["protocol_hash"][:16],
             found=other.run["protocol_hash"][:16],
         )
+    if one.run["weld"] != other.run["weld"]:
+        welded = (one if one.run["weld"] else other).folder
+        raise EvaluationError("a result with upstream's weld can't be compared with one without", where=welded)
     both = sorted(one.outcomes.keys() & other.outcomes.keys())
     if not both:
         raise EvaluationError("these results have no episodes in common", where=other.folder)
     names = [result.run["policy"]["name"] for result in (one, other)]
+    measured = one.run["protocol"] + (" with upstream's weld" if one.run["weld"] else "")
     lines = [
-        f"A: {names[0]} ({one.folder}), B: {names[1]} ({other.folder}); {len(both)} episodes of {one.run['protocol']} "
+        f"A: {names[0]} ({one.folder}), B: {names[1]} ({other.folder}); {len(both)} episodes of {measured} "
         "that both have. McNemar's exact test, Tango's interval; claims go by the p-value.",
         "",
         "| configuration | n | A | B | only A | only B | B - A | p |",

@@ -22,6 +22,7 @@ def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
     pack = result.run.get("pack_hashes", {}).get(protocol.rules.pack)
     if pack != protocol.rules.pack_hash:
         found.append(f"it was measured with another pack: {pack}")
+    found += _of_weld(result, protocol)
     for number, outcome in result.outcomes.items():
         if not 0 <= number < len(protocol.episodes):
             found.append(f"episode {number}: the protocol has none of this number")
@@ -36,6 +37,15 @@ def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
     if missing:
         found.append(f"{missing} of {len(protocol.episodes)} episodes are missing")
     return found
+
+
+def _of_weld(result: Result, protocol: LoadedProtocol) -> Iterator[str]:
+    weld = result.run["weld"]
+    if weld and protocol.rules.stepping != "upstream":
+        yield "it was measured with upstream's weld, which does not belong to this protocol's steps"
+    for number, outcome in result.outcomes.items():
+        if ("welds" in outcome.measures) != weld:
+            yield f"episode {number}: it {'counts no welds' if weld else 'counts welds'}, the run says weld: {weld}"
 
 
 def _too_long(outcome: Outcome, protocol: LoadedProtocol, run: dict[str, Any]) -> Iterator[str]:

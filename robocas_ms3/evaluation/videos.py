@@ -19,6 +19,7 @@ from robocas_ms3.evaluation.report.failed import VIDEOS, video_name
 from robocas_ms3.evaluation.results import Outcome, Result
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
+from robocas_ms3.evaluation.weld import refuse
 from robocas_ms3.files import make_folder, replacing
 
 SIZE = (480, 360)  # pixels
@@ -63,6 +64,8 @@ def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Seq
             found=protocol.hash,
         )
     protocol.rules.refuse(policy.wants)
+    if result.run["weld"]:
+        refuse(protocol.rules.stepping, "processes")
     require_renderer()
     make_folder(result.folder / VIDEOS)
     for config in dict.fromkeys(protocol.episodes[number].config for number in episodes):
@@ -74,7 +77,7 @@ def _film(result: Result, protocol: LoadedProtocol, policy: Policy, numbers: lis
     rules, first = protocol.rules, protocol.episodes[numbers[0]]
     rate = rate_of(protocol, policy.wants)
     size = {"width": SIZE[0], "height": SIZE[1]}
-    watched = {"render_mode": "rgb_array", "human_render_camera_configs": size}
+    watched = {"render_mode": "rgb_array", "human_render_camera_configs": size, "weld": result.run["weld"]}
     made = make_env(protocol, policy.wants, first, 1, backend="processes", **watched)
     env = _Watched(made, max(1, round(rate / _FRAMES)))
     try:

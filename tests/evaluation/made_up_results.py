@@ -16,6 +16,7 @@ RUN_OF = {
     "protocol": "made_up",
     "protocol_hash": "ab" * 32,
     "policy": {"name": "mine", "class": "mine:Policy", "wants": {"rate_hz": None}},
+    "weld": False,
     "backend": "processes",
     "versions": {"robocas_ms3": "0.1.0", "torch": "2.4"},
     "pack_hashes": {"builtin": "cd" * 32},

@@ -3,10 +3,13 @@
 import pytest
 import yaml
 
+from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli import eval as command
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.config import load_task_config
+from robocas_ms3.errors import EvaluationError, RobocasError
 from robocas_ms3.evaluation.freeze import Plan, freeze
 from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.scenes.frozen import FrozenLayouts
 
 PLAN = {
     "rules": {"name": "tiny", "description": "One episode.", "max_seconds": {"pick": 5}},
@@ -32,14 +35,52 @@ def test_it_appears_whole_and_loads(made):
 
 def test_its_episode_is_that_of_the_shipped_protocol_of_the_same_seed(made):
     (mine,), shipped = load_protocol(made).episodes, load_protocol("smoke").episodes[0]
-    assert mine.split == "mine"
-    assert mine.model_copy(update={"split": shipped.split}) == shipped
+    assert (mine.split, mine.config) == ("mine", "pick_table_scattered-mine")
+    assert mine.model_copy(update={"split": shipped.split, "config": shipped.config}) == shipped
 
 
 def test_a_folder_that_is_there_is_refused_before_anything_is_drawn(made, tmp_path):
     (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
     with pytest.raises(EvaluationError, match="something already"):
         command.main(command.Eval(("freeze", str(tmp_path / "plan.yaml")), out=made))
+
+
+def test_scenes_may_be_changed_and_misnamed(tmp_path):
+    fewer = {"objects": {"count": 2}, "layout": {"kind": "orderly", "copies": 1, "rows": 1}}
+    scene = {"config": "pick_table_scattered", "count": 1, "first_seed": 110010, "change": fewer}
+    parts = [{**scene, "split": words, "words": words, "name": "two"} for words in ("asked", "wrong", "empty")]
+    train = [{"config": "pick_table_scattered", "change": {"objects": {"count": 1}}, "name": "one"}]
+    list(freeze(Plan.model_validate({**PLAN, "parts": parts, "train": train}), tmp_path / "out"))
+    protocol = load_protocol(tmp_path / "out")
+    asked, wrong, empty = protocol.episodes
+    config = load_task_config(protocol.config_file("two"))
+    assert (config.objects.count, config.layout.kind) == (2, "orderly")
+    assert {path.name for path in (tmp_path / "out" / "layouts").iterdir()} == {"two.npy"}
+    layouts = FrozenLayouts(protocol.layouts_file("two"), load_pack("builtin").objects)
+    (other,) = set(layouts(asked.seed, asked.seed).object_ids) - {asked.target}
+    names = {one: load_pack("builtin").objects[one].asset.name for one in (asked.target, other)}
+    assert asked.instruction == f"grasp the {names[asked.target]} on the table and move it to the basket"
+    assert wrong.instruction == f"grasp the {names[other]} on the table and move it to the basket"
+    assert (empty.instruction, empty.target) == ("", asked.target)
+    assert [path.name for path in protocol.train_files()] == ["one.yaml"]
+    before = protocol.hash
+    protocol.train_files()[0].write_text("task: pick")
+    assert load_protocol(tmp_path / "out").hash != before
+
+
+@pytest.mark.parametrize(
+    ("second", "said"),
+    [
+        ({"change": {"objects": {"count": 3}}}, "pick_table_scattered-mine: two configurations of one name"),
+        ({"change": {"objects": {"number": 3}}}, "objects.*number"),
+        ({"config": "nothing"}, "nothing"),
+    ],
+)
+def test_parts_that_can_not_be(tmp_path, second, said):
+    plan = {**PLAN, "parts": [PLAN["parts"][0], {**PLAN["parts"][0], **second}]}
+    with pytest.raises(RobocasError, match=said):
+        list(freeze(Plan.model_validate(plan), tmp_path / "out"))
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("text", ["parts: []", "rules: [", "rules: {}\nparts: [{config: x}]"])

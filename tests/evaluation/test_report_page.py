@@ -90,6 +90,15 @@ def test_it_says_what_it_was_measured_with(result):
     assert {"ab" * 32, "cd" * 32, "robocas_ms3 0.1.0, torch 2.4", "mine:Policy"} <= set(texts)
 
 
+def test_it_names_the_weld(result, tmp_path):
+    welded = write(tmp_path / "welded", result.outcomes.values(), weld=True)
+    reader = Reader(page(welded))
+    assert reader.texts[:2] == ["mine by made_up with upstream's weld"] * 2
+    assert any(text.startswith("With upstream's weld: ") for text in reader.texts)
+    assert reader.after("upstream's weld", 1) == ["yes"]
+    assert Reader(page(result)).after("upstream's weld", 1) == ["no"]
+
+
 def test_it_leads_nowhere_but_to_its_own_videos(result):
     text = page(result, result.folder)
     assert Reader(text).links == []

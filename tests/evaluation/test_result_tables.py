@@ -61,3 +61,14 @@ def test_comparisons_of_different_protocols_or_of_nothing_are_refused(tmp_path):
         comparison(one, write(tmp_path / "b", [outcome(0)], protocol_hash="ef" * 32))
     with pytest.raises(EvaluationError, match="no episodes in common"):
         comparison(one, write(tmp_path / "c", [outcome(1)]))
+
+
+def test_the_weld_is_named_and_compared_with_its_like_alone(tmp_path):
+    without = write(tmp_path / "a", [outcome(0)])
+    one, other = (write(tmp_path / name, [outcome(0)], weld=True) for name in "bc")
+    assert markdown(one).startswith("# mine by made_up with upstream's weld\n\n**With upstream's weld: ")
+    assert "weld" not in markdown(without)
+    assert "1 episodes of made_up with upstream's weld that both have" in comparison(one, other)
+    for pair in ((one, without), (without, one)):
+        with pytest.raises(EvaluationError, match=r"/b: a result with upstream's weld can't be compared"):
+            comparison(*pair)

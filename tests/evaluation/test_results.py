@@ -37,11 +37,31 @@ def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
         read(tmp_path / "a")
 
 
-@pytest.mark.parametrize("key", ["protocol_hash", "policy", "versions", "pack_hashes", "backend"])
+@pytest.mark.parametrize("key", ["protocol_hash", "policy", "weld", "versions", "pack_hashes", "backend"])
 def test_resuming_with_something_else_is_refused(tmp_path, key):
     write(tmp_path / "a", [outcome(0)])
     with pytest.raises(EvaluationError, match=f"another {key}"):
         begin(tmp_path / "a", {**RUN_OF, key: "other"}, resume=True)
+
+
+def test_a_result_from_before_there_was_a_weld_is_one_without_it(tmp_path):
+    run = {name: value for name, value in RUN_OF.items() if name != "weld"}
+    begin(tmp_path / "a", run, resume=False)
+    append(tmp_path / "a", outcome(0))
+    write(tmp_path / "b", [outcome(1)])
+    assert read(tmp_path / "a").run == RUN_OF
+    assert list(read(tmp_path / "a", tmp_path / "b").outcomes) == [0, 1]
+    assert list(begin(tmp_path / "a", RUN_OF, resume=True)) == [0]
+    with pytest.raises(EvaluationError, match="another weld"):
+        begin(tmp_path / "a", {**RUN_OF, "weld": True}, resume=True)
+
+
+def test_parts_with_the_weld_and_without_are_two_results(tmp_path):
+    write(tmp_path / "a", [outcome(0)])
+    write(tmp_path / "b", [outcome(1)], weld=True)
+    assert len(parts_of([tmp_path / "a", tmp_path / "b"])) == 2
+    with pytest.raises(EvaluationError, match=r"another weld.*expected False, found True"):
+        merge([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
 
 
 def test_a_result_that_is_there_is_not_gone_on_with_unasked(tmp_path):
@@ -78,7 +98,7 @@ def test_the_same_holds_within_a_file(tmp_path):
         write(tmp_path / "a", [outcome(0), outcome(0, came_to=3)])
 
 
-@pytest.mark.parametrize("key", ["protocol_hash", "policy", "versions", "pack_hashes", "backend"])
+@pytest.mark.parametrize("key", ["protocol_hash", "policy", "weld", "versions", "pack_hashes", "backend"])
 def test_parts_of_different_results_are_refused(tmp_path, key):
     write(tmp_path / "a", [outcome(0)])
     write(tmp_path / "b", [outcome(1)], **{key: {"torch": "other"}})

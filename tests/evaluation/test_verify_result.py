@@ -89,6 +89,16 @@ def test_another_protocol_or_pack_is_found(folder, protocol):
     ]
 
 
+def test_a_weld_where_none_can_be_is_found(folder, protocol):
+    tamper(folder, 0, measures=read(folder).outcomes[0].measures | {"welds": 1.0})
+    assert problems(read(folder), protocol) == ["episode 0: it counts welds, the run says weld: False"]
+    tamper_run(folder, weld=True)
+    found = problems(read(folder), protocol)
+    assert "it was measured with upstream's weld, which does not belong to this protocol's steps" in found
+    assert "episode 1: it counts no welds, the run says weld: True" in found
+    assert len(found) == 8
+
+
 def test_the_command_fails_where_something_is_wrong(folder, capsys):
     assert command.main(command.Eval(("verify", str(folder)))) == 0
     assert "8 episodes of smoke, all well" in capsys.readouterr().out

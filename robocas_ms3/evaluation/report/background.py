@@ -18,7 +18,11 @@ def measured_with(result: Result, protocol: LoadedProtocol | None) -> str:
         pairs += [("what it says", protocol.rules.description), ("its rules", _rules(protocol))]
     pairs += [("policy", policy["name"])]
     pairs += [(f"policy, {name}", _plain(value)) for name, value in policy.items() if name != "name"]
-    pairs += [("backend", run["backend"]), ("versions", _plain(run["versions"]))]
+    pairs += [
+        ("upstream's weld", "yes" if run["weld"] else "no"),
+        ("backend", run["backend"]),
+        ("versions", _plain(run["versions"])),
+    ]
     pairs += [(f"pack {name}", value) for name, value in run["pack_hashes"].items()]
     machines = {_plain(part["machine"]) for part in run.get("parts", [])} or {_plain(run.get("machine", {}))}
     pairs += [("machine", machine) for machine in sorted(machines)]

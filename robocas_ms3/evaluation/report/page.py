@@ -17,7 +17,8 @@ from robocas_ms3.evaluation.report.stages import FAILURES, STAGES
 from robocas_ms3.evaluation.results import Outcome, Result
 from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, share, success_by
-from robocas_ms3.evaluation.tables import P_VIS_EDGES
+from robocas_ms3.evaluation.tables import P_VIS_EDGES, WELDED
+from robocas_ms3.evaluation.tables import title as title_of
 
 
 def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | None = None) -> str:
@@ -30,7 +31,7 @@ def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | 
     """
     here = files("robocas_ms3.evaluation.report")
     style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "script.js"))
-    title = escape(f"{result.run['policy']['name']} by {result.run['protocol']}")
+    title = escape(title_of(result))
     parts = [_lead(result, protocol)]
     if result.outcomes:
         parts += [
@@ -54,7 +55,7 @@ def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | 
 def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
     count, of = len(result.outcomes), "" if protocol is None else f" of {len(protocol.episodes)}"
     said = f"{count}{of} episodes, protocol hash <code>{escape(result.run['protocol_hash'][:16])}</code>."
-    notes = []
+    notes = [WELDED] if result.run["weld"] else []
     if protocol is not None and count < len(protocol.episodes):
         notes.append(f"{len(protocol.episodes) - count} episodes of the protocol are missing: this is no whole result.")
     broken = sum(bool(outcome.error) for outcome in result.outcomes.values())
@@ -90,15 +91,15 @@ def _splits(result: Result) -> str:
     if len(splits) < 2:
         return ""
     rows = []
-    for config, outcomes in _with_all(result.by("config")):
-        row = [escape(config)]
+    for task, outcomes in _with_all(result.by("task")):
+        row = [escape(task)]
         for split in splits:
             of_split = [outcome for outcome in outcomes if outcome.split == split]
             found = result.rate("success", of_split) if of_split else None
             row += [str(len(of_split)), rate(found), bar(found, "good")]
         rows.append(row)
     heads = [
-        "configuration",
+        "task",
         *(head for split in splits for head in (f"{escape(split)}, n#", "success#", "0 to 100 %")),
     ]
     return section("Splits", "Success, side by side.", table(heads, rows, "splits"))

@@ -1,0 +1,221 @@
+"""Upstream's weld: what is lifted hangs on the hand, until the gripper is told to open, and no longer."""
+
+from __future__ import annotations
+
+import shutil
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import sapien
+import torch
+
+import robocas_ms3  # noqa: F401
+from robocas_ms3.cli.main import run as cli
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.policies import make_policy
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.run import Settings, evaluate
+from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
+from robocas_ms3.evaluation.verify import problems
+from robocas_ms3.evaluation.videos import film
+from robocas_ms3.evaluation.weld import Weld, refuse
+from robocas_ms3.robots.constants import HAND_LINK
+
+OPEN, CLOSE = 1.0, 0.0
+
+
+class ClaimsSuccess(gym.Wrapper):
+    """An environment whose task has succeeded at every step."""
+
+    def step(self, action: Any) -> Any:
+        *others, info = self.env.step(action)
+        return (*others, {**info, "success": torch.tensor([True])})
+
+
+def made(weld: bool = True, wrap: Any = lambda env: env, **kwargs: Any) -> PolicyStepping:
+    env = gym.make(
+        "RoboCASPick-v1",
+        obs_mode="none",
+        reward_mode="none",
+        render_backend="none",
+        control_mode=control_mode("robocas"),
+        sim_config={"control_freq": 5},
+        max_episode_steps=10_000,
+        **kwargs,
+    )
+    stepped = PolicyStepping(wrap(env), "robocas", "tcp", "upstream", weld=weld)
+    stepped.reset(seed=3)
+    return stepped
+
+
+def stay(gripper: float) -> np.ndarray:
+    return np.array([0, 0, 0, 0, 0, 0, gripper])
+
+
+def target(env: PolicyStepping) -> Any:
+    base: Any = env.unwrapped
+    return base.objects[int(base.target_slot)]._bodies[0]
+
+
+def grasp(env: PolicyStepping, above: float | None = None) -> dict[str, Any]:
+    """Close the fingers on the target, which waits at the TCP, up in the air; ``above``: m that it has been raised."""
+    base: Any = env.unwrapped
+    body = target(env)
+    pose = sapien.Pose(base.agent.tcp.pose.sp.p, [1, 0, 0, 0])
+    if above is not None:
+        base.start_poses[0, base.target_slot, 2] = float(pose.p[2]) - above
+    body.disable_gravity = True
+    body.entity.set_pose(pose)
+    body.set_linear_velocity(np.zeros(3))
+    body.set_angular_velocity(np.zeros(3))
+    *_, info = env.step(stay(CLOSE))
+    body.disable_gravity = False
+    return info
+
+
+def open_fingers(env: PolicyStepping) -> None:
+    """Open them without telling whoever welds."""
+    for _ in range(3):
+        env.env.step(torch.tensor([[0, 0, 0, 0, 0, 0, OPEN]]))
+
+
+def in_hand(env: PolicyStepping) -> sapien.Pose:
+    base: Any = env.unwrapped
+    return base.agent.robot.links_map[HAND_LINK]._bodies[0].entity_pose.inv() * target(env).entity_pose
+
+
+def test_what_is_welded_keeps_its_pose_in_the_hand_whatever_arm_and_fingers_do():
+    env, rng = made(), np.random.default_rng(0)
+    assert float(grasp(env)["welds"]) == 1
+    before = in_hand(env)
+    shifts, turns = [], []
+    for number in range(40):
+        if number % 10 == 0:
+            open_fingers(env)
+        *_, info = env.step(np.concatenate([rng.uniform(-0.1, 0.1, 3), rng.uniform(-0.4, 0.4, 3), [CLOSE]]))
+        gone = before.inv() * in_hand(env)
+        shifts.append(np.linalg.norm(gone.p))
+        turns.append(2 * np.arcsin(min(1.0, np.linalg.norm(gone.q[1:]))))
+    assert np.isfinite(target(env).linear_velocity).all()
+    assert max(shifts) < 0.001  # m
+    assert max(turns) < np.deg2rad(0.5)
+    assert float(info["path_length"]) > 1  # the arm did move
+    assert float(info["welds"]) == 1
+    env.close()
+
+
+@pytest.mark.parametrize("weld", [True, False])
+def test_it_hangs_until_the_gripper_is_told_to_open_and_then_falls(weld):
+    env = made(weld)
+    grasp(env)
+    height = target(env).entity_pose.p[2]
+    open_fingers(env)
+    fallen = height - target(env).entity_pose.p[2]
+    assert fallen == pytest.approx(0, abs=0.001) if weld else fallen > 0.3
+    env.step(stay(OPEN))
+    env.step(stay(OPEN))
+    assert height - target(env).entity_pose.p[2] > 0.3
+    env.close()
+
+
+def test_it_is_welded_once_a_grasp():
+    env = made()
+    counts = [grasp(env)["welds"], env.step(stay(CLOSE))[-1]["welds"], env.step(stay(OPEN))[-1]["welds"]]
+    counts += [grasp(env)["welds"]]
+    assert [float(count) for count in counts] == [1, 1, 1, 2]
+    env.close()
+
+
+@pytest.mark.parametrize(("above", "welds"), [(0.025, 0), (0.035, 1)])
+def test_what_was_hardly_raised_is_not_welded(above, welds):
+    env = made()
+    info = grasp(env, above)
+    assert bool(info["target_grasped"])
+    assert float(info["welds"]) == welds
+    env.close()
+
+
+def test_what_one_finger_touches_is_not_welded():
+    env = made()
+    base: Any = env.unwrapped
+    forces = torch.zeros(1, 3, len(base.objects), 3)
+    forces[0, 0] = forces[0, 2] = 5.0  # N, on the left finger and the hand
+    base.gripper_forces = lambda: forces
+    assert float(grasp(env)["welds"]) == 0
+    env.close()
+
+
+def test_there_is_no_success_while_anything_is_welded():
+    env = made(wrap=ClaimsSuccess)
+    assert not bool(grasp(env)["success"])
+    open_fingers(env)  # in the basket, at rest and touched by nothing it would still hang
+    assert not bool(env.step(stay(CLOSE))[-1]["success"])
+    assert bool(env.step(stay(OPEN))[-1]["success"])
+    env.close()
+
+
+@pytest.mark.parametrize("reconfiguration_freq", [0, 1])
+def test_no_weld_outlives_a_reset(reconfiguration_freq):
+    env = made(reconfiguration_freq=reconfiguration_freq)
+    base: Any = env.unwrapped
+    grasp(env)
+    _, info = env.reset(seed=4)
+    assert float(info["welds"]) == 0
+    for _ in range(4):
+        *_, info = env.step(np.array([0, 0, -0.08, 0, 0, 0, CLOSE]))
+    assert float(info["welds"]) == 0
+    assert float(info["path_length"]) > 0.2
+    shift = (base.object_poses - base.start_poses)[0, :, :3].norm(dim=-1)
+    assert float(shift[base.present[0]].max()) < 0.005
+    env.step(stay(OPEN))
+    assert float(grasp(env)["welds"]) == 1  # as ever
+    env.close()
+
+
+def test_it_is_refused_where_it_does_not_belong(tmp_path, capsys):
+    out = tmp_path / "out"
+    command = ["eval", "--policy", "random", "--weld", "--out", str(out), "--backend", "processes", "--protocol"]
+    assert cli([*command, "smoke"]) == 1
+    assert "--weld: the weld belongs to upstream's steps (expected stepping upstream, found timed)" in (
+        capsys.readouterr().err
+    )
+    assert not out.exists()
+    with pytest.raises(EvaluationError, match=r"nothing can be welded on a GPU \(found gpu\)\. Pass --backend"):
+        refuse("upstream", "gpu")
+    with pytest.raises(EvaluationError, match="nothing can be welded on a GPU"):
+        Weld(SimpleNamespace(gpu_sim_enabled=True))
+
+
+def play(folder, protocol, policy="random", **settings) -> dict[int, dict]:
+    settings = Settings(1, "processes", **{"tasks": ("pick",), "episodes": 2, **settings})
+    list(evaluate(load_protocol(protocol), make_policy(policy), policy, folder, settings))
+    return {number: one.without_clock() for number, one in results.read(folder).outcomes.items()}
+
+
+@pytest.mark.slow
+def test_where_nothing_is_lifted_it_changes_nothing(tmp_path):
+    short = tmp_path / "short"
+    shutil.copytree(load_protocol("paper-v1").folder, short)
+    rules = short / "protocol.yaml"
+    rules.write_text(rules.read_text().replace("max_steps: 150", "max_steps: 10"))
+    without, welded = play(tmp_path / "without", short), play(tmp_path / "with", short, weld=True)
+    assert [one["measures"].pop("welds") for one in welded.values()] == [0, 0]
+    assert welded == without
+    with pytest.raises(EvaluationError, match="another weld"):
+        results.read(tmp_path / "without", tmp_path / "with")
+
+
+@pytest.mark.slow
+def test_an_evaluation_with_it_counts_it_says_so_and_is_filmed_alike(tmp_path, needs_renderer):
+    protocol, folder = load_protocol("paper-v1"), tmp_path / "out"
+    (outcome,) = play(folder, protocol.folder, "scripted-motions", episodes=1, weld=True).values()
+    assert outcome["success"] and outcome["measures"]["welds"] == 1
+    result = results.read(folder)
+    assert result.run["weld"] is True
+    assert problems(result, protocol) == ["399 of 400 episodes are missing"]
+    (filmed,) = film(result, protocol, make_policy("scripted-motions"), [0])
+    assert filmed.same and filmed.outcome.measures["welds"] == 1
