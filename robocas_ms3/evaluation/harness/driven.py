@@ -1,7 +1,7 @@
 """Episodes of a protocol for somebody else's loop, one at a time: it resets and steps, and is told what is seen.
 
-Beneath is the loop of `rollout`, in a thread, with a policy that hands out what it sees and waits for actions. So steps,
-ends and measures are those of ``robocas eval``, to the bit.
+Beneath is the loop of `rollout`, in a thread, with a policy that hands out what it sees and waits for actions. So
+steps, ends and measures are those of ``robocas eval``, to the bit.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A benchmark of vla-eval: its runs name ``robocas_ms3.evaluation.harness.vla_eval:RoboCAS``; docs/vla_eval.md.
 
-Written to vla-eval 0.8's interface without deriving from it, so that this package needs no vla-eval: who uses this class
-is vla-eval. One of its tasks is a configuration of the protocol, its episodes in the protocol's order.
+Written to vla-eval 0.8's interface without deriving from it, so that this package needs no vla-eval: who uses this
+class is vla-eval. One of its tasks is a configuration of the protocol, its episodes in the protocol's order.
 """
 
 from __future__ import annotations
@@ -136,8 +136,9 @@ class RoboCAS:
                 expected=f"episodes_per_task: {len(episodes)} at most",
                 found=number + 1,
             )
-        self._episode, self._recorder, self._begun = episodes[number], recorder, time.monotonic()
-        self._seen = self._driven.reset(self._episode.episode)
+        episode = episodes[number]
+        self._episode, self._recorder, self._begun = episode, recorder, time.monotonic()
+        self._seen = self._driven.reset(episode.episode)
         self._record()
 
     async def apply_action(self, action: Mapping[str, Any]) -> None:
@@ -206,8 +207,8 @@ class RoboCAS:
 def state_of(seen: Observations) -> NDArray[np.float32]:
     """(18,) as ``observation.state`` of our LeRobot datasets has it.
 
-    TCP in the arm's base frame, position m and quaternion xyzw; seven joints, rad; width of the gripper, m; the base's x,
-    y, m, and yaw, rad.
+    TCP in the arm's base frame, position m and quaternion xyzw; seven joints, rad; width of the gripper, m; the base's
+    x, y, m, and yaw, rad.
     """
     tcp, qpos = seen.tcp_in_base[0], seen.qpos[0]
     return np.concatenate([tcp[:3], tcp[[4, 5, 6, 3]], qpos[3:10], seen.gripper_width[0], qpos[:3]]).astype(np.float32)
