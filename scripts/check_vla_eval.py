@@ -1,7 +1,7 @@
 """Plays episodes of the protocol smoke with vla-eval itself, and with `robocas eval`; run by check_others.sh.
 
 python check_vla_eval.py                        check all
-python check_vla_eval.py serve PORT KEPT LOG    the model server of it: does what KEPT has, writes its instructions to LOG
+python check_vla_eval.py serve PORT KEPT LOG    the model server of it: does what KEPT has, keeps what it hears in LOG
 """
 
 from __future__ import annotations
