@@ -2,8 +2,10 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("websockets")
@@ -21,27 +23,46 @@ class Up:
 """
 
 
+@contextmanager
+def serving(policy, folder):
+    """The command at work, and the address that it says."""
+    words = [sys.executable, ROOT / "robocas_cli.py", "serve-policy", policy, "--port", "0"]
+    where = {"PYTHONPATH": f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', ROOT)}"}
+    served = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | where)
+    try:
+        assert served.stdout is not None
+        said = served.stdout.readline()
+        assert said.startswith(f"{policy} at ws://127.0.0.1:")
+        yield served, said.split()[-1]
+    finally:
+        served.kill()
+        served.communicate()
+
+
 def test_a_policy_of_ones_own_is_served_until_ctrl_c(tmp_path):
     from robocas_ms3.evaluation.remote.client import RemotePolicy
     from robocas_ms3.evaluation.remote.messages import wants_message
 
     (tmp_path / "mine.py").write_text(POLICY)
-    words = [sys.executable, ROOT / "robocas_cli.py", "serve-policy", "mine:Up", "--port", "0"]
-    where = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', ROOT)}"}
-    served = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | where)
-    try:
-        assert served.stdout is not None
-        said = served.stdout.readline()
-        assert said.startswith("mine:Up at ws://127.0.0.1:")
-        remote = RemotePolicy(said.split()[-1])
+    with serving("mine:Up", tmp_path) as (served, url):
+        remote = RemotePolicy(url)
         assert wants_message(remote.wants)["convention"] == "delta_quaternion"
         remote.close()
         served.send_signal(signal.SIGINT)
         out, err = served.communicate(timeout=20)
         assert (out, err.strip(), served.returncode) == ("closed\n", "interrupted", 130)
-    finally:
-        served.kill()
-        served.communicate()
+
+
+def test_openpis_client_is_served(tmp_path):
+    openpi = pytest.importorskip("openpi_client.websocket_client_policy")
+    sizes = {"qpos": 12, "tcp_in_base": 7, "gripper_width": 1}
+    seen = {f"observation/{name}": np.zeros(size, np.float32) for name, size in sizes.items()}
+    with serving("random", tmp_path) as (_, url):
+        client = openpi.WebsocketClientPolicy(host="127.0.0.1", port=int(url.rpartition(":")[2]))
+        assert client.get_server_metadata()["robocas_wants"]["reference"] == "tcp"
+        first, second = (client.infer({**seen, "prompt": "take the apple"})["actions"] for _ in range(2))
+    assert first.shape == second.shape == (1, 7)
+    assert not np.array_equal(first, second)
 
 
 def test_an_address_that_is_none():

@@ -1,0 +1,1 @@
+"""Other people's harnesses: our episodes in their loops."""

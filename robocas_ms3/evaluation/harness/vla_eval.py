@@ -1,0 +1,224 @@
+"""A benchmark of vla-eval: its runs name ``robocas_ms3.evaluation.harness.vla_eval:RoboCAS``; docs/vla_eval.md.
+
+Written to vla-eval 0.8's interface without deriving from it, so that this package needs no vla-eval: who uses this
+class is vla-eval. One of its tasks is a configuration of the protocol, its episodes in the protocol's order.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.harness.driven import DrivenEpisodes
+from robocas_ms3.evaluation.policy import Observations
+from robocas_ms3.evaluation.protocol import Episode, load_protocol
+from robocas_ms3.evaluation.remote.messages import actions_of, wants_of
+from robocas_ms3.evaluation.results import STAGES
+from robocas_ms3.evaluation.rollout import TRACKED
+
+# How vla-eval calls what the numbers of an action mean, where it has a word for it.
+_ROTATIONS = {
+    "robocas": (3, "euler_xyz"),
+    "delta_euler": (3, "euler_xyz"),
+    "delta_axis_angle": (3, "axis_angle"),
+    "delta_quaternion": (4, "quaternion_wxyz"),
+}
+_STATE = 18  # numbers of `state_of`
+
+
+class RoboCAS:
+    """The episodes of a protocol, as vla-eval's runners play them, in mode ``sync``.
+
+    Args:
+        protocol: name of a shipped one, or a folder.
+        cameras: (width, height) in pixels by camera, in the order in which a model server is sent the pictures.
+        convention: what actions mean, one of ``evaluation.actions.CONVENTIONS``.
+        reference: what motions are relative to: ``tcp`` or ``target``.
+        rate_hz: actions a second; None: the protocol's.
+
+    Raises:
+        EvaluationError: no such protocol, or these are none of it.
+        DatasetError: there are cameras, and no render device.
+    """
+
+    def __init__(
+        self,
+        protocol: str = "smoke",
+        cameras: Mapping[str, list[int]] | None = None,
+        convention: str = "robocas",
+        reference: str = "target",
+        rate_hz: float | None = None,
+    ) -> None:
+        said = {"cameras": dict(cameras or {}), "convention": convention, "reference": reference, "rate_hz": rate_hz}
+        self._wants = wants_of(said, "params")
+        self._driven = DrivenEpisodes(load_protocol(protocol), self._wants)
+        self._of_config: dict[str, list[Episode]] = {}
+        for episode in self._driven.protocol.episodes:
+            self._of_config.setdefault(episode.config, []).append(episode)
+        self._episode: Episode | None = None
+        self._seen: Observations | None = None
+        self._recorder: Any = None
+        self._begun = 0.0
+
+    @classmethod
+    def configure_render(cls, mode: str) -> dict[str, str]:
+        """Nothing to set: SAPIEN renders on the GPU, and where there is none on the processor."""
+        return {}
+
+    def get_tasks(self) -> list[dict[str, Any]]:
+        """A task a configuration; ``tasks:`` of a run may name these or, as suites, the short names of tasks."""
+        return [
+            {"name": config, "suite": episodes[0].task, "episodes": len(episodes)}
+            for config, episodes in self._of_config.items()
+        ]
+
+    def get_metadata(self) -> dict[str, Any]:
+        """``max_steps`` is that of the longest task; those of others end by the protocol's rules."""
+        tasks = {episode.task for episode in self._driven.protocol.episodes}
+        return {"max_steps": max(self._driven.max_steps(task) for task in tasks)}
+
+    def get_metric_keys(self) -> dict[str, str]:
+        """What is averaged over episodes; the others stay with each of them."""
+        names = ("success", "success_at_end", "success_v0", *STAGES.values(), "seconds", *TRACKED)
+        return dict.fromkeys(names, "mean")
+
+    def get_action_spec(self) -> dict[str, Any]:
+        """What actions mean, in vla-eval's words."""
+        from vla_eval.specs import DimSpec  # pyright: ignore[reportMissingImports]
+
+        convention = self._wants.convention
+        if convention not in _ROTATIONS:
+            return {"joints": DimSpec("joints", 7, "absolute_joint_positions"), "gripper": _gripper(DimSpec)}
+        size, turn = _ROTATIONS[convention]
+        grip = DimSpec("gripper", 1, "binary_open_01", (0, 1)) if convention == "robocas" else _gripper(DimSpec)
+        return {
+            "position": DimSpec("position", 3, "delta_xyz", description="m, in the TCP's frame"),
+            "rotation": DimSpec("rotation", size, turn, description="in the TCP's frame"),
+            "gripper": grip,
+        }
+
+    def get_observation_spec(self) -> dict[str, Any]:
+        """What is seen, in vla-eval's words."""
+        from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec  # pyright: ignore[reportMissingImports]
+
+        images = dict.fromkeys(["image", *self._wants.cameras] if self._wants.cameras else [], IMAGE_RGB)
+        return {**images, "state": DimSpec("state", _STATE, "robocas"), "language": LANGUAGE}
+
+    def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
+        """What only mode ``live`` asks for, in which the clock's time would choose the steps, not the protocol.
+
+        Raises:
+            NotImplementedError: it is asked for; vla-eval says so before the first episode.
+        """
+        raise NotImplementedError("RoboCAS' protocols are played in mode sync")
+
+    async def start_episode(self, task: Mapping[str, Any], recorder: Any = None) -> None:
+        """Begin an episode of a task.
+
+        Args:
+            task: of `get_tasks`, with ``episode_idx``.
+            recorder: takes pictures of the first camera.
+
+        Raises:
+            EvaluationError: the protocol has no more of it.
+        """
+        episodes, number = self._of_config[task["name"]], task["episode_idx"]
+        if number >= len(episodes):
+            raise EvaluationError(
+                "the protocol has no more episodes of this task",
+                where=task["name"],
+                expected=f"episodes_per_task: {len(episodes)} at most",
+                found=number + 1,
+            )
+        episode = episodes[number]
+        self._episode, self._recorder, self._begun = episode, recorder, time.monotonic()
+        self._seen = self._driven.reset(episode.episode)
+        self._record()
+
+    async def apply_action(self, action: Mapping[str, Any]) -> None:
+        """Play an action, or all of a chunk.
+
+        Raises:
+            WireError: it is none of the convention.
+        """
+        actions = actions_of({"actions": action.get("actions", action.get("action"))}, self._wants.convention)
+        self._seen = self._driven.step(actions[None])
+        self._record()
+
+    async def get_observation(self) -> dict[str, Any]:
+        """``images`` (H, W, 3) uint8 by camera, ``state`` (18,) and ``task_description``."""
+        seen = self._seen
+        assert seen is not None  # of an episode that is over vla-eval asks for no observation
+        return {
+            "images": {name: images[0] for name, images in seen.images.items()},
+            "state": state_of(seen),
+            "task_description": seen.instructions[0],
+        }
+
+    async def is_done(self) -> bool:
+        """Whether the protocol's rules ended the episode."""
+        return self._seen is None
+
+    async def get_time(self) -> float:
+        """Clock time since the episode began, s."""
+        return time.monotonic() - self._begun
+
+    async def get_result(self) -> dict[str, Any]:
+        """All that ``robocas eval`` says of an episode, whether flags ever held, and what it was measured with.
+
+        Raises:
+            EvaluationError: vla-eval ended it before the protocol does.
+        """
+        outcome, episode = self._driven.outcome, self._episode
+        if outcome is None or episode is None:
+            raise EvaluationError(
+                "the run ended an episode before the protocol does",
+                where="max_steps",
+                fix="Leave max_steps out of the run's configuration.",
+            )
+        return {
+            **{name: step is not None for name, step in outcome.flags.items()},
+            **outcome.measures,
+            **vars(outcome),
+            "instruction": episode.instruction,
+            **{name: self._driven.about[name] for name in ("protocol", "protocol_hash", "versions")},
+        }
+
+    def cleanup(self) -> None:
+        """End the env's process."""
+        self._driven.close()
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """(H, W, 3) the first camera's picture; None: there is none."""
+        images = self._seen.images if self._seen is not None else {}
+        return next(iter(images.values()))[0] if images else None
+
+    def _record(self) -> None:
+        if self._recorder is not None:
+            self._recorder.record_video(self.render())
+
+
+def state_of(seen: Observations) -> NDArray[np.float32]:
+    """(18,) as ``observation.state`` of our LeRobot datasets has it.
+
+    TCP in the arm's base frame, position m and quaternion xyzw; seven joints, rad; width of the gripper, m; the base's
+    x, y, m, and yaw, rad.
+    """
+    tcp, qpos = seen.tcp_in_base[0], seen.qpos[0]
+    return np.concatenate([tcp[:3], tcp[[4, 5, 6, 3]], qpos[3:10], seen.gripper_width[0], qpos[:3]]).astype(np.float32)
+
+
+def _gripper(spec: Any) -> Any:
+    return spec("gripper", 1, "binary_close_negative", (-1, 1))
+
+
+if "vla_eval" in sys.modules:  # `vla-eval test` asks whether a benchmark is derived from its own
+    from vla_eval.benchmarks.base import Benchmark  # pyright: ignore[reportMissingImports]
+
+    Benchmark.register(RoboCAS)

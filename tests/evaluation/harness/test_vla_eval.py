@@ -1,0 +1,142 @@
+"""The benchmark as vla-eval's runners ask it; scripts/check_others.sh lets vla-eval itself do it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("websockets")
+pytest.importorskip("msgpack")
+
+from robocas_ms3.errors import EvaluationError, WireError
+from robocas_ms3.evaluation.harness import driven
+from robocas_ms3.evaluation.harness.vla_eval import RoboCAS
+from robocas_ms3.evaluation.protocol import load_protocol
+
+ACT = {"actions": np.array([1, 0, 0, 0, 0, 0, 1], np.float32)}
+
+
+class Recorder:
+    """Keeps pictures."""
+
+    def __init__(self) -> None:
+        self.frames: list[Any] = []
+
+    def record_video(self, frame: Any) -> None:
+        self.frames.append(frame)
+
+
+@pytest.fixture
+def benchmark(made, monkeypatch):
+    monkeypatch.setattr(driven, "require_renderer", lambda: None)
+    benchmark = RoboCAS(cameras={"base_camera": [6, 4]}, rate_hz=5)
+    yield benchmark
+    benchmark.cleanup()
+
+
+async def play(benchmark, task, *, max_steps=None, recorder=None) -> dict[str, Any]:
+    """As the runner of vla-eval's mode sync goes."""
+    await benchmark.start_episode(task, recorder=recorder)
+    seen = [await benchmark.get_observation()]
+    for _ in range(max_steps or benchmark.get_metadata()["max_steps"]):
+        await benchmark.apply_action(ACT)
+        if await benchmark.is_done():
+            break
+        seen.append(await benchmark.get_observation())
+    assert await benchmark.get_time() >= 0
+    return {"seen": seen, "metrics": await benchmark.get_result()}
+
+
+def test_a_task_is_a_configuration_and_its_episodes_are_the_protocols(benchmark, made):
+    tasks = benchmark.get_tasks()
+    assert [(task["name"], task["suite"], task["episodes"]) for task in tasks] == [
+        ("pick_table_scattered", "pick", 2),
+        ("select_table_orderly", "select", 2),
+        ("search_table_small_heap", "search", 2),
+        ("open_pick_drawer", "open_pick", 2),
+    ]
+    assert benchmark.get_metadata() == {"max_steps": 600}
+    listed = load_protocol("smoke").episodes
+    for number, task in ((number, task) for task in tasks for number in range(2)):
+        played = asyncio.run(play(benchmark, {**task, "episode_idx": number}))
+        metrics = played["metrics"]
+        episode = listed[metrics["episode"]]
+        assert (episode.config, metrics["seed"]) == (task["name"], made[-1].seeds[-1])
+        assert {one["task_description"] for one in played["seen"]} == {episode.instruction}
+        assert metrics["instruction"] == episode.instruction
+        assert len(played["seen"]) == metrics["steps"] == 5
+    assert [env.seeds for env in made] == [[110000, 110001]] * 4
+
+
+def test_what_a_result_says(benchmark):
+    recorder = Recorder()
+    task = {**benchmark.get_tasks()[0], "episode_idx": 0}
+    metrics = asyncio.run(play(benchmark, task, recorder=recorder))["metrics"]
+    assert metrics["success"] is metrics["success_at_end"] is metrics["reached_any"] is True
+    assert metrics["success_v0"] is metrics["fail"] is False
+    assert (metrics["failure_stage"], metrics["seconds"], metrics["path_length"]) == ("", 1.0, 5.0)
+    assert metrics["flags"]["reached_any"] == 2
+    assert metrics["protocol_hash"] == load_protocol("smoke").hash
+    assert set(metrics["versions"]) >= {"sapien", "numpy"}
+    assert json.loads(json.dumps(metrics)) == metrics
+    averaged = {name for name in benchmark.get_metric_keys() if name in metrics}
+    assert averaged >= {"success", "success_at_end", "success_v0", "reached_any", "seconds", "contact_impulse"}
+    assert all(isinstance(metrics[name], bool | int | float) for name in averaged)
+    assert [frame is None or int(frame.max()) for frame in recorder.frames] == [0, 1, 2, 3, 4, True]
+
+
+def test_what_is_seen(benchmark):
+    seen = asyncio.run(play(benchmark, {**benchmark.get_tasks()[0], "episode_idx": 0}))["seen"]
+    assert [one["images"]["base_camera"].max() for one in seen] == [0, 1, 2, 3, 4]
+    assert seen[0]["images"]["base_camera"].shape == (4, 6, 3)
+    # position, quaternion xyzw of one stored wxyz, joints 3 to 9, width, base
+    expected = [1, 2, 3, 0.1, 0.2, 0.3, 0.4, 13, 14, 15, 16, 17, 18, 19, 0.05, 10, 11, 12]
+    np.testing.assert_allclose(seen[0]["state"], expected)
+    assert seen[0]["state"].dtype == np.float32
+
+
+def test_an_episode_that_the_run_cuts_short_is_no_result(benchmark):
+    task = {**benchmark.get_tasks()[0], "episode_idx": 0}
+    with pytest.raises(EvaluationError, match="Leave max_steps out"):
+        asyncio.run(play(benchmark, task, max_steps=4))
+    assert asyncio.run(play(benchmark, task, max_steps=5))["metrics"]["success"]
+
+
+def test_more_episodes_than_the_protocol_has(benchmark):
+    task = {**benchmark.get_tasks()[0], "episode_idx": 2}
+    with pytest.raises(EvaluationError, match="expected episodes_per_task: 2 at most, found 3"):
+        asyncio.run(play(benchmark, task))
+
+
+@pytest.mark.parametrize("actions", [None, np.zeros(6), [float("nan")] * 7, [1e9] * 7])
+def test_an_action_that_is_none_fails_its_episode_alone(benchmark, actions, monkeypatch):
+    task = {**benchmark.get_tasks()[0], "episode_idx": 0}
+    with monkeypatch.context() as patched:
+        patched.setitem(ACT, "actions", actions)
+        with pytest.raises(WireError):
+            asyncio.run(play(benchmark, task))
+    assert asyncio.run(play(benchmark, task))["metrics"]["steps"] == 5
+
+
+@pytest.mark.parametrize(
+    ("params", "words"),
+    [
+        ({"protocol": "smok"}, "smoke"),
+        ({"convention": "euler"}, "convention"),
+        ({"cameras": {"wrist": [4, 4]}}, "cameras"),
+        ({"rate_hz": 7}, "divisor of 100"),
+        ({"protocol": "paper-v1", "convention": "joint_positions"}, "none of this protocol's"),
+    ],
+)
+def test_parameters_that_are_none(params, words):
+    with pytest.raises(EvaluationError, match=words):
+        RoboCAS(**params)
+
+
+def test_mode_live_is_refused(benchmark):
+    with pytest.raises(NotImplementedError, match="mode sync"):
+        benchmark.get_hold_action(None)
