@@ -1,14 +1,12 @@
-"""A result, and two of them, as Markdown."""
+"""A result as Markdown."""
 
 from __future__ import annotations
 
 from collections import Counter
 
-from robocas_ms3.errors import EvaluationError
-from robocas_ms3.evaluation.power import too_few
 from robocas_ms3.evaluation.results import STAGES, Outcome, Result
 from robocas_ms3.evaluation.retrieval import orders
-from robocas_ms3.evaluation.statistics import Share, compare, success_by
+from robocas_ms3.evaluation.statistics import Share, success_by
 
 P_VIS_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 WELDED = (
@@ -94,50 +92,6 @@ def _retrieval(result: Result) -> list[str]:
             shares = f"{one.score:.2f} | {one.moved:.1f} | {100 * one.needed:.0f} %"
             lines.append(f"| {config} | {one.held} | {shares} | {one.left:.1f} |")
     return lines
-
-
-def comparison(one: Result, other: Result) -> str:
-    """Two results over the same episodes.
-
-    Raises:
-        EvaluationError: they are of different protocols, one is with the weld, or they have no episodes in common.
-    """
-    if one.run["protocol_hash"] != other.run["protocol_hash"]:
-        raise EvaluationError(
-            "results of different protocols can't be compared",
-            where=other.folder,
-            expected=one.run["protocol_hash"][:16],
-            found=other.run["protocol_hash"][:16],
-        )
-    if one.run["weld"] != other.run["weld"]:
-        welded = (one if one.run["weld"] else other).folder
-        raise EvaluationError("a result with upstream's weld can't be compared with one without", where=welded)
-    both = sorted(one.outcomes.keys() & other.outcomes.keys())
-    if not both:
-        raise EvaluationError("these results have no episodes in common", where=other.folder)
-    names = [result.run["policy"]["name"] for result in (one, other)]
-    measured = one.run["protocol"] + (" with upstream's weld" if one.run["weld"] else "")
-    lines = [
-        f"A: {names[0]} ({one.folder}), B: {names[1]} ({other.folder}); {len(both)} episodes of {measured} "
-        "that both have. McNemar's exact test, Tango's interval; claims go by the p-value.",
-        "",
-        "| configuration | n | A | B | only A | only B | B - A | p |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    warnings = []
-    configs = sorted({one.outcomes[number].config for number in both})
-    for config in [*configs, *(["all"] if len(configs) > 1 else [])]:
-        numbers = [number for number in both if config in ("all", one.outcomes[number].config)]
-        a, b = ([result.outcomes[number].success for number in numbers] for result in (one, other))
-        found = compare(b, a)
-        lines.append(
-            f"| {config} | {len(numbers)} | {sum(a)} | {sum(b)} | {found.only_b} | {found.only_a} | "
-            f"{100 * (sum(b) - sum(a)) / len(numbers):+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f}) | "
-            f"{found.p_value:.3g} |"
-        )
-        warning = too_few(found)
-        warnings += [f"- {config}: {warning}"] if warning else []
-    return "\n".join([*lines, *(["", *warnings] if warnings else [])]) + "\n"
 
 
 def percent(share: Share, *, interval: bool = True) -> str:

@@ -173,7 +173,7 @@ def test_commands_on_parts(tmp_path, capsys):
         (("report",), "of what?"),
         (("merge", "a"), "where to?"),
         (("compare", "a"), "no result"),
-        (("compare", "ok", "ok", "ok"), "compares two results"),
+        (("compare", "ok"), "no such protocol"),
         (("verify", "a"), "no result"),
     ],
 )

@@ -3,8 +3,7 @@
 import pytest
 from made_up_results import outcome, write
 
-from robocas_ms3.errors import EvaluationError
-from robocas_ms3.evaluation.tables import comparison, markdown
+from robocas_ms3.evaluation.tables import markdown
 
 
 @pytest.fixture
@@ -41,34 +40,24 @@ def test_without_occlusion_there_is_no_such_table(tmp_path):
     assert "p_vis" not in markdown(write(tmp_path / "a", [outcome(0)]))
 
 
-def test_a_comparison_takes_the_episodes_that_both_have(tmp_path):
-    one = write(tmp_path / "a", [outcome(number, came_to=0) for number in range(8)])
-    other = write(tmp_path / "b", [outcome(number) for number in range(1, 9)], policy={"name": "better"})
-    found = row(comparison(one, other), "table")
-    assert found[:6] == ["table", "7", "0", "7", "0", "7"]
-    assert found[6].startswith("+100.0 (")
-    assert float(found[7]) == pytest.approx(2 * 0.5**7, rel=0.01)
-
-
-def test_a_comparison_that_shows_nothing_says_so(tmp_path):
-    one, other = (write(tmp_path / name, [outcome(0, came_to=came)]) for name, came in (("a", 0), ("b", 7)))
-    assert "differ by less than 1 episodes can tell" in comparison(one, other)
-
-
-def test_comparisons_of_different_protocols_or_of_nothing_are_refused(tmp_path):
-    one = write(tmp_path / "a", [outcome(0)])
-    with pytest.raises(EvaluationError, match="different protocols"):
-        comparison(one, write(tmp_path / "b", [outcome(0)], protocol_hash="ef" * 32))
-    with pytest.raises(EvaluationError, match="no episodes in common"):
-        comparison(one, write(tmp_path / "c", [outcome(1)]))
-
-
-def test_the_weld_is_named_and_compared_with_its_like_alone(tmp_path):
-    without = write(tmp_path / "a", [outcome(0)])
-    one, other = (write(tmp_path / name, [outcome(0)], weld=True) for name in "bc")
+def test_the_weld_is_named(tmp_path):
+    one = write(tmp_path / "a", [outcome(0)], weld=True)
     assert markdown(one).startswith("# mine by made_up with upstream's weld\n\n**With upstream's weld: ")
-    assert "weld" not in markdown(without)
-    assert "1 episodes of made_up with upstream's weld that both have" in comparison(one, other)
-    for pair in ((one, without), (without, one)):
-        with pytest.raises(EvaluationError, match=r"/b: a result with upstream's weld can't be compared"):
-            comparison(*pair)
+    assert "weld" not in markdown(write(tmp_path / "b", [outcome(0)]))
+
+
+def test_splits_stand_side_by_side(tmp_path):
+    outcomes = [outcome(0), outcome(1, 0), outcome(2, 0, split="new"), outcome(3, task="select", split="new")]
+    said = markdown(write(tmp_path / "a", outcomes))
+    assert "| task | new | test |" in said
+    assert row(said, "pick") == ["pick", "0 % (0 to 98) of 1", "50 % (1 to 99) of 2"]
+    assert row(said, "select") == ["select", "100 % (3 to 100) of 1", ""]
+    assert "By split" not in markdown(write(tmp_path / "b", outcomes[:2]))
+
+
+def test_what_was_moved_before_the_target_is_summed_up(tmp_path):
+    move = {"object": "lid", "step": 3, "needed": True, "in_order": True}
+    order = {"moved": [move, {**move, "needed": False, "in_order": False}], "needed": ["lid"], "left": 0, "score": 0.5}
+    said = markdown(write(tmp_path / "a", [outcome(0, retrieval=order), outcome(1)]))
+    assert row(said.partition("moved before")[2], "table") == ["table", "1", "0.50", "2.0", "50 %", "0.0"]
+    assert "moved before" not in markdown(write(tmp_path / "b", [outcome(1)]))

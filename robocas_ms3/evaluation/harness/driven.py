@@ -19,7 +19,7 @@ from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
 from robocas_ms3.evaluation.results import Outcome
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.run import Settings, about
-from robocas_ms3.evaluation.stage import make_env, rate_of, start_of
+from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
 
 
 class DrivenEpisodes:
@@ -119,7 +119,7 @@ class DrivenEpisodes:
             ends = Rules(self.max_steps(episode.task), tuple(rules.ends_on), rules.max_v0_steps)
             start = start_of(self.protocol, episode)
             (played,) = Rollouts(env, self._policy, ends, 1 / self.rate, refill=True).play([start])
-            said.put(Outcome.of(played, config=episode.config, split=episode.split, p_vis=episode.p_vis))
+            said.put(Outcome.of(played, episode, object_ids(self.protocol, episode)))
         except Exception as error:  # of an env, or actions that don't fit; the harness' thread raises it
             self._close_env()
             said.put(error)

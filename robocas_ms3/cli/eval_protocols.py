@@ -1,0 +1,43 @@
+"""``robocas eval protocols | freeze``: protocols that are shipped, and one's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def protocols() -> int:
+    """List the protocols that are shipped."""
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+
+    for name in shipped_protocols():
+        protocol = load_protocol(name)
+        say(f"{name}: {len(protocol.episodes)} episodes, {protocol.hash[:12]}: {protocol.rules.description}")
+        if protocol.train_files():
+            say(f"    to train on: {', '.join(map(str, protocol.train_files()))}")
+    return 0
+
+
+def freeze(plan: Path, out: Path | None) -> int:
+    """Make a protocol."""
+    import yaml
+
+    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.evaluation.freeze import Plan
+    from robocas_ms3.evaluation.freeze import freeze as make
+    from robocas_ms3.evaluation.protocol import load_protocol
+
+    if out is None:
+        raise EvaluationError("where to?", where="--out", expected="a folder")
+    try:
+        read = Plan.model_validate(yaml.safe_load(plan.read_text(encoding="utf-8")))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise EvaluationError("no plan of a protocol", where=plan, found=" ".join(str(error).split())) from error
+    if out.exists():
+        raise EvaluationError("there is something already", where=out, fix="Choose another --out.")
+    with bar("episodes") as shown:
+        for done, total in make(read, out):
+            shown.at(done, total)
+    say(f"{out}: {len(load_protocol(out).episodes)} episodes, {load_protocol(out).hash}")
+    return 0

@@ -1,0 +1,129 @@
+"""``robocas eval report | merge | compare | verify | videos``: what is done with results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from robocas_ms3.evaluation.protocol import LoadedProtocol
+    from robocas_ms3.evaluation.results import Result
+
+
+def report(folders: list[Path], out: Path | None, protocol: str) -> int:
+    """Print a result's tables; write them and its page into its folder, those of several into another one."""
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.tables import markdown
+
+    result = read(*folders)
+    say(markdown(result))
+    if out is None and len(folders) > 1:
+        say("Pass --out DIR for the page of several folders.")
+    else:
+        write_pages(result, out or folders[0], protocol)
+    return 0
+
+
+def merge(folders: list[Path], out: Path | None, protocol: str) -> int:
+    """Write parts of a result as one."""
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.evaluation.results import merge as write
+
+    if out is None:
+        raise EvaluationError("where to?", where="--out", expected="a folder")
+    result = write(folders, out)
+    say(f"{out}: {len(result.outcomes)} episodes")
+    write_pages(result, out, protocol)
+    return 0
+
+
+def compare(folders: list[Path], protocol: str) -> int:
+    """Compare results; of more folders than two, those that were measured with the same are parts of one.
+
+    A single result is compared with itself, split by split.
+    """
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.evaluation.comparison import comparison, comparison_of_splits
+    from robocas_ms3.evaluation.results import parts_of, read
+
+    groups = [[folder] for folder in folders] if len(folders) == 2 else parts_of(folders)
+    results = [read(*parts) for parts in groups]
+    if len(results) == 1:
+        say(comparison_of_splits(results[0], protocol_of(results[0], protocol)))
+    else:
+        say(comparison(results))
+    return 0
+
+
+def verify(folders: list[Path], protocol: str) -> int:
+    """See that a result is whole, and of a protocol that is here; 1 where it isn't."""
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.verify import problems
+
+    result: Result = read(*folders)
+    name = str(result.run["protocol"])
+    found = problems(result, protocol_of(result, protocol))
+    for problem in found:
+        say(problem)
+    where = ", ".join(map(str, folders))
+    say(f"{where}: " + (f"{len(found)} problems" if found else f"{len(result.outcomes)} episodes of {name}, all well"))
+    return 1 if found else 0
+
+
+def videos(folder: Path, protocol: str, policy: str, count: int) -> int:
+    """Film failed episodes, and link the videos in the page.
+
+    Raises:
+        EvaluationError: it is of a policy that is not builtin, and was not named again: a file chooses no code.
+    """
+    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.demos.checks import check_number
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.evaluation.policies import BUILTIN, open_policy
+    from robocas_ms3.evaluation.results import read
+    from robocas_ms3.evaluation.videos import failed_of_each_kind, film
+
+    check_number("count", count, 1)
+    result = read(folder)
+    loaded = protocol_of(result, protocol)
+    numbers = failed_of_each_kind(result, count)
+    name = str(result.run["policy"]["name"])
+    if name not in BUILTIN and policy != name:
+        fix = f"Name it yourself, if you trust it: --policy {name}"
+        raise EvaluationError("this result is of a policy of somebody's own", where=folder, found=name, fix=fix)
+    with open_policy(name) as played, bar("videos") as shown:
+        for done, filmed in enumerate(film(result, loaded, played, numbers), start=1):
+            say(str(filmed.path) + ("" if filmed.same else ": this time it came out differently"))
+            shown.at(done, len(numbers))
+    if not numbers:
+        say("no episode failed")
+    write_pages(result, folder, protocol)
+    return 0
+
+
+def protocol_of(result: Result, given: str) -> LoadedProtocol:
+    """The protocol that a result names, or the folder that was given."""
+    from robocas_ms3.evaluation.protocol import load_protocol
+
+    return load_protocol(given if Path(given).is_dir() else result.run["protocol"])
+
+
+def write_pages(result: Result, out: Path, given: str) -> None:
+    """Write the report, and say where it is."""
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.evaluation.report import write_report
+
+    try:
+        protocol = protocol_of(result, given)
+    except EvaluationError:
+        protocol = None  # one of somebody's own, who knows where
+    if protocol is not None and protocol.hash != result.run["protocol_hash"]:
+        protocol = None
+    written = write_report(result, out, protocol)
+    say(f"{out}: {', '.join(path.name for path in written)}")
+    if not any(path.suffix == ".parquet" for path in written):
+        say('no episodes.parquet without pyarrow: pip install "robocas-ms3[lerobot]" brings it')

@@ -1,0 +1,125 @@
+"""Results over the same scenes, compared pair by pair: several of one protocol, or the splits of one result."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.power import too_few
+from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.statistics import Comparison, compare, holm
+
+_ALPHA = 0.05
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Row:
+    """Two runs over the scenes of a configuration or task.
+
+    Attributes:
+        where: name of that; `ALL`: of all of them together.
+        pair: what the runs are called.
+        found: the second one's successes against the first one's.
+    """
+
+    where: str
+    pair: tuple[str, str]
+    found: Comparison
+
+
+def comparison(results: Sequence[Result]) -> str:
+    """Two or more results, over the episodes that all have; as Markdown.
+
+    Raises:
+        EvaluationError: they are of different protocols, some are with the weld, or they have no episodes in common.
+    """
+    first = results[0]
+    for other in results[1:]:
+        if first.run["protocol_hash"] != other.run["protocol_hash"]:
+            raise EvaluationError(
+                "results of different protocols can't be compared",
+                where=other.folder,
+                expected=first.run["protocol_hash"][:16],
+                found=other.run["protocol_hash"][:16],
+            )
+        if first.run["weld"] != other.run["weld"]:
+            welded = (first if first.run["weld"] else other).folder
+            raise EvaluationError("a result with upstream's weld can't be compared with one without", where=welded)
+    shared = sorted(set.intersection(*(set(result.outcomes) for result in results)))
+    if not shared:
+        raise EvaluationError("these results have no episodes in common", where=results[-1].folder)
+    names = [chr(ord("A") + number) for number in range(len(results))]
+    measured = first.run["protocol"] + (" with upstream's weld" if first.run["weld"] else "")
+    said = [f"{name}: {one.run['policy']['name']} ({one.folder})" for name, one in zip(names, results, strict=True)]
+    both = "both" if len(results) == 2 else "all"
+    head = f"{', '.join(said)}; {len(shared)} episodes of {measured} that {both} have."
+    configs = sorted({first.outcomes[number].config for number in shared})
+    rows = []
+    for config in [*configs, *([ALL] if len(configs) > 1 else [])]:
+        numbers = [number for number in shared if config in (ALL, first.outcomes[number].config)]
+        successes = [[result.outcomes[number].success for number in numbers] for result in results]
+        for one, other in combinations(range(len(results)), 2):
+            found = compare(successes[other], successes[one])
+            rows.append(Row(config, (names[one], names[other]), found))
+    return _table(head, "configuration", rows)
+
+
+def comparison_of_splits(result: Result, protocol: LoadedProtocol) -> str:
+    """The splits of one result whose scenes are the same, each against the first one; as Markdown.
+
+    Raises:
+        EvaluationError: no two splits have the same scenes.
+    """
+    configs = {(episode.task, episode.split): episode.config for episode in protocol.episodes}
+    rows = []
+    for task in dict.fromkeys(task for task, _ in configs):
+        first, *others = [split for of, split in configs if of == task]
+        for split in others:
+            files = [protocol.layouts_file(configs[task, name]) for name in (first, split)]
+            if files[0].read_bytes() != files[1].read_bytes():
+                continue
+            sides = [
+                {one.seed: one.success for one in result.outcomes.values() if (one.task, one.split) == (task, name)}
+                for name in (first, split)
+            ]
+            seeds = sorted(sides[0].keys() & sides[1].keys())
+            if seeds:
+                found = compare([sides[1][seed] for seed in seeds], [sides[0][seed] for seed in seeds])
+                rows.append(Row(task, (first, split), found))
+    if not rows:
+        fix = "Name another result to compare it with."
+        raise EvaluationError("no two splits of this result have the same scenes", where=result.folder, fix=fix)
+    head = f"{result.run['policy']['name']} ({result.folder}), splits of {result.run['protocol']} over the same scenes."
+    return _table(head, "task", rows)
+
+
+def _table(head: str, where: str, rows: list[Row]) -> str:
+    """Rows of one family of claims, and those over all configurations, which are a family of their own."""
+    adjusted: dict[int, tuple[float, int]] = {}
+    for together in (False, True):
+        family = [number for number, row in enumerate(rows) if (row.where == ALL) == together]
+        for number, p in zip(family, holm([rows[number].found.p_value for number in family]), strict=True):
+            adjusted[number] = p, len(family)
+    lines = [
+        f"{head} McNemar's exact test, Tango's interval; claims go by Holm's p, adjusted for all rows of a kind.",
+        "",
+        f"| {where} | first, second | n | first | second | only first | only second | second - first | p | Holm's p |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    warnings = []
+    for number, row in enumerate(rows):
+        found, (p, claims) = row.found, adjusted[number]
+        change = f"{100 * found.difference:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f})"
+        lines.append(
+            f"| {row.where} | {', '.join(row.pair)} | {found.n} | {found.successes_b} | {found.successes_a} | "
+            f"{found.only_b} | {found.only_a} | {change} | {found.p_value:.3g} | {p:.3g} |"
+        )
+        warning = too_few(found, alpha=_ALPHA / claims)
+        if warning:
+            pair = "" if len({row.pair for row in rows}) == 1 else f", {', '.join(row.pair)}"
+            warnings.append(f"- {row.where}{pair}: {warning}")
+    return "\n".join([*lines, *(["", *warnings] if warnings else [])]) + "\n"

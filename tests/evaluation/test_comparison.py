@@ -1,0 +1,111 @@
+"""Results over the same scenes, compared pair by pair."""
+
+import pytest
+from made_up_results import outcome, write
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.comparison import comparison, comparison_of_splits
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.statistics import holm, mcnemar
+
+
+def rows(said: str) -> list[list[str]]:
+    lines = [line for line in said.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[1:]]
+
+
+def test_it_takes_the_episodes_that_both_have(tmp_path):
+    one = write(tmp_path / "a", [outcome(number, came_to=0) for number in range(8)])
+    other = write(tmp_path / "b", [outcome(number) for number in range(1, 9)], policy={"name": "better"})
+    said = comparison([one, other])
+    assert said.startswith(f"A: mine ({one.folder}), B: better ({other.folder}); 7 episodes of made_up that both have.")
+    ((config, pair, *counts, change, p, adjusted),) = rows(said)
+    assert (config, pair, counts) == ("table", "A, B", ["7", "0", "7", "0", "7"])
+    assert change.startswith("+100.0 (")
+    assert float(p) == float(adjusted) == pytest.approx(2 * 0.5**7, rel=0.01)
+
+
+def test_what_shows_nothing_says_so(tmp_path):
+    one, other = (write(tmp_path / name, [outcome(0, came_to=came)]) for name, came in (("a", 0), ("b", 7)))
+    assert "differ by less than 1 episodes can tell" in comparison([one, other])
+
+
+def test_several_claims_are_adjusted_by_holm(tmp_path):
+    """Of three results over two configurations; those over all configurations are a family of their own."""
+
+    def result(name: str, good: int):
+        outcomes = [outcome(n, 7 if n % 20 < good else 0, config="left" if n < 20 else "right") for n in range(40)]
+        return write(tmp_path / name, outcomes, policy={"name": name})
+
+    found = rows(comparison([result("bad", 2), result("better", 9), result("best", 18)]))
+    assert [row[:2] for row in found] == [
+        [where, pair] for where in ("left", "right", "all") for pair in ("A, B", "A, C", "B, C")
+    ]
+    of_one = [mcnemar(7, 0), mcnemar(16, 0), mcnemar(9, 0)]
+    of_all = [mcnemar(14, 0), mcnemar(32, 0), mcnemar(18, 0)]
+    adjusted = [*holm([*of_one, *of_one]), *holm(of_all)]
+    for row, p, by_holm in zip(found, [*of_one, *of_one, *of_all], adjusted, strict=True):
+        assert float(row[-2]) == pytest.approx(p, rel=0.01)
+        assert float(row[-1]) == pytest.approx(by_holm, rel=0.01)
+
+
+def test_too_few_for_several_claims_though_enough_for_one(tmp_path):
+    """Six scenes that one alone solves: p = 1/32, which is a claim by itself, but not one of two."""
+
+    def result(name: str, came_to: int):
+        return write(
+            tmp_path / name, [outcome(n, came_to if n < 6 else 7, config="ab"[n % 2 * (n > 5)]) for n in range(8)]
+        )
+
+    said = comparison([result("one", 0), result("two", 7)])
+    (a, b, both) = rows(said)
+    assert (a[0], a[-2], a[-1]) == ("a", "0.0312", "0.0625")
+    assert (b[0], both[0], both[-1]) == ("b", "all", "0.0312")
+    assert "- a: " in said
+    assert "- all: " not in said
+
+
+def test_of_different_protocols_or_of_nothing(tmp_path):
+    one = write(tmp_path / "a", [outcome(0)])
+    with pytest.raises(EvaluationError, match="different protocols"):
+        comparison([one, one, write(tmp_path / "b", [outcome(0)], protocol_hash="ef" * 32)])
+    with pytest.raises(EvaluationError, match="no episodes in common"):
+        comparison([one, write(tmp_path / "c", [outcome(1)])])
+
+
+def test_with_the_weld_it_is_compared_with_its_like_alone(tmp_path):
+    without = write(tmp_path / "a", [outcome(0)])
+    one, other = (write(tmp_path / name, [outcome(0)], weld=True) for name in "bc")
+    assert "1 episodes of made_up with upstream's weld that both have" in comparison([one, other])
+    for pair in ([one, without], [without, one]):
+        with pytest.raises(EvaluationError, match=r"/b: a result with upstream's weld can't be compared"):
+            comparison(pair)
+
+
+def of_suite(folder, name, succeeds):
+    """A result in which an episode of a suite succeeds or not."""
+    protocol = load_protocol(name)
+    outcomes = [
+        outcome(
+            one.episode, 7 if succeeds(one) else 0, task=one.task, config=one.config, seed=one.seed, split=one.split
+        )
+        for one in protocol.episodes
+    ]
+    return write(folder, outcomes), protocol
+
+
+def test_splits_over_the_same_scenes(tmp_path):
+    found = rows(
+        comparison_of_splits(
+            *of_suite(tmp_path / "a", "instructions-v1", lambda one: one.split in {"seen", "paraphrase"})
+        )
+    )
+    assert [row[:2] for row in found] == [
+        [task, f"seen, {split}"] for task in ("pick", "select", "search") for split in ("paraphrase", "wrong", "empty")
+    ]
+    assert [row[3:5] for row in found[:3]] == [["50", "50"], ["50", "0"], ["50", "0"]]
+
+
+def test_splits_over_other_scenes_are_no_pairs(tmp_path):
+    with pytest.raises(EvaluationError, match="no two splits of this result have the same scenes"):
+        comparison_of_splits(*of_suite(tmp_path / "a", "objects-v1", lambda one: True))
