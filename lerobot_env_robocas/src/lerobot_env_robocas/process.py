@@ -46,8 +46,8 @@ class Process:
         self.python = find_python(python)
         self._timeout = timeout_s
         ours, theirs = socket.socketpair()
-        log = tempfile.TemporaryFile()  # of what it prints; its last line is told if it dies
-        command = [self.python, "-W", "ignore", "-m", MODULE, str(theirs.fileno())]
+        log = tempfile.TemporaryFile()  # noqa: SIM115  (of what it prints; its last line is told if it dies)
+        command = [self.python, "-W", "ignore", "-m", MODULE, str(theirs.fileno()), str(os.getpid())]
         try:
             child = subprocess.Popen(
                 command, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=_clean()
@@ -55,7 +55,7 @@ class Process:
         except OSError as error:
             ours.close()
             log.close()
-            raise RoboCASProcessError(f"no interpreter at {self.python}: {error.strerror}. {_FIX}") from error
+            raise RoboCASProcessError(f"no interpreter at {self.python}: {error.strerror}. {_FIX}") from None
         finally:
             theirs.close()
         ours.settimeout(timeout_s)
@@ -80,15 +80,15 @@ class Process:
             data = msgpack.packb(message, default=_written)
             self._end.sendall(len(data).to_bytes(_LENGTH, "big") + data)
             answer = self._answer()
-        except TimeoutError as error:
+        except TimeoutError:
             self._child.kill()
             self.close()
             what = f"the simulating process did not answer within {self._timeout:g} s"
-            raise RoboCASProcessError(f"{what}, and was ended. --env.timeout_s=N gives it longer.") from error
-        except (EOFError, OSError) as error:
+            raise RoboCASProcessError(f"{what}, and was ended. --env.timeout_s=N gives it longer.") from None
+        except (EOFError, OSError):
             said = self._last_words()
             self.close()
-            raise RoboCASProcessError(said) from error
+            raise RoboCASProcessError(said) from None
         if "error" in answer:
             self.close()
             raise RoboCASProcessError(answer["error"])

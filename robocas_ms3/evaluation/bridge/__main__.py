@@ -1,11 +1,10 @@
-"""``python -m robocas_ms3.evaluation.bridge FD``: play episodes for the process at the other end of a socket.
+"""``python -m robocas_ms3.evaluation.bridge FD PID``: play episodes for a process at the other end of a socket.
 
 Started by ``lerobot_env_robocas``, not by people.
 """
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 import sys
@@ -16,11 +15,16 @@ from robocas_ms3.errors import RobocasError
 from robocas_ms3.evaluation.bridge.channel import Channel, leave_with
 
 
-def main(fd: int) -> int:
-    """Run until the other end is closed; gives the exit code."""
+def main(fd: int, starter: int) -> int:
+    """Run until the other end is closed; gives the exit code.
+
+    Args:
+        fd: descriptor of this end.
+        starter: id of the process that has the other one.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the starter's, which closes its end
     end = socket.socket(fileno=fd)
-    leave_with(end, os.getppid())
+    leave_with(end, starter)
     channel, bridge = Channel(end), None
     try:
         from robocas_ms3.evaluation.bridge.server import open_bridge  # the simulator, which takes seconds
@@ -43,4 +47,4 @@ def main(fd: int) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(int(sys.argv[1])))
+    sys.exit(main(*map(int, sys.argv[1:])))

@@ -1,4 +1,4 @@
-"""Plays episodes of a protocol, a batch at a time, for the process at the other end of a channel, which acts in them."""
+"""Plays episodes of a protocol, a batch at a time, for a process at the other end of a channel, which acts in them."""
 
 from __future__ import annotations
 
