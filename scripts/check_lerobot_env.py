@@ -23,7 +23,7 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.import_utils import register_third_party_plugins
 
-PYTHON = os.environ["ROBOCAS_PYTHON"]
+PYTHON = os.environ["ROBOCAS_SIM_PYTHON"]
 LOOKS = {"cameras": "base_camera,gripper_camera", "observation_width": 64, "observation_height": 48}
 # Run by `robocas eval` in its own interpreter: the demonstrator, whose actions are kept by episode.
 RECORDER = """

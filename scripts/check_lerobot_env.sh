@@ -7,7 +7,7 @@
 # demonstrator by LeRobot's loop, which must come out as `robocas eval` has them. Needs scripts/setup.sh to have run.
 # The first run downloads gigabytes (torch with its CUDA libraries); no GPU is needed, nothing is fetched from a model hub.
 #
-# ROBOCAS_PYTHON              interpreter that has robocas_ms3 (default: .venv's in the checkout)
+# ROBOCAS_SIM_PYTHON              interpreter that has robocas_ms3 (default: .venv's in the checkout)
 # ROBOCAS_LEROBOT_ENV_VENV    folder of LeRobot's environment (default: .venv-lerobot-env in the checkout)
 # ROBOCAS_LEROBOT_ENV_PYTHON  interpreter to make it with (default: python3.12, the oldest that lerobot 0.6 takes)
 set -euo pipefail
@@ -26,6 +26,6 @@ if [ "$(cat "$venv/.packages" 2>/dev/null)" != "$stamp" ]; then
 fi
 "$venv/bin/python" -m pip --disable-pip-version-check install -qq --force-reinstall --no-deps ./lerobot_env_robocas
 "$venv/bin/python" -m pip --disable-pip-version-check install -qq ./lerobot_env_robocas # what else it needs
-export ROBOCAS_PYTHON=${ROBOCAS_PYTHON:-$PWD/.venv/bin/python}
+export ROBOCAS_SIM_PYTHON=${ROBOCAS_SIM_PYTHON:-$PWD/.venv/bin/python}
 export HF_HUB_OFFLINE=1 HF_HOME="$venv/hub"
 exec "$venv/bin/python" -W ignore scripts/check_lerobot_env.py

@@ -38,7 +38,7 @@ class RoboCASEnvConfig(EnvConfig):
         cameras: with commas between them; the first one is filmed.
         observation_width, observation_height: of every camera, pixels.
         convention, reference: what actions mean.
-        python: interpreter that has robocas_ms3; default: $ROBOCAS_PYTHON, else that of the ``robocas`` command.
+        python: interpreter that has robocas_ms3; default: $ROBOCAS_SIM_PYTHON, else that of the ``robocas`` command.
         backend: ``processes``, ``gpu`` or ``auto``.
         results: folder for results that ``robocas eval report`` and ``compare`` read, one a task.
         policy_name: of the policy, in those results.

@@ -17,7 +17,7 @@ import msgpack
 import numpy as np
 
 MODULE = "robocas_ms3.evaluation.bridge"
-VARIABLE = "ROBOCAS_PYTHON"
+VARIABLE = "ROBOCAS_SIM_PYTHON"
 _LENGTH = 8  # bytes of a message's length, most significant first
 _PATIENCE = 10.0  # s that a process which was told to leave may take
 _FIX = (
@@ -77,7 +77,7 @@ class Process:
         if not self.close.alive:
             raise RoboCASProcessError("the simulating process was closed")
         try:
-            data = msgpack.packb(message, default=_written)
+            data: bytes = msgpack.Packer(default=_written).pack(message)
             self._end.sendall(len(data).to_bytes(_LENGTH, "big") + data)
             answer = self._answer()
         except TimeoutError:
@@ -126,7 +126,7 @@ def find_python(python: str | None) -> str:
     """The interpreter that has robocas_ms3.
 
     Args:
-        python: as it was asked for; None: $ROBOCAS_PYTHON, else the one beside the ``robocas`` that the shell would
+        python: as it was asked for; None: $ROBOCAS_SIM_PYTHON, else the one beside the ``robocas`` that the shell would
             find, else this one.
     """
     asked = python or os.environ.get(VARIABLE)

@@ -170,6 +170,10 @@ class RoboCASVectorEnv(gym.vector.VectorEnv):
 
 
 def _space(cameras: dict[str, tuple[int, int]], widths: dict[str, int]) -> gym.spaces.Dict:
-    pixels = {name: gym.spaces.Box(0, 255, (h, w, 3), np.uint8) for name, (w, h) in cameras.items()}
-    numbers = {name: gym.spaces.Box(-np.inf, np.inf, (width,), np.float32) for name, width in widths.items()}
-    return gym.spaces.Dict({"pixels": gym.spaces.Dict(pixels), **numbers})
+    spaces: dict[str, gym.Space[Any]] = {
+        name: gym.spaces.Box(-np.inf, np.inf, (width,), np.float32) for name, width in widths.items()
+    }
+    pixels: dict[str, gym.Space[Any]] = {
+        name: gym.spaces.Box(0, 255, (h, w, 3), np.uint8) for name, (w, h) in cameras.items()
+    }
+    return gym.spaces.Dict({"pixels": gym.spaces.Dict(pixels), **spaces})

@@ -66,8 +66,18 @@ def leave_with(end: socket.socket, starter: int) -> None:
 
 
 def _wait_and_leave(end: int, starter: int) -> None:
-    poll = select.poll()
+    parent, poll = os.getppid(), select.poll()  # a script between the two may be the parent
     poll.register(end, 0)  # nothing but hang-ups
-    while not poll.poll(1000 * _LOOK) and os.getppid() == starter:
+    while not poll.poll(1000 * _LOOK) and os.getppid() == parent and _is_there(starter):
         pass
     os._exit(1)
+
+
+def _is_there(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True

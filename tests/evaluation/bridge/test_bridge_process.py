@@ -43,7 +43,7 @@ def gone(pid: int, seconds: float = 20) -> bool:
     [
         ("echo one; echo 'the disk is full' >&2; exit 3", r"ended \(exit code 3\): the disk is full\. It ran /"),
         ("kill -SEGV $$", r"ended \(signal 11\): it printed nothing"),
-        (f"exec {sys.executable} -S -c 'import numpy'", r"No module named 'numpy'.*pass --env.python=.*ROBOCAS_PYTHON"),
+        (f"exec {sys.executable} -S -c 'import numpy'", r"No module named 'numpy'.*pass --env.python=.*ROBOCAS_SIM_PYTHON"),
         (f"exec {sys.executable} -c 'import os; os.close(int(os.environ[\"FD\"]))'", "ended"),
     ],
 )
@@ -99,13 +99,13 @@ def test_it_leaves_with_who_started_it_though_killed(forked):
 
 
 def test_the_interpreter_that_is_taken(tmp_path, monkeypatch):
-    monkeypatch.delenv("ROBOCAS_PYTHON", raising=False)
+    monkeypatch.delenv("ROBOCAS_SIM_PYTHON", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
     assert process.find_python(None) == sys.executable
     for name in ("robocas", "python"):
         (tmp_path / name).write_text("#!/bin/sh\n")
         (tmp_path / name).chmod(0o755)
     assert process.find_python(None) == str(tmp_path / "python")
-    monkeypatch.setenv("ROBOCAS_PYTHON", "/of/the/variable")
+    monkeypatch.setenv("ROBOCAS_SIM_PYTHON", "/of/the/variable")
     assert process.find_python(None) == "/of/the/variable"
     assert process.find_python("~/python") == os.path.expanduser("~/python")
