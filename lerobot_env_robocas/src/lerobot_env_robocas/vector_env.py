@@ -19,7 +19,7 @@ class RoboCASVectorEnv(gym.vector.VectorEnv):
     """Plays the episodes of a task of a frozen protocol, N at a time.
 
     A seed is the number of an episode in the task's list, modulo the list's length. An env whose episode has ended
-    stays as it is, and costs nothing, until the next reset.
+    is shown as it ended, until the next reset.
 
     Observations: ``pixels`` by camera (N, H, W, 3) uint8, ``agent_pos`` (N, 18), ``joint_velocity`` (N, 7),
     ``arm_base`` (N, 7), ``gripper_open`` (N, 1): columns of robocas_ms3's LeRobot datasets. Reward: 1 where an episode
