@@ -21,11 +21,11 @@ stamp="${PACKAGES[*]}"
 if [ "$(cat "$venv/.packages" 2>/dev/null)" != "$stamp" ]; then
     echo "environment $venv: ${PACKAGES[*]} (minutes the first time)"
     "${ROBOCAS_LEROBOT_ENV_PYTHON:-python3.12}" -m venv --clear "$venv"
-    "$venv/bin/python" -m pip --disable-pip-version-check install -qq "${PACKAGES[@]}"
+    "$venv/bin/python" -m pip --disable-pip-version-check install -qq "${PACKAGES[@]}" ./lerobot_env_robocas
     echo "$stamp" >"$venv/.packages"
 fi
+# What it needs is there; its code may be another than last time.
 "$venv/bin/python" -m pip --disable-pip-version-check install -qq --force-reinstall --no-deps ./lerobot_env_robocas
-"$venv/bin/python" -m pip --disable-pip-version-check install -qq ./lerobot_env_robocas # what else it needs
 export ROBOCAS_SIM_PYTHON=${ROBOCAS_SIM_PYTHON:-$PWD/.venv/bin/python}
 export HF_HUB_OFFLINE=1 HF_HOME="$venv/hub"
 exec "$venv/bin/python" -W ignore scripts/check_lerobot_env.py
