@@ -44,6 +44,8 @@ class Eval:
     shard: str = "0/1"
     """Only a part of the episodes, K/N: the K-th of N runs, from 0 on. The words above take the folders of
     all parts."""
+    split: str = ""
+    """Only the episodes of this split, such as `seen`."""
     episodes: int | None = None
     """Only the first so many of each configuration."""
     weld: bool = False
@@ -102,7 +104,16 @@ def run(cfg: Eval) -> int:
     protocol = load_protocol(cfg.protocol)
     name = re.sub(r"[^\w.-]+", "_", cfg.policy) + ("_weld" if cfg.weld else "")
     out = cfg.out or Path("eval") / protocol.rules.name / name
-    settings = Settings(cfg.envs, cfg.backend, cfg.workers, shard_of(cfg.shard), cfg.words, cfg.episodes, cfg.weld)
+    settings = Settings(
+        num_envs=cfg.envs,
+        backend=cfg.backend,
+        workers=cfg.workers,
+        shard=shard_of(cfg.shard),
+        tasks=cfg.words,
+        episodes=cfg.episodes,
+        split=cfg.split,
+        weld=cfg.weld,
+    )
     succeeded = played = 0
     with open_policy(cfg.policy) as policy, bar("episodes") as shown:
         try:

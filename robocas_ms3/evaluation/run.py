@@ -32,6 +32,7 @@ class Settings:
         shard: (number, of how many): only these episodes, every n-th.
         tasks: only these; empty: all of the protocol's.
         episodes: only the first so many of each configuration.
+        split: only the episodes of this split; empty: of all.
         weld: whether what is lifted is welded to the hand, as upstream does (`weld`).
     """
 
@@ -41,6 +42,7 @@ class Settings:
     shard: tuple[int, int] = (0, 1)
     tasks: tuple[str, ...] = ()
     episodes: int | None = None
+    split: str = ""
     weld: bool = False
 
 
@@ -70,7 +72,7 @@ def evaluate(
         refuse(protocol.rules.stepping, choose_backend(settings.backend))
     wanted = chosen(protocol.episodes, settings)
     if not wanted:
-        raise EvaluationError("no episodes", where=protocol.rules.name, found=f"tasks {list(settings.tasks)}")
+        raise EvaluationError("no episodes in this part", where=protocol.rules.name, found=settings.shard)
     if policy.wants.cameras:
         require_renderer()
     done = results.begin(folder, about(protocol, policy, name, settings), resume=resume)
@@ -85,12 +87,25 @@ def evaluate(
 
 
 def chosen(episodes: Sequence[Episode], settings: Settings) -> list[Episode]:
-    """The episodes of a run."""
+    """The episodes of a run.
+
+    Raises:
+        EvaluationError: there are none of these tasks, or of this split.
+    """
+    for what, wanted in (("task", settings.tasks), ("split", (settings.split,) if settings.split else ())):
+        known = dict.fromkeys(str(getattr(episode, what)) for episode in episodes)
+        for name in wanted:
+            if name not in known:
+                raise EvaluationError(
+                    f"the protocol has no such {what}", where="episodes", expected=", ".join(known), found=name
+                )
     number, of = settings.shard
     taken: dict[str, int] = {}
     found = []
     for episode in episodes:
         if settings.tasks and episode.task not in settings.tasks:
+            continue
+        if settings.split not in ("", episode.split):
             continue
         taken[episode.config] = taken.get(episode.config, 0) + 1
         if settings.episodes is not None and taken[episode.config] > settings.episodes:

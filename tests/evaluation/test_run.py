@@ -103,8 +103,14 @@ def test_a_policy_that_does_not_fit_is_refused_before_anything_is_written(tmp_pa
     rules = load_protocol("paper-v1").rules
     with pytest.raises(EvaluationError, match=r"another rate \(expected 5 Hz, found 10 Hz\)"):
         rules.refuse(Wants(reference="tcp", rate_hz=10))
-    with pytest.raises(EvaluationError, match="no episodes"):
+    with pytest.raises(
+        EvaluationError, match=r"no such task \(expected pick, select, search, open_pick, found nothing"
+    ):
         play(tmp_path / "out", tasks=("nothing",))
+    with pytest.raises(EvaluationError, match=r"no such split \(expected test, found seen"):
+        play(tmp_path / "out", split="seen")
+    with pytest.raises(EvaluationError, match="no episodes in this part"):
+        play(tmp_path / "out", tasks=("pick",), shard=(90, 100))
 
 
 def test_who_wants_to_see_needs_a_renderer(tmp_path, monkeypatch):
@@ -140,6 +146,9 @@ def test_episodes_are_chosen_by_task_count_and_shard():
     assert [one.episode for one in chosen(episodes, Settings(tasks=("search", "pick")))] == [0, 1, 4, 5]
     assert [one.episode for one in chosen(episodes, Settings(episodes=1))] == [0, 2, 4, 6]
     assert [one.episode for one in chosen(episodes, Settings(shard=(1, 3)))] == [1, 4, 7]
+    suite = load_protocol("objects-v1").episodes
+    new = chosen(suite, Settings(split="new", tasks=("pick",)))
+    assert [one.episode for one in new] == [*range(50, 100)]
 
 
 def test_policies_by_name():

@@ -1,0 +1,50 @@
+"""``python -m robocas_ms3.evaluation.bridge FD PID``: play episodes for a process at the other end of a socket.
+
+Started by ``lerobot_env_robocas``, not by people.
+"""
+
+from __future__ import annotations
+
+import signal
+import socket
+import sys
+import traceback
+from contextlib import suppress
+
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.evaluation.bridge.channel import Channel, leave_with
+
+
+def main(fd: int, starter: int) -> int:
+    """Run until the other end is closed; gives the exit code.
+
+    Args:
+        fd: descriptor of this end.
+        starter: id of the process that has the other one.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the starter's, which closes its end
+    end = socket.socket(fileno=fd)
+    leave_with(end, starter)
+    channel, bridge = Channel(end), None
+    try:
+        from robocas_ms3.evaluation.bridge.server import open_bridge  # the simulator, which takes seconds
+
+        bridge = open_bridge(channel)
+        channel.send({"ready": bridge.ready()})
+        bridge.run()
+    except EOFError:
+        return 0
+    except Exception as error:  # whatever it is, the other end is to hear of it
+        traceback.print_exc()
+        said = str(error) if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}"
+        with suppress(OSError):
+            channel.send({"error": " ".join(said.split())})
+        return 1
+    finally:
+        if bridge is not None:
+            bridge.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*map(int, sys.argv[1:])))

@@ -1,0 +1,76 @@
+"""What an env's robot feels is, number for number, what a dataset holds of the same states."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("websockets")
+pytest.importorskip("msgpack")
+
+from robocas_ms3.datasets.episode import Joints, episode_arrays, robot_frames
+from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
+from robocas_ms3.demos.sampling import gripper_open, invert, to_matrices
+from robocas_ms3.evaluation.bridge.proprioception import KEYS, WIDTHS, Proprioception
+from robocas_ms3.robots.constants import FINGER_TARGETS
+
+STEPS = 60
+COMMANDS = np.where(np.arange(STEPS) // 7 % 2, -1.0, 1.0)
+
+
+def moving(seed: int) -> Joints:
+    """A robot that turns on the spot, more than once, and swings its arm through where the quaternion's sign jumps."""
+    rng = np.random.default_rng(seed)
+    root = np.array([[0.4, -1.2, 0.0, np.cos(1.1), 0, 0, np.sin(1.1)]])
+    qpos = np.cumsum(rng.normal(scale=0.2, size=(STEPS, 12)), axis=0)
+    qpos[:, 2] = np.linspace(0, 9, STEPS)
+    qpos[:, 10:] = 0.04
+    qpos = qpos.astype(np.float32).astype(np.float64)
+    qvel = rng.normal(size=(STEPS, 12)).astype(np.float32).astype(np.float64)
+    return Joints(qpos, qvel, np.tile(to_matrices(root), (STEPS, 1, 1)))
+
+
+def observed(robots: list[Joints], step: int) -> dict:
+    """The observation of a vector environment at a step: float32, poses wxyz."""
+
+    def seven(poses):
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+        return np.concatenate([poses[:, :3, 3], turn], axis=1)[step].astype(np.float32)
+
+    frames = [robot_frames(joints) for joints in robots]
+    in_base = [invert(one.arm_base_in_world) @ one.tcp_in_world for one in frames]
+    return {
+        "agent": {
+            "qpos": np.stack([joints.qpos[step] for joints in robots]).astype(np.float32),
+            "qvel": np.stack([joints.qvel[step] for joints in robots]).astype(np.float32),
+            "tcp_in_arm_base": np.stack([seven(poses) for poses in in_base]),
+        },
+        "extra": {"tcp_pose": np.stack([seven(one.tcp_in_world) for one in frames])},
+    }
+
+
+def test_every_step_of_two_envs_is_what_a_dataset_holds():
+    robots, feels = [moving(1), moving(2)], Proprioception()
+    for env in range(2):
+        feels.begin(env, observed(robots, 0))
+    read: list[list[dict]] = [[], []]
+    for step in range(STEPS):
+        for env in range(2):
+            command = None if step == 0 else float(COMMANDS[step - 1])
+            read[env].append(feels.read(env, observed(robots, step), command))
+    for env, joints in enumerate(robots):
+        samples = np.arange(STEPS)
+        status = gripper_open(COMMANDS, samples, finger_range=FINGER_TARGETS, initial_width=0.08)
+        columns = frame_columns(episode_arrays(robot_frames(joints), joints, status, "", []))
+        for name, column in KEYS.items():
+            found = np.stack([one[name] for one in read[env]])
+            assert found.dtype == np.float32
+            np.testing.assert_allclose(found, columns[column], atol=3e-6, err_msg=name)
+    turns = np.stack([one["agent_pos"] for one in read[0]])
+    assert np.ptp(turns[:, 17]) > 2 * np.pi  # it went round
+    assert (np.sum(turns[1:, 3:7] * turns[:-1, 3:7], axis=1) >= 0).all()
+
+
+def test_all_state_columns_of_a_dataset_are_there():
+    columns = {one.key: one.width for one in FEATURES if one.key.startswith("observation.")}
+    assert {KEYS[name]: width for name, width in WIDTHS.items()} == columns
