@@ -10,7 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from robocas_ms3.arrays import as_tensor
 from robocas_ms3.tasks.search import RoboCASSearchEnv
+from robocas_ms3.tasks.transfer import Moment
 
 # share of an object that another one hides from above, from which on it lies over it; what is measured of points is off
 # by 0.08 at the 95th percentile
@@ -36,7 +38,9 @@ class Retrieval:
         self._needed = torch.zeros(shape, dtype=torch.bool, device=env.device)
         self._moved_at = torch.zeros(shape, dtype=torch.int16, device=env.device)
         self._moved_time = torch.zeros(shape, device=env.device)  # s
+        self._held = torch.zeros(shape[0], dtype=torch.bool, device=env.device)  # by now
         self._steps = torch.zeros(shape[0], dtype=torch.int16, device=env.device)
+        self._found: Tensor | None = None  # of `read`, until something changes
 
     def reset(self, envs: Any) -> None:
         """Begin anew in some envs, from the heaps as they lie."""
@@ -46,13 +50,15 @@ class Retrieval:
         first = env.clutter(envs).obstacles | over[rows, :, env.target_slot[envs]]
         self._over[envs], self._needed[envs] = over, needed(first, over)
         self._moved_at[envs], self._moved_time[envs], self._steps[envs] = 0, torch.inf, 0
+        self._held[envs], self._found = False, None
 
-    def look(self, info: dict[str, Any]) -> None:
+    def look(self, moment: Moment) -> None:
         """Look at what has moved in a control step of the policy step that has begun."""
-        waiting = (self._moved_at == 0) & ~info["target_grasped"][:, None]
-        now = self._env.disturbed & waiting
+        self._held |= as_tensor(moment.held)
+        now = as_tensor(moment.disturbed) & (self._moved_at == 0) & ~self._held[:, None]
         if not now.is_cuda and not now.any():
             return
+        self._found = None
         seconds = self._env.elapsed_steps[:, None] * self._env.control_timestep
         self._moved_at = torch.where(now, self._steps[:, None] + 1, self._moved_at)
         self._moved_time = torch.where(now, seconds, self._moved_time)
@@ -67,9 +73,12 @@ class Retrieval:
         The policy step after which each object was first moved, from 1 on, or 0; whether it was needed; and whether
         that came in order: what lay over it moved earlier, or within a second, as what is pushed as one does.
         """
+        if self._found is not None:
+            return self._found
         late = self._moved_time[:, :, None] > self._moved_time[:, None] + TOGETHER  # row later than column
         in_order = (self._moved_at > 0) & self._needed & ~(self._over & late).any(dim=1)
-        return torch.stack([self._moved_at, self._needed.short(), in_order.short()], dim=-1)
+        self._found = torch.stack([self._moved_at, self._needed.short(), in_order.short()], dim=-1)
+        return self._found
 
 
 def needed(first: Tensor, over: Tensor) -> Tensor:

@@ -85,6 +85,7 @@ class Rollouts:
         self._playing: dict[int, Played] = {}
         self._chunks: dict[int, list[NDArray[np.floating]]] = {}
         self._obs: Any = None
+        self._info: dict[str, Any] = {}
         self._embed = TextEmbedder() if policy.wants.language == "embedding" else None
 
     def play(self, episodes: Sequence[Start]) -> Iterator[Played]:
@@ -108,26 +109,33 @@ class Rollouts:
         for start in starts:
             self._playing[start.env], self._chunks[start.env] = Played(start), []
             self._note(self._playing[start.env], info)
+        self._info = info
         self._policy.reset(starts)
 
     def _step(self) -> Iterator[Played]:
         self._ask()
         for env, played in list(self._playing.items()):
             if played.error:
-                del self._playing[env]
-                yield played
+                yield self._end(env)
         if not self._playing:
             return
         actions = np.zeros((self._count, self._size), np.float32)  # of envs that are done; nobody looks
         for env in self._playing:
             actions[env] = self._chunks[env].pop(0)
-        self._obs, _, _, _, info = self._env.step(actions)
+        self._obs, _, _, _, self._info = self._env.step(actions)
         for env, played in list(self._playing.items()):
             played.steps += 1
-            self._note(played, info)
-            if self._is_over(played, info):
-                del self._playing[env]
-                yield played
+            self._note(played, self._info)
+            if self._is_over(played, self._info):
+                yield self._end(env)
+
+    def _end(self, env: int) -> Played:
+        played, info = self._playing.pop(env), self._info
+        measured = (*TRACKED, _WELDS) if _WELDS in info else TRACKED
+        played.measures = {name: round(float(info[name][env]), 4) for name in measured}
+        if "retrieval" in info:
+            played.retrieval = info["retrieval"][env].copy()
+        return played
 
     def _ask(self) -> None:
         """See that every env that plays has an action."""
@@ -189,10 +197,6 @@ class Rollouts:
                     played.flags[name], played.flag_seconds[name] = played.steps, round(played.seconds, 4)
                 played.flags.setdefault(name, None)
                 played.flag_seconds.setdefault(name, None)
-        measured = (*TRACKED, _WELDS) if _WELDS in info else TRACKED
-        played.measures = {name: round(float(info[name][env]), 4) for name in measured}
-        if "retrieval" in info:
-            played.retrieval = info["retrieval"][env]
 
     def _is_over(self, played: Played, info: dict[str, Any]) -> bool:
         rules, env = self._rules, played.start.env

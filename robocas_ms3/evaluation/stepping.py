@@ -67,6 +67,11 @@ class PolicyStepping(gym.Wrapper):
         self._told[rows], self._width_change[rows] = True, 0.0
         return obs, {**info, **self._happened(info)}
 
+    def get_info(self) -> dict[str, Any]:
+        """What infos hold, such as workers share."""
+        info = self._base.get_info()
+        return {**info, **self._happened(info)}
+
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """One policy step.
 
@@ -128,10 +133,11 @@ class PolicyStepping(gym.Wrapper):
     def _control(self, actions: np.ndarray) -> tuple:
         if self._weld and self._told[0]:
             self._weld.open()
-        width = self._width()
+        width = self._width() if self._stepping == "upstream" else 0.0
         result = self.env.step(torch.as_tensor(actions, dtype=torch.float32, device=self._base.device))
-        self._width_change = np.abs(self._width() - width)
-        self._tracker.look(result[-1], self._told)
+        if self._stepping == "upstream":
+            self._width_change = np.abs(self._width() - width)
+        self._tracker.look(self._told)
         return result
 
     def _tcp(self) -> tuple[np.ndarray, Rotation]:

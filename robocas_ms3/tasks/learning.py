@@ -119,7 +119,7 @@ class LearningEnv(TransferEnv):
         now = self._moment
         assert now is not None
         found = {
-            "disturbed": rewards.count_share(now.disturbed),
+            "disturbed": rewards.count_share(now.disturbed.sum(1)),
             "basket_shift": rewards.shift(now.basket[:, :3], native(self.basket_at_start)[:, :3]),
             "action_rate": self._action_rate(action),
         }

@@ -32,7 +32,8 @@ class Moment(NamedTuple):
         held: (N,) bool, whether the target is held; so are the next ones.
         touched: the gripper touches it.
         in_basket: it is in the basket.
-        disturbed: (N,) int.
+        disturbed: (N, K) bool, which objects other than the target no longer stand as they stood.
+        forces: (N, 3, K, 3) N, of objects on left finger, right finger and hand, world frame.
     """
 
     objects: Any
@@ -41,6 +42,7 @@ class Moment(NamedTuple):
     touched: Any
     in_basket: Any
     disturbed: Any
+    forces: Any
 
 
 class TransferEnv(RoboCASEnv):
@@ -159,10 +161,15 @@ class TransferEnv(RoboCASEnv):
         success = native(self._stages["target_lifted"]) & reduce(and_, measures.values())
         fail = self._has_failed(measures, objects, basket)
         stages = dict(zip(self.STAGES, self._reached.clone(), strict=True))
-        disturbed = self._disturbed(objects[..., :7]).sum(1)
-        self._moment = Moment(objects, basket, held, now["reached_target"], measures["in_basket"], disturbed)
+        disturbed, touched = self._disturbed(objects[..., :7]), now["reached_target"]
+        self._moment = Moment(objects, basket, held, touched, measures["in_basket"], disturbed, forces)
         flags = {"success": as_tensor(success), "fail": as_tensor(fail)}
-        return {**stages, **flags, "disturbed": as_tensor(disturbed)}
+        return {**stages, **flags, "disturbed": as_tensor(disturbed.sum(1))}
+
+    @property
+    def moment(self) -> Moment:
+        """What `evaluate` found last; the same object as before where nothing has changed since."""
+        return self._moment
 
     def _has_failed(self, measures: dict[str, Any], objects: Any, basket: Any) -> Any:
         """(N,) bool of ``fail``, native, from `_target_measures`, states (N, K, 13) and the basket's pose (N, 7)."""
@@ -214,11 +221,13 @@ class TransferEnv(RoboCASEnv):
             "basket_stands": terms.stands(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:]),
         }
 
-    def fallen(self) -> torch.Tensor:
-        """(N, K) bool: which objects lie more than 5 cm below what they stood on, and not in the basket."""
-        objects, centers = native(self.object_states), native(self._centers_of_mass)
+    def fallen(self) -> Any:
+        """(N, K) bool, native: which objects lie 5 cm below what they stood on, not in the basket; as of `moment`."""
+        objects = self._moment.objects
         low = (objects[..., 2] < self._surface - terms.FALLEN) & native(self.present)
-        return as_tensor(low & ~self._in_basket(objects[..., :7], centers, native(self.basket_pose)))
+        if none(low):  # as nearly always
+            return low
+        return low & ~self._in_basket(objects[..., :7], native(self._centers_of_mass), self._moment.basket)
 
     def _in_basket(self, poses: Any, centers_of_mass: Any, basket: Any) -> Any:
         """(N,) or (N, K) bool: whose centre of mass is in the basket's inner volume; all native (`arrays`).
@@ -232,13 +241,8 @@ class TransferEnv(RoboCASEnv):
         low, high = native(self._basket_low), native(self._basket_high)
         return terms.inside_box(centers, basket[:, :3], basket[:, 3:], low, high)
 
-    @property
-    def disturbed(self) -> torch.Tensor:
-        """(N, K) bool: which objects other than the target no longer stand as they stood; don't write to it."""
-        return as_tensor(self._disturbed(native(self.object_states)[..., :7]))
-
     def _disturbed(self, poses: Any) -> Any:
-        """`disturbed`, native, from poses (N, K, 7)."""
+        """(N, K) bool: which objects other than the target no longer stand as they stood, from poses (N, K, 7)."""
         support, undo = self.fixtures.furniture[self.task_config.surface.furniture], None
         if isinstance(support, Articulation) and self.model.support_link:
             links = [support.links_map[name] for name in (BODY, self.model.support_link)]

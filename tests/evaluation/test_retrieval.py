@@ -24,6 +24,9 @@ class Heap:
         self.present, self.target_slot = torch.ones(1, 4, dtype=torch.bool), torch.tensor([TARGET])
         self.disturbed, self.elapsed_steps = torch.zeros(1, 4, dtype=torch.bool), torch.zeros(1, dtype=torch.int32)
 
+    def moment(self, *, held: bool = False):
+        return SimpleNamespace(disturbed=self.disturbed, held=torch.tensor([held] * len(self.disturbed)))
+
     def covering(self, envs):
         return OVER
 
@@ -40,7 +43,7 @@ def kept_of(moves: dict[int, int], held_at: int = 1000, steps: int = 200) -> np.
         heap.elapsed_steps += 1
         for slot, at in moves.items():
             heap.disturbed[0, slot] |= step == at
-        retrieval.look({"target_grasped": torch.tensor([step >= held_at])})
+        retrieval.look(heap.moment(held=step == held_at))
         if step % 2 == 0:
             retrieval.end_step()
     return retrieval.read()[0].numpy()
@@ -114,7 +117,7 @@ def test_envs_begin_anew_on_their_own():
     retrieval = Retrieval(heap)
     retrieval.reset(torch.tensor([0, 1]))
     heap.disturbed[:, CUP], heap.elapsed_steps[:] = True, 1
-    retrieval.look({"target_grasped": torch.tensor([False, False])})
+    retrieval.look(heap.moment())
     retrieval.end_step()
     retrieval.reset(torch.tensor([1]))
     assert retrieval.read()[:, CUP].tolist() == [[1, 1, 1], [0, 1, 0]]

@@ -306,8 +306,8 @@ def _describe(env: gym.Env) -> Made:
     observations, actions = (env.get_wrapper_attr(f"single_{kind}_space") for kind in ("observation", "action"))
     if not isinstance(actions, gym.spaces.Box):
         raise VectorEnvError("these actions can't be sent to processes", expected="a box", found=actions)
-    base: Any = env.unwrapped
-    infos = [(path, np.asarray(leaf)) for path, leaf in leaves(base.get_info()) if isinstance(leaf, torch.Tensor)]
+    infos_of = env.get_wrapper_attr("get_info")  # of the outermost that says what infos hold
+    infos = [(path, np.asarray(leaf)) for path, leaf in leaves(infos_of()) if isinstance(leaf, torch.Tensor)]
     fields = [
         Field(("action",), actions.shape, actions.dtype.name),
         Field(("at_work",), (), "bool"),

@@ -1,0 +1,152 @@
+"""CPU time of the evaluation's loop beside a bare one over the same scenes and actions; prints JSON.
+
+The bare loop resets the same vector environment and steps it: no policy, no stages, no measures, nothing written. Both
+play one episode in each env, with the same joint targets, to the same last step; resets are not timed. The two take
+turns, and a case's figure is the median of its turns. CPU time is of this process and its workers together.
+
+Run: python benchmarks/evaluation.py [--tasks pick search] [--turns 5] [--steps 300]
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from numpy.typing import NDArray
+
+import robocas_ms3
+from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.rollout import Rollouts, Rules
+from robocas_ms3.evaluation.stage import make_env, start_of
+from robocas_ms3.robots.constants import ARM_SLICE
+from robocas_ms3.tasks.spec import TASKS
+
+RATE = 20  # Hz
+REACH = 0.3  # rad that the joints go to and fro
+
+
+@dataclass
+class Args:
+    tasks: tuple[str, ...] = ("pick", "search")
+    """Of the protocol."""
+    protocol: str = "ms3-v1"
+    """Whose scenes."""
+    envs: int = 2
+    """Envs at a time."""
+    turns: int = 5
+    """Of each case."""
+    steps: int = 300
+    """Of each env a turn."""
+
+
+class Waving:
+    """Joints that go to and fro about where they are, gripper open."""
+
+    wants = Wants("joint_positions", rate_hz=RATE, language="none")
+
+    def __init__(self) -> None:
+        self._step, self._from = 0, np.zeros((0, 7))
+
+    def reset(self, starts: list[Start]) -> None:
+        """Begin anew, all envs at once."""
+        self._step = 0
+
+    def act(self, observations: Observations) -> NDArray[np.floating]:
+        """(E, 8) joint targets."""
+        return self.targets(observations.qpos)
+
+    def targets(self, qpos: NDArray[np.floating]) -> NDArray[np.floating]:
+        """The next targets, from what the joints are at the first step."""
+        if self._step == 0:
+            self._from = np.array(qpos[:, ARM_SLICE])
+        self._step += 1
+        away = REACH * np.sin(self._step / RATE) * np.array([1, 0.5, 1, 0.5, 1, 1, 1])
+        return np.concatenate([self._from + away, np.ones((len(self._from), 1))], axis=1).astype(np.float32)
+
+
+def main(args: Args) -> None:
+    torch.set_num_threads(1)
+    protocol, cases = load_protocol(args.protocol), {}
+    for task in args.tasks:
+        episodes = [one for one in protocol.episodes if one.task == task][: args.envs]
+        bare = robocas_ms3.make_vec(
+            TASKS[task].env_id,
+            args.envs,
+            arrays="numpy",
+            auto_reset=False,
+            ignore_terminations=True,
+            record_metrics=False,
+            backend="processes",
+            config=str(protocol.config_file(episodes[0].config)),
+            layouts=str(protocol.layouts_file(episodes[0].config)),
+            control_mode="pd_joint_pos",
+            obs_mode="state_dict",
+            reward_mode="none",
+            render_backend="none",
+            sim_config={"control_freq": RATE},
+            max_episode_steps=10**9,
+        )
+        ours = make_env(protocol, Waving.wants, episodes[0], args.envs, backend="processes")
+        spent: dict[str, list[float]] = {"bare": [], "evaluation": []}
+        for _ in range(args.turns):
+            spent["bare"].append(alone(bare, [one.seed for one in episodes], args.steps))
+            spent["evaluation"].append(evaluated(ours, [start_of(protocol, one) for one in episodes], args.steps))
+        per_step = {name: 1000 * float(np.median(turns)) / args.steps / args.envs for name, turns in spent.items()}
+        cases[task] = {
+            **{f"{name}, cpu ms a step": round(value, 3) for name, value in per_step.items()},
+            "evaluation / bare": round(per_step["evaluation"] / per_step["bare"], 3),
+            "turns": {name: [round(turn, 2) for turn in turns] for name, turns in spent.items()},
+        }
+        bare.close()
+        ours.close()
+    print(json.dumps({"cores": os.cpu_count(), **vars(args), "cases": cases}, indent=2))
+
+
+def alone(env: Any, seeds: list[int], steps: int) -> float:
+    """CPU seconds of a bare loop."""
+    policy = Waving()
+    policy.reset([])
+    obs, _ = env.reset(seed=seeds, options={"env_idx": np.arange(len(seeds))})
+    before = cpu(env)
+    for _ in range(steps):
+        obs, *_ = env.step(policy.targets(obs["agent"]["qpos"]))
+    return cpu(env) - before
+
+
+def evaluated(env: Any, starts: list[Start], steps: int) -> float:
+    """CPU seconds of the evaluation's loop from the first step on."""
+    policy = Counting(env)
+    ended = list(Rollouts(env, policy, Rules(steps, ends_on=()), 1 / RATE, refill=True).play(starts))
+    assert [one.steps for one in ended] == [steps] * len(starts)
+    return cpu(env) - policy.before
+
+
+class Counting(Waving):
+    """Notes the CPU time at the first step."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__()
+        self.before, self._env = 0.0, env
+
+    def reset(self, starts: list[Start]) -> None:
+        """Begin anew, all envs at once."""
+        super().reset(starts)
+        self.before = cpu(self._env)
+
+
+def cpu(env: Any) -> float:
+    """Seconds of CPU time that this process and an environment's workers have used."""
+    workers = [int(Path(f"/proc/{pid}/schedstat").read_text().split()[0]) / 1e9 for pid in env.unwrapped.pids]
+    return time.process_time() + sum(workers)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
