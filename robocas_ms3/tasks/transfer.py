@@ -222,9 +222,12 @@ class TransferEnv(RoboCASEnv):
         }
 
     def fallen(self) -> Any:
-        """(N, K) bool, native: which objects lie 5 cm below what they stood on, not in the basket; as of `moment`."""
+        """(N, K) bool, native: which objects but the target lay 5 cm below what they stood on in `moment`, not in the basket.
+
+        The target is carried there, and if it falls, that is ``fail``.
+        """
         objects = self._moment.objects
-        low = (objects[..., 2] < self._surface - terms.FALLEN) & native(self.present)
+        low = (objects[..., 2] < self._surface - terms.FALLEN) & native(self.present & ~self._is_target)
         if none(low):  # as nearly always
             return low
         return low & ~self._in_basket(objects[..., :7], native(self._centers_of_mass), self._moment.basket)

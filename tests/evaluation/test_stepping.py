@@ -117,6 +117,10 @@ def test_what_happened_is_counted_from_the_reset_on():
     assert not bool(info["success_v0"])
     assert float(info["fallen"]) == 1
     assert float(info["disturbed_most"]) >= 1
+    base.objects[slot].set_pose(robot_pose(torch.tensor([[3.0, 2.0, 0.05]]), pose))
+    *_, info = env.step(along(0.0))
+    assert bool(info["fail"])
+    assert float(info["fallen"]) == 1  # others only
     env.reset(seed=3)
     *_, info = env.step(along(0.0))
     assert [float(info[name]) for name in ("fallen", "disturbed_most", "v0_steps")] == [0, 0, 0]
