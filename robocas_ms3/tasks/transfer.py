@@ -222,7 +222,7 @@ class TransferEnv(RoboCASEnv):
         }
 
     def fallen(self) -> Any:
-        """(N, K) bool, native: which objects but the target lay 5 cm below what they stood on in `moment`, not in the basket.
+        """(N, K) bool, native: which other objects lay 5 cm below what they stood on in `moment`, not in the basket.
 
         The target is carried there, and if it falls, that is ``fail``.
         """
