@@ -29,8 +29,8 @@ class Eval:
     policy: str = "scripted"
     """Of whom: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), random, still, replay:TRAJECTORY.h5,
     module:Class of your own, or ws://HOST:PORT, a server's (`robocas serve-policy`)."""
-    protocol: str = "ms3-v1"
-    """Name of a shipped protocol, or its folder."""
+    protocol: str | None = None
+    """Name of a shipped protocol, or a folder. Default: ms3-v1; of a result, the shipped one that it names."""
     out: Path | None = None
     """Folder to write to. Default: eval/PROTOCOL/POLICY, with the weld eval/PROTOCOL/POLICY_weld."""
     resume: bool = False
@@ -101,7 +101,7 @@ def run(cfg: Eval) -> int:
             expected = f"one of {', '.join(TASKS)}; or {', '.join(WORDS)}"
             raise EvaluationError("no such task", where=word, expected=expected)
     check_number("envs", cfg.envs, 1)
-    protocol = load_protocol(cfg.protocol)
+    protocol = load_protocol(cfg.protocol or "ms3-v1")
     name = re.sub(r"[^\w.-]+", "_", cfg.policy) + ("_weld" if cfg.weld else "")
     out = cfg.out or Path("eval") / protocol.rules.name / name
     settings = Settings(

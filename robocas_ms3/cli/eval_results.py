@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from robocas_ms3.evaluation.results import Result
 
 
-def report(folders: list[Path], out: Path | None, protocol: str) -> int:
+def report(folders: list[Path], out: Path | None, protocol: str | None) -> int:
     """Print a result's tables; write them and its page into its folder, those of several into another one."""
     from robocas_ms3.cli.bars import say
     from robocas_ms3.evaluation.results import read
@@ -25,7 +25,7 @@ def report(folders: list[Path], out: Path | None, protocol: str) -> int:
     return 0
 
 
-def merge(folders: list[Path], out: Path | None, protocol: str) -> int:
+def merge(folders: list[Path], out: Path | None, protocol: str | None) -> int:
     """Write parts of a result as one."""
     from robocas_ms3.cli.bars import say
     from robocas_ms3.errors import EvaluationError
@@ -39,7 +39,7 @@ def merge(folders: list[Path], out: Path | None, protocol: str) -> int:
     return 0
 
 
-def compare(folders: list[Path], protocol: str) -> int:
+def compare(folders: list[Path], protocol: str | None) -> int:
     """Compare results; of more folders than two, those that were measured with the same are parts of one.
 
     A single result is compared with itself, split by split.
@@ -57,7 +57,7 @@ def compare(folders: list[Path], protocol: str) -> int:
     return 0
 
 
-def verify(folders: list[Path], protocol: str) -> int:
+def verify(folders: list[Path], protocol: str | None) -> int:
     """See that a result is whole, and of a protocol that is here; 1 where it isn't."""
     from robocas_ms3.cli.bars import say
     from robocas_ms3.evaluation.results import read
@@ -73,7 +73,7 @@ def verify(folders: list[Path], protocol: str) -> int:
     return 1 if found else 0
 
 
-def videos(folder: Path, protocol: str, policy: str, count: int) -> int:
+def videos(folder: Path, protocol: str | None, policy: str, count: int) -> int:
     """Film failed episodes, and link the videos in the page.
 
     Raises:
@@ -104,14 +104,25 @@ def videos(folder: Path, protocol: str, policy: str, count: int) -> int:
     return 0
 
 
-def protocol_of(result: Result, given: str) -> LoadedProtocol:
-    """The protocol that a result names, or the folder that was given."""
-    from robocas_ms3.evaluation.protocol import load_protocol
+def protocol_of(result: Result, given: str | None) -> LoadedProtocol:
+    """The protocol that was given, or the shipped one that a result names: a result chooses no folder.
 
-    return load_protocol(given if Path(given).is_dir() else result.run["protocol"])
+    Raises:
+        EvaluationError: none was given, and none of that name is shipped.
+    """
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+
+    name, shipped = result.run["protocol"], shipped_protocols()
+    if given is None and name not in shipped:
+        expected, fix = f"one of {', '.join(shipped)}", "Pass --protocol FOLDER."
+        raise EvaluationError(
+            "its protocol is not shipped", where=result.folder, expected=expected, found=name, fix=fix
+        )
+    return load_protocol(shipped[name] if given is None else given)
 
 
-def write_pages(result: Result, out: Path, given: str) -> None:
+def write_pages(result: Result, out: Path, given: str | None) -> None:
     """Write the report, and say where it is."""
     from robocas_ms3.cli.bars import say
     from robocas_ms3.errors import EvaluationError

@@ -57,9 +57,13 @@ def comparison(results: Sequence[Result]) -> str:
     said = [f"{name}: {one.run['policy']['name']} ({one.folder})" for name, one in zip(names, results, strict=True)]
     both = "both" if len(results) == 2 else "all"
     head = f"{', '.join(said)}; {len(shared)} episodes of {measured} that {both} have."
+    differing = [key for key in ("backend", "versions") if any(one.run[key] != first.run[key] for one in results)]
+    if differing:
+        head += f" **Measured with different {' and '.join(differing)}.**"
     configs = sorted({first.outcomes[number].config for number in shared})
     rows = []
-    for config in [*configs, *([ALL] if len(configs) > 1 else [])]:
+    pooled = len({(first.outcomes[number].task, first.outcomes[number].seed) for number in shared}) == len(shared)
+    for config in [*configs, *([ALL] if len(configs) > 1 and pooled else [])]:
         numbers = [number for number in shared if config in (ALL, first.outcomes[number].config)]
         successes = [[result.outcomes[number].success for number in numbers] for result in results]
         for one, other in combinations(range(len(results)), 2):
@@ -74,22 +78,24 @@ def comparison_of_splits(result: Result, protocol: LoadedProtocol) -> str:
     Raises:
         EvaluationError: no two splits have the same scenes.
     """
-    configs = {(episode.task, episode.split): episode.config for episode in protocol.episodes}
+    if result.run["protocol_hash"] != protocol.hash:
+        raise EvaluationError(
+            "it is of another protocol", where=result.folder, expected=protocol.hash, found=result.run["protocol_hash"]
+        )
+    scenes: dict[tuple[str, bytes], list[tuple[str, str]]] = {}  # (split, configuration) of those with the same scenes
+    for task, split, config in dict.fromkeys((one.task, one.split, one.config) for one in protocol.episodes):
+        scenes.setdefault((task, protocol.layouts_file(config).read_bytes()), []).append((split, config))
     rows = []
-    for task in dict.fromkeys(task for task, _ in configs):
-        first, *others = [split for of, split in configs if of == task]
-        for split in others:
-            files = [protocol.layouts_file(configs[task, name]) for name in (first, split)]
-            if files[0].read_bytes() != files[1].read_bytes():
-                continue
+    for (task, _), (first, *others) in scenes.items():
+        for other in others:
             sides = [
-                {one.seed: one.success for one in result.outcomes.values() if (one.task, one.split) == (task, name)}
-                for name in (first, split)
+                {one.seed: one.success for one in result.outcomes.values() if (one.split, one.config) == side}
+                for side in (first, other)
             ]
             seeds = sorted(sides[0].keys() & sides[1].keys())
             if seeds:
                 found = compare([sides[1][seed] for seed in seeds], [sides[0][seed] for seed in seeds])
-                rows.append(Row(task, (first, split), found))
+                rows.append(Row(task, (first[0], other[0]), found))
     if not rows:
         fix = "Name another result to compare it with."
         raise EvaluationError("no two splits of this result have the same scenes", where=result.folder, fix=fix)
@@ -105,7 +111,8 @@ def _table(head: str, where: str, rows: list[Row]) -> str:
         for number, p in zip(family, holm([rows[number].found.p_value for number in family]), strict=True):
             adjusted[number] = p, len(family)
     lines = [
-        f"{head} McNemar's exact test, Tango's interval; claims go by Holm's p, adjusted for all rows of a kind.",
+        f"{head} McNemar's exact test, Tango's interval; claims go by Holm's p, adjusted for all rows but "
+        f"`{ALL}`, and for all of these.",
         "",
         f"| {where} | first, second | n | first | second | only first | only second | second - first | p | Holm's p |",
         "|---|---|---|---|---|---|---|---|---|---|",
@@ -118,7 +125,7 @@ def _table(head: str, where: str, rows: list[Row]) -> str:
             f"| {row.where} | {', '.join(row.pair)} | {found.n} | {found.successes_b} | {found.successes_a} | "
             f"{found.only_b} | {found.only_a} | {change} | {found.p_value:.3g} | {p:.3g} |"
         )
-        warning = too_few(found, alpha=_ALPHA / claims)
+        warning = None if p <= _ALPHA else too_few(found, alpha=_ALPHA / claims)
         if warning:
             pair = "" if len({row.pair for row in rows}) == 1 else f", {', '.join(row.pair)}"
             warnings.append(f"- {row.where}{pair}: {warning}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +30,11 @@ class Scene(StrictModel):
     """A configuration, and what of it is changed."""
 
     config: str = Field(description="name of a shipped configuration, or a YAML file")
-    name: str = Field(default="", description="of the file it becomes; default: the configuration's, and the split's")
+    name: str = Field(
+        default="",
+        pattern=r"^[A-Za-z0-9_-]*$",
+        description="of the file it becomes; default: the configuration's, and the split's",
+    )
     change: dict[str, Any] = Field(default={}, description="keys that have other values, in the configuration's form")
 
     def changed(self) -> TaskConfig:
@@ -41,6 +45,11 @@ class Scene(StrictModel):
         """
         config = load_task_config(self.config)
         return load_task_config(_merged(config.model_dump(mode="json"), self.change)) if self.change else config
+
+    @property
+    def file(self) -> str:
+        """Name of its configuration's file."""
+        return self.name or Path(self.config).stem
 
 
 class Part(Scene):
@@ -56,7 +65,7 @@ class Part(Scene):
     @property
     def file(self) -> str:
         """Name of its configuration in the protocol."""
-        return self.name or Path(self.config).stem + ("" if self.split == "test" else f"-{self.split}")
+        return self.name or super().file + ("" if self.split == "test" else f"-{self.split}")
 
 
 class Plan(StrictModel):
@@ -88,13 +97,13 @@ def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Ite
     except ValidationError as error:
         found = " ".join(str(error).split())
         raise EvaluationError("no rules of a protocol", where="rules", found=found) from error
-    configs = _configs(plan.parts)
+    configs, train = _configs(plan.parts), _configs(plan.train)
     total, episodes = sum(part.count for part in plan.parts), []
     with replacing_folder(folder) as tmp:
         for inside in (CONFIGS, LAYOUTS, *([TRAIN] if plan.train else [])):
             make_folder(tmp / inside)
-        for scene in plan.train:
-            _write_config(scene.changed(), tmp / TRAIN / f"{scene.name or Path(scene.config).stem}.yaml")
+        for name, config in train.items():
+            _write_config(config, tmp / TRAIN / f"{name}.yaml")
         for name, config in configs.items():
             _write_config(config, tmp / CONFIGS / f"{name}.yaml")
         scenes: dict[str, dict[int, Layout]] = {}
@@ -111,7 +120,7 @@ def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Ite
         (tmp / RULES).write_text(said, encoding="utf-8")
 
 
-def _configs(parts: list[Part]) -> dict[str, TaskConfig]:
+def _configs(parts: Sequence[Scene]) -> dict[str, TaskConfig]:
     """Configurations by name."""
     found: dict[str, TaskConfig] = {}
     for part in parts:
@@ -184,5 +193,7 @@ def _said(part: Part, env: TransferEnv, seed: int) -> str:
     if part.words == "asked":
         return env.instruction().text
     others = sorted(env.names() - {env.target_asset().asset.name})
+    if not others:
+        raise EvaluationError("no other object whose name would be wrong", where=f"{part.file}, seed {seed}")
     rng = np.random.default_rng([seed, _WRONG])
     return env.instruction(name=others[int(rng.integers(len(others)))]).text

@@ -27,7 +27,15 @@ from robocas_ms3.files import make_folder, replacing_folder, write_json
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
-_SAME = ("protocol", "protocol_hash", "policy", "weld", "backend", "versions", "pack_hashes")  # of parts of one result
+_SAME = {  # of parts of one result, and what each is
+    "protocol": str,
+    "protocol_hash": str,
+    "policy": dict,
+    "weld": bool,
+    "backend": str,
+    "versions": dict,
+    "pack_hashes": dict,
+}
 _BEFORE = {"weld": False}  # of results that were written before there was one
 # evaluation_v0.md and the paper's table: reach, pick, recognise, clear
 STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
@@ -147,6 +155,10 @@ class Result:
         held = [getattr(one, what) if hasattr(one, what) else one.flags.get(what) is not None for one in chosen]
         return share(sum(held), len(held))
 
+    def repeats(self) -> bool:
+        """Whether a scene may be there several times, in several splits: then its episodes must not be pooled."""
+        return len({(one.task, one.seed) for one in self.outcomes.values()}) < len(self.outcomes)
+
     def by(self, name: str) -> dict[str, list[Outcome]]:
         """Its outcomes by one of their attributes, such as ``config``; sorted."""
         found: dict[str, list[Outcome]] = {}
@@ -220,17 +232,19 @@ def read(*folders: Path) -> Result:
 
 
 def parts_of(folders: Iterable[Path]) -> list[list[Path]]:
-    """Folders by what they were measured with: those that `read` takes together."""
-    found: list[tuple[list[Any], list[Path]]] = []
+    """Folders that `read` takes together: measured with the same, and of other episodes than those before."""
+    found: list[tuple[list[Any], set[int], list[Path]]] = []
     for folder in folders:
-        run = _read(folder).run
-        key = [run[name] for name in _SAME]
-        group = next((group for other, group in found if other == key), None)
-        if group is None:
-            found.append((key, [folder]))
+        part = _read(folder)
+        key = [part.run[name] for name in _SAME]
+        for other, episodes, group in found:
+            if other == key and not episodes & part.outcomes.keys():
+                group.append(folder)
+                episodes.update(part.outcomes)
+                break
         else:
-            group.append(folder)
-    return [group for _, group in found]
+            found.append((key, set(part.outcomes), [folder]))
+    return [group for _, _, group in found]
 
 
 def merge(folders: Sequence[Path], out: Path) -> Result:
@@ -273,7 +287,9 @@ def _read(folder: Path) -> Result:
     except (OSError, ValueError) as error:
         raise EvaluationError("no result of an evaluation", where=folder, found=error) from error
     run = {**_BEFORE, **run} if isinstance(run, dict) else {}
-    missing = [key for key in _SAME if key not in run]
+    missing = [key for key, kind in _SAME.items() if not isinstance(run.get(key), kind)]
+    if not missing and not isinstance(run["policy"].get("name"), str):
+        missing = ["policy.name"]
     if missing:
         raise EvaluationError("no result of an evaluation", where=folder / RUN, expected=", ".join(missing))
     return Result(folder, run, outcomes)

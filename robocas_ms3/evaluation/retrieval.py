@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from robocas_ms3.arrays import as_tensor
-from robocas_ms3.tasks.search import RoboCASSearchEnv
+from robocas_ms3.tasks.search import ENVS_AT_ONCE, RoboCASSearchEnv
 from robocas_ms3.tasks.transfer import Moment
 
 # share of an object that another one hides from above, from which on it lies over it; what is measured of points is off
 # by 0.08 at the 95th percentile
 LIES_OVER = 0.1
 TOGETHER = 1.0  # s of the scene in which objects that are pushed as one begin to move
+_NEVER = 2**30  # control steps
 
 
 class Retrieval:
@@ -37,19 +38,24 @@ class Retrieval:
         self._over = torch.zeros(*shape, shape[1], dtype=torch.bool, device=env.device)
         self._needed = torch.zeros(shape, dtype=torch.bool, device=env.device)
         self._moved_at = torch.zeros(shape, dtype=torch.int16, device=env.device)
-        self._moved_time = torch.zeros(shape, device=env.device)  # s
+        self._moved_time = torch.zeros(shape, dtype=torch.int32, device=env.device)  # control steps
         self._held = torch.zeros(shape[0], dtype=torch.bool, device=env.device)  # by now
         self._steps = torch.zeros(shape[0], dtype=torch.int16, device=env.device)
         self._found: Tensor | None = None  # of `read`, until something changes
 
     def reset(self, envs: Any) -> None:
         """Begin anew in some envs, from the heaps as they lie."""
+        for some in torch.arange(len(self._steps), device=self._env.device)[envs].split(ENVS_AT_ONCE):
+            self._begin(some)
+
+    def _begin(self, envs: Tensor) -> None:
         env = self._env
         over = env.covering(envs) >= LIES_OVER
         rows = torch.arange(len(over), device=env.device)
+        over[rows, env.target_slot[envs]] = False  # what the target lies on need not wait for it
         first = env.clutter(envs).obstacles | over[rows, :, env.target_slot[envs]]
         self._over[envs], self._needed[envs] = over, needed(first, over)
-        self._moved_at[envs], self._moved_time[envs], self._steps[envs] = 0, torch.inf, 0
+        self._moved_at[envs], self._moved_time[envs], self._steps[envs] = 0, _NEVER, 0
         self._held[envs], self._found = False, None
 
     def look(self, moment: Moment) -> None:
@@ -59,9 +65,9 @@ class Retrieval:
         if not now.is_cuda and not now.any():
             return
         self._found = None
-        seconds = self._env.elapsed_steps[:, None] * self._env.control_timestep
+        time = self._env.elapsed_steps[:, None].to(torch.int32)
         self._moved_at = torch.where(now, self._steps[:, None] + 1, self._moved_at)
-        self._moved_time = torch.where(now, seconds, self._moved_time)
+        self._moved_time = torch.where(now, time, self._moved_time)
 
     def end_step(self) -> None:
         """Count a policy step."""
@@ -75,7 +81,8 @@ class Retrieval:
         """
         if self._found is not None:
             return self._found
-        late = self._moved_time[:, :, None] > self._moved_time[:, None] + TOGETHER  # row later than column
+        second = round(TOGETHER / self._env.control_timestep)
+        late = self._moved_time[:, :, None] > self._moved_time[:, None] + second  # row later than column
         in_order = (self._moved_at > 0) & self._needed & ~(self._over & late).any(dim=1)
         self._found = torch.stack([self._moved_at, self._needed.short(), in_order.short()], dim=-1)
         return self._found

@@ -53,7 +53,7 @@ def markdown(result: Result) -> str:
         found = Counter(one.failure_stage for one in outcomes if one.failure_stage)
         said = ", ".join(f"{stage} {count}" for stage, count in found.most_common())
         lines.append(f"| {config} | {said or 'none failed'} |")
-    hidden = [one for one in result.outcomes.values() if one.p_vis is not None]
+    hidden = [one for one in first_splits(result) if one.p_vis is not None]
     if hidden:
         lines += ["", "## By what is seen of the target (p_vis)", "", "| p_vis | n | success |", "|---|---|---|"]
         for found in success_by([one.p_vis or 0.0 for one in hidden], [one.success for one in hidden], P_VIS_EDGES):
@@ -62,6 +62,16 @@ def markdown(result: Result) -> str:
                 f"| {found.low:g} to {found.high:g} | {0 if found.share is None else found.share.n} | {rate} |"
             )
     return "\n".join([*lines, *_retrieval(result)]) + "\n"
+
+
+def first_splits(result: Result) -> list[Outcome]:
+    """The outcomes; where scenes may be there several times, those of each task's first split alone."""
+    if not result.repeats():
+        return list(result.outcomes.values())
+    first: dict[str, str] = {}
+    for one in result.outcomes.values():
+        first.setdefault(one.task, one.split)
+    return [one for one in result.outcomes.values() if one.split == first[one.task]]
 
 
 def _splits(result: Result) -> list[str]:

@@ -55,9 +55,26 @@ def _too_long(outcome: Outcome, protocol: LoadedProtocol, run: dict[str, Any]) -
         yield f"{outcome.steps} steps, {limit} are allowed"
 
 
+def _of_retrieval(outcome: Outcome) -> Iterator[str]:
+    """What is said of its order against itself; that of a policy that failed at once was not looked at."""
+    order = outcome.retrieval
+    if order is None:
+        return
+    try:
+        late = [move["object"] for move in order["moved"] if not 0 < move["step"] <= outcome.steps]
+        right = sum(move["needed"] and move["in_order"] for move in order["moved"])
+        held, of = outcome.flags.get("target_grasped"), len(order["moved"]) + order["left"]
+        score = None if held is None else 1.0 if of == 0 else round(right / of, 4)
+        if outcome.task != "search" or late or order["left"] < 0 or order["score"] != score:
+            yield "its order of retrieval does not agree with itself"
+    except (TypeError, KeyError, ZeroDivisionError):
+        yield "its order of retrieval is none"
+
+
 def _at_odds(outcome: Outcome, protocol: LoadedProtocol) -> Iterator[str]:
     """What an outcome says against itself."""
     flags = outcome.flags
+    yield from _of_retrieval(outcome)
     if outcome.success != (flags.get("success") is not None):
         yield "success does not agree with its flags"
     stage = failure_stage(flags, outcome.error)

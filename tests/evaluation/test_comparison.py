@@ -1,11 +1,13 @@
 """Results over the same scenes, compared pair by pair."""
 
+import shutil
+
 import pytest
 from made_up_results import outcome, write
 
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.comparison import comparison, comparison_of_splits
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocol import EPISODES, load_protocol, shipped_protocols
 from robocas_ms3.evaluation.statistics import holm, mcnemar
 
 
@@ -65,6 +67,28 @@ def test_too_few_for_several_claims_though_enough_for_one(tmp_path):
     assert "- all: " not in said
 
 
+def test_no_warning_of_what_holm_lets_claim(tmp_path):
+    """b: p = 1/32, the greater of two, so that it may have all of alpha."""
+    outcomes = [
+        [outcome(n, came if n < 40 else 7, config="a" if n < 20 else "b") for n in range(26)] for came in (0, 7)
+    ]
+    one, other = (write(tmp_path / name, some) for name, some in zip("ab", outcomes, strict=True))
+    said = comparison([one, other])
+    assert [row[0] for row in rows(said) if float(row[-1]) <= 0.05] == ["a", "b", "all"]
+    assert "tell" not in said
+
+
+def test_scenes_that_are_there_several_times_are_not_pooled(tmp_path):
+    outcomes = [outcome(n, seed=n % 4, config="ab"[n // 4], split="ab"[n // 4]) for n in range(8)]
+    one, other = (write(tmp_path / name, outcomes) for name in "ab")
+    assert [row[0] for row in rows(comparison([one, other]))] == ["a", "b"]
+
+
+def test_other_versions_are_said(tmp_path):
+    one, other = (write(tmp_path / name, [outcome(0)], backend=name) for name in ("gpu", "processes"))
+    assert "**Measured with different backend.**" in comparison([one, other])
+
+
 def test_of_different_protocols_or_of_nothing(tmp_path):
     one = write(tmp_path / "a", [outcome(0)])
     with pytest.raises(EvaluationError, match="different protocols"):
@@ -91,7 +115,7 @@ def of_suite(folder, name, succeeds):
         )
         for one in protocol.episodes
     ]
-    return write(folder, outcomes), protocol
+    return write(folder, outcomes, protocol_hash=protocol.hash), protocol
 
 
 def test_splits_over_the_same_scenes(tmp_path):
@@ -104,6 +128,30 @@ def test_splits_over_the_same_scenes(tmp_path):
         [task, f"seen, {split}"] for task in ("pick", "select", "search") for split in ("paraphrase", "wrong", "empty")
     ]
     assert [row[3:5] for row in found[:3]] == [["50", "50"], ["50", "0"], ["50", "0"]]
+
+
+def test_splits_of_another_protocol(tmp_path):
+    result, _ = of_suite(tmp_path / "a", "instructions-v1", lambda one: True)
+    with pytest.raises(EvaluationError, match="another protocol"):
+        comparison_of_splits(result, load_protocol("cameras-v1"))
+
+
+def test_a_split_may_have_several_configurations(tmp_path):
+    """Of the same seeds: those with the same scenes are pairs."""
+    folder = shutil.copytree(shipped_protocols()["cameras-v1"], tmp_path / "mine")
+    lines = (folder / EPISODES).read_text()
+    (folder / EPISODES).write_text(lines.replace('"task":"select"', '"task":"pick"'))
+    protocol = load_protocol(folder)
+    outcomes = []
+    for one in protocol.episodes:
+        same = {name: getattr(one, name) for name in ("task", "config", "seed", "split")}
+        succeeds = one.split == "seen" or one.config == "select_table_orderly-far"
+        outcomes.append(outcome(one.episode, 7 if succeeds else 0, **same))
+    found = rows(comparison_of_splits(write(tmp_path / "r", outcomes, protocol_hash=protocol.hash), protocol))
+    assert [row[1:5] for row in found] == [
+        [f"seen, {split}", "50", "50", second]
+        for split, second in (("near", "0"), ("far", "0"), ("near", "0"), ("far", "50"))
+    ]
 
 
 def test_splits_over_other_scenes_are_no_pairs(tmp_path):

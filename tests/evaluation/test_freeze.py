@@ -97,3 +97,30 @@ def test_rules_that_no_protocol_has_leave_nothing_behind(tmp_path):
     with pytest.raises(EvaluationError, match="no rules of a protocol.*speed"):
         list(freeze(plan, tmp_path / "out"))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"train": [{"config": "pick_table_scattered"}] * 2}, None),
+        (
+            {"train": [{"config": "pick_table_scattered", "change": {"objects": {"count": n}}} for n in (3, 4)]},
+            "pick_table_scattered: two configurations of one name",
+        ),
+        ({"parts": [{**PLAN["parts"][0], "words": "wrong", "change": {"objects": {"count": 1}}}]}, "no other object"),
+    ],
+)
+def test_plans_that_can_not_be_followed(tmp_path, changed, said):
+    plan = Plan.model_validate({**PLAN, **changed})
+    if said is None:
+        list(freeze(plan, tmp_path / "out"))
+        assert len(load_protocol(tmp_path / "out").train_files()) == 1
+        return
+    with pytest.raises(EvaluationError, match=said):
+        list(freeze(plan, tmp_path / "out"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_name_is_no_path():
+    with pytest.raises(ValueError, match="name"):
+        Plan.model_validate({**PLAN, "train": [{"config": "pick_table_scattered", "name": "../x"}]})

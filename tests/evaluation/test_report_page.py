@@ -173,7 +173,7 @@ def test_commands_on_parts(tmp_path, capsys):
         (("report",), "of what?"),
         (("merge", "a"), "where to?"),
         (("compare", "a"), "no result"),
-        (("compare", "ok"), "no such protocol"),
+        (("compare", "ok"), "its protocol is not shipped"),
         (("verify", "a"), "no result"),
     ],
 )

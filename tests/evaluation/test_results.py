@@ -98,13 +98,37 @@ def test_the_same_holds_within_a_file(tmp_path):
         write(tmp_path / "a", [outcome(0), outcome(0, came_to=3)])
 
 
-@pytest.mark.parametrize("key", ["protocol_hash", "policy", "weld", "versions", "pack_hashes", "backend"])
+OTHERS = {
+    "protocol_hash": "ef" * 32,
+    "policy": {"name": "other"},
+    "weld": True,
+    "versions": {"torch": "other"},
+    "pack_hashes": {"builtin": "other"},
+    "backend": "gpu",
+}
+
+
+@pytest.mark.parametrize("key", OTHERS)
 def test_parts_of_different_results_are_refused(tmp_path, key):
     write(tmp_path / "a", [outcome(0)])
-    write(tmp_path / "b", [outcome(1)], **{key: {"torch": "other"}})
+    write(tmp_path / "b", [outcome(1)], **{key: OTHERS[key]})
     with pytest.raises(EvaluationError, match=f"another {key}"):
         read(tmp_path / "a", tmp_path / "b")
     assert parts_of([tmp_path / "a", tmp_path / "b"]) == [[tmp_path / "a"], [tmp_path / "b"]]
+
+
+@pytest.mark.parametrize("key", [*OTHERS, "protocol"])
+def test_a_run_of_another_form_is_none(tmp_path, key):
+    with pytest.raises(EvaluationError, match=f"no result of an evaluation.*{key}"):
+        write(tmp_path / "a", [outcome(0)], **{key: ["other"]})
+
+
+def test_what_was_played_twice_is_two_results(tmp_path):
+    """As of two checkpoints that are called the same."""
+    for name, numbers in (("a", (0, 1)), ("b", (2,)), ("c", (1, 2))):
+        write(tmp_path / name, [outcome(number) for number in numbers])
+    folders = [tmp_path / name for name in "abc"]
+    assert parts_of(folders) == [folders[:2], folders[2:]]
 
 
 def test_a_difference_of_versions_names_only_what_differs(tmp_path):

@@ -1,11 +1,13 @@
 """What was done to a result afterwards is found, as far as its files can tell."""
 
 import json
+import shutil
 
 import pytest
 from made_up_results import of_protocol
 
 from robocas_ms3.cli import eval as command
+from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, read
 from robocas_ms3.evaluation.verify import problems
@@ -105,3 +107,39 @@ def test_the_command_fails_where_something_is_wrong(folder, capsys):
     tamper(folder, 3, seed=5)
     assert command.main(command.Eval(("verify", str(folder)))) == 1
     assert "episode 3: seed is 5, not 110001" in capsys.readouterr().out
+
+
+MOVE = {"object": "lid", "step": 5, "needed": True, "in_order": True}
+ORDER = {"moved": [MOVE], "needed": ["lid"], "left": 1, "score": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("changed", "well"),
+    [
+        ({}, True),
+        ({"score": 7.5}, False),
+        ({"score": None}, False),
+        ({"left": -1}, False),
+        ({"moved": [{**MOVE, "step": 10**6}]}, False),
+        ({"moved": [{"object": "lid"}]}, False),
+        ({"moved": 3}, False),
+    ],
+)
+def test_an_order_of_retrieval_agrees_with_itself(folder, protocol, changed, well):
+    number = next(one.episode for one in protocol.episodes if one.task == "search")
+    tamper(folder, number, retrieval={**ORDER, **changed})
+    said = [problem for problem in problems(read(folder), protocol) if "retrieval" in problem]
+    assert len(said) == (0 if well else 1)
+    tamper(folder, 0, retrieval=ORDER)  # of pick
+    assert any("episode 0: its order" in problem for problem in problems(read(folder), protocol))
+
+
+def test_a_result_chooses_no_folder(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ms3-v1").mkdir()  # the default's name is none that was given
+    assert command.main(command.Eval(("verify", str(folder)))) == 0
+    shutil.copytree(load_protocol("smoke").folder, tmp_path / "easy")
+    tamper_run(folder, protocol="easy")
+    with pytest.raises(EvaluationError, match="its protocol is not shipped.*found easy.*--protocol FOLDER"):
+        command.main(command.Eval(("verify", str(folder))))
+    assert command.main(command.Eval(("verify", str(folder)), protocol="easy")) == 0

@@ -80,6 +80,13 @@ class Bridge:
         self._protocol.rules.refuse(self.wants)
         settings = Settings(asked.num_envs, asked.backend, tasks=(asked.task,), split=asked.split)
         self._episodes = chosen(self._protocol.episodes, settings)
+        configs = list(dict.fromkeys(episode.config for episode in self._episodes))
+        if asked.num_envs > 1 and len(configs) > 1:  # a batch has one
+            splits = ", ".join(dict.fromkeys(episode.split for episode in self._episodes))
+            fix = f"Choose one of the splits {splits}; or play one episode at a time."
+            raise EvaluationError(
+                "several configurations", where=asked.protocol, expected="one", found=", ".join(configs), fix=fix
+            )
         require_renderer()
         self._rate = rate_of(self._protocol, self.wants)
         steps = self._protocol.rules.steps(asked.task, self._rate)
@@ -137,12 +144,7 @@ class Bridge:
         if not isinstance(numbers, list) or len(numbers) != self._count or any(one not in known for one in numbers):
             expected = f"{self._count} numbers of episodes below {len(known)} to play"
             raise WireError("no batch", expected=expected, found=str(message)[:200])
-        episodes = [self._episodes[number] for number in numbers]
-        configs = {episode.config for episode in episodes}
-        if len(configs) > 1:
-            fix = "Choose a split, or play one episode at a time."
-            raise EvaluationError("a batch of several configurations", found=", ".join(sorted(configs)), fix=fix)
-        return episodes
+        return [self._episodes[number] for number in numbers]
 
     def _play(self, episodes: list[Episode]) -> None:
         env, actor = self._env_of(episodes[0]), self._actor

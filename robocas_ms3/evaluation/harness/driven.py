@@ -121,8 +121,10 @@ class DrivenEpisodes:
             (played,) = Rollouts(env, self._policy, ends, 1 / self.rate, refill=True).play([start])
             said.put(Outcome.of(played, episode, object_ids(self.protocol, episode)))
         except Exception as error:  # of an env, or actions that don't fit; the harness' thread raises it
-            self._close_env()
-            said.put(error)
+            try:
+                self._close_env()
+            finally:
+                said.put(error)
 
     def _env_of(self, episode: Episode) -> Any:
         if self._config != episode.config:

@@ -17,7 +17,7 @@ from robocas_ms3.evaluation.report.stages import FAILURES, STAGES
 from robocas_ms3.evaluation.results import Outcome, Result
 from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, share, success_by
-from robocas_ms3.evaluation.tables import P_VIS_EDGES, WELDED
+from robocas_ms3.evaluation.tables import P_VIS_EDGES, WELDED, first_splits
 from robocas_ms3.evaluation.tables import title as title_of
 
 
@@ -67,7 +67,7 @@ def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
 def _headline(result: Result) -> str:
     rows = []
     groups = result.by("config")
-    for config, outcomes in _with_all(groups):
+    for config, outcomes in groups.items() if result.repeats() else _with_all(groups):
         found = result.rate("success", outcomes)
         seconds = float(np.mean([outcome.seconds for outcome in outcomes]))
         steps = float(np.mean([outcome.steps for outcome in outcomes]))
@@ -140,7 +140,7 @@ def _failures(result: Result) -> str:
 
 
 def _hidden(result: Result) -> str:
-    hidden = [outcome for outcome in result.outcomes.values() if outcome.p_vis is not None]
+    hidden = [outcome for outcome in first_splits(result) if outcome.p_vis is not None]
     if not hidden:
         return ""
     bins = success_by([o.p_vis or 0.0 for o in hidden], [o.success for o in hidden], P_VIS_EDGES)
