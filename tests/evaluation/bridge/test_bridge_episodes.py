@@ -39,11 +39,11 @@ class Down:
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
-    """The protocol smoke with four seconds an episode."""
+    """The protocol smoke with two seconds an episode."""
     folder = tmp_path_factory.mktemp("protocols") / "short"
     shutil.copytree(load_protocol("smoke").folder, folder)
     rules = folder / "protocol.yaml"
-    rules.write_text(rules.read_text().replace("max_steps: null", "max_steps: 20"))
+    rules.write_text(rules.read_text().replace("max_steps: null", "max_steps: 10"))
     return folder
 
 
@@ -65,7 +65,7 @@ def test_outcomes_pictures_and_instructions_are_those_of_robocas_eval(needs_rend
     said = [protocol.episodes[number].instruction for number in (4, 5)]
     assert list(made.call("task_description")) == list(made.get_attr("task_description")) == said
     assert said[0] != said[1]
-    assert made.call("_max_episode_steps") == (20, 20)
+    assert made.call("_max_episode_steps") == (10, 10)
     assert made.observation_space.contains(obs)
     seen, done = [], np.zeros(2, bool)
     while not done.all():

@@ -112,7 +112,7 @@ def test_real_episodes_come_out_as_in_an_evaluation(tmp_path):
         wants = Wants(reference="tcp", language="none", rate_hz=5)
 
     protocol = load_protocol("smoke")
-    settings = Settings(1, "processes", tasks=("pick", "select"), episodes=1)
+    settings = Settings(1, "processes", tasks=("pick",), episodes=1)
     list(evaluate(protocol, Brief(), "random", tmp_path, settings))
     driven, policy = DrivenEpisodes(protocol, Brief.wants), RandomPolicy()
     for number, outcome in results.read(tmp_path).outcomes.items():
