@@ -160,11 +160,11 @@ class Result:
         return len({(one.task, one.seed) for one in self.outcomes.values()}) < len(self.outcomes)
 
     def by(self, name: str) -> dict[str, list[Outcome]]:
-        """Its outcomes by one of their attributes, such as ``config``; sorted."""
+        """Its outcomes by one of their attributes, such as ``config``; sorted, but splits as the protocol has them."""
         found: dict[str, list[Outcome]] = {}
         for outcome in self.outcomes.values():
             found.setdefault(getattr(outcome, name), []).append(outcome)
-        return dict(sorted(found.items()))
+        return found if name == "split" else dict(sorted(found.items()))
 
 
 def begin(folder: Path, run: dict[str, Any], *, resume: bool) -> dict[int, Outcome]:

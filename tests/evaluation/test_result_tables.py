@@ -48,10 +48,11 @@ def test_the_weld_is_named(tmp_path):
 
 def test_splits_stand_side_by_side(tmp_path):
     outcomes = [outcome(0), outcome(1, 0), outcome(2, 0, split="new"), outcome(3, task="select", split="new")]
+    # as the protocol has them, what is seen first
     said = markdown(write(tmp_path / "a", outcomes))
-    assert "| task | new | test |" in said
-    assert row(said, "pick") == ["pick", "0 % (0 to 98) of 1", "50 % (1 to 99) of 2"]
-    assert row(said, "select") == ["select", "100 % (3 to 100) of 1", ""]
+    assert "| task | test | new |" in said
+    assert row(said, "pick") == ["pick", "50 % (1 to 99) of 2", "0 % (0 to 98) of 1"]
+    assert row(said, "select") == ["select", "", "100 % (3 to 100) of 1"]
     assert "By split" not in markdown(write(tmp_path / "b", outcomes[:2]))
 
 

@@ -80,8 +80,12 @@ def _headline(result: Result) -> str:
     heads = ("configuration", "task", "n#", "success#", "0 to 100 %", "at the end#", "upstream's#", "steps#", "s#")
     said = (
         "Success held at some moment; at the last one; upstream's rule at the last one. Intervals are "
-        "Clopper and Pearson's, 95 %. Steps and seconds of the scene are means over all episodes; so is the last row, "
-        "in which a configuration with more episodes weighs more."
+        "Clopper and Pearson's, 95 %. Steps and seconds of the scene are means over all episodes"
+        + (
+            "."
+            if result.repeats()
+            else "; so is the last row, in which a configuration with more episodes weighs more."
+        )
     )
     return section("Success", said, table(heads, rows, "bars"))
 
