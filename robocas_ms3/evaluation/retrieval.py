@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from robocas_ms3.arrays import as_tensor
+from robocas_ms3.arrays import as_tensor, choose, native, none
 from robocas_ms3.tasks.search import ENVS_AT_ONCE, RoboCASSearchEnv
 from robocas_ms3.tasks.transfer import Moment
 
@@ -37,10 +37,10 @@ class Retrieval:
         shape = tuple(env.present.shape)
         self._over = torch.zeros(*shape, shape[1], dtype=torch.bool, device=env.device)
         self._needed = torch.zeros(shape, dtype=torch.bool, device=env.device)
-        self._moved_at = torch.zeros(shape, dtype=torch.int16, device=env.device)
-        self._moved_time = torch.zeros(shape, dtype=torch.int32, device=env.device)  # control steps
-        self._held = torch.zeros(shape[0], dtype=torch.bool, device=env.device)  # by now
-        self._steps = torch.zeros(shape[0], dtype=torch.int16, device=env.device)
+        self._moved_at = native(torch.zeros(shape, dtype=torch.int16, device=env.device))
+        self._moved_time = native(torch.zeros(shape, dtype=torch.int32, device=env.device))  # control steps
+        self._held = native(torch.zeros(shape[0], dtype=torch.bool, device=env.device))  # by now
+        self._steps = native(torch.zeros(shape[0], dtype=torch.int16, device=env.device))
         self._found: Tensor | None = None  # of `read`, until something changes
 
     def reset(self, envs: Any) -> None:
@@ -55,19 +55,20 @@ class Retrieval:
         over[rows, env.target_slot[envs]] = False  # what the target lies on need not wait for it
         first = env.clutter(envs).obstacles | over[rows, :, env.target_slot[envs]]
         self._over[envs], self._needed[envs] = over, needed(first, over)
-        self._moved_at[envs], self._moved_time[envs], self._steps[envs] = 0, _NEVER, 0
-        self._held[envs], self._found = False, None
+        some = native(envs)
+        self._moved_at[some], self._moved_time[some], self._steps[some] = 0, _NEVER, 0
+        self._held[some], self._found = False, None
 
     def look(self, moment: Moment) -> None:
         """Look at what has moved in a control step of the policy step that has begun."""
-        self._held |= as_tensor(moment.held)
-        now = as_tensor(moment.disturbed) & (self._moved_at == 0) & ~self._held[:, None]
-        if not now.is_cuda and not now.any():
+        self._held |= moment.held
+        now = moment.disturbed & (self._moved_at == 0) & ~self._held[:, None]
+        if none(now):
             return
         self._found = None
-        time = self._env.elapsed_steps[:, None].to(torch.int32)
-        self._moved_at = torch.where(now, self._steps[:, None] + 1, self._moved_at)
-        self._moved_time = torch.where(now, time, self._moved_time)
+        time = native(self._env.elapsed_steps.to(torch.int32))[:, None]
+        self._moved_at = choose(now, self._steps[:, None] + 1, self._moved_at)
+        self._moved_time = choose(now, time, self._moved_time)
 
     def end_step(self) -> None:
         """Count a policy step."""
@@ -82,9 +83,10 @@ class Retrieval:
         if self._found is not None:
             return self._found
         second = round(TOGETHER / self._env.control_timestep)
-        late = self._moved_time[:, :, None] > self._moved_time[:, None] + second  # row later than column
-        in_order = (self._moved_at > 0) & self._needed & ~(self._over & late).any(dim=1)
-        self._found = torch.stack([self._moved_at, self._needed.short(), in_order.short()], dim=-1)
+        moved_at, time = as_tensor(self._moved_at), as_tensor(self._moved_time)
+        late = time[:, :, None] > time[:, None] + second  # row later than column
+        in_order = (moved_at > 0) & self._needed & ~(self._over & late).any(dim=1)
+        self._found = torch.stack([moved_at, self._needed.short(), in_order.short()], dim=-1)
         return self._found
 
 

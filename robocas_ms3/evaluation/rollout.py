@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from robocas_ms3.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Observations, Policy, Start
+from robocas_ms3.evaluation.tracking import MEASURES, summed
 from robocas_ms3.language.embed import TextEmbedder
 
-TRACKED = ("path_length", "contact_impulse", "disturbed_most", "fallen")  # of `tracking`, as they end
 _WELDS = "welds"  # of `weld`, where there is one
 
 
@@ -86,6 +86,8 @@ class Rollouts:
         self._chunks: dict[int, list[NDArray[np.floating]]] = {}
         self._obs: Any = None
         self._info: dict[str, Any] = {}
+        self._flags: list[str] = []  # names of an info's flags
+        self._held = np.zeros((0, self._count), dtype=bool)  # by flag and env, whether it has held in its episode
         self._embed = TextEmbedder() if policy.wants.language == "embedding" else None
 
     def play(self, episodes: Sequence[Start]) -> Iterator[Played]:
@@ -108,8 +110,12 @@ class Rollouts:
         starts = [Start(**{**vars(start), "env": env}) for env, start in pairs]
         for start in starts:
             self._playing[start.env], self._chunks[start.env] = Played(start), []
-            self._note(self._playing[start.env], info)
         self._info = info
+        if not self._flags:
+            self._flags = [name for name, value in info.items() if _is_flag(value)]
+            self._held = np.zeros((len(self._flags), self._count), dtype=bool)
+        self._held[:, envs] = False
+        self._note()
         self._policy.reset(starts)
 
     def _step(self) -> Iterator[Played]:
@@ -123,16 +129,22 @@ class Rollouts:
         for env in self._playing:
             actions[env] = self._chunks[env].pop(0)
         self._obs, _, _, _, self._info = self._env.step(actions)
-        for env, played in list(self._playing.items()):
+        for played in self._playing.values():
             played.steps += 1
-            self._note(played, self._info)
-            if self._is_over(played, self._info):
-                yield self._end(env)
+        self._note()
+        for env in [env for env, played in self._playing.items() if self._is_over(played)]:
+            yield self._end(env)
 
     def _end(self, env: int) -> Played:
         played, info = self._playing.pop(env), self._info
-        measured = (*TRACKED, _WELDS) if _WELDS in info else TRACKED
-        played.measures = {name: round(float(info[name][env]), 4) for name in measured}
+        played.seconds = self._seconds(env)
+        for name in self._flags:
+            played.at_end[name] = bool(info[name][env])
+            played.flags.setdefault(name, None)
+            played.flag_seconds.setdefault(name, None)
+        played.measures = {name: round(float(summed(info, name)[env]), 4) for name in MEASURES}
+        if _WELDS in info:
+            played.measures[_WELDS] = float(info[_WELDS][env])
         if "retrieval" in info:
             played.retrieval = info["retrieval"][env].copy()
         return played
@@ -162,8 +174,9 @@ class Rollouts:
                 expected=f"({len(envs)}, {self._size}) or ({len(envs)}, chunk, {self._size})",
                 found=actions.shape,
             )
-        for env, chunk in zip(envs, chunks, strict=True):
-            if not np.isfinite(chunk).all():
+        finite = np.isfinite(chunks).all((1, 2))
+        for env, chunk, good in zip(envs, chunks, finite, strict=True):
+            if not good:
                 self._playing[env].error = self._playing[env].error or "the policy's action is not finite"
             self._chunks[env] = list(chunk)
             self._playing[env].inference_seconds += spent
@@ -186,19 +199,25 @@ class Rollouts:
             state=np.concatenate([value[index] for value in extra.values()], axis=1) if wants.state else None,
         )
 
-    def _note(self, played: Played, info: dict[str, Any]) -> None:
-        env = played.start.env
-        played.seconds = float(info["elapsed_steps"][env]) * self._dt
-        for name, value in info.items():
-            if isinstance(value, np.ndarray) and value.dtype == bool and value.ndim == 1:
-                now = bool(value[env])
-                played.at_end[name] = now
-                if now and played.flags.get(name) is None:
-                    played.flags[name], played.flag_seconds[name] = played.steps, round(played.seconds, 4)
-                played.flags.setdefault(name, None)
-                played.flag_seconds.setdefault(name, None)
+    def _note(self) -> None:
+        """Write down which flags hold for the first time."""
+        new = np.array([self._info[name] for name in self._flags]) & ~self._held
+        if not new.any():
+            return
+        for flag, env in np.argwhere(new):
+            self._held[flag, env] = True
+            if env in self._playing:
+                played, name = self._playing[env], self._flags[flag]
+                played.flags[name], played.flag_seconds[name] = played.steps, round(self._seconds(env), 4)
 
-    def _is_over(self, played: Played, info: dict[str, Any]) -> bool:
-        rules, env = self._rules, played.start.env
-        v0 = rules.max_v0_steps is not None and info["v0_steps"][env] >= rules.max_v0_steps
-        return v0 or played.steps >= rules.max_steps or any(played.at_end.get(name) for name in rules.ends_on)
+    def _seconds(self, env: int) -> float:
+        return float(self._info["elapsed_steps"][env]) * self._dt
+
+    def _is_over(self, played: Played) -> bool:
+        rules, info, env = self._rules, self._info, played.start.env
+        v0 = rules.max_v0_steps is not None and summed(info, "v0_steps")[env] >= rules.max_v0_steps
+        return v0 or played.steps >= rules.max_steps or any(info[name][env] for name in rules.ends_on if name in info)
+
+
+def _is_flag(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype == bool and value.ndim == 1

@@ -10,12 +10,15 @@ import torch
 from robocas_ms3.arrays import as_float, as_tensor, greater, length, native
 from robocas_ms3.evaluation.retrieval import Retrieval
 from robocas_ms3.tasks import terms
+from robocas_ms3.tasks.bodies import link_poses
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 from robocas_ms3.tasks.transfer import Moment, TransferEnv
 
 V0_RADIUS = 0.1  # m between the origins of target and basket in xy: upstream's success
 V0_STEPS = 5  # policy steps like that after which upstream's episode ends
-SUMS = ("path_length", "contact_impulse", "disturbed_most", "fallen", "v0_steps")
+MEASURES = ("path_length", "contact_impulse", "disturbed_most", "fallen")
+SUMS = (*MEASURES, "v0_steps")  # columns of what is read
+_PATH, _IMPULSE, _DISTURBED, _FALLEN, _V0_STEPS = range(len(SUMS))
 
 
 class Tracker:
@@ -31,19 +34,18 @@ class Tracker:
 
     def __init__(self, env: TransferEnv) -> None:
         self._env = env
-        self._kept = {name: native(torch.zeros(env.num_envs, device=env.device)) for name in SUMS}
+        self._sums = native(torch.zeros(env.num_envs, len(SUMS), device=env.device))
         self._near = native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
         self._in_v0 = native(torch.zeros(env.num_envs, dtype=torch.bool, device=env.device))
-        self._tcp = native(env.agent.tcp_pos.clone())
+        self._tcp = self._tcp_pos()
         self._moment: Moment | None = None
         self._retrieval = Retrieval(env) if isinstance(env, RoboCASSearchEnv) else None
 
     def reset(self, envs: Any) -> None:
         """Begin anew in some envs."""
-        for name, kept in self._kept.items():
-            self._kept[name] = _cleared(kept, envs)
+        self._sums[envs] = 0
         self._near, self._in_v0 = _cleared(self._near, envs), _cleared(self._in_v0, envs)
-        self._tcp[envs] = native(self._env.agent.tcp_pos)[envs]
+        self._tcp[envs] = self._tcp_pos()[envs]
         self._moment = None
         if self._retrieval is not None:
             self._retrieval.reset(envs)
@@ -54,17 +56,17 @@ class Tracker:
         Args:
             opened: (N,) bool, whether each gripper was told to be open.
         """
-        env, kept = self._env, self._kept
-        tcp = native(env.agent.tcp_pos.clone())
-        kept["path_length"] = kept["path_length"] + length(tcp - self._tcp)  # infos hold the one of before
+        env, sums = self._env, self._sums
+        tcp = self._tcp_pos()
+        sums[:, _PATH] += length(tcp - self._tcp)
         self._tcp = tcp
         moment = env.moment
         if moment is not self._moment:
             self._moment = moment
             impulse = length(moment.forces).sum((1, 2)) * env.control_timestep
-            kept["contact_impulse"] = kept["contact_impulse"] + impulse
-            kept["disturbed_most"] = greater(kept["disturbed_most"], as_float(moment.disturbed.sum(1)))
-            kept["fallen"] = greater(kept["fallen"], as_float(env.fallen().sum(1)))
+            sums[:, _IMPULSE] += impulse
+            sums[:, _DISTURBED] = greater(sums[:, _DISTURBED], as_float(moment.disturbed.sum(1)))
+            sums[:, _FALLEN] = greater(sums[:, _FALLEN], as_float(env.fallen().sum(1)))
             target = terms.of_target(moment.objects[..., :2], native(env.target_slot))
             self._near = length(target - moment.basket[:, :2]) <= V0_RADIUS
             if self._retrieval is not None:
@@ -72,22 +74,29 @@ class Tracker:
         told = torch.as_tensor(opened, device=env.device) if isinstance(tcp, torch.Tensor) else opened
         self._in_v0 = self._near & told
 
+    def _tcp_pos(self) -> Any:
+        return native(link_poses(self._env.scene, [self._env.agent.tcp]))[:, 0, :3]  # a fourth of `tcp.pose`'s time
+
     def end_step(self) -> None:
         """Count a policy step, after its last control step."""
-        self._kept["v0_steps"] = self._kept["v0_steps"] + self._in_v0
+        self._sums[:, _V0_STEPS] += self._in_v0
         if self._retrieval is not None:
             self._retrieval.end_step()
 
     def read(self) -> dict[str, torch.Tensor]:
-        """(N,) each, for an info: what was kept, since the reset.
+        """What was kept since the reset, for an info.
 
-        ``path_length`` m of the TCP; ``contact_impulse`` N s between gripper and objects; ``disturbed_most`` and
-        ``fallen``, numbers of objects; ``success_v0`` bool, upstream's rule at this moment, and ``v0_steps``, how many
-        policy steps it has held. Of search also ``retrieval``, `Retrieval.read`.
+        ``sums`` (N, 5), see ``SUMS``: m of the TCP's path; N s between gripper and objects; numbers of objects
+        disturbed at once, and fallen; policy steps that upstream's rule has held. ``success_v0`` (N,) bool, that rule
+        at this moment. Of search also ``retrieval``, `Retrieval.read`.
         """
-        kept = {name: as_tensor(value) for name, value in self._kept.items()}
         order = {} if self._retrieval is None else {"retrieval": self._retrieval.read()}
-        return {**kept, "success_v0": as_tensor(self._in_v0), **order}
+        return {"sums": as_tensor(self._sums).clone(), "success_v0": as_tensor(self._in_v0), **order}
+
+
+def summed(info: dict[str, Any], name: str) -> Any:
+    """(N,) of an info's ``sums``, the one of that name."""
+    return info["sums"][:, SUMS.index(name)]
 
 
 def _cleared(values: Any, envs: Any) -> Any:

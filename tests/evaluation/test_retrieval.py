@@ -25,7 +25,7 @@ class Heap:
         self.disturbed, self.elapsed_steps = torch.zeros(1, 4, dtype=torch.bool), torch.zeros(1, dtype=torch.int32)
 
     def moment(self, *, held: bool = False):
-        return SimpleNamespace(disturbed=self.disturbed, held=torch.tensor([held] * len(self.disturbed)))
+        return SimpleNamespace(disturbed=self.disturbed.numpy(), held=np.array([held] * len(self.disturbed)))
 
     def covering(self, envs):
         return OVER

@@ -20,7 +20,7 @@ from robocas_ms3.evaluation.policy import Observations
 from robocas_ms3.evaluation.protocol import Episode, load_protocol
 from robocas_ms3.evaluation.remote.messages import actions_of, wants_of
 from robocas_ms3.evaluation.results import STAGES
-from robocas_ms3.evaluation.rollout import TRACKED
+from robocas_ms3.evaluation.tracking import MEASURES
 
 # How vla-eval calls what the numbers of an action mean, where it has a word for it.
 _ROTATIONS = {
@@ -85,7 +85,7 @@ class RoboCAS:
 
     def get_metric_keys(self) -> dict[str, str]:
         """What is averaged over episodes; the others stay with each of them."""
-        names = ("success", "success_at_end", "success_v0", *STAGES.values(), "seconds", *TRACKED)
+        names = ("success", "success_at_end", "success_v0", *STAGES.values(), "seconds", *MEASURES)
         return dict.fromkeys(names, "mean")
 
     def get_action_spec(self) -> dict[str, Any]:

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from robocas_ms3.evaluation.tracking import SUMS
+
 SOURCE = Path(__file__).resolve().parents[3] / "lerobot_env_robocas" / "src" / "lerobot_env_robocas"
 
 
@@ -53,7 +55,6 @@ class Counting:
         return {"agent": agent, "extra": {"tcp_pose": pose}, "sensor_data": {"base_camera": {"rgb": pictures}}}
 
     def _info(self) -> dict[str, Any]:
-        zero = np.zeros(self.num_envs, np.float32)
-        tracked = dict.fromkeys(("path_length", "contact_impulse", "disturbed_most", "fallen", "v0_steps"), zero)
+        tracked = {"sums": np.zeros((self.num_envs, len(SUMS)), np.float32)}
         done = self.sums >= self.seeds + 2
         return {**tracked, "success": done, "fail": ~done & False, "elapsed_steps": self.elapsed.copy()}
