@@ -52,8 +52,6 @@ class Benchmark:
 class StandIn:
     """A ``FrameSource`` of grey ramps."""
 
-    gripper_column, finger_range = 7, (-0.01, 0.04)
-
     def __init__(self, _env_info: dict[str, Any], _control_mode: str, pictures: Any) -> None:
         self.pictures = pictures
         width, height = pictures.size or (640, 480)
@@ -70,7 +68,7 @@ class StandIn:
         for sample in samples:
             rgb = {name: np.roll(self.rgb, sample, 1) for name in self.pictures.cameras}
             depth = {name: np.roll(self.depth, sample, 1) for name in self.pictures.cameras}
-            yield Frame(rgb, depth, np.eye(4), np.eye(4))
+            yield Frame(rgb, depth)
 
     def cameras(self) -> dict[str, Any]:
         """All in one place."""

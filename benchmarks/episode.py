@@ -30,8 +30,8 @@ import tyro
 from robocas_ms3.config import load_task_config
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
 from robocas_ms3.demos.open_loop import Noise
-from robocas_ms3.demos.record import open_trajectory
-from robocas_ms3.demos.sampling import dataset_actions, sample_states, sample_stride
+from robocas_ms3.recordings.motion import Motion, sample_states, sample_stride
+from robocas_ms3.recordings.reading import open_trajectory
 from robocas_ms3.robots.constants import ROBOT_UID
 
 FRESH = 1000  # first number of the noise drawn here; trials while generating have smaller ones
@@ -176,7 +176,7 @@ def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> N
         return
     world = generator.worlds[0]
     stride = sample_stride(generator.settings.control_freq, world.rate_hz)
-    own = dataset_actions(states, actions[:, 7], sample_states(len(actions), stride)).astype(np.float64)
+    own = Motion.of(states, actions[:, 7], sample_states(len(actions), stride)).actions[:-1].astype(np.float64)
     noise = Noise(args.noise[0] / 1000, float(np.deg2rad(args.noise[1])))
     for draw in range(-1, args.draws):
         world.reset(found.seed)

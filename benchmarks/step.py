@@ -21,7 +21,7 @@ import tyro
 from mani_skill.envs.tasks import PickCubeEnv  # noqa: F401  (registers it)
 
 import robocas_ms3.tasks  # noqa: F401
-from robocas_ms3.demos.record import EpisodeRecorder
+from robocas_ms3.recordings.writing import EpisodeRecorder
 from robocas_ms3.robots.constants import ARM_JOINTS, ARM_REST, FINGER_JOINTS, FINGER_TARGETS
 
 CUBE_REST = (0.0, np.pi / 8, 0.0, -np.pi * 5 / 8, 0.0, np.pi * 3 / 4, np.pi / 4)

@@ -19,6 +19,7 @@ LAYERS = (
     ("robots",),
     ("language",),
     ("tasks",),
+    ("recordings",),
     ("planning",),
     ("demos",),
     ("datasets",),

@@ -53,6 +53,8 @@ class Convert:
     """Add to the dataset that is there; its episodes keep their numbers."""
     jobs: int = 1
     """Processes that render."""
+    pack: str | None = None
+    """Name or folder of the objects' pack, instead of the one named there; a file can't choose a folder."""
 
 
 def main(cfg: Convert) -> int:
@@ -95,6 +97,7 @@ def _convert(cfg: Convert) -> int:
             "overwrite": cfg.overwrite,
             "resume": cfg.resume,
             "jobs": cfg.jobs,
+            "pack": cfg.pack,
             "on_start": shown.start,
             "on_episode": shown.advance,
         }

@@ -30,6 +30,8 @@ class Replay:
     """Write the replayed episodes to this HDF5 file."""
     allow_failure: bool = False
     """With --save: write failed episodes too."""
+    pack: str | None = None
+    """Name or folder of the objects' pack, instead of the one named there; a file can't choose a folder."""
     overwrite: bool = False
     """Replace the file given by --save if it exists."""
 
@@ -40,8 +42,8 @@ def main(cfg: Replay) -> int:
     from rich.console import Console
     from rich.progress import track
 
-    from robocas_ms3.demos.record import read_json
     from robocas_ms3.demos.replay import replay
+    from robocas_ms3.recordings.entries import read_json
 
     trajectory = cfg.trajectory / "trajectory.h5" if cfg.trajectory.is_dir() else cfg.trajectory
     total = len(read_json(trajectory)["episodes"][: cfg.count])
@@ -54,6 +56,7 @@ def main(cfg: Replay) -> int:
         save=cfg.save,
         allow_failure=cfg.allow_failure,
         overwrite=cfg.overwrite,
+        pack=cfg.pack,
     )
     console = Console(highlight=False, soft_wrap=True)
     done = list(track(results, "replaying", total=total, console=Console(stderr=True)))

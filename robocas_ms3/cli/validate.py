@@ -34,6 +34,8 @@ class Validate:
     min_share: float | None = None
     """With --replay: exit code 1 where a smaller share of a task's episodes succeeds again (0 to 1), or where
     none of them could be tried."""
+    pack: str | None = None
+    """With --replay: name or folder of the objects' pack, instead of the one named there."""
     json: bool = False
     """Print a machine-readable report."""
 
@@ -64,7 +66,7 @@ def main(cfg: Validate) -> int:
         console.print(f"{cfg.dataset}: {counts}, {verdict}")
     content, wrong = report.as_json(), bool(report.violations)
     if cfg.replay:
-        replays = _replay(cfg.dataset)
+        replays = _replay(cfg.dataset, cfg.pack)
         content["replay"] = replays.as_json()
         least = cfg.min_share or 0.0
         wrong |= any((of_task["share"] or 0.0) < least for of_task in replays.by_task().values())
@@ -92,11 +94,11 @@ def _validate_lerobot(root: Path, *, on_episode: Callable[[int, int], None]) -> 
     return Report(counts[0], counts[1], violations)
 
 
-def _replay(root: Path) -> ReplayReport:
+def _replay(root: Path, pack: str | None) -> ReplayReport:
     from robocas_ms3.datasets.replay_check import replay_dataset
 
     with bar("replaying", transient=True) as shown:
-        return replay_dataset(root, on_episode=lambda _, count: shown.next_of(count))
+        return replay_dataset(root, pack=pack, on_episode=lambda _, count: shown.next_of(count))
 
 
 def _lines(report: ReplayReport) -> Iterator[str]:

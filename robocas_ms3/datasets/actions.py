@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.demos.sampling import stored_actions
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.motion import stored_actions
 
 ACTION_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 """Motion in m and Euler xyz angles in rad, both in the EEF frame at the step; gripper command, 1 = open."""

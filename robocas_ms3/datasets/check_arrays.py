@@ -12,8 +12,8 @@ from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.rigid import ANGLE_TOLERANCE, NORM_TOLERANCE, POSITION_TOLERANCE, apart, same
 from robocas_ms3.datasets.tolerant import planar_motion
 from robocas_ms3.datasets.violation import Violation
-from robocas_ms3.demos.sampling import relative_motion
 from robocas_ms3.language.templates import GOAL_TYPES
+from robocas_ms3.recordings.motion import relative_motion
 
 
 def check_shapes(file: str, arrays: dict[str, NDArray], steps: int) -> Iterator[Violation]:

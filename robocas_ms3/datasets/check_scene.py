@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.scene_values import check_rate, check_settings_values, check_values, one_seed
+from robocas_ms3.datasets.scene_values import check_rate, check_settings_values, check_values
 from robocas_ms3.datasets.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.violation import Violation
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.seeds import one_seed
 
 FILE = schema.CONVERSION_FILE
 

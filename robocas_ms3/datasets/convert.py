@@ -22,12 +22,13 @@ from robocas_ms3.datasets.plan import Plan, appended_plan, dataset_settings, new
 from robocas_ms3.datasets.provenance import succeeded
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.timing import Timing
-from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.workers import Job, OpenSource, write_all
 from robocas_ms3.datasets.writer import FrameSource, WrittenEpisode
-from robocas_ms3.demos.sampling import sample_stride
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
+from robocas_ms3.recordings.environment import RecordedEnv
+from robocas_ms3.recordings.motion import sample_stride
+from robocas_ms3.recordings.reading import TrajectoryFile
 
 _log = logging.getLogger(__name__)
 
@@ -54,11 +55,11 @@ class Conversion:
         return sum((episode.timing for episode in self.episodes), start=Timing(write=self.joining))
 
 
-def open_env(env_info: dict[str, Any], control_mode: str, pictures: Pictures) -> FrameSource:
+def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> FrameSource:
     """Show states through the environment that recorded them."""
     from robocas_ms3.datasets.render import EnvFrames
 
-    return EnvFrames(env_info, control_mode, pictures)
+    return EnvFrames(env, control_mode, pictures)
 
 
 def convert(
@@ -73,6 +74,7 @@ def convert(
     resume: bool = False,
     append: bool = False,
     jobs: int = 1,
+    pack: str | Path | None = None,
     on_start: Callable[[int], None] | None = None,
     on_episode: Callable[[WrittenEpisode], None] | None = None,
     open_source: OpenSource = open_env,
@@ -94,6 +96,7 @@ def convert(
         append: add to the dataset in ``out``; what is there keeps its numbers and its side of the split, and recordings
             that it holds already are not added again.
         jobs: worker processes.
+        pack: name or folder of the objects' pack, instead of what the file names.
         on_start: called with the number of episodes to write.
         on_episode: called after each.
         open_source: what shows the states; must be importable by workers.
@@ -105,7 +108,7 @@ def convert(
     """
     begun = time.perf_counter()
     out, pictures = Path(out), pictures or Pictures()
-    with TrajectoryFile(trajectory) as file:
+    with TrajectoryFile(trajectory, pack=pack) as file:
         stride = sample_stride(file.control_freq, rate_hz)
         chosen = choose(file, include_failed)
         settings = dataset_settings(rate_hz, pictures, embeddings)
@@ -132,7 +135,7 @@ def convert(
             missing = [task for task in plan.tasks if not (out / schema.episode_folder(task[0])).is_dir()]
             if on_start:
                 on_start(len(missing))
-            job = Job(file.path, out, stride, rate_hz, pictures, vectors, open_source, missing)
+            job = Job(file.path, pack, out, stride, rate_hz, pictures, vectors, open_source, missing)
             written = _write(job, file.env_info, plan, jobs, on_episode)
             if left := still_missing(out, plan.content):
                 _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))

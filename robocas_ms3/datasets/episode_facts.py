@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from robocas_ms3.config import load_task_config
 from robocas_ms3.datasets.provenance import succeeded, task_of
 from robocas_ms3.datasets.sources import Source
-from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
 from robocas_ms3.datasets.trajectory_source import TrajectorySource
 from robocas_ms3.errors import DatasetError, RobocasError
+from robocas_ms3.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 
 Array = NDArray[np.float64]

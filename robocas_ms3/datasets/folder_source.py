@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import SubGoal
 from robocas_ms3.datasets.reader import Dataset, Episode, no_dataset
 from robocas_ms3.datasets.tolerant import DAMAGED, first_line, is_declared
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.subgoals import SubGoal, read_subgoals
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.sources import Split
@@ -79,15 +79,7 @@ class FolderSource:
     def goals(self, number: int) -> list[SubGoal]:
         """Sub-goals of an episode, from ``data_info.json``."""
         entries = self.info.get("step_goals", {}).get(str(number), [])
-        try:
-            return [SubGoal(e["goal_type"], e["goal_description"], *map(int, e["goal_range"])) for e in entries]
-        except (KeyError, TypeError, ValueError) as error:
-            raise DatasetError(
-                "these sub-goals are damaged",
-                where=f"{self.path / schema.DATA_INFO_FILE}, step_goals.{number}",
-                expected="goal_type, goal_range [first, last], goal_description",
-                found=str(entries)[:80],
-            ) from error
+        return read_subgoals(entries, f"{self.path / schema.DATA_INFO_FILE}, step_goals.{number}")
 
     def arrays(self, number: int, keys: Sequence[str]) -> dict[str, NDArray]:
         """Read some of an episode's arrays.

@@ -12,10 +12,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.demos.sampling import invert
+from robocas_ms3.recordings.motion import invert
 
 Array = NDArray[np.float64]
 
@@ -52,6 +53,25 @@ class View:
         grid, known = self.grid(step)
         return grid[known]
 
+    def reach(self, step: int = 0) -> Array:
+        """(N,) m, how far about each of `points` the surface goes on, as far as this camera can tell.
+
+        The inverse depth of a plane is linear in the pixels: where a pixel departs from what those beside it say, by as
+        much as depths may differ, there may be an edge.
+        """
+        z = self.depth.astype(np.float64) / 1000
+        inverse = np.divide(1, z, out=np.zeros_like(z), where=z > 0)
+        padded = np.pad(inverse, 1, mode="edge")
+        bends = [
+            np.abs(padded[:-2, 1:-1] + padded[2:, 1:-1] - 2 * inverse),
+            np.abs(padded[1:-1, :-2] + padded[1:-1, 2:] - 2 * inverse),
+        ]
+        smooth = (z > 0) & (np.maximum(*bends) * z**2 < _tolerance(z))
+        pixels = cv2.distanceTransform(np.pad(smooth.astype(np.uint8), 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
+        rows, columns = self._pixels(step)
+        seen = z[rows, columns]
+        return (pixels[rows, columns] * seen / self.intrinsic[:2].max())[seen > 0]
+
     def level_points(self) -> Array:
         """(N, 3) those on level surfaces."""
         grid, known = self.grid()
@@ -63,13 +83,16 @@ class View:
 
     def grid(self, step: int = 0) -> tuple[Array, NDArray[np.bool_]]:
         """Every ``step``-th row and column: points (R, C, 3) in the world, m, and whether something was seen (R, C)."""
-        step = step or max(1, self.depth.shape[0] // POINT_ROWS)
-        rows, columns = np.mgrid[step // 2 : self.depth.shape[0] : step, step // 2 : self.depth.shape[1] : step]
+        rows, columns = self._pixels(step)
         z = self.depth[rows, columns].astype(np.float64) / 1000
         fx, fy, cx, cy = self.intrinsic
         # SAPIEN's rays go through pixel centres, which lie at + 0.5.
         local = np.stack([(columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z], axis=-1)
         return local @ self.camera_in_world[:3, :3].T + self.camera_in_world[:3, 3], z > 0
+
+    def _pixels(self, step: int) -> NDArray[np.int64]:
+        step = step or max(1, self.depth.shape[0] // POINT_ROWS)
+        return np.mgrid[step // 2 : self.depth.shape[0] : step, step // 2 : self.depth.shape[1] : step]
 
 
 def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]]:
@@ -85,6 +108,7 @@ def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]
     agreement: dict[str, float] = {}  # of cameras that others may agree with
     for index, views in enumerate(steps):
         clouds = {view.camera: view.points() for view in views}
+        reaches = {view.camera: view.reach() for view in views}
         broken = [law for view in views for law in _floor(view, clouds[view.camera])]
         seen = {camera for camera, points in clouds.items() if len(points) >= MIN_POINTS}
         for camera in clouds:
@@ -94,7 +118,7 @@ def check(steps: Sequence[Sequence[View]]) -> Iterator[tuple[int, str, str, str]
             for other in views:
                 if other is view:
                     continue
-                count, through, agree = compare(clouds[other.camera], view)
+                count, through, agree = compare(clouds[other.camera], view, reaches[other.camera])
                 if count < MIN_POINTS:
                     continue
                 for camera in (view.camera, other.camera):
@@ -126,25 +150,27 @@ def _floor(view: View, points: Array) -> Iterator[tuple[str, str, str]]:
         yield view.camera, "floor at height 0", f"a floor {np.median(near) * 100:.0f} cm off"
 
 
-def compare(points: Array, view: View) -> tuple[int, float, float]:
+def compare(points: Array, view: View, reach: Array | None = None) -> tuple[int, float, float]:
     """Compare points another camera saw with a view.
 
     Args:
         points: (N, 3) in the world, m.
         view: where they may be seen.
+        reach: (N,) m, see `View.reach`; what is smaller than a pixel of the view may be missed by it. None: far.
 
     Returns:
         How many fall into the picture; which share of them the view looks through; which share lies at its depth.
     """
     local = (points - view.camera_in_world[:3, 3]) @ invert(view.camera_in_world)[:3, :3].T
-    local = local[local[:, 2] > NEAR]
+    reach = np.full(len(local), np.inf) if reach is None else reach
+    local, reach = local[local[:, 2] > NEAR], reach[local[:, 2] > NEAR]
     fx, fy, cx, cy = view.intrinsic
     z = local[:, 2]
     columns = np.floor(local[:, 0] / z * fx + cx).astype(int)
     rows = np.floor(local[:, 1] / z * fy + cy).astype(int)
     height, width = view.depth.shape
     inside = (columns >= 1) & (columns < width - 1) & (rows >= 1) & (rows < height - 1)
-    rows, columns, z = rows[inside], columns[inside], z[inside]
+    rows, columns, z, reach = rows[inside], columns[inside], z[inside], reach[inside]
     if len(z) == 0:
         return 0, 0.0, 0.0
     around = np.stack([view.depth[rows + i, columns + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]) / 1000
@@ -152,7 +178,14 @@ def compare(points: Array, view: View) -> tuple[int, float, float]:
     if not known.any():
         return 0, 0.0, 0.0
     z, nearest, farthest = z[known], around[:, known].min(axis=0), around[:, known].max(axis=0)
-    tolerance = 0.01 + 0.01 * z
+    tolerance = _tolerance(z)
     through = nearest > z + tolerance
+    telling = reach[known] > z / view.intrinsic[:2].min()
     agree = ~through & (farthest > z - tolerance)
-    return len(z), float(np.mean(through)), float(np.mean(agree))
+    looked = float(np.mean(through[telling])) if np.sum(telling) >= MIN_POINTS else 0.0
+    return len(z), looked, float(np.mean(agree))
+
+
+def _tolerance(z: Array) -> Array:
+    """By how much depths of one place may differ, m."""
+    return 0.01 + 0.01 * z

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import SubGoal
 from robocas_ms3.datasets.reader import Dataset, Episode
-from robocas_ms3.datasets.scene_values import one_seed
 from robocas_ms3.datasets.tolerant import DAMAGED, first_line
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import write_json
+from robocas_ms3.recordings.seeds import one_seed
+from robocas_ms3.recordings.subgoals import SubGoal
 
 SPLIT_RULE = (
     "seeds in the order of sha256(seed), the first tenth validates; episodes of one seed stay together; what is"

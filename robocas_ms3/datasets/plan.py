@@ -16,8 +16,8 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.info import SPLIT_RULE
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.provenance import fingerprint, succeeded
-from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.reading import TrajectoryFile
 
 SETTINGS = ("rate_hz", "cameras", "image_size", "image_format", "depth", "embeddings")
 """What all episodes of a dataset share."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
+from robocas_ms3.recordings.reading import Recording, TrajectoryFile
 
 
 def fingerprint(recording: Recording) -> str:

@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-from robocas_ms3.datasets.episode import robot_frames
 from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.trajectory import Recording
 from robocas_ms3.datasets.writer import CameraModel, Frame
-from robocas_ms3.demos.sampling import invert
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.environment import RecordedEnv
+from robocas_ms3.recordings.motion import invert
+from robocas_ms3.recordings.reading import Recording
 
 _SAME_PLACE = 1e-3  # m
 
@@ -27,44 +26,33 @@ class EnvFrames:
 
     Attributes:
         env: the environment.
-        gripper_column: of its actions.
-        finger_range: target of one finger at -1 and +1, m.
     """
 
-    def __init__(self, env_info: dict[str, Any], control_mode: str, pictures: Pictures | None = None) -> None:
+    def __init__(self, env: RecordedEnv, control_mode: str, pictures: Pictures | None = None) -> None:
         """Make the environment, with cameras.
 
         Args:
-            env_info: of the trajectory's JSON.
+            env: what the trajectory was recorded in.
             control_mode: of its actions.
             pictures: which ones to render; default: all.
 
         Raises:
             DatasetError: there is no render device, or no such environment.
         """
-        kwargs = dict(env_info["env_kwargs"])
-        sensors = dict(kwargs.pop("sensor_configs", None) or {})
+        sensors = dict(env.kwargs.get("sensor_configs") or {})
         self._pictures = pictures or Pictures()
         if self._pictures.size is not None:
             sensors["width"], sensors["height"] = self._pictures.size
-        for key in ("render_backend", "render_mode", "sim_backend", "num_envs", "obs_mode", "control_mode"):
-            kwargs.pop(key, None)
         require_renderer()
-        try:
-            self.env = gym.make(
-                env_info["env_id"],
-                obs_mode="+".join(self._pictures.kinds),
-                control_mode=control_mode,
-                num_envs=1,
-                sim_backend="physx_cpu",
-                sensor_configs=sensors,
-                **kwargs,
-            )
-        except gym.error.Error as error:
-            raise DatasetError("no such environment", where=env_info["env_id"], found=str(error)) from error
+        self.env = env.make(
+            obs_mode="+".join(self._pictures.kinds),
+            control_mode=control_mode,
+            num_envs=1,
+            sim_backend="physx_cpu",
+            sensor_configs=sensors,
+        )
         self._base: Any = self.env.unwrapped
         self._loaded = False
-        self.gripper_column, self.finger_range = 0, (0.0, 0.0)
 
     def close(self) -> None:
         """Free the renderer."""
@@ -79,10 +67,6 @@ class EnvFrames:
         self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
         for name in set(self._base._sensors) - set(self._pictures.cameras):
             del self._base._sensors[name]  # they are made anew at each reset; what is there is rendered
-        controller = self._base.agent.controller
-        self.gripper_column = controller.action_mapping["gripper"][0]
-        gripper = controller.controllers["gripper"].config
-        self.finger_range = (float(gripper.lower), float(gripper.upper))
         self._check_scene(recording)
 
     def _check_scene(self, recording: Recording) -> None:
@@ -117,11 +101,10 @@ class EnvFrames:
 
     def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[Frame]:
         """Show some of the states, in order; ``load`` comes first."""
-        links = robot_frames(recording.joints(samples))
-        for index, tcp, base in zip(samples, links.tcp_in_world, links.arm_base_in_world, strict=True):
-            yield self._frame(recording.state(int(index)), tcp, base)
+        for index in samples:
+            yield self._frame(recording.state(int(index)))
 
-    def _frame(self, state: dict[str, dict[str, NDArray[np.float32]]], tcp: NDArray, base: NDArray) -> Frame:
+    def _frame(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> Frame:
         """Show one state, without a step of physics."""
         tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
         self._base.set_state_dict(tensors)
@@ -130,8 +113,6 @@ class EnvFrames:
         return Frame(
             rgb={name: pictures[name]["rgb"][0].cpu().numpy() for name in wanted.cameras},
             depth={name: to_millimetres(pictures[name]["depth"][0, ..., 0]) for name in wanted.cameras if wanted.depth},
-            tcp_in_world=tcp,
-            arm_base_in_world=base,
         )
 
     def cameras(self) -> dict[str, CameraModel]:

@@ -12,10 +12,12 @@ import numpy as np
 
 from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.reader import Dataset, Episode
-from robocas_ms3.datasets.scene_values import one_seed
 from robocas_ms3.datasets.tolerant import first_line
 from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.errors import RobocasError
+from robocas_ms3.recordings.entries import read_reset_options
+from robocas_ms3.recordings.environment import read_env
+from robocas_ms3.recordings.seeds import one_seed
 
 SAME_PLACE = 1e-3  # m
 BASE_STILL = 1e-3  # m that the base may move in all: 7-D actions do not move it
@@ -74,6 +76,7 @@ def replay_dataset(
     root: str | Path,
     *,
     numbers: Iterable[int] | None = None,
+    pack: str | Path | None = None,
     on_episode: Callable[[EpisodeReplay, int], None] = lambda episode, count: None,
 ) -> ReplayReport:
     """Play the 7-D actions of a RoboCAS folder with ``pd_ee_delta_pose`` at the dataset's rate, without any correction.
@@ -81,6 +84,7 @@ def replay_dataset(
     Args:
         root: the dataset.
         numbers: of episodes; default: all.
+        pack: name or folder of the objects' pack, instead of what the episodes name.
         on_episode: called with each outcome and the number of episodes.
 
     Raises:
@@ -88,7 +92,7 @@ def replay_dataset(
     """
     dataset = Dataset(Path(root))
     chosen = dataset.numbers if numbers is None else list(numbers)
-    player = _Player(dataset.rate_hz)
+    player = _Player(dataset.rate_hz, pack)
     replays = []
     try:
         for number in chosen:
@@ -102,8 +106,8 @@ def replay_dataset(
 class _Player:
     """Keeps the environment from one episode to the next while it is the same."""
 
-    def __init__(self, rate_hz: float) -> None:
-        self._rate_hz = rate_hz
+    def __init__(self, rate_hz: float, pack: str | Path | None) -> None:
+        self._rate_hz, self._pack = rate_hz, pack
         self._key, self._open_loop = "", None
 
     def play(self, number: int, episode: Episode) -> EpisodeReplay:
@@ -116,7 +120,7 @@ class _Player:
                 return EpisodeReplay(number, task, None, skipped=reason)
             arrays = episode.arrays
             open_loop = self._environment(scene["env_info"])
-            open_loop.reset(seed, scene.get("reset_options") or {})
+            open_loop.reset(seed, read_reset_options(scene.get("reset_options"), "reset_options"))
             other = _other_scene(scene, open_loop)
             if other:
                 return EpisodeReplay(number, task, None, skipped=f"its seed builds another scene now: {other}")
@@ -132,7 +136,8 @@ class _Player:
         key = json.dumps(env_info, sort_keys=True)
         if self._open_loop is None or key != self._key:
             self.close()
-            self._key, self._open_loop = key, OpenLoop(env_info, self._rate_hz)
+            env = read_env(env_info, "scene.json, env_info", pack=self._pack)
+            self._key, self._open_loop = key, OpenLoop(env, self._rate_hz)
         return self._open_loop
 
     def close(self) -> None:

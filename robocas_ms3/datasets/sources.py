@@ -12,11 +12,11 @@ from typing import Any, Literal, Protocol
 
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.episode import SubGoal
 from robocas_ms3.datasets.folder_source import FolderSource
 from robocas_ms3.datasets.reader import Episode
 from robocas_ms3.datasets.trajectory_source import TrajectorySource
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.subgoals import SubGoal
 
 Split = Literal["train", "val", "all"]
 

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.episode import to_matrices, wrap_angle
-from robocas_ms3.demos.sampling import relative_motion
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.motion import relative_motion
 
 SPECS = {spec.name: spec for spec in schema.EPISODE_INFO}
 DAMAGED = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError)

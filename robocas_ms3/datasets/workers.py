@@ -6,7 +6,6 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +14,12 @@ from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.pool import do_all
 from robocas_ms3.datasets.provenance import scene_record
 from robocas_ms3.datasets.timing import Timing
-from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.writer import FrameSource, WrittenEpisode, write_episode
+from robocas_ms3.recordings.environment import RecordedEnv
+from robocas_ms3.recordings.reading import TrajectoryFile
 
-OpenSource = Callable[[dict[str, Any], str, Pictures], FrameSource]
-"""Makes a frame source from ``env_info``, control mode and what is to be rendered."""
+OpenSource = Callable[[RecordedEnv, str, Pictures], FrameSource]
+"""Makes a frame source from what was recorded in, control mode and what is to be rendered."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class Job:
 
     Attributes:
         trajectory: the HDF5 file.
+        pack: of its objects, instead of what it names.
         out: the dataset.
         stride: control steps a dataset step.
         rate_hz: of the dataset.
@@ -38,6 +39,7 @@ class Job:
     """
 
     trajectory: Path
+    pack: str | Path | None
     out: Path
     stride: int
     rate_hz: float
@@ -61,7 +63,7 @@ class _Writer:
 
     def __init__(self, job: Job) -> None:
         self.job = job
-        self.file = TrajectoryFile(job.trajectory)
+        self.file = TrajectoryFile(job.trajectory, pack=job.pack)
         self.source: FrameSource | None = None
         self.control_mode = ""
 
@@ -71,7 +73,7 @@ class _Writer:
             recording = self.file.recording(index)
             if self.source is None or recording.control_mode != self.control_mode:
                 self._close_source()
-                self.source = job.open_source(self.file.env_info, recording.control_mode, job.pictures)
+                self.source = job.open_source(self.file.env, recording.control_mode, job.pictures)
                 self.control_mode = recording.control_mode
         return write_episode(
             job.out,

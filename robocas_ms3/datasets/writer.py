@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import Frames, episode_arrays, sample_subgoals
+from robocas_ms3.datasets.episode import episode_arrays
 from robocas_ms3.datasets.pictures import Pictures, write_picture
 from robocas_ms3.datasets.timing import Timing
-from robocas_ms3.datasets.trajectory import Recording
-from robocas_ms3.demos.sampling import gripper_open, sample_states
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder
+from robocas_ms3.recordings.motion import sample_states
+from robocas_ms3.recordings.reading import Recording
+from robocas_ms3.recordings.subgoals import sample_subgoals
 
 ENCODERS = 2  # threads; OpenCV encodes outside Python's lock
 _MAX_WAITING = 24  # pictures, which bounds memory
@@ -47,20 +48,14 @@ class Frame:
     Attributes:
         rgb: camera -> (H, W, 3) uint8.
         depth: camera -> (H, W) uint16, mm; empty where depth is not wanted.
-        tcp_in_world, arm_base_in_world: (4, 4).
     """
 
     rgb: dict[str, NDArray[np.uint8]]
     depth: dict[str, NDArray[np.uint16]]
-    tcp_in_world: NDArray[np.float64]
-    arm_base_in_world: NDArray[np.float64]
 
 
 class FrameSource(Protocol):
     """Shows recorded states; the renderer is one, tests bring another."""
-
-    gripper_column: int
-    finger_range: tuple[float, float]
 
     def load(self, recording: Recording) -> None:
         """Build the recording's scene."""
@@ -138,23 +133,13 @@ def show_episode(
         raise DatasetError("too many steps", where=where, expected=f"<= {schema.MAX_STEPS}", found=len(samples))
     with timing.measure("load"):
         source.load(recording)
-    poses = []
     begun = time.perf_counter()
     for step, frame in enumerate(source.frames(recording, samples)):
         timing.render += time.perf_counter() - begun
-        poses.append((frame.tcp_in_world, frame.arm_base_in_world))
         on_frame(step, frame)
         begun = time.perf_counter()
     with timing.measure("write"):
-        tcp, base = (np.stack(column) for column in zip(*poses, strict=True))
-        joints = recording.joints(samples)
-        status = gripper_open(
-            recording.actions[:, source.gripper_column],
-            samples,
-            finger_range=source.finger_range,
-            initial_width=float(joints.qpos[0, 10:12].sum()),
-        )
-        arrays = episode_arrays(Frames(tcp, base), joints, status, recording.instruction, subgoals, embed)
+        arrays = episode_arrays(recording.motion(samples), recording.instruction, subgoals, embed)
     return Shown(arrays, source.cameras(), source.scene())
 
 

@@ -19,9 +19,7 @@ from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.demos.forking import say_once, why_not_fork
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
-from robocas_ms3.demos.record import EpisodeRecorder
 from robocas_ms3.demos.resimulation import Resimulation
-from robocas_ms3.demos.sampling import sample_stride
 from robocas_ms3.demos.trials import NOISY, Trials
 from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.planning.backends import DEFAULT, make_planner
@@ -31,6 +29,9 @@ from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.retreating import back_out
+from robocas_ms3.recordings.environment import RecordedEnv
+from robocas_ms3.recordings.motion import sample_stride
+from robocas_ms3.recordings.writing import EpisodeRecorder
 from robocas_ms3.robots.urdf import robot_files
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.spec import TASKS
@@ -157,11 +158,9 @@ class EpisodeGenerator:
         self.worlds: list[OpenLoop] = []
         self.trials: Trials | None = None
         if settings.replay_rate and not config.base_motion:
-            info = {
-                "env_id": TASKS[settings.task].env_id,
-                "env_kwargs": {"config": settings.config, "pack": settings.pack, "layouts": settings.layouts},
-            }
-            self.worlds = [OpenLoop(info, settings.replay_rate) for _ in range(1 + settings.noisy_trials)]
+            scene = {"config": settings.config, "pack": settings.pack, "layouts": settings.layouts}
+            env = RecordedEnv(TASKS[settings.task].env_id, None, scene)
+            self.worlds = [OpenLoop(env, settings.replay_rate) for _ in range(1 + settings.noisy_trials)]
             noise = Noise(settings.noise_mm / 1000, float(np.deg2rad(settings.noise_deg)))
             stride = sample_stride(settings.control_freq, settings.replay_rate)
             self.trials = Trials(self.worlds, noise, stride)

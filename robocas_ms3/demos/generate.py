@@ -14,11 +14,13 @@ import numpy as np
 from robocas_ms3.demos.checks import check_arguments, check_same_run
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.ledger import Failure, Ledger, count_by_stage
-from robocas_ms3.demos.record import merge, open_trajectory, read_json
 from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
 from robocas_ms3.planning.executor import Seconds
+from robocas_ms3.recordings.entries import read_json
+from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.writing import merge
 
 _BEGINNINGS = {"run.json", "failures.jsonl", "episodes"}  # of a run that has not finished a seed yet
 

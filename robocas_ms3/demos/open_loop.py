@@ -5,21 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-from robocas_ms3.demos.sampling import Array
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.environment import RecordedEnv
+from robocas_ms3.recordings.motion import Array
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.tasks.transfer import TransferEnv
 
 CONTROL_MODE = "pd_ee_delta_pose"
 SETTLE_SECONDS = 1.0  # after the last action, held still: what was let go comes to rest
-_OTHERWISE = ("control_mode", "obs_mode", "reward_mode", "render_backend", "render_mode", "sim_backend", "num_envs")
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class OpenLoop:
     """An environment that takes dataset actions.
 
     Args:
-        env_info: ``env_id`` and ``env_kwargs`` of the recording.
+        env: what the recording was made in.
         rate_hz: of the actions; a whole number that divides the rate of physics.
 
     Attributes:
@@ -72,26 +71,20 @@ class OpenLoop:
         DatasetError: no such rate or environment.
     """
 
-    def __init__(self, env_info: dict[str, Any], rate_hz: float) -> None:
+    def __init__(self, env: RecordedEnv, rate_hz: float) -> None:
         if rate_hz < 1 or rate_hz != int(rate_hz) or 100 % int(rate_hz):
             expected = "a whole number that divides 100"
             raise DatasetError(
                 "actions can't be played at this rate", where="rate_hz", expected=expected, found=rate_hz
             )
-        kwargs = {key: value for key, value in env_info["env_kwargs"].items() if key not in _OTHERWISE}
-        kwargs["sim_config"] = {**kwargs.get("sim_config", {}), "control_freq": int(rate_hz)}
         torch.set_num_threads(1)
-        try:
-            self._env = gym.make(
-                env_info["env_id"],
-                obs_mode="none",
-                reward_mode="none",
-                control_mode=CONTROL_MODE,
-                render_backend="none",
-                **kwargs,
-            )
-        except gym.error.Error as error:
-            raise DatasetError("no such environment", where=env_info["env_id"], found=str(error)) from error
+        self._env = env.make(
+            obs_mode="none",
+            reward_mode="none",
+            control_mode=CONTROL_MODE,
+            render_backend="none",
+            sim_config={**env.kwargs.get("sim_config", {}), "control_freq": int(rate_hz)},
+        )
         self.rate_hz = int(rate_hz)
         self.success, self.clipped = False, 0
         self._gripper = 1.0

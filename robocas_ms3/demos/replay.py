@@ -15,9 +15,12 @@ from mani_skill.trajectory.utils import dict_to_list_of_dicts
 
 from robocas_ms3.demos.checks import check_number
 from robocas_ms3.demos.convert_actions import CONVERTIBLE, ActionConverter
-from robocas_ms3.demos.record import EpisodeRecorder, merge, open_trajectory, read_json
 from robocas_ms3.errors import DatasetError, RobocasError
 from robocas_ms3.files import claim_output, replacing_folder
+from robocas_ms3.recordings.entries import read_json, read_reset
+from robocas_ms3.recordings.environment import RecordedEnv, read_env
+from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.writing import EpisodeRecorder, merge
 from robocas_ms3.tasks.base import RoboCASEnv
 
 
@@ -49,6 +52,7 @@ def replay(
     save: Path | None = None,
     allow_failure: bool = False,
     overwrite: bool = False,
+    pack: str | Path | None = None,
     env_kwargs: dict[str, Any] | None = None,
 ) -> Iterator[Replay]:
     """Replay episodes one by one, as the iterator is asked for them. Arguments are checked at once.
@@ -62,6 +66,7 @@ def replay(
         save: write the replayed episodes to this HDF5 file.
         allow_failure: write the failed ones too.
         overwrite: replace ``save`` if it exists.
+        pack: name or folder of the objects' pack, instead of what the file names.
         env_kwargs: further arguments of the environment.
 
     Raises:
@@ -73,8 +78,8 @@ def replay(
         check_number("count", count, 1)
     _check_obs_mode(obs_mode)
     data = read_json(trajectory)
-    info = data["env_info"]
-    recorded_mode = info["env_kwargs"]["control_mode"]
+    env = read_env(data["env_info"], trajectory.with_suffix(".json"), pack=pack)
+    recorded_mode = env.control_mode
     mode = control_mode or recorded_mode
     if mode not in {*CONVERTIBLE, recorded_mode}:
         raise DatasetError(
@@ -94,11 +99,11 @@ def replay(
             raise DatasetError("this is the recording itself", where=save, fix="Choose another name for the replay.")
         for path in (save, save.with_suffix(".json")):
             claim_output(path, overwrite=overwrite, resume=None)
-    kwargs = {**info["env_kwargs"], "control_mode": mode, "obs_mode": obs_mode, **(env_kwargs or {})}
+    kwargs = {"control_mode": mode, "obs_mode": obs_mode, **(env_kwargs or {})}
     if obs_mode == "none":
         kwargs.setdefault("render_backend", "none")
     episodes = data["episodes"][:count]
-    return _replay_all(trajectory, info["env_id"], kwargs, episodes, use_env_states, save, allow_failure)
+    return _replay_all(trajectory, env, kwargs, episodes, use_env_states, save, allow_failure)
 
 
 def _check_obs_mode(mode: str) -> None:
@@ -115,7 +120,7 @@ def _check_obs_mode(mode: str) -> None:
 
 def _replay_all(
     trajectory: Path,
-    env_id: str,
+    recorded: RecordedEnv,
     kwargs: dict[str, Any],
     episodes: list[dict[str, Any]],
     use_env_states: bool,
@@ -123,7 +128,7 @@ def _replay_all(
     allow_failure: bool,
 ) -> Iterator[Replay]:
     torch.set_num_threads(1)  # as where episodes are generated
-    env = gym.make(env_id, **kwargs)
+    env = recorded.make(**kwargs)
     try:
         if save is None:
             for episode in episodes:
@@ -158,7 +163,10 @@ def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env
             raise DatasetError("the file lacks an episode its JSON lists", where=trajectory, found=name)
         group: Any = file[name]
         actions, states = np.array(group["actions"]), dict_to_list_of_dicts(group["env_states"])
-    _, info = env.reset(**episode["reset_kwargs"])
+    seed, options = read_reset(episode, f"{trajectory}, {name}")
+    if not np.isfinite(actions).all():
+        raise DatasetError("NaN or infinity", where=f"{trajectory}, {name}, actions", fix="Record it again.")
+    _, info = env.reset(seed=seed, options=options)
     convert = ActionConverter(base_env) if base_env.control_mode != episode["control_mode"] else None
     if use_env_states:
         base_env.set_state_dict(states[0])
@@ -167,7 +175,7 @@ def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env
         if use_env_states:
             base_env.set_state_dict(state)
     error = None if convert else state_distance(cast(Any, base_env.get_state_dict()), states[-1])
-    return Replay(episode["episode_id"], int(episode["episode_seed"]), bool(info["success"][0]), error)
+    return Replay(episode["episode_id"], seed, bool(info["success"][0]), error)
 
 
 def state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:

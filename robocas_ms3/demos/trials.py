@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
-from robocas_ms3.demos.sampling import dataset_actions, sample_states
 from robocas_ms3.errors import EpisodeLost
+from robocas_ms3.recordings.motion import Motion, sample_states
 from robocas_ms3.robots.constants import ROBOT_UID
 
 # m by which the target may be off the recording at the end of a part. What else lies about may roll elsewhere: where
@@ -62,7 +62,7 @@ class Trials:
         if not finished:
             samples = samples[samples % self._stride == 0]
         new = samples[self._played :]
-        actions = dataset_actions(states["articulations"][ROBOT_UID], gripper, new).astype(np.float64)
+        actions = Motion.of(states["articulations"][ROBOT_UID], gripper, new).actions[:-1].astype(np.float64)
         for number, world in enumerate(self._worlds if noisy else self._worlds[:1]):
             self._play(world, number, actions)
             reason = self._what_is_wrong(world, states, int(new[-1]), finished)

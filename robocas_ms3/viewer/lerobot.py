@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset, LeRobotEpisode
-from robocas_ms3.datasets.scene_values import one_seed
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.seeds import one_seed
 from robocas_ms3.viewer import damage
 from robocas_ms3.viewer.arrays import show_arrays
 from robocas_ms3.viewer.damage import ledger_entry, readable, split_of, table

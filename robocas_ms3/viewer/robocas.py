@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.reader import Dataset, Episode
-from robocas_ms3.datasets.scene_values import one_seed
 from robocas_ms3.datasets.tolerant import DAMAGED
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.seeds import one_seed
 from robocas_ms3.viewer import damage
 from robocas_ms3.viewer.arrays import NEEDED, show_arrays
 from robocas_ms3.viewer.damage import entry_of, integer, ledger_entry, rate_of, readable, split_of, table, text

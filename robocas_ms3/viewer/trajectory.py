@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import planar_base, robot_frames
+from robocas_ms3.datasets.episode import planar_base
 from robocas_ms3.datasets.provenance import succeeded, task_of
-from robocas_ms3.datasets.scene_values import one_seed, sound
-from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
+from robocas_ms3.datasets.scene_values import sound
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.reading import Recording, TrajectoryFile
+from robocas_ms3.recordings.seeds import one_seed
 from robocas_ms3.robots import constants as c
 from robocas_ms3.viewer.damage import integer, readable, text
 from robocas_ms3.viewer.failures import Failures, describe, stages
@@ -76,10 +77,9 @@ class TrajectorySource:
         entry, _ = _entry(self.file.episodes[position])  # the table says what is wrong
         config = self._kwargs.get("config")
         steps = recording.control_steps + 1
-        joints = recording.joints(np.arange(steps))
-        frames = robot_frames(joints)
-        to_base = np.linalg.inv(frames.arm_base_in_world)
-        tcp = to_base @ frames.tcp_in_world
+        motion = recording.motion(np.arange(steps))
+        to_base = np.linalg.inv(motion.arm_base_in_world)
+        tcp = to_base @ motion.tcp_in_world
         xyzw = Rotation.from_matrix(tcp[:, :3, :3]).as_quat()
         last = steps - 1
         return make_episode(
@@ -97,12 +97,12 @@ class TrajectorySource:
                 for goal in recording.subgoals
             ],
             plots=[
-                *motion_plots(tcp[:, :3, 3], xyzw, joints.qpos[:, c.ARM_SLICE]),
-                gripper_plot(joints.qpos[:, c.FINGER_SLICE].sum(axis=1), None),
+                *motion_plots(tcp[:, :3, 3], xyzw, motion.qpos[:, c.ARM_SLICE]),
+                gripper_plot(motion.qpos[:, c.FINGER_SLICE].sum(axis=1), None),
                 *_actions(recording),
-                *base_plot(planar_base(joints)),
+                *base_plot(planar_base(motion.root_in_world, motion.qpos)),
             ],
-            trace=make_trace(frames.tcp_in_world, _objects(recording, entry, to_base[0]), moving=True),
+            trace=make_trace(motion.tcp_in_world, _objects(recording, entry, to_base[0]), moving=True),
             facts={
                 "Configuration": config if isinstance(config, str) else None,  # a whole one is too long
                 "Object pack": self._kwargs.get("pack"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import signal
@@ -12,6 +11,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+from synthetic import write_trajectory
 
 from robocas_ms3.cli.main import run
 
@@ -20,11 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(scope="module")
 def trajectory(tmp_path_factory):
-    spec = importlib.util.spec_from_file_location("_synthetic", ROOT / "tests/datasets/synthetic.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.write_trajectory(tmp_path_factory.mktemp("run") / "trajectory.h5", seeds=(3, 4))
+    return write_trajectory(tmp_path_factory.mktemp("run") / "trajectory.h5", seeds=(3, 4))
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])

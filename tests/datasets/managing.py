@@ -80,7 +80,7 @@ def make(folder, name, seeds, **kwargs):
 
 def die(moment, *words):
     """Run `robocas` in a process of its own, which is killed at a moment."""
-    command = [sys.executable, str(Path(__file__).parent / "dying_manage.py"), moment, *map(str, words)]
+    command = [sys.executable, str(Path(__file__).parents[1] / "support" / "dying_manage.py"), moment, *map(str, words)]
     environment = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
     assert done.returncode == -signal.SIGKILL, done.stderr

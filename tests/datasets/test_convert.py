@@ -10,17 +10,17 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from synthetic import STEPS, RayCaster, made_up_vectors, robot_frames, write_trajectory
+from synthetic import STEPS, RayCaster, made_up_vectors, write_trajectory
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.convert import convert
 from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.validate import validate
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.files import locked_folder
+from robocas_ms3.recordings.reading import TrajectoryFile
 
 
 def run(trajectory, out, **kwargs):
@@ -67,17 +67,16 @@ def test_failed_episodes_stay_out_and_are_numbered_without_a_gap(made, trajector
 def test_arrays_are_those_of_the_sampled_states(made, trajectory):
     samples = [0, 4, 8, 12, 16, 20, 22]
     with TrajectoryFile(trajectory) as file:
-        robot = file.recording(2).states["articulations"]["robocas_mobile_panda"][samples]
+        recording = file.recording(2)
+    robot, motion = recording.states["articulations"]["robocas_mobile_panda"][samples], recording.motion(samples)
     with np.load(made / "episode_0000001" / "episode_info.npz", allow_pickle=False) as arrays:
         np.testing.assert_array_equal(arrays["robot_joints"], robot[:, 16:23])
         base = to_matrices(arrays["base_pos"], arrays["base_orn"])
         ee = base @ to_matrices(arrays["ee_pos"], arrays["ee_orn"])
         # Actions 0..8 open; state 8 was reached by action 7, state 12 by action 11.
         assert arrays["gripper_status"].tolist() == [True, True, True, False, False, False, False]
-    for row, state in enumerate(robot):
-        expected_base, expected_tcp = robot_frames(state)
-        np.testing.assert_allclose(base[row], expected_base, atol=1e-5)
-        np.testing.assert_allclose(ee[row], expected_tcp, atol=1e-5)
+    np.testing.assert_allclose(base, motion.arm_base_in_world, atol=1e-5)
+    np.testing.assert_allclose(ee, motion.tcp_in_world, atol=1e-5)
 
 
 def test_pictures_are_what_was_seen(made, trajectory):
@@ -305,7 +304,13 @@ def test_killed_and_resumed_is_as_if_never_killed(trajectory, tmp_path, moment):
     out = tmp_path / "out"
     if moment == "rmtree":
         shutil.copytree(tmp_path / "whole", out)
-    command = [sys.executable, str(Path(__file__).parent / "dying.py"), moment, str(trajectory), str(out)]
+    command = [
+        sys.executable,
+        str(Path(__file__).parents[1] / "support" / "dying.py"),
+        moment,
+        str(trajectory),
+        str(out),
+    ]
     environment = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}  # there is no simulator in this, only its import
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
     assert done.returncode == -signal.SIGKILL, done.stderr

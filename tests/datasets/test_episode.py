@@ -5,21 +5,18 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.episode import (
-    Frames,
-    Joints,
-    SubGoal,
     compose,
     continuous_xyzw,
     episode_arrays,
     planar_base,
-    sample_subgoals,
     to_matrices,
     wxyz_to_xyzw,
     xyzw_to_wxyz,
 )
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.demos.sampling import gripper_open, invert, relative_motion, sample_states, sample_stride
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.motion import Motion, gripper_open, invert, relative_motion, sample_states, sample_stride
+from robocas_ms3.recordings.subgoals import SubGoal, sample_subgoals
 
 
 @st.composite
@@ -77,9 +74,10 @@ def test_orientations_never_flip_their_sign():
 def arrays_of(tcp, base, *, qpos=None, subgoals=None, embed=None):
     count = len(tcp)
     qpos = np.zeros((count, 12)) if qpos is None else qpos
-    joints = Joints(qpos, np.zeros((count, 12)), np.broadcast_to(np.eye(4), (count, 4, 4)))
+    root = np.broadcast_to(np.eye(4), (count, 4, 4))
+    motion = Motion(qpos, np.zeros((count, 12)), root, tcp, base, np.ones(count, bool))
     subgoals = subgoals or [SubGoal("move and grasp", "grasp it", 0, count - 1)]
-    return episode_arrays(Frames(tcp, base), joints, np.ones(count, bool), "do it", subgoals, embed)
+    return episode_arrays(motion, "do it", subgoals, embed)
 
 
 def test_relative_motion_is_in_the_frame_of_the_hand():
@@ -118,7 +116,7 @@ def test_base_pose_in_the_world():
     qpos = np.zeros((2, 12))
     qpos[1, :3] = 0.2, 0.0, np.deg2rad(100)
     expected = [[0.7, 0.15, np.pi / 2], [0.7, 0.35, np.deg2rad(190)]]  # on from 90, not to -170
-    np.testing.assert_allclose(planar_base(Joints(qpos, qpos, root)), expected, atol=1e-12)
+    np.testing.assert_allclose(planar_base(root, qpos), expected, atol=1e-12)
 
 
 def test_turns_of_the_base_take_the_short_way_round():
@@ -187,10 +185,9 @@ def test_gripper_status_is_the_command_that_led_there():
     # Fingers go to -0.01 + (a + 1) / 2 * 0.05 m each: open (> 0.02 m) above a = 0.2.
     commands = np.array([1, 1, 1, -1, -1, 0.1, 0.3, 1], float)
     samples = np.array([0, 3, 4, 6, 7, 8])
-    kwargs = dict(finger_range=(-0.01, 0.04))
-    status = gripper_open(commands, samples, initial_width=0.08, **kwargs)
+    status = gripper_open(commands, samples, initial_width=0.08)
     assert status.tolist() == [True, True, False, False, True, True]
-    assert not gripper_open(commands, samples, initial_width=0.0, **kwargs)[0]
+    assert not gripper_open(commands, samples, initial_width=0.0)[0]
 
 
 def test_the_bases_yaw_does_not_jump():
@@ -198,5 +195,5 @@ def test_the_bases_yaw_does_not_jump():
     qpos = np.zeros((4, 12))
     qpos[:, 2] = -np.pi + np.array([0, 1e-6, -1e-6, -0.1])
     root = np.tile(np.eye(4), (4, 1, 1))
-    yaw = planar_base(Joints(qpos, qpos, root))[:, 2]
+    yaw = planar_base(root, qpos)[:, 2]
     np.testing.assert_allclose(yaw, qpos[:, 2], atol=1e-9)

@@ -24,9 +24,9 @@ from robocas_ms3.datasets.lerobot.request import Request
 from robocas_ms3.datasets.lerobot.schema import Limits
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.files import locked_folder
+from robocas_ms3.recordings.reading import TrajectoryFile
 
 
 def run(source, out, **kwargs):
@@ -305,7 +305,13 @@ def test_what_breaks_is_gone_on_with(trajectory, lerobot, tmp_path):
 def test_killed_and_resumed_is_as_if_never_killed(trajectory, lerobot, tmp_path, moment):
     """kill -9 in a process of its own; nothing lies under a final name that is not whole."""
     out = tmp_path / "out"
-    command = [sys.executable, str(Path(__file__).parent / "dying_lerobot.py"), moment, str(trajectory), str(out)]
+    command = [
+        sys.executable,
+        str(Path(__file__).parents[1] / "support" / "dying_lerobot.py"),
+        moment,
+        str(trajectory),
+        str(out),
+    ]
     environment = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}  # there is no simulator in this, only its import
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
     assert done.returncode == -signal.SIGKILL, done.stderr

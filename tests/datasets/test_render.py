@@ -13,9 +13,9 @@ from robocas_ms3.datasets import geometry
 from robocas_ms3.datasets.convert import convert
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.render import EnvFrames
-from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.validate import validate
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.reading import TrajectoryFile
 
 ENV_ID = "robocas_ms3:RoboCASPick-v1"
 SIZE = (96, 72)
@@ -77,7 +77,7 @@ def recording(recorded):
 @pytest.fixture(scope="module")
 def source(recorded, recording):
     with TrajectoryFile(recorded[0]) as file:
-        frames = EnvFrames(file.env_info, "pd_joint_pos", Pictures(size=SIZE))
+        frames = EnvFrames(file.env, "pd_joint_pos", Pictures(size=SIZE))
     frames.load(recording)
     yield frames
     frames.close()
@@ -92,7 +92,8 @@ def test_states_look_as_they_did(source, recording, recorded):
     _, seen, tcp = recorded
     for index in (0, 4, STEPS):
         frame = shown(source, recording, index)
-        np.testing.assert_allclose(frame.tcp_in_world, tcp[index], atol=1e-5)
+        by_kinematics = recording.motion(np.array([index])).tcp_in_world[0]
+        np.testing.assert_allclose(by_kinematics, tcp[index], atol=1e-5)
         for camera in frame.rgb:
             then = seen[index][camera]
             difference = np.abs(frame.rgb[camera].astype(int) - then["rgb"][0].numpy()).max(axis=2)
@@ -128,7 +129,8 @@ def test_depth_agrees_with_the_cameras(source, recording):
     steps = []
     for index in (0, 5, STEPS):
         frame = shown(source, recording, index)
-        parents = {"gripper_camera": frame.tcp_in_world, "base_camera": frame.arm_base_in_world}
+        motion = recording.motion(np.array([index]))
+        parents = {"gripper_camera": motion.tcp_in_world[0], "base_camera": motion.arm_base_in_world[0]}
         steps.append(
             [
                 geometry.View(n, frame.depth[n], m.intrinsic, parents.get(n, np.eye(4)) @ m.camera_in_parent)

@@ -26,8 +26,8 @@ class Player:
         basket_pose=np.eye(4),
     )
 
-    def __init__(self, env_info, rate_hz):
-        if env_info["env_kwargs"].get("pack") == "gone":
+    def __init__(self, env, rate_hz):
+        if env.kwargs.get("pack") == "gone":
             raise AssetError("no such pack", where="gone")
         self.rate_hz, self.closed, self.plays = rate_hz, False, []
         Player.made.append(self)
@@ -111,7 +111,10 @@ def test_tracking_error_by_hand(dataset):
         ({"layout": {"poses": [[0, 0, 0], [0, 0.5, 0], [0, 0, 0]]}}, "another scene now: objects up to 500 mm away"),
         ({"layout": {"robot_pose": [0.2, 0, 0, 1, 0, 0, 0]}}, "another scene now: the robot up to 200 mm away"),
         ({"layout": {"basket_pose": [0, 0, 0.1, 1, 0, 0, 0]}}, "another scene now: the basket up to 100 mm away"),
-        ({"env_info": {"env_id": "x", "env_kwargs": {"pack": "gone"}}}, "no such pack"),
+        ({"env_info": {"env_id": "X-v1", "env_kwargs": {"pack": "gone"}}}, "no such pack"),
+        ({"env_info": {"env_id": "X-v1", "env_kwargs": {"pack": "/there"}}}, "expected a name, no path, found /there"),
+        ({"env_info": {"env_id": "evil:X-v1", "env_kwargs": {}}}, "a file can't choose this"),
+        ({"reset_options": {"reset_to_env_states": {}}}, "reset_options: a file can't choose these"),
     ],
 )
 def test_what_can_not_be_tried_is_named_and_the_rest_goes_on(dataset, changes, reason):
@@ -180,11 +183,11 @@ def test_the_command_tells_it_and_may_ask_for_a_share(dataset, capsys):
 def test_a_share_that_nobody_could_see_is_not_enough(dataset, capsys, json_too):
     """As where the pack is not installed, or for one of two tasks."""
     for number in (0, 1):
-        edit_scene(dataset, number, env_info={"env_id": "x", "env_kwargs": {"pack": "gone"}})
+        edit_scene(dataset, number, env_info={"env_id": "X-v1", "env_kwargs": {"pack": "gone"}})
     command = ["validate", str(dataset), "--replay", *json_too]
     assert run(command) == 0
     said = "pick: none of 2 episodes could be replayed: no share is known"
     assert json_too or said in capsys.readouterr().out
     assert run([*command, "--min-share", "0.9"]) == 1
-    edit_scene(dataset, 0, env_info={"env_id": "y", "env_kwargs": {}}, task="select")
+    edit_scene(dataset, 0, env_info={"env_id": "Y-v1", "env_kwargs": {}}, task="select")
     assert run([*command, "--min-share", "0.9"]) == 1

@@ -21,10 +21,10 @@ from torch.utils.data import DataLoader, WeightedRandomSampler
 
 from robocas_ms3.datasets import RoboCASDataset
 from robocas_ms3.datasets.actions import ActionScale, episode_actions
-from robocas_ms3.datasets.episode import Joints, robot_frames
 from robocas_ms3.datasets.sampling import SampleIndex, balancing_weights
 from robocas_ms3.datasets.windows import Window
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.motion import Motion
 from robocas_ms3.robots.constants import ARM_EVALUATION_START
 
 CAMERAS = ("base_camera", "gripper_camera")
@@ -314,7 +314,7 @@ def test_forward_kinematics_by_hand():
     qpos[1, 3:10] = ARM_EVALUATION_START
     root = np.tile(np.eye(4), (2, 1, 1))
     root[:, 0, 3] = 1
-    frames = robot_frames(Joints(qpos, qpos, root))
+    frames = Motion.of_joints(root, qpos, qpos, np.ones(2, bool))
     assert np.allclose(frames.arm_base_in_world[0, :3, 3], [1.1, 0.2, 0.49])
     assert np.allclose(frames.tcp_in_world[0, :3, 3], [1.1, 0.2 + 0.088, 0.49 + 0.926 - 0.1334])
     assert np.allclose(frames.tcp_in_world[0, :3, 2], [0, 0, -1])

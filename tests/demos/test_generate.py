@@ -15,12 +15,14 @@ from mani_skill.utils.structs import Pose
 from robocas_ms3.demos import branches
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings, horizon
 from robocas_ms3.demos.generate import generate
-from robocas_ms3.demos.record import merge, open_trajectory, read_json
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.trials import Trials
 from robocas_ms3.errors import DatasetError, EpisodeLost, OutputExistsError, PlanningFailed, RobocasError
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Trajectory
+from robocas_ms3.recordings.entries import read_json
+from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.writing import merge
 from robocas_ms3.robots.constants import ARM_SLICE
 
 pytestmark = pytest.mark.slow
@@ -133,12 +135,12 @@ def test_files_that_cannot_be_read_are_one_clear_line(run, tmp_path):
     cut = tmp_path / "cut.h5"
     content = summary.trajectory.read_bytes()
     cut.write_bytes(content[: len(content) // 2])
-    with pytest.raises(DatasetError, match="JSON is missing"):
+    with pytest.raises(DatasetError, match="JSON that belongs to this trajectory is missing"):
         read_json(cut)
-    with pytest.raises(DatasetError, match="no readable HDF5 file.*cut short"):
+    with pytest.raises(DatasetError, match="can.t read this HDF5 file: it is cut off"):
         open_trajectory(cut)
     cut.with_suffix(".json").write_text(json.dumps(read_json(summary.trajectory)))
-    with pytest.raises(DatasetError, match="cut short"):
+    with pytest.raises(DatasetError, match="cut off"):
         merge([cut], tmp_path / "merged.h5")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cut.h5", "cut.json"]
 

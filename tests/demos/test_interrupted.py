@@ -14,8 +14,8 @@ from robocas_ms3.demos import workers
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.ledger import Failure
-from robocas_ms3.demos.record import read_json
 from robocas_ms3.demos.workers import generate_seeds, shard_name
+from robocas_ms3.recordings.entries import read_json
 
 SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
 HOPELESS = 2  # a seed without an episode
@@ -29,7 +29,9 @@ def record(folder, seed):
     seconds = {"reset": 1.0, "planning": 2.0, "simulation": 3.0}
     episode = {"episode_id": 0, "episode_seed": seed, "elapsed_steps": 10 + seed}
     episode["robocas"] = {"attempts": 1, "seconds": seconds}
-    path.with_suffix(".json").write_text(json.dumps({"env_info": {}, "episodes": [episode]}))
+    path.with_suffix(".json").write_text(
+        json.dumps({"env_info": {"env_id": "X-v1", "env_kwargs": {}}, "episodes": [episode]})
+    )
 
 
 @pytest.fixture(autouse=True)

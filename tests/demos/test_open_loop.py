@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from robocas_ms3.datasets.actions import episode_actions
-from robocas_ms3.datasets.episode import episode_arrays, robot_frames, sample_subgoals
-from robocas_ms3.datasets.trajectory import TrajectoryFile
+from robocas_ms3.datasets.episode import episode_arrays
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
-from robocas_ms3.demos.sampling import gripper_open, sample_states
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.robots.constants import FINGER_TARGETS
+from robocas_ms3.recordings.motion import sample_states
+from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.recordings.subgoals import sample_subgoals
 
 pytestmark = pytest.mark.slow
 SEED = 1  # a light target: one that hangs heavily off the gripper bends the arm by millimetres
@@ -48,11 +48,8 @@ def recorded(tmp_path_factory):
 
 def own_actions(recording):
     samples = sample_states(recording.control_steps, 4)
-    joints = recording.joints(samples)
-    commands = recording.actions[:, 7]
-    status = gripper_open(commands, samples, finger_range=FINGER_TARGETS, initial_width=joints.qpos[0, 10:].sum())
     goals = sample_subgoals(recording.subgoals, samples)
-    arrays = episode_arrays(robot_frames(joints), joints, status, recording.instruction, goals)
+    arrays = episode_arrays(recording.motion(samples), recording.instruction, goals)
     return episode_actions(arrays)[:-1], arrays["ee_pos"]
 
 

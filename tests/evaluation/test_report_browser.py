@@ -1,16 +1,12 @@
 """The page of a result in a real browser: nothing overflows, nothing fails, and the list can be narrowed."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import pytest
+from browser import Browser, require_chromium
 from made_up_results import outcome, write
 
 from robocas_ms3.evaluation.report import PAGE, write_report
 
 pytestmark = pytest.mark.slow
-BROWSER = Path(__file__).resolve().parents[1] / "viewer" / "browser.py"
 SHOWN = (
     "[...document.querySelectorAll('table.failed tbody tr')].filter(row => !row.hidden)"
     ".map(row => row.cells[0].textContent).join()"
@@ -18,18 +14,8 @@ SHOWN = (
 
 
 @pytest.fixture(scope="module")
-def driver():
-    if "browser" not in sys.modules:
-        spec = importlib.util.spec_from_file_location("browser", BROWSER)
-        assert spec is not None and spec.loader is not None
-        sys.modules["browser"] = module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    return sys.modules["browser"]
-
-
-@pytest.fixture(scope="module")
-def browser(driver, tmp_path_factory):
-    with driver.Browser(driver.require_chromium(), tmp_path_factory.mktemp("profile")) as running:
+def browser(tmp_path_factory):
+    with Browser(require_chromium(), tmp_path_factory.mktemp("profile")) as running:
         yield running
 
 

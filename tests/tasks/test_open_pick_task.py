@@ -9,11 +9,9 @@ import yaml
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.config import shipped_configs
-from robocas_ms3.datasets.episode import Frames, episode_arrays, planar_base, sample_subgoals
-from robocas_ms3.datasets.trajectory import TrajectoryFile
+from robocas_ms3.datasets.episode import episode_arrays, planar_base
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
 from robocas_ms3.demos.replay import replay
-from robocas_ms3.demos.sampling import sample_states
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.skills.driving import base_at, drive
@@ -21,6 +19,9 @@ from robocas_ms3.planning.skills.grasping import plan_grasp
 from robocas_ms3.planning.skills.handles import DEEPER, open_part, plan_pull, pull_share
 from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.stance import drive_to_handle
+from robocas_ms3.recordings.motion import sample_states
+from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.recordings.subgoals import sample_subgoals
 
 pytestmark = pytest.mark.slow
 
@@ -93,16 +94,16 @@ def test_a_drive_is_in_the_datasets_base_motion(driven):
     with TrajectoryFile(path) as file:
         recording = file.recording(0)
     samples = sample_states(recording.control_steps, 4)
-    joints = recording.joints(samples)
-    x, y, yaw = planar_base(joints).T
+    motion = recording.motion(samples)
+    x, y, yaw = planar_base(motion.root_in_world, motion.qpos).T
     base = np.tile(np.eye(4), (len(x), 1, 1))  # what rendering reads from the arm's base link
     base[:, 0, 0] = base[:, 1, 1] = np.cos(yaw)
     base[:, 1, 0] = np.sin(yaw)
     base[:, 0, 1] = -base[:, 1, 0]
     base[:, :3, 3] = np.column_stack([x, y, np.full(len(x), 0.49)])
     assert base[-1] == pytest.approx(seen["base"], abs=0.02)
-    closed = np.zeros(len(x), dtype=bool)
-    arrays = episode_arrays(Frames(base, base), joints, closed, "", sample_subgoals(recording.subgoals, samples))
+    assert motion.arm_base_in_world == pytest.approx(base, abs=1e-5)
+    arrays = episode_arrays(motion, "", sample_subgoals(recording.subgoals, samples))
     steps = np.linalg.norm(arrays["base_rel_pos"], axis=1)
     assert steps.max() > 0.02
     assert steps.sum() == pytest.approx(np.hypot(0.2, 0.1), abs=0.02)

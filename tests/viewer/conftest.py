@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
-from pathlib import Path
 
 import pytest
-
-DATASETS = Path(__file__).resolve().parents[1] / "datasets"
+import synthetic
 
 
 @pytest.fixture(scope="session")
 def made_up():
     """The module that makes trajectories and pictures for the tests of datasets."""
-    if "synthetic" not in sys.modules:
-        spec = importlib.util.spec_from_file_location("synthetic", DATASETS / "synthetic.py")
-        assert spec is not None and spec.loader is not None
-        sys.modules["synthetic"] = module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    return sys.modules["synthetic"]
+    return synthetic
 
 
 @pytest.fixture(scope="session")

@@ -43,6 +43,7 @@ def convert_lerobot(
     overwrite: bool = False,
     resume: bool = False,
     jobs: int = 1,
+    pack: str | Path | None = None,
     limits: Limits | None = None,
     on_start: Callable[[int], None] | None = None,
     on_episode: Callable[[WrittenEpisode], None] | None = None,
@@ -63,6 +64,7 @@ def convert_lerobot(
         overwrite: replace what is in ``out``.
         resume: keep the episodes that are there.
         jobs: worker processes.
+        pack: name or folder of the objects' pack, instead of what a trajectory names.
         limits: sizes of files; default: LeRobot's.
         on_start: called with the number of episodes to write.
         on_episode: called after each.
@@ -76,7 +78,7 @@ def convert_lerobot(
     require_extra()
     begun = time.perf_counter()
     out, limits = Path(out), limits or Limits()
-    request = Request(Path(source), rate_hz, pictures or Pictures(), include_failed, open_source)
+    request = Request(Path(source), rate_hz, pictures or Pictures(), include_failed, open_source, pack)
     with closing(open_request(request)) as opened:
         plan = _plan(opened, opened.entries(), codec)
         with locked_folder(out):

@@ -28,6 +28,7 @@ class Request:
         pictures: cameras, size and depth.
         include_failed: also episodes without success.
         open_source: makes what shows a trajectory's states.
+        pack: of the objects, instead of what a trajectory names.
     """
 
     path: Path
@@ -35,6 +36,7 @@ class Request:
     pictures: Pictures
     include_failed: bool
     open_source: OpenSource
+    pack: str | Path | None = None
 
 
 class EpisodeSource(Protocol):

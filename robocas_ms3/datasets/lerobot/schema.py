@@ -30,8 +30,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.demos.sampling import relative_motion
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.motion import relative_motion
 
 CODEBASE_VERSION = "v3.0"
 ROBOT_TYPE = "mobile_panda"

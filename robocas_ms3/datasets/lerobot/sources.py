@@ -10,10 +10,10 @@ from robocas_ms3.datasets.lerobot.request import EpisodeSource, OnFrame, Request
 from robocas_ms3.datasets.lerobot.schema import whole_rate
 from robocas_ms3.datasets.provenance import fingerprint, scene_record, succeeded
 from robocas_ms3.datasets.timing import Timing
-from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.datasets.writer import FrameSource, Shown, show_episode
-from robocas_ms3.demos.sampling import sample_stride
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.motion import sample_stride
+from robocas_ms3.recordings.reading import TrajectoryFile
 
 DEFAULT_RATE = 5.0
 
@@ -38,7 +38,7 @@ class TrajectorySource:
         """
         self._request = request
         self._rate = DEFAULT_RATE if request.rate_hz is None else request.rate_hz
-        self._file = TrajectoryFile(request.path)
+        self._file = TrajectoryFile(request.path, pack=request.pack)
         try:
             self.fps = whole_rate(self._rate)
             self._stride = sample_stride(self._file.control_freq, self._rate)
@@ -80,7 +80,7 @@ class TrajectorySource:
             if self._source is None or recording.control_mode != self._control_mode:
                 self._close_source()
                 request = self._request
-                self._source = request.open_source(self._file.env_info, recording.control_mode, request.pictures)
+                self._source = request.open_source(self._file.env, recording.control_mode, request.pictures)
                 self._control_mode = recording.control_mode
         shown = show_episode(
             recording,

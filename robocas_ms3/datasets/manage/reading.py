@@ -16,9 +16,9 @@ from robocas_ms3.datasets.manage.picture_check import check_pictures
 from robocas_ms3.datasets.reader import Dataset, Episode, said_of
 from robocas_ms3.datasets.rigid import NORM_TOLERANCE, POSITION_TOLERANCE, is_rigid, same
 from robocas_ms3.datasets.tolerant import SPECS, complete, derive_motion, load_arrays, planar_motion
-from robocas_ms3.demos.sampling import relative_motion
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.language.templates import GOAL_TYPES
+from robocas_ms3.recordings.motion import relative_motion
 
 ESSENTIAL = (
     "ee_pos",

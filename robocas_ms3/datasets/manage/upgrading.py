@@ -19,12 +19,12 @@ from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.plan import dataset_settings
 from robocas_ms3.datasets.provenance import fingerprint, scene_record, task_of
 from robocas_ms3.datasets.reader import Dataset, Episode
-from robocas_ms3.datasets.trajectory import Recording, TrajectoryFile
 from robocas_ms3.datasets.workers import OpenSource
 from robocas_ms3.datasets.writer import FrameSource
-from robocas_ms3.demos.sampling import sample_states, sample_stride
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import locked_folder, replacing, write_json
+from robocas_ms3.recordings.motion import sample_states, sample_stride
+from robocas_ms3.recordings.reading import Recording, TrajectoryFile
 
 _SAME_JOINTS = 1e-4  # rad
 _IN_SCENES = ("trajectory", "env_info", "control_freq")  # of version 1's conversion.json, in scene.json now
@@ -60,7 +60,7 @@ class _Source:
     def scene(self, recording: Recording) -> dict[str, Any]:
         if self.shown is None or recording.control_mode != self.control_mode:
             self.close()
-            self.shown = self.open_source(self.file.env_info, recording.control_mode, _SMALLEST)
+            self.shown = self.open_source(self.file.env, recording.control_mode, _SMALLEST)
             self.control_mode = recording.control_mode
         self.shown.load(recording)
         return self.shown.scene()
@@ -203,7 +203,7 @@ def _record(
     recording = _recording(entry, source, dataset.root)
     stride = sample_stride(source.file.control_freq, dataset.rate_hz)
     samples = sample_states(recording.control_steps, stride)
-    joints = recording.joints(samples).qpos[:, 3:10]
+    joints = recording.motion(samples).qpos[:, 3:10]
     found = episode.arrays.get("robot_joints")
     if found is None or found.shape != joints.shape or not np.abs(found - joints).max() <= _SAME_JOINTS:  # NaN too
         raise DatasetError(

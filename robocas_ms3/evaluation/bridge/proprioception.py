@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.episode import Joints, episode_arrays, robot_frames
+from robocas_ms3.datasets.episode import episode_arrays
 from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
-from robocas_ms3.demos.sampling import gripper_open, invert, to_matrices
-from robocas_ms3.robots.constants import ARM_BASE_LINK, BASE_SLICE, FINGER_SLICE, FINGER_TARGETS
+from robocas_ms3.recordings.motion import Motion, gripper_open, invert, to_matrices
+from robocas_ms3.robots.constants import ARM_BASE_LINK, BASE_SLICE, FINGER_SLICE
 from robocas_ms3.robots.forward import chain
 from robocas_ms3.robots.urdf import robot_files
 
@@ -69,12 +69,11 @@ class Proprioception:
             gripper: its command in force, -1 closed to 1 open; None: there was none yet.
         """
         robot, qpos = self._robots[env], _row(obs, env)[0]
-        joints = Joints(qpos, obs["agent"]["qvel"][env][None].astype(np.float64), robot.root)
+        qvel = obs["agent"]["qvel"][env][None].astype(np.float64)
         commands = np.array([] if gripper is None else [gripper])
-        status = gripper_open(
-            commands, np.array([len(commands)]), finger_range=FINGER_TARGETS, initial_width=robot.width
-        )
-        columns = frame_columns(episode_arrays(robot_frames(joints), joints, status, "", []))
+        opened = gripper_open(commands, np.array([len(commands)]), initial_width=robot.width)
+        motion = Motion.of_joints(robot.root, qpos, qvel, opened)
+        columns = frame_columns(episode_arrays(motion, "", []))
         found = {name: columns[column][0] for name, column in KEYS.items()}
         robot.last = found if robot.last is None else _continued(robot.last, found)
         return robot.last

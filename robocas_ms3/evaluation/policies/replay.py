@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.demos.record import open_trajectory, read_json
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.recordings.entries import read_json, read_reset
+from robocas_ms3.recordings.environment import read_env
+from robocas_ms3.recordings.reading import open_trajectory
 
 
 class ReplayPolicy:
@@ -27,16 +29,18 @@ class ReplayPolicy:
 
     def __init__(self, trajectory: Path) -> None:
         data = read_json(trajectory)
-        kwargs = data["env_info"]["env_kwargs"]
-        if kwargs["control_mode"] != "pd_joint_pos":
+        env = read_env(data["env_info"], trajectory.with_suffix(".json"))
+        if env.control_mode != "pd_joint_pos":
             raise EvaluationError(
-                "can't be played here", where=trajectory, expected="pd_joint_pos", found=kwargs["control_mode"]
+                "can't be played here", where=trajectory, expected="pd_joint_pos", found=env.control_mode
             )
         self._trajectory = trajectory
-        self._episodes = {int(one["episode_seed"]): one["episode_id"] for one in data["episodes"]}
+        self._episodes = {
+            read_reset(one, f"{trajectory}, traj_{one['episode_id']}")[0]: one["episode_id"] for one in data["episodes"]
+        }
         self.wants = Wants(
             convention="joint_positions",
-            rate_hz=kwargs.get("sim_config", {}).get("control_freq", 20),
+            rate_hz=env.kwargs.get("sim_config", {}).get("control_freq", 20),
             language="none",
         )
         self._followers = Followers()

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
-from robocas_ms3.demos.sampling import sample_stride
 from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack, PoseTrack, Track
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.recordings.motion import sample_stride
 from robocas_ms3.robots.constants import ROBOT_UID
 
 _FREQ = 20  # Hz, at which it plans

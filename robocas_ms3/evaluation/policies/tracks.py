@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.demos.sampling import gripper_open, invert, sample_states, split_states
 from robocas_ms3.evaluation.policy import Observations
-from robocas_ms3.robots.constants import ARM_SLICE, FINGER_SLICE, FINGER_TARGETS
-from robocas_ms3.robots.forward import link_poses
+from robocas_ms3.recordings.motion import Motion, sample_states
+from robocas_ms3.robots.constants import ARM_SLICE
 
 Array = NDArray[np.floating]
 
@@ -70,11 +69,8 @@ class PoseTrack:
             stride: control steps a policy step.
         """
         samples = sample_states(len(gripper), stride)
-        root, qpos, _ = split_states(robot_states)
-        tcp, base = link_poses(root[samples], qpos[samples])
-        width = float(qpos[0, FINGER_SLICE].sum())
-        opened = gripper_open(gripper, samples, finger_range=FINGER_TARGETS, initial_width=width)
-        return cls((invert(base) @ tcp)[1:], opened[1:])
+        motion = Motion.of(robot_states, gripper, samples)
+        return cls(motion.tcp_in_base[1:], motion.gripper_open[1:])
 
     def next(self, observations: Observations, row: int) -> Array:
         """(7,) a motion in RoboCAS' convention; see `Track`."""

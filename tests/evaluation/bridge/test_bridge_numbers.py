@@ -6,17 +6,16 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from robocas_ms3.datasets.episode import Joints, episode_arrays, robot_frames
+from robocas_ms3.datasets.episode import episode_arrays
 from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
-from robocas_ms3.demos.sampling import gripper_open, invert, to_matrices
 from robocas_ms3.evaluation.bridge.proprioception import KEYS, WIDTHS, Proprioception
-from robocas_ms3.robots.constants import FINGER_TARGETS
+from robocas_ms3.recordings.motion import Motion, gripper_open, to_matrices
 
 STEPS = 60
 COMMANDS = np.where(np.arange(STEPS) // 7 % 2, -1.0, 1.0)
 
 
-def moving(seed: int) -> Joints:
+def moving(seed: int) -> Motion:
     """A robot that turns on the spot, more than once, and swings its arm through where the quaternion's sign jumps."""
     rng = np.random.default_rng(seed)
     root = np.array([[0.4, -1.2, 0.0, np.cos(1.1), 0, 0, np.sin(1.1)]])
@@ -25,10 +24,11 @@ def moving(seed: int) -> Joints:
     qpos[:, 10:] = 0.04
     qpos = qpos.astype(np.float32).astype(np.float64)
     qvel = rng.normal(size=(STEPS, 12)).astype(np.float32).astype(np.float64)
-    return Joints(qpos, qvel, np.tile(to_matrices(root), (STEPS, 1, 1)))
+    opened = gripper_open(COMMANDS, np.arange(STEPS), initial_width=0.08)
+    return Motion.of_joints(np.tile(to_matrices(root), (STEPS, 1, 1)), qpos, qvel, opened)
 
 
-def observed(robots: list[Joints], step: int) -> dict:
+def observed(robots: list[Motion], step: int) -> dict:
     """The observation of a vector environment at a step: float32, poses wxyz."""
 
     def seven(poses):
@@ -37,15 +37,13 @@ def observed(robots: list[Joints], step: int) -> dict:
         turn = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
         return np.concatenate([poses[:, :3, 3], turn], axis=1)[step].astype(np.float32)
 
-    frames = [robot_frames(joints) for joints in robots]
-    in_base = [invert(one.arm_base_in_world) @ one.tcp_in_world for one in frames]
     return {
         "agent": {
-            "qpos": np.stack([joints.qpos[step] for joints in robots]).astype(np.float32),
-            "qvel": np.stack([joints.qvel[step] for joints in robots]).astype(np.float32),
-            "tcp_in_arm_base": np.stack([seven(poses) for poses in in_base]),
+            "qpos": np.stack([robot.qpos[step] for robot in robots]).astype(np.float32),
+            "qvel": np.stack([robot.qvel[step] for robot in robots]).astype(np.float32),
+            "tcp_in_arm_base": np.stack([seven(robot.tcp_in_base) for robot in robots]),
         },
-        "extra": {"tcp_pose": np.stack([seven(one.tcp_in_world) for one in frames])},
+        "extra": {"tcp_pose": np.stack([seven(robot.tcp_in_world) for robot in robots])},
     }
 
 
@@ -58,10 +56,8 @@ def test_every_step_of_two_envs_is_what_a_dataset_holds():
         for env in range(2):
             command = None if step == 0 else float(COMMANDS[step - 1])
             read[env].append(feels.read(env, observed(robots, step), command))
-    for env, joints in enumerate(robots):
-        samples = np.arange(STEPS)
-        status = gripper_open(COMMANDS, samples, finger_range=FINGER_TARGETS, initial_width=0.08)
-        columns = frame_columns(episode_arrays(robot_frames(joints), joints, status, "", []))
+    for env, robot in enumerate(robots):
+        columns = frame_columns(episode_arrays(robot, "", []))
         for name, column in KEYS.items():
             found = np.stack([one[name] for one in read[env]])
             assert found.dtype == np.float32

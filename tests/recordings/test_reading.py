@@ -5,13 +5,18 @@ import numpy as np
 import pytest
 from synthetic import STEPS, make_states, write_trajectory
 
-from robocas_ms3.datasets.trajectory import TrajectoryFile
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.reading import TrajectoryFile
 
 
 @pytest.fixture
 def own(tmp_path):
     return write_trajectory(tmp_path / "F.h5", seeds=(3,))
+
+
+@pytest.fixture
+def trajectory(tmp_path):
+    return write_trajectory(tmp_path / "F.h5", seeds=(3, 4, 5))
 
 
 def edit_json(path, change):
@@ -30,13 +35,13 @@ def test_what_was_written_is_read(trajectory):
     assert [(g.first, g.last) for g in recording.subgoals] == [(0, 11), (12, 21)]
     states = make_states(4)
     np.testing.assert_array_equal(recording.state(7)["actors"]["object_1"], states["actors"]["object_1"][7:8])
-    joints = recording.joints(np.array([0, STEPS]))
+    motion = recording.motion(np.array([0, STEPS]))
     robot = states["articulations"]["robocas_mobile_panda"]
-    np.testing.assert_array_equal(joints.qpos, robot[[0, STEPS], 13:25])
-    np.testing.assert_array_equal(joints.qvel, robot[[0, STEPS], 25:])
+    np.testing.assert_array_equal(motion.qpos, robot[[0, STEPS], 13:25])
+    np.testing.assert_array_equal(motion.qvel, robot[[0, STEPS], 25:])
     # The root is turned by 90 deg: its x axis is the world's y.
-    np.testing.assert_allclose(joints.root_in_world[0, :3, 0], [0, 1, 0], atol=1e-6)
-    np.testing.assert_allclose(joints.root_in_world[0, :3, 3], [0.7, 0.15, 0], atol=1e-6)
+    np.testing.assert_allclose(motion.root_in_world[0, :3, 0], [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(motion.root_in_world[0, :3, 3], [0.7, 0.15, 0], atol=1e-6)
 
 
 def fails(path, match):
@@ -97,3 +102,62 @@ def test_an_episode_without_states(own):
     with h5py.File(own, "a") as file:
         del file["traj_0/env_states"]
     fails(own, "this episode is damaged")
+
+
+def spoil(path, name, row):
+    with h5py.File(path, "a") as file:
+        file[f"traj_0/{name}"][row] = np.nan
+
+
+@pytest.mark.parametrize(
+    ("name", "row"),
+    [("actions", 21), ("env_states/actors/object_1", 3), ("env_states/articulations/robocas_mobile_panda", 0)],
+)
+def test_no_numbers(own, name, row):
+    spoil(own, name, row)
+    fails(own, f"{name.removeprefix('env_states/')}, row {row}: NaN or infinity")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"episode_seed": "3"}, "episode_seed: no such seed .expected an integer from 0 on, found 3"),
+        ({"episode_seed": -1}, "no such seed"),
+        ({"episode_seed": [3, 4]}, "no such seed"),
+        ({"episode_seed": True}, "no such seed"),
+        ({"reset_kwargs": {"options": {"reset_to_env_states": {}}}}, "options: a file can't choose these"),
+        ({"reset_kwargs": {"options": {"reconfigure": "yes"}}}, "options: a file can't choose these"),
+        ({"control_mode": 3}, "control_mode: the JSON's entry is wrong .expected text"),
+        ({"elapsed_steps": 2.0}, "elapsed_steps: the JSON's entry is wrong .expected an integer"),
+        ({"robocas": []}, "the JSON's entry is incomplete"),
+    ],
+)
+def test_entries_that_are_wrong(own, change, message):
+    edit_json(own, lambda data: data["episodes"][0].update(change))
+    fails(own, message)
+
+
+def test_sub_goals_that_are_wrong(own):
+    for goals in (3, [3], [{"goal_type": "a", "goal_description": "b", "goal_range": [0.0, 21]}], [{}]):
+        edit_json(own, lambda data, goals=goals: data["episodes"][0]["robocas"].update(subgoals=goals))
+        fails(own, "subgoals: these sub-goals are damaged")
+
+
+@pytest.mark.parametrize("freq", [0, -20, "20", True, None, float("nan"), float("inf")])
+def test_a_frequency_that_is_none(own, freq):
+    edit_json(own, lambda data: data["robocas"].update(control_freq=freq))
+    fails(own, "control_freq: no such frequency .expected a number > 0")
+
+
+def test_reconfiguring_is_an_option(own):
+    edit_json(own, lambda data: data["episodes"][0].update(reset_kwargs={"options": {"reconfigure": True}}))
+    with TrajectoryFile(own) as file:
+        assert file.entry(0).reset_options == {"reconfigure": True}
+
+
+def test_the_robot_alone(own):
+    with TrajectoryFile(own) as file:
+        whole, alone = file.recording(0), file.recording(0, bodies=False)
+    assert alone.states["actors"] == {}
+    samples = np.array([0, 4, 22])
+    np.testing.assert_array_equal(whole.motion(samples).actions, alone.motion(samples).actions)

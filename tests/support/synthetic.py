@@ -7,12 +7,11 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import to_matrices, wxyz_to_xyzw
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.writer import CameraModel, Frame
-from robocas_ms3.demos.sampling import invert
+from robocas_ms3.recordings.motion import invert
+from robocas_ms3.robots.constants import ARM_EVALUATION_START
 
 STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one
 SIZE = (64, 48)
@@ -40,17 +39,6 @@ def looking(eye, at):
     return matrix
 
 
-def robot_frames(robot_state):
-    """Made-up kinematics: arm base and TCP in the world from (13 + 24,) of a state."""
-    root = to_matrices(robot_state[:3].astype(float), wxyz_to_xyzw(robot_state[3:7].astype(float)))
-    q = robot_state[13:25].astype(float)
-    base = root @ pose([q[0], q[1], 0.49], Rotation.from_euler("z", q[2]))
-    tcp = pose(
-        [0.55 + 0.1 * q[4], 0.3 * q[3], 0.35 + 0.1 * q[6]], Rotation.from_euler("ZX", [q[9], np.pi + 0.1 * q[8]])
-    )
-    return base, base @ tcp
-
-
 CAMERA_IN_PARENT = {
     "base_camera": looking([0.1, 0.3, 1.2], [0.8, 0.0, 0.0]),
     "gripper_camera": pose([0.06, 0.0, -0.1]),
@@ -60,9 +48,6 @@ CAMERA_IN_PARENT = {
 
 class RayCaster:
     """A ``FrameSource``: floor, room, table and a cube for each actor."""
-
-    gripper_column = 7
-    finger_range = (-0.01, 0.04)
 
     def __init__(self, env_info, control_mode, pictures=None):
         self.pictures = pictures or Pictures()
@@ -91,15 +76,15 @@ class RayCaster:
         return np.array([height / 2, height / 2, width / 2, height / 2])  # 90 deg upright
 
     def frames(self, recording, samples):
-        for index in samples:
+        motion = recording.motion(np.asarray(samples))
+        for index, base, tcp in zip(samples, motion.arm_base_in_world, motion.tcp_in_world, strict=True):
             state = recording.state(int(index))
-            base, tcp = robot_frames(state["articulations"]["robocas_mobile_panda"][0])
             parents = {"base_camera": base, "gripper_camera": tcp, "static_camera": np.eye(4)}
             boxes = [TABLE] + [(p[0, :3] - HALF, p[0, :3] + HALF) for p in state["actors"].values()]
             wanted = {n: CAMERA_IN_PARENT[n] for n in self.pictures.cameras}
             shots = {n: self.shoot(parents[n] @ camera, boxes) for n, camera in wanted.items()}
             depth = {n: p[1] for n, p in shots.items() if self.pictures.depth}
-            yield Frame({n: p[0] for n, p in shots.items()}, depth, tcp, base)
+            yield Frame({n: p[0] for n, p in shots.items()}, depth)
 
     def shoot(self, camera_in_world, boxes):
         width, height = self.size
@@ -127,7 +112,7 @@ def make_states(seed, steps=STEPS):
     rng = np.random.default_rng(seed)
     t = np.linspace(0, 1, steps + 1)[:, None]
     qpos = np.zeros((steps + 1, 12))
-    qpos[:, 3:10] = rng.uniform(-0.5, 0.5, 7) + t * rng.uniform(-0.6, 0.6, 7)
+    qpos[:, 3:10] = np.array(ARM_EVALUATION_START) + rng.uniform(-0.1, 0.1, 7) + t * rng.uniform(-0.15, 0.15, 7)
     qpos[:, 10:] = np.where(t < 0.4, 0.04, 0.02)
     robot = np.zeros((steps + 1, 37), np.float32)
     robot[:, :3] = 0.7, 0.15, 0.0

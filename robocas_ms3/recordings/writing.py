@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import version
@@ -18,12 +17,14 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.wrappers.record import parse_env_info
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing, write_json
+from robocas_ms3.recordings.entries import read_json
+from robocas_ms3.recordings.environment import recorded_id
+from robocas_ms3.recordings.reading import open_trajectory
 from robocas_ms3.tasks.base import RoboCASEnv
 
 # Settings of one machine or one run; a trajectory has to replay without them.
-_LOCAL_KWARGS = ("render_backend", "render_mode", "sim_backend", "reward_mode")
+_LOCAL_KWARGS = ("layouts", "render_backend", "render_mode", "sim_backend", "reward_mode")
 _PICTURES = ("rgb", "depth", "seg")
 
 
@@ -119,8 +120,7 @@ class EpisodeRecorder(gym.Wrapper):
         assert info is not None, "the environment was made by gym.make"
         kwargs = {key: value for key, value in info["env_kwargs"].items() if key not in _LOCAL_KWARGS}
         return {
-            # with the module's name in front gymnasium imports this package by itself: ManiSkill's own tools then work
-            "env_id": f"robocas_ms3:{info['env_id']}",
+            "env_id": recorded_id(str(info["env_id"])),
             "env_kwargs": kwargs,
             "max_episode_steps": find_max_episode_steps_value(self.env),
         }
@@ -196,34 +196,3 @@ def merge(shards: list[Path], out: Path) -> None:
                         episodes.append({**episode, "episode_id": number})
         # the JSON first: an HDF5 file that is there always has its JSON
         write_json(out.with_suffix(".json"), {**merged, "episodes": episodes})
-
-
-def open_trajectory(path: Path) -> h5py.File:
-    """Open an HDF5 trajectory for reading.
-
-    Raises:
-        DatasetError: it is missing, damaged or no HDF5 file.
-    """
-    try:
-        return h5py.File(path, "r")
-    except FileNotFoundError as error:
-        raise DatasetError("no such trajectory file", where=path) from error
-    except OSError as error:
-        raise DatasetError(
-            "this is no readable HDF5 file; it may have been cut short", where=path, fix="Generate it again."
-        ) from error
-
-
-def read_json(trajectory: Path) -> dict[str, Any]:
-    """Read the JSON beside a trajectory.
-
-    Raises:
-        DatasetError: it is missing or damaged.
-    """
-    path = trajectory.with_suffix(".json")
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DatasetError("the trajectory's JSON is missing", where=path) from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DatasetError("the trajectory's JSON is damaged", where=path, found=error) from error

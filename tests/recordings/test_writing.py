@@ -10,7 +10,7 @@ import pytest
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 import robocas_ms3.tasks  # noqa: F401
-from robocas_ms3.demos.record import EpisodeRecorder
+from robocas_ms3.recordings.writing import EpisodeRecorder
 from robocas_ms3.robots.constants import ARM_REST
 
 pytestmark = pytest.mark.slow

@@ -7,6 +7,8 @@ step alone is shorter.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -50,7 +52,6 @@ def gripper_open(
     commands: NDArray[np.floating],
     samples: NDArray[np.int64],
     *,
-    finger_range: tuple[float, float],
     initial_width: float,
 ) -> NDArray[np.bool_]:
     """Gripper command in force at each sampled state: that of the action which led there.
@@ -60,13 +61,12 @@ def gripper_open(
     Args:
         commands: (S,) gripper actions in [-1, 1].
         samples: (T,) from ``sample_states``.
-        finger_range: target of one finger at -1 and at +1, m.
         initial_width: of the gripper at reset, m, which is its target until the first action.
 
     Returns:
         (T,) bool.
     """
-    low, high = finger_range
+    low, high = FINGER_TARGETS
     finger_targets = low + (np.clip(commands, -1, 1) + 1) / 2 * (high - low)
     widths = np.concatenate([[initial_width], 2 * finger_targets])
     return widths[samples] > OPEN_WIDTH + 1e-6
@@ -114,24 +114,60 @@ def stored_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[n
     return actions.astype(np.float32)
 
 
-def dataset_actions(
-    robot_states: NDArray[np.floating], gripper: NDArray[np.floating], samples: NDArray[np.int64]
-) -> NDArray[np.float32]:
-    """What a dataset will hold of a recording, to the last bit: the actions between its sampled states.
+@dataclass(frozen=True)
+class Motion:
+    """What the robot did, at the T states that a dataset keeps of an episode.
 
-    Args:
-        robot_states: (S + 1, 37) after the reset and after each control step.
-        gripper: (S,) commands in [-1, 1].
-        samples: (T,) indices of states, from ``sample_states``, the first of them 0, or some of them in a row.
-
-    Returns:
-        (T - 1, 7) actions.
+    Attributes:
+        qpos: (T, 12) base x, y, yaw, 7 arm joints, 2 fingers, m and rad.
+        qvel: (T, 12) the same order.
+        root_in_world: (T, 4, 4).
+        tcp_in_world: (T, 4, 4), by forward kinematics.
+        arm_base_in_world: (T, 4, 4), the same.
+        gripper_open: (T,) bool, commands, see `gripper_open`.
     """
-    root_in_world, qpos, _ = split_states(robot_states[samples])
-    tcp, base = link_poses(root_in_world, qpos)
-    width = float(robot_states[0, _POSE : _POSE + len(JOINTS)][FINGER_SLICE].astype(np.float64).sum())
-    status = gripper_open(gripper, samples, finger_range=FINGER_TARGETS, initial_width=width)
-    return stored_actions(*stored_motion(invert(base) @ tcp), status)[:-1]
+
+    qpos: Array
+    qvel: Array
+    root_in_world: Array
+    tcp_in_world: Array
+    arm_base_in_world: Array
+    gripper_open: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls, robot_states: NDArray[np.floating], gripper: NDArray[np.floating], samples: NDArray[np.int64]
+    ) -> Motion:
+        """The one way from recorded states to what datasets hold of them, to the last bit.
+
+        Args:
+            robot_states: (S + 1, 37) after the reset and after each control step.
+            gripper: (S,) commands in [-1, 1].
+            samples: (T,) indices of states, from `sample_states`, or some of them in a row.
+        """
+        root_in_world, qpos, qvel = split_states(robot_states[samples])
+        width = float(split_states(robot_states[:1])[1][0, FINGER_SLICE].sum())
+        return cls.of_joints(root_in_world, qpos, qvel, gripper_open(gripper, samples, initial_width=width))
+
+    @classmethod
+    def of_joints(cls, root_in_world: Array, qpos: Array, qvel: Array, opened: NDArray[np.bool_]) -> Motion:
+        """Of what the attributes of these names say."""
+        return cls(qpos, qvel, root_in_world, *link_poses(root_in_world, qpos), opened)
+
+    @property
+    def tcp_in_base(self) -> Array:
+        """(T, 4, 4)."""
+        return invert(self.arm_base_in_world) @ self.tcp_in_world
+
+    @property
+    def actions(self) -> NDArray[np.float32]:
+        """(T, 7), see `stored_actions`."""
+        return stored_actions(*stored_motion(self.tcp_in_base), self.gripper_open)
+
+
+def gripper_commands(actions: NDArray[np.floating], control_mode: str) -> NDArray[np.floating]:
+    """(S,) of the gripper, in [-1, 1]: behind 6 numbers of the end effector, or 7 joints, in (S, A) actions."""
+    return actions[:, 6 if "_ee_" in control_mode else 7]
 
 
 def split_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:
