@@ -112,7 +112,7 @@ def content_hash(*parts: object, files: Iterable[Path] = (), packages: Sequence[
     Args:
         parts: settings; must have a telling ``repr``.
         files: source files; their names count too.
-        packages: folders of ``asset_tools`` with further code that takes part, besides what all assets share.
+        packages: folders of ``asset_tools`` with further code and YAML that takes part, besides what all assets share.
     """
     digest = hashlib.sha256(repr((SCHEMA_VERSION, parts)).encode())
     for path in files:
@@ -126,7 +126,7 @@ def content_hash(*parts: object, files: Iterable[Path] = (), packages: Sequence[
 def _code(package: str) -> str:
     here = Path(__file__).parent
     digest = hashlib.sha256()
-    for path in sorted((here / package).glob("*.py")):
+    for path in sorted(path for path in (here / package).iterdir() if path.suffix in (".py", ".yaml")):
         if package or not path.name.startswith(NOT_INVOLVED):
             digest.update(path.read_bytes())
     if not package:

@@ -60,6 +60,7 @@ def modules(folder: Path) -> dict[str, Path]:
 
 
 MODULES = modules(PACKAGE)
+MESH_TOOLS = modules(ROOT / "asset_tools")
 
 
 @lru_cache
@@ -84,7 +85,7 @@ def imports(module: str, path: Path) -> tuple[tuple[str, bool], ...]:
             for alias in node.names:
                 # `from robocas_ms3 import paths` names a module, `from robocas_ms3.paths import data_dir` does not
                 name = f"{base}.{alias.name}"
-                found.append((name if name in MODULES else base, id(node) in local))
+                found.append((name if name in MODULES or name in MESH_TOOLS else base, id(node) in local))
     return tuple(found)
 
 
@@ -149,9 +150,22 @@ def test_mesh_tools_are_imported_by_the_assets_command_alone_when_it_runs():
     assert users <= {("robocas_ms3.cli.assets_make", True), ("robocas_ms3.cli.assets_show", True)}
 
 
+def test_the_builtin_formulas_are_imported_by_their_command_alone():
+    """They are not in the wheel."""
+    shipped = MODULES | MESH_TOOLS | {"robocas_cli": ROOT / "robocas_cli.py"}
+    users = {
+        (module, local)
+        for module, path in shipped.items()
+        if not module.startswith("asset_tools.builtin")
+        for name, local in imports(module, path)
+        if f"{name}.".startswith("asset_tools.builtin.")
+    }
+    assert users == {("robocas_ms3.cli.assets_make", True)}
+
+
 def test_mesh_tools_know_only_the_lowest_layers():
     allowed = {"errors", "paths", "files", "assets"}
-    for module, path in modules(ROOT / "asset_tools").items():
+    for module, path in MESH_TOOLS.items():
         for name, _ in imports(module, path):
             if name.startswith("robocas_ms3"):
                 assert layer(name) in allowed, f"{module} imports {name}"

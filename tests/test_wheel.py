@@ -25,6 +25,16 @@ env.close()
 """
 
 
+IMPORT_ALL = """
+import importlib, pkgutil
+import asset_tools
+names = [found.name for found in pkgutil.walk_packages(asset_tools.__path__, "asset_tools.")]
+for name in names:
+    importlib.import_module(name)
+print(asset_tools.__file__, *names)
+"""
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
@@ -50,9 +60,13 @@ def installed(wheel, tmp_path_factory) -> Path:
     return python
 
 
-def run(python: Path, *words: str, cwd: Path) -> str:
+def call(python: Path, *words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run([python, *words], cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+    return subprocess.run([python, *words], cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+
+
+def run(python: Path, *words: str, cwd: Path) -> str:
+    done = call(python, *words, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -73,7 +87,8 @@ def test_configs_and_builtin_pack_travel_in_the_wheel(wheel):
     for asset in json.loads(manifest.read_text())["assets"]:
         for file in asset["files"]:
             assert f"robocas_ms3/data/packs/builtin/{asset['id']}/{file}" in names
-    assert not [name for name in names if name.startswith(("tests/", "scripts/", "task_configs/"))]
+    left_out = ("tests/", "scripts/", "task_configs/", "asset_tools/builtin")
+    assert not [name for name in names if name.startswith(left_out)]
     assert wheel.stat().st_size < 60e6
 
 
@@ -91,3 +106,19 @@ def test_the_command_runs_from_the_wheel(installed, tmp_path):
     (builtin,) = [pack for pack in found["packs"] if pack["name"] == "builtin"]
     assert Path(builtin["folder"]).is_relative_to(installed.parent.parent)
     assert builtin["error"] == ""
+
+
+def test_mesh_tools_work_without_the_formulas(installed, tmp_path):
+    file, *names = run(installed, "-c", IMPORT_ALL, cwd=tmp_path).split()
+    assert Path(file).is_relative_to(installed.parent.parent)
+    assert "asset_tools.partnet.importer" in names
+    assert not [name for name in names if name.startswith("asset_tools.builtin")]
+
+
+def test_the_builtin_pack_is_not_built_from_a_wheel(installed, tmp_path):
+    done = call(installed, str(installed.with_name("robocas")), "assets", "build", cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "error: the formulas of the builtin pack are not installed (expected asset_tools/builtin of the repository, "
+        "found an installed wheel). Clone the repository to change them; the pack itself is installed and complete.\n"
+    )

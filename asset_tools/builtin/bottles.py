@@ -6,8 +6,10 @@ Rings are (half_x, half_y, z, exponent, corner cut) in metres, see ``surfaces``.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 from scipy.optimize import root_scalar
 
 from asset_tools.builtin.mesh import Patch, Shape, Size, fitted
@@ -23,22 +25,46 @@ from asset_tools.builtin.surfaces import (
 )
 
 Ring = tuple[float, float, float, float, float]
+Row = Annotated[Sequence[float], Field(min_length=2, max_length=5)]  # of a product's file, see ``bottle``
 
 
-def squeeze_bottle(size: Size) -> Shape:
-    """A flat bottle that narrows upwards, with a conical nozzle. Regions: side, shoulder, cap, bottom."""
-    a, b, h = _halves(size)
-    side = [*_foot(a * 0.97, b, 4), (a, b, h * 0.2, 4, 0.04), (a * 0.72, b, h * 0.68, 4, 0)]
-    shoulder = [(a * 0.68, b * 0.9, h * 0.765, 2.8, 0.016), _neck(0.019, h * 0.835)]
-    cap = [_neck(0.021, h * 0.835), _neck(0.021, h * 0.88, 0.002), _neck(0.0105, h * 0.9, 0.006)]
-    cap += [_neck(0.0055, h * 0.992, 0.002), _neck(0.004, h, 0.002), _neck(0, h)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.68, h * 0.835, h * 0.9])
-
-
-def flip_top_bottle(
-    size: Size, *, exponent: float = 2.4, cap_height: float = 0.2, taper: float = 0.6, waist: float = 0.0
+def bottle(
+    size: Size,
+    *,
+    foot: tuple[float, float, float],
+    side: Sequence[Row],
+    shoulder: Sequence[Row],
+    cap: Sequence[Row],
+    cuts: Sequence[float],
 ) -> Shape:
-    """An oval bottle whose shoulders go on into a wide oval cap.
+    """A bottle that is a stack of rings.
+
+    Args:
+        size: see ``shapes``.
+        foot: half width and half depth of the rounded lower edge, as fractions of the size's; exponent.
+        side, shoulder, cap: rings upwards: half width, half depth, height as fractions of the size's, exponent, corner
+            cut in m; or, of round ones, radius in m, height as a fraction, corner cut in m (0), exponent (2).
+        cuts: see ``stacked_pieces``, as fractions of the height.
+    """
+    a, b, h = _halves(size)
+
+    def rings(rows: Sequence[Row]) -> list[Ring]:
+        found = []
+        for row in rows:
+            if len(row) == 5:
+                x, y, z, exponent, cut = row
+                found.append((a * x, b * y, h * z, exponent, cut))
+            else:
+                radius, z, cut, exponent = (*row, *(0.0, 2.0)[len(row) - 2 :])
+                found.append((radius, radius, h * z, exponent, cut))
+        return found
+
+    lower = _foot(a * foot[0], b * foot[1], foot[2])
+    return _bottle(size, [*lower, *rings(side)], rings(shoulder), rings(cap), cuts=[h * cut for cut in cuts])
+
+
+def flip_top_bottle(size: Size, *, exponent: float, cap_height: float, taper: float, waist: float) -> Shape:
+    """An oval bottle with a waist, whose shoulders go on into a wide oval cap.
 
     Args:
         size: see ``shapes``. exponent: of its section.
@@ -48,73 +74,13 @@ def flip_top_bottle(
     a, b, h = _halves(size)
     cap_z, top = h * (1 - cap_height), h * (0.88 - cap_height)
     ca, cb = a * taper, min(b * 0.84, a * taper)
-    side = [*_foot(a, b, exponent), (a, b, top, exponent, 0)]
-    cuts = [cap_z]
-    if waist:
-        middle = top * 0.52
-        narrow = a * (1 - waist), b * (1 - waist / 2)
-        side[2:2] = [(a, b, top * 0.14, exponent, 0.03), (*narrow, middle, exponent, 0.05)]
-        side[-1:] = [(a, b, top * 0.94, exponent, 0.03), (a, b, top, exponent, 0)]
-        cuts = [middle, cap_z]
+    middle = top * 0.52
+    side = [*_foot(a, b, exponent), (a, b, top * 0.14, exponent, 0.03)]
+    side += [(a * (1 - waist), b * (1 - waist / 2), middle, exponent, 0.05)]
+    side += [(a, b, top * 0.94, exponent, 0.03), (a, b, top, exponent, 0)]
     shoulder = [(a, b, top + 0.35 * (cap_z - top), exponent, 0.02), (ca * 0.97, cb * 0.97, cap_z, 2.2, 0)]
     cap = [(ca, cb, cap_z, 2.2, 0), (ca * 0.97, cb * 0.97, h, 2.2, 0.004), (ca * 0.8, cb * 0.8, h, 2.2, 0)]
-    return _bottle(size, side, shoulder, cap, cuts=cuts)
-
-
-def teardrop_bottle(size: Size) -> Shape:
-    """A flat bottle, broad low down, that narrows without shoulders into a flip-top cap."""
-    a, b, h = _halves(size)
-    side = [*_foot(a * 0.90, b * 0.94, 2.3), (a, b, h * 0.26, 2.3, 0.05), (a * 0.80, b * 0.93, h * 0.66, 2.3, 0)]
-    shoulder = [(a * 0.60, b * 0.80, h * 0.82, 2.3, 0)]
-    cap = [(a * 0.62, b * 0.83, h * 0.82, 2.3, 0), (a * 0.52, b * 0.72, h, 2.3, 0.006), (a * 0.4, b * 0.5, h, 2.3, 0)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.82])
-
-
-def disc_top_bottle(size: Size) -> Shape:
-    """A slender flat bottle with round shoulders and a small low cap."""
-    a, b, h = _halves(size)
-    side = [*_foot(a, b, 3), (a, b, h * 0.66, 3, 0)]
-    shoulder = [(a * 0.98, b * 0.98, h * 0.77, 3, 0.018), (a * 0.55, b * 0.7, h * 0.85, 2.4, 0.008)]
-    shoulder += [_neck(0.0100, h * 0.865, 0.002), _neck(0.0095, h * 0.885)]
-    cap = [_neck(0.0130, h * 0.885), _neck(0.0125, h, 0.002), _neck(0.0100, h)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.857, h * 0.885])
-
-
-def tapered_bottle(size: Size) -> Shape:
-    """Broad at the shoulders and narrow at the foot, nearly rectangular, with a slim tall cap."""
-    a, b, h = _halves(size)
-    side = [*_foot(a * 0.72, b * 0.78, 4), (a, b, h * 0.62, 4, 0)]
-    shoulder = [(a * 0.985, b * 0.985, h * 0.695, 3.5, 0.014), (0.014, 0.014, h * 0.75, 2.2, 0.006)]
-    shoulder += [_neck(0.0115, h * 0.765)]
-    cap = [_neck(0.0135, h * 0.765), _neck(0.0165, h, 0.002), _neck(0.0120, h)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.62, h * 0.75])
-
-
-def screw_cap_bottle(size: Size) -> Shape:
-    """A nearly rectangular bottle with a tall screw cap."""
-    a, b, h = _halves(size)
-    side = [*_foot(a, b, 4), (a, b, h * 0.6, 4, 0)]
-    shoulder = [(a, b, h * 0.7, 4, 0.022), _neck(0.016, h * 0.77, 0.004), _neck(0.0155, h * 0.80)]
-    cap = [_neck(0.0195, h * 0.8), _neck(0.018, h, 0.002), _neck(0.014, h)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.6, h * 0.77, h * 0.8])
-
-
-def flask(size: Size) -> Shape:
-    """A square flask with a long sloping neck and a measuring cup for a cap."""
-    a, b, h = _halves(size)
-    side = [*_foot(a, b, 5), (a, b, h * 0.46, 5, 0)]
-    shoulder = [(a, b, h * 0.51, 4.5, 0.012), _neck(0.0105, h * 0.735, 0.008), _neck(0.0105, h * 0.77)]
-    cap = [_neck(0.0130, h * 0.77), _neck(0.0180, h, 0.001), _neck(0.0150, h)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.735, h * 0.77])
-
-
-def foamer(size: Size) -> Shape:
-    """An oval bottle under a tall dome, which covers the foam pump."""
-    a, b, h = _halves(size)
-    side = [*_foot(a, b, 2.3), (a, b, h * 0.53, 2.3, 0)]
-    shoulder = [(a * 0.98, b * 0.98, h * 0.61, 2.3, 0.014), _neck(0.0170, h * 0.65)]
-    cap = [_neck(0.0185, h * 0.65), _neck(0.0182, h * 0.90, 0.02), _neck(0.0145, h * 0.985, 0.012), _neck(0, h)]
-    return _bottle(size, side, shoulder, cap, cuts=[h * 0.65])
+    return _bottle(size, side, shoulder, cap, cuts=[middle, cap_z])
 
 
 def drink_bottle(size: Size) -> Shape:
@@ -135,13 +101,12 @@ def drink_bottle(size: Size) -> Shape:
     return _bottle(size, side, shoulder, cap, pieces=pieces)
 
 
-def pump_bottle(size: Size, *, exponent: float = 3.0, body: float = 0.66, reach: float = 1.0) -> Shape:
+def pump_bottle(size: Size, *, exponent: float, body: float) -> Shape:
     """A bottle with a pump, its spout towards +x. Regions: side, shoulder, cap, spout, bottom.
 
     Args:
         size: see ``shapes``. exponent: of its section.
         body: height of its straight part, as a fraction of the height.
-        reach: of the spout, as a fraction of half the width.
     """
     a, b, h = _halves(size)
     side = [*_foot(a, b, exponent), (a, b, h * body, exponent, 0)]
@@ -151,7 +116,7 @@ def pump_bottle(size: Size, *, exponent: float = 3.0, body: float = 0.66, reach:
     cap += [_neck(0.005, h * 0.93, 0.001), (0.0135, 0.0115, h * 0.935, 2.4, 0.002)]
     cap += [(0.0145, 0.0125, h, 2.4, 0.004), _neck(0, h)]
     t = np.linspace(0, 1, 7)
-    path = np.stack([0.004 + (a * reach - 0.006) * t, 0 * t, h * 0.972 - 0.009 * t**3], axis=-1)
+    path = np.stack([0.004 + (a - 0.006) * t, 0 * t, h * 0.972 - 0.009 * t**3], axis=-1)
     radii = np.stack([0.0048 - 0.0014 * t, 0.0062 - 0.0024 * t], axis=-1)
     path, radii = np.concatenate([path[:1], path, path[-1:]]), np.concatenate([[[0, 0]], radii, [[0, 0]]])
     path[0, 0] -= 1e-4

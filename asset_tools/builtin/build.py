@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 
 from asset_tools.build import build_furniture, build_object
+from asset_tools.builtin.catalogue import products
 from asset_tools.builtin.furniture import MAKERS
-from asset_tools.builtin.objects import SPECS
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import FurnitureAsset, ObjectAsset
@@ -27,11 +27,11 @@ def builtin_jobs(ids: Sequence[str] = ()) -> list[Job]:
     Raises:
         AssetError: there is no such builtin asset.
     """
-    known = [*MAKERS, *(spec.id for spec in SPECS)]
+    known = [*MAKERS, *products()]
     unknown = sorted(set(ids) - set(known))
     if unknown:
         raise AssetError("no such builtin asset", expected=f"one of {', '.join(known)}", found=", ".join(unknown))
-    content = content_hash(packages=("builtin", "builtin/furniture"))
+    content = content_hash(packages=("builtin", "builtin/furniture", "builtin/products"))
     return [Job(id_, partial(build_asset, id_), content) for id_ in ids or known]
 
 
@@ -44,17 +44,17 @@ def build_asset(asset_id: str, folder: Path) -> ObjectAsset | FurnitureAsset:
     """
     if asset_id in MAKERS:
         return build_furniture(MAKERS[asset_id](), folder)
-    spec = {spec.id: spec for spec in SPECS}[asset_id]
-    shape, mesh = spec.build()
+    product = products()[asset_id]
+    shape, mesh = product.build()
     source = ObjectSource(
-        id=spec.id,
-        name=spec.name,
-        category=spec.category,
+        id=product.id,
+        name=product.name,
+        category=product.category,
         mesh=mesh,
         closed=shape.closed(),
-        mass=spec.mass,
-        graspnet_id=spec.graspnet_id,
+        mass=product.mass,
+        graspnet_id=product.graspnet_id,
         pieces=list(shape.pieces) or None,
-        hollow=spec.hollow,
+        hollow=product.hollow,
     )
     return build_object(source, folder)

@@ -23,8 +23,8 @@ def _spline_rings(points: Sequence[tuple[float, float]], count: int) -> np.ndarr
 
 def fruit(
     size: Size,
-    profile: Sequence[tuple[float, float]],
     *,
+    profile: Sequence[tuple[float, float]],
     lobes: float = 0.0,
     lean: float = 0.0,
     groove: float = 0.0,
@@ -70,6 +70,21 @@ def fruit(
         parts.append(sweep("stem", path, radii, normal=(0, 1, 0), segments=8, detail=0.6))
         pieces += chained_pieces(parts[1][0], 1)
     return fitted(parts, size, pieces=pieces)
+
+
+def round_fruit(
+    size: Size, *, radius: float, flatness: float, dimple: float, lobes: float = 0.0, groove: float = 0.0
+) -> Shape:
+    """A fruit that is a flattened ball with a dimple at the top.
+
+    Args:
+        size: see ``fruit``. radius: of the ball, m. flatness: its height as a fraction of its width.
+        dimple: its depth, m. lobes, groove: see ``fruit``.
+    """
+    angles = np.linspace(0, np.pi, 9)
+    line = [(float(radius * np.sin(a)), float(-radius * flatness * np.cos(a))) for a in angles]
+    line[-1] = (0.0, line[-1][1] - dimple)
+    return fruit(size, profile=line, lobes=lobes, groove=groove)
 
 
 def banana(size: Size) -> Shape:

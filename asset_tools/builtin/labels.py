@@ -2,25 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from PIL import Image
+from pydantic import AfterValidator
 
 from asset_tools.builtin.mesh import Shape
 from asset_tools.builtin.motifs import MOTIFS
 from asset_tools.builtin.textures import Box, Canvas, Colour, Painter
+from robocas_ms3.assets.manifest import StrictModel
 
 METAL = (186, 190, 194)
 PLATED = ("stripes", "diagonal", "dots")  # styles too busy to print on: words stand on a plate of the base colour
 
 
-@dataclass(frozen=True)
-class Label:
+FACTS = {  # heading and rows of the table on the back
+    "food": (
+        "Contents",
+        [("Energy", "420 kJ"), ("Fat", "0.8 g"), ("Sugars", "9.5 g"), ("Protein", "2.1 g"), ("Salt", "0.6 g")],
+    ),
+    "care": (
+        "Directions",
+        [("Use", "daily"), ("Skin", "all"), ("Water", "70 %"), ("Keep", "cool"), ("Open", "1 year")],
+    ),
+}
+
+
+def _known(motif: str) -> str:
+    if motif not in MOTIFS:
+        raise ValueError(f"no such motif; known are {', '.join(MOTIFS)}")
+    return motif
+
+
+class Label(StrictModel):
     """The print on a package.
 
-    Args:
+    Attributes:
         title, subtitle, amount: words; the title may hold line breaks.
         base, accent: the package's colours. ink: of the letters. outline: around the title's letters, or none.
         amount_ink: of the amount, where the ground there differs.
@@ -28,41 +46,26 @@ class Label:
         motif: a picture of ``MOTIFS``.
         cap: colour of lids, caps and nozzles. ridged: with grooves to turn it by; otherwise it flips open.
         turn: degrees by which the front is turned (tubes: 90).
-        rows: of the table on the back.
+        facts: the table on the back, of ``FACTS``.
     """
 
     title: str
-    subtitle: str
-    amount: str
+    subtitle: str = ""
+    amount: str = ""
     base: Colour
     accent: Colour
     ink: Colour
-    motif: str
+    motif: Annotated[str, AfterValidator(_known)]
     style: Literal["bands", "half", "wave", "stripes", "diagonal", "panel", "dots", "plain"] = "bands"
     outline: Colour | None = None
     amount_ink: Colour | None = None
     cap: Colour = (240, 240, 238)
     ridged: bool = True
-    turn: int = 0
-    rows: tuple[tuple[str, str], ...] = (
-        ("Energy", "420 kJ"),
-        ("Fat", "0.8 g"),
-        ("Sugars", "9.5 g"),
-        ("Protein", "2.1 g"),
-        ("Salt", "0.6 g"),
-    )
+    turn: Literal[0, 90] = 0
+    facts: Literal["food", "care"] = "food"
 
 
-CARE_ROWS = (
-    ("Use", "daily"),
-    ("Skin", "all"),
-    ("Water", "70 %"),
-    ("Keep", "cool"),
-    ("Open", "1 year"),
-)
-
-
-def paint_carton(shape: Shape, rng: np.random.Generator, label: Label) -> Image.Image:
+def paint_carton(shape: Shape, rng: np.random.Generator, *, label: Label) -> Image.Image:
     """All six faces of a box; the larger ones show the front."""
     painter = Painter(shape, rng, label.base)
     largest = max(region.size[0] * region.size[1] for region in shape.regions.values())
@@ -73,7 +76,7 @@ def paint_carton(shape: Shape, rng: np.random.Generator, label: Label) -> Image.
             if wide * high > 0.6 * largest:
                 _front(canvas, (0.06, 0.15, 0.94, 0.85) if label.style == "bands" else (0.05, 0.04, 0.95, 0.96), label)
             elif name == "right" and high > wide:
-                canvas.facts((0.1, 0.3, 0.9, 0.75), "Contents", list(label.rows))
+                canvas.facts((0.1, 0.3, 0.9, 0.75), *FACTS[label.facts])
                 canvas.text(label.amount, (0.1, 0.8, 0.9, 0.9), label.ink, bold=0.03)
             elif name == "left" and high > wide:
                 canvas.text(
@@ -94,7 +97,7 @@ def paint_carton(shape: Shape, rng: np.random.Generator, label: Label) -> Image.
     return painter.image()
 
 
-def paint_wrapped(shape: Shape, rng: np.random.Generator, label: Label, *, metal: bool = False) -> Image.Image:
+def paint_wrapped(shape: Shape, rng: np.random.Generator, *, label: Label, metal: bool = False) -> Image.Image:
     """Cans, jars and bottles: print around the ``side``, plain caps and lids.
 
     Args:
@@ -112,8 +115,7 @@ def paint_wrapped(shape: Shape, rng: np.random.Generator, label: Label, *, metal
             canvas.rectangle((0.5 - half - 0.035, 0.1, 0.5 + half + 0.035, 0.93), label.accent, corner=0.12)
         top, bottom = (0.14, 0.86) if label.style == "bands" else (0.12, 0.91)
         _front(canvas, (0.5 - half, top, 0.5 + half, bottom), label)
-        heading = "Directions" if label.rows == CARE_ROWS else "Contents"
-        canvas.facts((0.825, 0.22, 0.99, 0.8), heading, list(label.rows))
+        canvas.facts((0.825, 0.22, 0.99, 0.8), *FACTS[label.facts])
         if label.style in ("panel", *PLATED):
             ground = label.accent if label.style == "panel" else label.base
             canvas.rectangle((0.01, 0.22, 0.175, 0.84), ground, corner=0.12)
@@ -133,14 +135,14 @@ def paint_wrapped(shape: Shape, rng: np.random.Generator, label: Label, *, metal
     return painter.image()
 
 
-def paint_tube(shape: Shape, rng: np.random.Generator, label: Label) -> Image.Image:
+def paint_tube(shape: Shape, rng: np.random.Generator, *, label: Label) -> Image.Image:
     """Tubes: the print runs along the body, front and back alike."""
     painter = Painter(shape, rng, label.base)
     with painter.region("side") as canvas:
         _background(canvas, label)
         canvas.rectangle((0, 0, 1, 0.055), label.accent)
         _front(canvas, (0.30, 0.14, 0.70, 0.86), label)
-        canvas.facts((0.8, 0.28, 0.97, 0.66), "Directions", list(label.rows))
+        canvas.facts((0.8, 0.28, 0.97, 0.66), *FACTS[label.facts])
         if label.style in PLATED:
             canvas.rectangle((0.04, 0.12, 0.21, 0.68), label.base, corner=0.12)
         canvas.barcode((0.05, 0.5, 0.2, 0.66))
@@ -150,7 +152,7 @@ def paint_tube(shape: Shape, rng: np.random.Generator, label: Label) -> Image.Im
     return painter.image()
 
 
-def paint_soap(shape: Shape, rng: np.random.Generator, label: Label) -> Image.Image:
+def paint_soap(shape: Shape, rng: np.random.Generator, *, label: Label) -> Image.Image:
     """A bar of soap with its name pressed in."""
     painter = Painter(shape, rng, label.base)
     for name in ("top", "bottom"):
@@ -161,7 +163,7 @@ def paint_soap(shape: Shape, rng: np.random.Generator, label: Label) -> Image.Im
     return painter.image()
 
 
-def paint_mug(shape: Shape, rng: np.random.Generator, label: Label) -> Image.Image:
+def paint_mug(shape: Shape, rng: np.random.Generator, *, label: Label) -> Image.Image:
     """A glazed mug with a band of print."""
     painter = Painter(shape, rng, label.base)
     with painter.region("side") as canvas:

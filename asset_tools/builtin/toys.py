@@ -1,21 +1,17 @@
-"""Toys, tools and a few things of desk and sport: the table of those that are modelled freely in space."""
+"""A puzzle cube and a ball."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from functools import cache, partial
 
 import numpy as np
 import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from asset_tools.builtin import animals, planes, tools
 from asset_tools.builtin.mesh import Patch, Shape, Size, fitted
-from asset_tools.builtin.models import Model, paint_in_space, unwrapped
-from asset_tools.builtin.spec import ObjectSpec
+from asset_tools.builtin.models import paint_in_space, unwrapped
 from asset_tools.builtin.surfaces import FACES
 from asset_tools.builtin.textures import Colour, Painter
+from asset_tools.builtin.tools import lettering
 from asset_tools.decompose import few_vertices
 
 STICKERS: dict[str, Colour] = {
@@ -60,7 +56,7 @@ def rubiks_cube(size: Size) -> Shape:
     return fitted([patches], size, pieces=[few_vertices(body)])
 
 
-def paint_cube(shape: Shape, rng: np.random.Generator) -> Image.Image:
+def paint_rubiks_cube(shape: Shape, rng: np.random.Generator) -> Image.Image:
     """Coloured stickers with round corners on black, as some turns leave them."""
     painter = Painter(shape, rng, (16, 16, 18))
     for name, colours in scrambled().items():
@@ -112,96 +108,8 @@ def paint_racquetball(shape: Shape, rng: np.random.Generator) -> Image.Image:
         # The seam of two halves; it lies level as on a ball that was just moulded.
         result *= (1 - 0.45 * np.exp(-((z / 0.45) ** 2)) + 0.22 * np.exp(-(((np.abs(z) - 1.2) / 0.5) ** 2)))[:, None]
         front = y < 0
-        result[front & tools.lettering("PRO", x, z - 11.5, 7.0)] = (240, 244, 250)
+        result[front & lettering("PRO", x, z - 11.5, 7.0)] = (240, 244, 250)
         result[front & (np.abs(z - 5.6) < 0.6) & (np.abs(x) < 9)] = (240, 244, 250)
         return result
 
     return paint_in_space(shape, colours)
-
-
-@cache
-def _model(maker: Callable[[], Model]) -> Model:
-    return maker()
-
-
-def _shape(size: Size, *, maker: Callable[[], Model]) -> Shape:
-    return _model(maker).shape(size)
-
-
-def _paint(shape: Shape, rng: np.random.Generator, *, maker: Callable[[], Model]) -> Image.Image:
-    return _model(maker).paint(shape, rng)
-
-
-def _toy(
-    id: str,
-    category: str,
-    size: Size,
-    mass: float,
-    maker: Callable[[], Model],
-    graspnet_id: int,
-    roughness: float,
-    spoken: str = "",
-    *,
-    hollow: bool = False,
-) -> ObjectSpec:
-    shape, paint = partial(_shape, maker=maker), partial(_paint, maker=maker)
-    return ObjectSpec(id, category, size, mass, shape, paint, roughness, graspnet_id, spoken, hollow)
-
-
-TOYS: tuple[ObjectSpec, ...] = (
-    _toy("power_drill", "tool", (0.184, 0.057, 0.187), 0.895, tools.power_drill, 8, 0.5),
-    _toy("scissors", "tool", (0.200, 0.087, 0.016), 0.082, tools.scissors, 9, 0.35, hollow=True),
-    _toy("flat_screwdriver", "tool", (0.215, 0.031, 0.031), 0.098, tools.screwdriver, 20, 0.35, "screwdriver"),
-    ObjectSpec(
-        "racquetball", "ball", (0.055, 0.055, 0.055), 0.041, ball, paint_racquetball, 0.7, 21, "blue rubber ball"
-    ),
-    _toy(
-        "toy_airplane_a",
-        "toy",
-        (0.140, 0.150, 0.062),
-        0.095,
-        planes.red_airplane,
-        24,
-        0.5,
-        "red toy airplane",
-        hollow=True,
-    ),
-    _toy(
-        "toy_airplane_c",
-        "toy",
-        (0.160, 0.142, 0.064),
-        0.085,
-        planes.airliner,
-        25,
-        0.35,
-        "white toy airplane",
-        hollow=True,
-    ),
-    _toy(
-        "toy_airplane_k",
-        "toy",
-        (0.108, 0.120, 0.063),
-        0.080,
-        planes.biplane,
-        31,
-        0.45,
-        "yellow toy biplane",
-        hollow=True,
-    ),
-    _toy("padlock", "lock", (0.047, 0.027, 0.075), 0.304, tools.padlock, 32, 0.3),
-    _toy("white_mouse", "mouse", (0.105, 0.060, 0.037), 0.090, tools.computer_mouse, 47, 0.4, "white computer mouse"),
-    _toy("large_elephant", "toy", (0.150, 0.070, 0.095), 0.140, animals.large_elephant, 51, 0.6, "grey toy elephant"),
-    _toy("rhinoceros", "toy", (0.135, 0.048, 0.068), 0.095, animals.rhinoceros, 52, 0.6, "toy rhinoceros"),
-    _toy(
-        "small_elephant",
-        "toy",
-        (0.090, 0.045, 0.060),
-        0.050,
-        animals.small_elephant,
-        53,
-        0.5,
-        "small blue toy elephant",
-    ),
-    _toy("monkey", "toy", (0.055, 0.060, 0.080), 0.065, animals.monkey, 54, 0.55, "toy monkey"),
-    ObjectSpec("rubiks_cube", "toy", (0.057, 0.057, 0.057), 0.094, rubiks_cube, paint_cube, 0.3, 71, "puzzle cube"),
-)

@@ -93,7 +93,7 @@ class ImportPartNet(_Making):
 
 @dataclass(kw_only=True)
 class Build:
-    """Make the builtin pack anew from its formulas (for people who work on it)."""
+    """Make the builtin pack anew from its formulas (for people who work on it, in a clone of the repository)."""
 
     out: Path | None = None
     """Its folder. Default: where the package has it."""
@@ -139,11 +139,21 @@ def import_partnet(command: ImportPartNet) -> int:
 
 def build(command: Build) -> int:
     """Run ``build``."""
-    with mesh_tools():
-        from asset_tools.builtin.build import DESCRIPTION, NAME, builtin_jobs
     from robocas_ms3.errors import AssetError
     from robocas_ms3.paths import builtin_packs_dir
 
+    try:
+        with mesh_tools():
+            from asset_tools.builtin.build import DESCRIPTION, NAME, builtin_jobs
+    except ModuleNotFoundError as error:
+        if error.name != "asset_tools.builtin":
+            raise
+        raise AssetError(
+            "the formulas of the builtin pack are not installed",
+            expected="asset_tools/builtin of the repository",
+            found="an installed wheel",
+            fix="Clone the repository to change them; the pack itself is installed and complete.",
+        ) from error
     if command.ids and command.out is None:
         raise AssetError("the shipped pack is made as a whole", found="--ids without --out", fix="Pass --out FOLDER.")
     out = command.out or builtin_packs_dir() / NAME

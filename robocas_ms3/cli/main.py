@@ -33,7 +33,6 @@ COMMANDS = (
     "stats",
     "merge",
     "split",
-    "upgrade",
     "import-robocas",
     "assets",
     "layouts",

@@ -25,14 +25,14 @@ def check_settings(root: Path) -> tuple[Pictures, list[Violation]]:
     try:
         settings = json.loads((root / FILE).read_text(encoding="utf-8"))
     except FileNotFoundError:
-        return Pictures(), [Violation(FILE, "", "this file (robocas import-robocas or upgrade writes one)", "no file")]
+        return Pictures(), [Violation(FILE, "", "this file (robocas import-robocas writes one)", "no file")]
     except (OSError, ValueError) as error:
         return Pictures(), [Violation(FILE, "", "settings of a dataset", str(error).splitlines()[0])]
     if not isinstance(settings, dict):
         return Pictures(), [Violation(FILE, "", "an object", type(settings).__name__)]
     version = settings.get("schema_version", 1)
     if version != schema.SCHEMA_VERSION:
-        expected = f"{schema.SCHEMA_VERSION} (robocas upgrade)"
+        expected = f"{schema.SCHEMA_VERSION} (convert it again from its recording)"
         return Pictures(), [Violation(FILE, "schema_version", expected, str(version))]
     problems = check_settings_values(settings)
     pictures = Pictures()

@@ -170,12 +170,5 @@ def _read(out: Path, missing: str, fix: str) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DatasetError(missing, where=path, fix=fix) from error
-    if content.get("schema_version") != schema.SCHEMA_VERSION:
-        raise DatasetError(
-            "a dataset of another schema version",
-            where=path,
-            expected=schema.SCHEMA_VERSION,
-            found=content.get("schema_version", 1),
-            fix="Run robocas upgrade first.",
-        )
+    schema.check_version(content.get("schema_version", 1), path)
     return content

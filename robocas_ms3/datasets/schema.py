@@ -25,13 +25,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from robocas_ms3.errors import DatasetError
 from robocas_ms3.language.embed import DIMENSIONS
 from robocas_ms3.language.templates import GOAL_TYPES
 
 DataType = Literal["float32", "int64", "bool", "str"]
 
 SCHEMA_VERSION = 2
-"""Raised when older datasets need ``robocas upgrade``. 1: no ``scene.json``; 0: upstream's, see docs/dataset.md."""
+"""Raised when older datasets have to be converted again. 1: no ``scene.json``; 0: upstream's, see docs/dataset.md."""
 
 EPISODE_FILE = "episode_info.npz"
 SCENE_FILE = "scene.json"
@@ -175,6 +176,28 @@ DATA_INFO: dict[str, str] = {
     " relative_rotation: the same of rel_orn as Euler xyz angles in rad}; last rows left out",
 }
 """Keys of ``data_info.json``. JSON turns the episode numbers of ``{number: ...}`` into strings."""
+
+
+def check_version(found: object, where: Path, what: str = "a dataset") -> None:
+    """Refuse what is of another schema version.
+
+    Args:
+        found: its version.
+        where: its folder or file.
+        what: it is.
+
+    Raises:
+        DatasetError: it is of another, and how to come to one of this.
+    """
+    if found != SCHEMA_VERSION:
+        fix = "Convert it again from its recording."
+        if found == 0:
+            fix = "Import it first: robocas import-robocas."
+        elif isinstance(found, int) and found > SCHEMA_VERSION:
+            fix = "Use a newer robocas."
+        raise DatasetError(
+            f"{what} of another schema version", where=where, expected=SCHEMA_VERSION, found=found, fix=fix
+        )
 
 
 def episode_folder(number: int) -> str:

@@ -9,8 +9,8 @@ import trimesh
 from sapien import physx
 
 from asset_tools.builtin.build import build_asset, builtin_jobs
+from asset_tools.builtin.catalogue import products
 from asset_tools.builtin.furniture import MAKERS
-from asset_tools.builtin.objects import SPECS
 from asset_tools.graspnet.catalogue import ENTRIES
 from asset_tools.quality.measure import judge
 from asset_tools.quality.packs import judge_furniture
@@ -18,6 +18,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.errors import AssetError
 
 DOWN = np.array([0.0, 0.0, -1.0])
+each = pytest.mark.parametrize("product", products().values(), ids=lambda product: product.id)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def pack():
 
 
 def test_ships_with_everything(pack):
-    assert set(pack.objects) == {spec.id for spec in SPECS}
+    assert set(pack.objects) == set(products())
     assert set(pack.furniture) == set(MAKERS)
     assert sum(path.stat().st_size for path in pack.root.rglob("*")) < 25e6
 
@@ -44,22 +45,22 @@ def test_is_as_good_as_packs_should_be(pack):
     assert judge_furniture({id_: loaded.asset.quality for id_, loaded in pack.furniture.items()}) == []
 
 
-@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.id)
-def test_shipped_object_is_what_the_table_says(pack, spec):
-    loaded = pack.objects[spec.id]
+@each
+def test_shipped_object_is_what_the_table_says(pack, product):
+    loaded = pack.objects[product.id]
     asset = loaded.asset
-    np.testing.assert_allclose(asset.extents, spec.size, atol=1e-4)
-    assert (asset.name, asset.category, asset.mass) == (spec.name, spec.category, spec.mass)
+    np.testing.assert_allclose(asset.extents, product.size, atol=1e-4)
+    assert (asset.name, asset.category, asset.mass) == (product.name, product.category, product.mass)
     points = np.concatenate(loaded.hulls)
     np.testing.assert_allclose(
-        [points.min(0), points.max(0)], [-np.array(spec.size) / 2, np.array(spec.size) / 2], atol=4e-3
+        [points.min(0), points.max(0)], [-np.array(product.size) / 2, np.array(product.size) / 2], atol=4e-3
     )
     assert asset.grasp_count >= 50 or asset.no_grasps_because
 
 
-@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.id)
-def test_can_be_grasped_from_above_as_it_usually_lies(pack, spec):
-    annotations = pack.objects[spec.id].annotations
+@each
+def test_can_be_grasped_from_above_as_it_usually_lies(pack, product):
+    annotations = pack.objects[product.id].annotations
     approach_in_object = annotations.grasps_tcp_in_object[:, :3, 2]
     steep = [
         (approach_in_object @ pose[:3, :3].T @ DOWN > np.cos(np.deg2rad(60))).sum()

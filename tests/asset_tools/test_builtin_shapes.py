@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from asset_tools.builtin import bottles, fruits, shapes, surfaces
+from asset_tools.builtin.catalogue import products
 from asset_tools.builtin.mesh import Patch, build_shape, fitted, pack_regions
-from asset_tools.builtin.objects import HOUSEHOLD
 from asset_tools.builtin.surfaces import rounded_box
 from asset_tools.decompose import GPU_LIMIT, flat_faces, volume_iou
 from robocas_ms3.assets.cooking import cooking_faults
@@ -14,6 +14,7 @@ from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.pack import HULLS
 
 GRIPPER_OPENING = 0.08  # m
+HOUSEHOLD = [p for p in products().values() if not p.model and p.category not in ("ball", "toy")]
 GRASPNET_IDS = {
     1: "sugar_box",
     2: "tomato_soup_can",
@@ -61,8 +62,8 @@ REAL = {
 
 @cache
 def built(name):
-    spec = next(spec for spec in HOUSEHOLD if spec.id == name)
-    return spec.shape(spec.size)
+    product = products()[name]
+    return product.shape(product.size)
 
 
 def test_table_of_objects():
@@ -71,7 +72,7 @@ def test_table_of_objects():
     assert all(spec.name == spec.name.lower() and "_" not in spec.name for spec in HOUSEHOLD)
     assert [spec.id for spec in HOUSEHOLD if spec.hollow] == ["mug"]
     for name, (size, mass) in REAL.items():
-        spec = next(spec for spec in HOUSEHOLD if spec.id == name)
+        spec = products()[name]
         assert (tuple(sorted(spec.size)), spec.mass) == (size, mass)
 
 
@@ -102,7 +103,7 @@ def test_pieces_are_cooked_as_they_are(tmp_path):
 
 def test_mug_pieces_leave_cavity_and_handle_open():
     hulls = [trimesh.convex.convex_hull(piece) for piece in built("mug").pieces]
-    _, depth, height = next(spec.size for spec in HOUSEHOLD if spec.id == "mug")
+    _, depth, height = products()["mug"].size
     axis = -0.117 / 2 + depth / 2
     angle, radius = np.meshgrid(np.linspace(0, 2 * np.pi, 41), [0.0, 0.02, depth / 2 - 0.0065])
     for z in (-height / 2 + 0.0075, 0.0, height / 2 + 0.001):
@@ -175,7 +176,7 @@ def test_sharp_box_has_flat_normals_and_ball_has_radial_ones():
     box = build_shape([rounded_box((0.1, 0.1, 0.1), 0.0)])
     assert np.sort(np.abs(box.normals), axis=1)[:, :2].max() < 1e-9
     half_circle = [(0.03 * np.sin(a), -0.03 * np.cos(a)) for a in np.linspace(0, np.pi, 13)]
-    ball = fruits.fruit((0.06, 0.06, 0.06), half_circle)
+    ball = fruits.fruit((0.06, 0.06, 0.06), profile=half_circle)
     radial = ball.vertices / np.linalg.norm(ball.vertices, axis=1, keepdims=True)
     assert np.einsum("ij,ij->i", radial, ball.normals).min() > 0.995
 

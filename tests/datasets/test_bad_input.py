@@ -109,9 +109,10 @@ def test_schema_versions_that_are_mixed(dataset, trajectory, tmp_path):
     edit(dataset / "episode_0000000" / "scene.json", lambda scene: scene.update(schema_version=1))
     assert violations(dataset) == ["episode_0000000/scene.json, schema_version: expected 2, found 1"]
     edit(dataset / "conversion.json", lambda content: content.pop("schema_version"))
-    assert "conversion.json, schema_version: expected 2 (robocas upgrade), found 1" in violations(dataset)
+    expected = "2 (convert it again from its recording)"
+    assert f"conversion.json, schema_version: expected {expected}, found 1" in violations(dataset)
     before = files_of(dataset)
-    with pytest.raises(DatasetError, match="another schema version .expected 2, found 1.*robocas upgrade"):
+    with pytest.raises(DatasetError, match="another schema version .expected 2, found 1.*again from its recording"):
         convert(trajectory, dataset, append=True, open_source=RayCaster)
     with pytest.raises(DatasetError, match="another schema version"):
         merge([dataset], tmp_path / "out")

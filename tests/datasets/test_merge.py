@@ -126,7 +126,7 @@ def test_other_settings(parts, tmp_path):
 def test_other_schema_versions(parts, tmp_path):
     old = spoiled(parts[0], tmp_path)
     edit(old / "conversion.json", lambda c: c.pop("schema_version"))
-    fails("expected 2, found 1.*robocas upgrade", [parts[1], old], tmp_path / "out")
+    fails("expected 2, found 1.*again from its recording", [parts[1], old], tmp_path / "out")
     (old / "conversion.json").unlink()
     fails("expected 2, found 0.*import-robocas", [parts[1], old], tmp_path / "out")
     newer = spoiled(parts[1], tmp_path)

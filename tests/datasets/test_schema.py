@@ -1,6 +1,10 @@
 from pathlib import Path
 
+import pytest
+
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.provenance import task_of
+from robocas_ms3.errors import DatasetError
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "dataset.md"
 
@@ -28,3 +32,28 @@ def test_keys_are_the_papers_and_upstreams():
         "language_embedding", "step_lang_goals", "step_goal_embs", "step_goal_type",
     }  # fmt: skip
     assert {spec.name for spec in schema.EPISODE_INFO} == paper | {"agv_pose", "rel_agv_pose"}
+
+
+@pytest.mark.parametrize(
+    ("found", "fix"),
+    [
+        (0, "Import it first: robocas import-robocas."),
+        (1, "Convert it again from its recording."),
+        ("2", "Convert it again from its recording."),
+        (schema.SCHEMA_VERSION + 1, "Use a newer robocas."),
+    ],
+)
+def test_other_versions_are_refused(found, fix):
+    schema.check_version(schema.SCHEMA_VERSION, Path("here"))
+    with pytest.raises(DatasetError) as caught:
+        schema.check_version(found, Path("here"), "an episode")
+    text = f"here: an episode of another schema version (expected {schema.SCHEMA_VERSION}, found {found}). {fix}"
+    assert str(caught.value) == text
+
+
+def test_a_task_is_known_by_its_environment():
+    from robocas_ms3.tasks.spec import TASKS
+
+    assert [task_of(f"robocas_ms3:{spec.env_id}") for spec in TASKS.values()] == list(TASKS)
+    assert task_of("PushCube-v1") is None
+    assert task_of(None) is None

@@ -214,7 +214,7 @@ def test_in_place_leaves_all_as_it_is_where_arrays_are_damaged(six, tmp_path, da
 def test_unknown_targets(six, tmp_path):
     root = shutil.copytree(six, tmp_path / "ds")
     edit(root / "episode_0000003" / "scene.json", lambda s: s.update(target=None))
-    with pytest.raises(DatasetError, match="episode_0000003.*does not say its target.*upgrade --trajectory"):
+    with pytest.raises(DatasetError, match="episode_0000003.*does not say its target.*another --by"):
         groups_of(Dataset(root), "target")
     edit(root / "episode_0000003" / "scene.json", lambda s: s.update(seed=None))
     assert groups_of(Dataset(root), "seed")[3] == "3"

@@ -73,7 +73,7 @@ def test_no_folder(tmp_path):
 
 def test_an_empty_folder(tmp_path):
     assert found(tmp_path) == [
-        "conversion.json: expected this file (robocas import-robocas or upgrade writes one), found no file",
+        "conversion.json: expected this file (robocas import-robocas writes one), found no file",
         "data_info.json: expected this file, found no file",
     ]
 

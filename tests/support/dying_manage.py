@@ -6,15 +6,13 @@ from dying import die_at
 
 from robocas_ms3 import files
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets.manage import assemble, importing, output, upgrading
+from robocas_ms3.datasets.manage import assemble, importing, output
 
 PLACES = {  # moment -> (module, function, which call is the last)
     "file": (output.Placed, "file", 70),  # in the second episode
     "rename": (files, "_move_in", 2),
     "merge overview": (assemble, "write_info", 1),
     "import overview": (importing, "write_info", 1),
-    "scene": (upgrading, "replacing", 2),  # of the second episode
-    "settings": (upgrading, "write_json", 1),
 }
 
 if __name__ == "__main__":

@@ -47,9 +47,9 @@ class Part:
         return mark or f"arrays {arrays_fingerprint(self.dataset.episode(number).arrays)}"
 
 
-def schema_version(dataset: Dataset) -> int:
+def schema_version(dataset: Dataset) -> object:
     """Version of a dataset's schema: 0 is upstream's."""
-    return int(dataset.settings.get("schema_version", 1)) if dataset.settings else 0
+    return dataset.settings.get("schema_version", 1) if dataset.settings else 0
 
 
 def open_part(root: Path) -> Part:
@@ -59,16 +59,7 @@ def open_part(root: Path) -> Part:
         DatasetError: there is none, it is of another version, unfinished, or contradicts itself.
     """
     dataset = Dataset(root)
-    version = schema_version(dataset)
-    if version != schema.SCHEMA_VERSION:
-        fixes = {0: "Run robocas import-robocas first.", 1: "Run robocas upgrade first."}
-        raise DatasetError(
-            "a dataset of another schema version",
-            where=root,
-            expected=schema.SCHEMA_VERSION,
-            found=version,
-            fix=fixes.get(version, "Use a newer robocas."),
-        )
+    schema.check_version(schema_version(dataset), root)
     check_whole(dataset)
     ledger = {int(number): entry for number, entry in dataset.settings.get("episodes", {}).items()}
     unlisted = [number for number in dataset.numbers if number not in ledger]
@@ -76,15 +67,8 @@ def open_part(root: Path) -> Part:
         where = root / schema.CONVERSION_FILE
         raise DatasetError("these episodes are not listed", where=where, found=shown(unlisted))
     for number in dataset.numbers:
-        found = dataset.episode(number).scene.get("schema_version", 1)
-        if found != schema.SCHEMA_VERSION:
-            raise DatasetError(
-                "an episode of another schema version",
-                where=root / schema.episode_folder(number) / schema.SCENE_FILE,
-                expected=schema.SCHEMA_VERSION,
-                found=found,
-                fix="Run robocas upgrade first.",
-            )
+        file = root / schema.episode_folder(number) / schema.SCENE_FILE
+        schema.check_version(dataset.episode(number).scene.get("schema_version", 1), file, "an episode")
     return Part(dataset, ledger, dataset.sides)
 
 

@@ -69,7 +69,7 @@ def groups_of(dataset: Dataset, by: By) -> dict[int, str]:
             raise DatasetError(
                 f"this episode does not say its {by}",
                 where=dataset.root / schema.episode_folder(number) / schema.SCENE_FILE,
-                fix="Run robocas upgrade --trajectory, or choose another --by.",
+                fix="Choose another --by, or convert the episode's recording again.",
             )
         groups[number] = str(value)
     return groups

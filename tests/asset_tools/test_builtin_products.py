@@ -1,0 +1,62 @@
+"""Files of products that are wrong."""
+
+import pytest
+
+from asset_tools.builtin.catalogue import load_products
+from robocas_ms3.errors import AssetError
+
+CARTON = """
+box:
+  category: box
+  graspnet_id: 1
+  size: [0.1, 0.1, 0.1]
+  mass: 1
+  shape: {kind: carton, radius: 0.002}
+  paint: {kind: carton, label: {title: BOX, base: [1, 2, 3], accent: [4, 5, 6], ink: [7, 8, 9], motif: sun}}
+"""
+
+
+def test_whole_numbers_lists_and_defaults(tmp_path):
+    (tmp_path / "boxes.yaml").write_text(CARTON)
+    box = load_products(tmp_path)["box"]
+    assert (box.name, box.mass, box.size, box.hollow, box.roughness) == ("box", 1.0, (0.1, 0.1, 0.1), False, 0.45)
+    assert (box.shape.radius, box.paint.label.title, box.paint.label.style) == (0.002, "BOX", "bands")
+    shape, _ = box.build()
+    assert shape.closed().extents == pytest.approx([0.1, 0.1, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "message"),
+    [
+        ("mass: 1", "mas: 1", "box.mass: Field required"),
+        ("mass: 1", "mass: heavy", "box.mass: Input should be a valid number .found 'heavy'"),
+        ("mass: 1", "mass: 2026-01-01", "box.mass: Input should be a valid number .found '2026-01-01'"),
+        ("mass: 1", "mass: -1", "box.mass: Input should be greater than 0 .found -1"),
+        ("size: [0.1, 0.1, 0.1]", "size: [0.1, 0.1]", "box.size.2: Field required"),
+        ("mass: 1", "mass: 1\n  weight: 2", "box.weight: Extra inputs are not permitted .found 2"),
+        ("kind: carton, radius", "kind: crate, radius", "box.shape: Input tag 'crate' .* does not match .* 'carton'"),
+        ("radius: 0.002", "corner: 0.002", "box.shape.carton.corner: Extra inputs are not permitted .found 0.002"),
+        ("radius: 0.002", "radius: [1]", r"box.shape.carton.radius: Input should be a valid number .found .1."),
+        ("[1, 2, 3]", "[1, 2, 256]", "box.paint.carton.label.base.2: .* less than or equal to 255 .found 256"),
+        ("motif: sun", "motif: moon", "box.paint.carton.label.motif: no such motif; known are tomato, sun.*'moon'"),
+        ("mass: 1", "mass: 1\n  model: padlock", "box: a product has a shape and a paint, or a model"),
+        ("mass: 1", "mass: 1\n  model: lock", "box.model: Input should be .*'padlock'.*found 'lock'"),
+        ("  shape: {kind: carton, radius: 0.002}\n", "", "box: a product has a shape and a paint, or a model"),
+        ("box:", "Box:", "Box.id: String should match pattern"),
+        (CARTON, "- box", "products can't be read .expected a mapping of products by id"),
+        (CARTON, "box: carton", "products can't be read .expected a mapping of products by id"),
+        (CARTON, "box: [", "products can't be read .found while parsing"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path, right, wrong, message):
+    assert right in CARTON
+    (tmp_path / "boxes.yaml").write_text(CARTON.replace(right, wrong))
+    with pytest.raises(AssetError, match=f"boxes.yaml(, |: ){message}"):
+        load_products(tmp_path)
+
+
+def test_an_id_in_two_files(tmp_path):
+    for name in ("boxes.yaml", "cans.yaml"):
+        (tmp_path / name).write_text(CARTON)
+    with pytest.raises(AssetError, match="cans.yaml, box: this product is there twice"):
+        load_products(tmp_path)
