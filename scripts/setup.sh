@@ -4,7 +4,7 @@
 #   bash scripts/setup.sh
 #
 # ROBOCAS_VENV            folder of the virtual environment (default: .venv in the checkout)
-# ROBOCAS_PYTHON          interpreter to make it with (default: the first of python3.12, 3.11, 3.10, python3 that fits)
+# ROBOCAS_PYTHON          interpreter to make it with (default: the first of python3.11, 3.12, 3.10, python3 that fits)
 # ROBOCAS_SKIP_RENDERER=1 leave rendering as it is
 # ROBOCAS_SKIP_BROWSER=1  install no Chromium for the tests of robocas view
 set -euo pipefail

@@ -1,14 +1,32 @@
 """A progress bar on stderr that appears when there is something to do, so that an error is one line.
 
-Where stderr is no terminal there is none, and no blank line either.
+Where stderr is no terminal, such as a log, there is a line a minute instead.
 """
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
+
+EVERY = 60.0  # s between two lines of a log
+
+
+class _Log:
+    """Lines on stderr, no more than one a minute."""
+
+    def __init__(self) -> None:
+        self._begun = self._told = time.monotonic()
+
+    def tell(self, text: str) -> None:
+        """Write a line, with the minutes that it took so far, if the last one is a minute old."""
+        now = time.monotonic()
+        if now - self._told >= EVERY:
+            self._told = now
+            print(f"{text}, {(now - self._begun) / 60:.0f} min", file=sys.stderr, flush=True)
 
 
 @dataclass(frozen=True)
@@ -17,6 +35,7 @@ class Bar:
 
     progress: Any
     description: str
+    log: _Log
 
     def start(self, count: int) -> None:
         """Show it, for so many."""
@@ -26,18 +45,25 @@ class Bar:
     def advance(self, *_: object) -> None:
         """One more is done."""
         self.progress.advance(self.progress.task_ids[0])
+        self._tell()
 
     def at(self, done: int, count: int) -> None:
         """So many of all are done."""
         if not self.progress.task_ids:
             self.start(count)
         self.progress.update(self.progress.task_ids[0], completed=done)
+        self._tell()
 
     def next_of(self, count: int) -> None:
         """One more of all is done."""
         if not self.progress.task_ids:
             self.start(count)
         self.advance()
+
+    def _tell(self) -> None:
+        if self.progress.disable:
+            task = self.progress.tasks[0]
+            self.log.tell(f"{self.description}: {task.completed:g} of {task.total:g}")
 
 
 def columns() -> tuple[Any, ...]:
@@ -62,7 +88,7 @@ def bar(description: str, *, transient: bool = False) -> Iterator[Bar]:
     console = Console(stderr=True)
     progress = Progress(*columns(), console=console, transient=transient, disable=not console.is_interactive)
     try:
-        yield Bar(progress, description)
+        yield Bar(progress, description, _Log())
     finally:
         if progress.live.is_started:  # else it prints an empty line
             progress.stop()

@@ -14,14 +14,14 @@ import tyro
 class Eval:
     """Measure a policy by a protocol: every episode of its list once, written as it ends.
 
-    robocas eval [TASK ...] --policy P --protocol NAME --out DIR   plays the episodes of these tasks, or of all
-    robocas eval report DIR ...                                    tables of a result, and its page report.html
-    robocas eval merge DIR ... --out DIR                           parts of a result, such as shards, as one
-    robocas eval compare DIR DIR ...                               over the same scenes, by exact tests; or its splits
-    robocas eval verify DIR ...                                    whether a result is whole, and of this protocol
-    robocas eval videos DIR                                        plays failed episodes again and films them
-    robocas eval protocols                                         lists the protocols that are shipped
-    robocas eval freeze PLAN.yaml --out DIR                        makes a protocol of your own
+    - eval [TASK ...] --policy P --protocol NAME --out DIR: plays the episodes of these tasks, or of all
+    - eval report DIR ...: tables of a result, and its page report.html
+    - eval merge DIR ... --out DIR: parts of a result, such as shards, as one
+    - eval compare DIR DIR ...: over the same scenes, by exact tests; of one result its splits
+    - eval verify DIR ...: whether a result is whole, and of its protocol
+    - eval videos DIR: plays failed episodes again and films them
+    - eval protocols: lists the protocols that are shipped
+    - eval freeze PLAN.yaml --out DIR: makes a protocol of your own
     """
 
     words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
@@ -35,6 +35,8 @@ class Eval:
     """Folder to write to. Default: eval/PROTOCOL/POLICY, with the weld eval/PROTOCOL/POLICY_weld."""
     resume: bool = False
     """Go on with a result that is there."""
+    retry_errors: bool = False
+    """With --resume: play episodes again that an error broke off, such as a server that was gone."""
     envs: int = 2
     """Envs at a time; the outcome does not depend on it."""
     workers: int | None = None
@@ -88,19 +90,25 @@ def run(cfg: Eval) -> int:
     """Play what a result lacks."""
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.cli.eval_results import write_pages
+    from robocas_ms3.config.load import nearest
     from robocas_ms3.demos.checks import check_number
     from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.policies import open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.run import Settings, evaluate
+    from robocas_ms3.evaluation.tables import markdown
     from robocas_ms3.tasks.spec import TASKS
 
     for word in cfg.words:
         if word not in TASKS:
             expected = f"one of {', '.join(TASKS)}; or {', '.join(WORDS)}"
-            raise EvaluationError("no such task", where=word, expected=expected)
-    check_number("envs", cfg.envs, 1)
+            raise EvaluationError("no such task", where=word, expected=expected, fix=nearest(word, [*TASKS, *WORDS]))
+    for name, number in (("envs", cfg.envs), ("episodes", cfg.episodes), ("workers", cfg.workers)):
+        if number is not None:
+            check_number(name, number, 1)
+    if cfg.retry_errors and not cfg.resume:
+        raise EvaluationError("there is nothing to retry", where="--retry-errors", fix="Pass --resume too.")
     protocol = load_protocol(cfg.protocol or "ms3-v1")
     name = re.sub(r"[^\w.-]+", "_", cfg.policy) + ("_weld" if cfg.weld else "")
     out = cfg.out or Path("eval") / protocol.rules.name / name
@@ -117,14 +125,20 @@ def run(cfg: Eval) -> int:
     succeeded = played = 0
     with open_policy(cfg.policy) as policy, bar("episodes") as shown:
         try:
-            for outcome, left in evaluate(protocol, policy, cfg.policy, out, settings, resume=cfg.resume):
+            played_now = evaluate(
+                protocol, policy, cfg.policy, out, settings, resume=cfg.resume, again=cfg.retry_errors
+            )
+            for outcome, left in played_now:
                 played += 1
                 succeeded += outcome.success
                 shown.at(played, played + left)
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command with --resume goes on") from None
     result = read(out)
-    say(f"{played} episodes played, {succeeded} succeeded; {out}: {len(result.outcomes)} episodes")
+    say(markdown(result))
+    broken = result.broken_off()
+    fix = f", {broken} broken off by an error (--resume --retry-errors plays them again)" if broken else ""
+    say(f"{played} episodes played, {succeeded} succeeded; {out}: {len(result.outcomes)} episodes{fix}")
     write_pages(result, out, cfg.protocol)
     return 0
 

@@ -68,6 +68,8 @@ def verify(folders: list[Path], protocol: str | None) -> int:
     found = problems(result, protocol_of(result, protocol))
     for problem in found:
         say(problem)
+    if broken := result.broken_off():
+        say(f"note: {broken} episodes were broken off by an error, and count as failures")
     where = ", ".join(map(str, folders))
     say(f"{where}: " + (f"{len(found)} problems" if found else f"{len(result.outcomes)} episodes of {name}, all well"))
     return 1 if found else 0

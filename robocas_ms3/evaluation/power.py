@@ -97,13 +97,10 @@ def too_few(comparison: Comparison, *, alpha: float = 0.05, power: float = 0.8) 
         return None
     shown = smallest_paired_difference(c.n, (c.only_a + c.only_b) / c.n, power=power, alpha=alpha)
     what_shows = (
-        "no difference, however large" if shown is None else f"differences of {np.ceil(100 * shown):.0f} points"
+        "no difference, however large" if shown is None else f"differences of {np.ceil(100 * shown):.0f} points or more"
     )
-    return (
-        f"{c.successes_a} of {c.n} against {c.successes_b} of {c.n} differ by less than {c.n} episodes can tell: "
-        f"{100 * c.difference:+.1f} points, {100 * c.level:g} % interval {100 * c.low:+.1f} to {100 * c.high:+.1f}, "
-        f"p = {c.p_value:.2g}; so few show {what_shows} ({100 * power:g} % power)"
-    )
+    count = "1 episode shows" if c.n == 1 else f"{c.n} episodes show"
+    return f"not told apart: {count} {what_shows} ({100 * power:g} % power)"
 
 
 def _check(counts: dict[str, int], name: str, share: float, power: float, alpha: float) -> None:

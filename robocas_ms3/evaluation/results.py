@@ -13,17 +13,15 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from robocas_ms3.errors import EvaluationError
-from robocas_ms3.evaluation import retrieval
-from robocas_ms3.evaluation.protocol import Episode
-from robocas_ms3.evaluation.rollout import Played
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import Share, share
-from robocas_ms3.files import make_folder, replacing_folder, write_json
+from robocas_ms3.files import make_folder, replacing, replacing_folder, write_json
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
@@ -36,103 +34,8 @@ _SAME = {  # of parts of one result, and what each is
     "versions": dict,
     "pack_hashes": dict,
 }
+_ADDRESSES = ("ws://", "wss://")
 _BEFORE = {"weld": False}  # of results that were written before there was one
-# evaluation_v0.md and the paper's table: reach, pick, recognise, clear
-STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
-_ORDER = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_target", "target_grasped", "target_lifted")
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What came of an episode.
-
-    Attributes:
-        episode: its number in the protocol.
-        task: short name.
-        config: name of its configuration.
-        seed: of its scene.
-        split: of the protocol.
-        success: the task had succeeded at some moment.
-        success_at_end: it had at the last one.
-        success_v0: upstream's rule held at the last one.
-        steps: policy steps.
-        seconds: of the scene.
-        failure_stage: see `failure_stage`; empty: it succeeded.
-        error: why.
-        flags: by stage or rule, the policy step after which it first held.
-        flag_seconds: the same in s of the scene.
-        measures: ``path_length`` m, ``contact_impulse`` N s, ``disturbed_most``, ``fallen``; ``welds`` with the weld.
-        inference_ms: clock time of the policy a step.
-        p_vis: share of the target that is seen from above.
-        retrieval: search: what was moved before the target, see `retrieval.outcome`.
-    """
-
-    episode: int
-    task: str
-    config: str
-    seed: int
-    split: str
-    success: bool
-    success_at_end: bool
-    success_v0: bool
-    steps: int
-    seconds: float
-    failure_stage: str
-    error: str = ""
-    flags: dict[str, int | None] = field(default_factory=dict)
-    flag_seconds: dict[str, float | None] = field(default_factory=dict)
-    measures: dict[str, float] = field(default_factory=dict)
-    inference_ms: float = 0.0
-    p_vis: float | None = None
-    retrieval: dict[str, Any] | None = None
-
-    @classmethod
-    def of(cls, played: Played, episode: Episode, objects: Sequence[str]) -> Outcome:
-        """What is kept of an episode that was played, with objects of these ids."""
-        flags, held_at, order = played.flags, played.flags.get("target_grasped"), None
-        if played.retrieval is not None:
-            cleared = flags.get("obstacles_cleared") is not None
-            order = retrieval.outcome(played.retrieval, objects, held_at, cleared=cleared)
-        return cls(
-            episode=episode.episode,
-            task=episode.task,
-            config=episode.config,
-            seed=episode.seed,
-            split=episode.split,
-            success=flags.get("success") is not None,
-            success_at_end=played.at_end.get("success", False),
-            success_v0=played.at_end.get("success_v0", False),
-            steps=played.steps,
-            seconds=round(played.seconds, 4),
-            failure_stage=failure_stage(flags, played.error),
-            error=played.error,
-            flags=flags,
-            flag_seconds=played.flag_seconds,
-            measures=played.measures,
-            inference_ms=round(1000 * played.inference_seconds / max(played.steps, 1), 3),
-            p_vis=episode.p_vis,
-            retrieval=order,
-        )
-
-    def without_clock(self) -> dict[str, Any]:
-        """All but what a clock said: the same for the same seed and policy."""
-        return {name: value for name, value in asdict(self).items() if name != "inference_ms"}
-
-
-def failure_stage(flags: dict[str, int | None], error: str = "") -> str:
-    """The stage an episode did not come to, next after the furthest that it did come to.
-
-    A target that is pulled out of its heap was reached though its obstacles were never cleared, so stages that were
-    left out on the way do not count. ``placed``: it was lifted; ``error``: the episode was broken off; empty: success.
-    """
-    if error:
-        return "error"
-    if flags.get("success") is not None:
-        return ""
-    stages = [stage for stage in _ORDER if stage in flags]
-    came = [number for number, stage in enumerate(stages) if flags[stage] is not None]
-    following = came[-1] + 1 if came else 0
-    return stages[following] if following < len(stages) else "placed"
 
 
 @dataclass(frozen=True)
@@ -159,6 +62,10 @@ class Result:
         """Whether a scene may be there several times, in several splits: then its episodes must not be pooled."""
         return len({(one.task, one.seed) for one in self.outcomes.values()}) < len(self.outcomes)
 
+    def broken_off(self) -> int:
+        """How many episodes an error ended."""
+        return sum(bool(one.error) for one in self.outcomes.values())
+
     def by(self, name: str) -> dict[str, list[Outcome]]:
         """Its outcomes by one of their attributes, such as ``config``; sorted, but splits as the protocol has them."""
         found: dict[str, list[Outcome]] = {}
@@ -167,8 +74,14 @@ class Result:
         return found if name == "split" else dict(sorted(found.items()))
 
 
-def begin(folder: Path, run: dict[str, Any], *, resume: bool) -> dict[int, Outcome]:
+def begin(folder: Path, run: dict[str, Any], *, resume: bool, again: bool = False) -> dict[int, Outcome]:
     """Begin a result, or go on with it.
+
+    Args:
+        folder: of the result.
+        run: what it is measured with.
+        resume: whether to go on with one that is there.
+        again: whether to drop episodes that were broken off by an error, so that they are played again.
 
     Returns:
         What is there already.
@@ -178,20 +91,24 @@ def begin(folder: Path, run: dict[str, Any], *, resume: bool) -> dict[int, Outco
     """
     make_folder(folder)
     path = folder / RUN
-    if not path.is_file():
+    if not path.is_file() or not (folder / OUTCOMES).is_file():  # without an episode it is of nothing yet
         write_json(path, run)
         return {}
     before = {**_BEFORE, **json.loads(path.read_text(encoding="utf-8"))}
-    if not resume and (folder / OUTCOMES).is_file():
+    if not resume:
         raise EvaluationError(
             "there is a result already", where=folder, fix="Pass --resume to go on, or another --out."
         )
     for key, value in run.items():
-        if before.get(key) != value:
-            raise EvaluationError(
-                f"can't go on with another {key}", where=folder, expected=before.get(key), found=value
-            )
-    return _mended(folder / OUTCOMES)
+        if _telling(key, before.get(key)) != _telling(key, value):
+            expected, found = _differing(before.get(key), value)
+            raise EvaluationError(f"can't go on with another {key}", where=folder, expected=expected, found=found)
+    outcomes = _mended(folder / OUTCOMES)
+    if again and any(one.error for one in outcomes.values()):
+        outcomes = {number: one for number, one in outcomes.items() if not one.error}
+        with replacing(folder / OUTCOMES) as tmp:
+            tmp.write_text(_lines(outcomes.values()), encoding="utf-8")
+    return outcomes
 
 
 def append(folder: Path, outcome: Outcome) -> None:
@@ -213,7 +130,7 @@ def read(*folders: Path) -> Result:
     outcomes: dict[int, Outcome] = {}
     for part in parts:
         for key in _SAME:
-            if part.run.get(key) != first.run.get(key):
+            if _telling(key, part.run.get(key)) != _telling(key, first.run.get(key)):
                 expected, found = _differing(first.run.get(key), part.run.get(key))
                 raise EvaluationError(
                     f"no part of one result with {first.folder}: another {key}",
@@ -236,7 +153,7 @@ def parts_of(folders: Iterable[Path]) -> list[list[Path]]:
     found: list[tuple[list[Any], set[int], list[Path]]] = []
     for folder in folders:
         part = _read(folder)
-        key = [part.run[name] for name in _SAME]
+        key = [_telling(name, part.run[name]) for name in _SAME]
         for other, episodes, group in found:
             if other == key and not episodes & part.outcomes.keys():
                 group.append(folder)
@@ -258,14 +175,24 @@ def merge(folders: Sequence[Path], out: Path) -> Result:
         raise EvaluationError("there is something already", where=out, fix="Choose another --out.")
     with replacing_folder(out) as folder:
         write_json(folder / RUN, result.run)
-        lines = [json.dumps(asdict(outcome)) + "\n" for outcome in result.outcomes.values()]
-        (folder / OUTCOMES).write_text("".join(lines), encoding="utf-8")
+        (folder / OUTCOMES).write_text(_lines(result.outcomes.values()), encoding="utf-8")
     return read(out)
 
 
 def versions() -> dict[str, str]:
     """Of the packages that a score hangs on."""
     return {name: version(name) for name in _PACKAGES}
+
+
+def _telling(key: str, value: Any) -> Any:
+    """What of a run's entry tells it from others: of a server that says what it serves not where that is."""
+    if key == "policy" and value and value.get("server") and value.get("name", "").startswith(_ADDRESSES):
+        return {name: said for name, said in value.items() if name != "name"}
+    return value
+
+
+def _lines(outcomes: Iterable[Outcome]) -> str:
+    return "".join(json.dumps(asdict(outcome)) + "\n" for outcome in outcomes)
 
 
 def _mended(path: Path) -> dict[int, Outcome]:

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
+from robocas_ms3.config.load import nearest
 from robocas_ms3.datasets.render import require_renderer
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Policy, describe
 from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
-from robocas_ms3.evaluation.results import Outcome
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
 from robocas_ms3.evaluation.weld import refuse
@@ -47,7 +48,14 @@ class Settings:
 
 
 def evaluate(
-    protocol: LoadedProtocol, policy: Policy, name: str, folder: Path, settings: Settings, *, resume: bool = False
+    protocol: LoadedProtocol,
+    policy: Policy,
+    name: str,
+    folder: Path,
+    settings: Settings,
+    *,
+    resume: bool = False,
+    again: bool = False,
 ) -> Iterator[tuple[Outcome, int]]:
     """Play the episodes that a result lacks, and write each as it ends.
 
@@ -58,6 +66,7 @@ def evaluate(
         folder: of the result.
         settings: how.
         resume: whether to go on with a result that is there.
+        again: whether to play episodes again that an error broke off.
 
     Yields:
         What came of an episode, and how many are still to come.
@@ -68,14 +77,16 @@ def evaluate(
             another run.
     """
     protocol.rules.refuse(policy.wants)
+    rate_of(protocol, policy.wants)
     if settings.weld:
         refuse(protocol.rules.stepping, choose_backend(settings.backend))
     wanted = chosen(protocol.episodes, settings)
     if not wanted:
-        raise EvaluationError("no episodes in this part", where=protocol.rules.name, found=settings.shard)
+        number, of = settings.shard
+        raise EvaluationError("no episodes in this part", where=protocol.rules.name, found=f"shard {number}/{of}")
     if policy.wants.cameras:
         require_renderer()
-    done = results.begin(folder, about(protocol, policy, name, settings), resume=resume)
+    done = results.begin(folder, about(protocol, policy, name, settings), resume=resume, again=again)
     left = [episode for episode in wanted if episode.episode not in done]
     count = len(left)
     for config in dict.fromkeys(episode.config for episode in left):
@@ -96,9 +107,8 @@ def chosen(episodes: Sequence[Episode], settings: Settings) -> list[Episode]:
         known = dict.fromkeys(str(getattr(episode, what)) for episode in episodes)
         for name in wanted:
             if name not in known:
-                raise EvaluationError(
-                    f"the protocol has no such {what}", where="episodes", expected=", ".join(known), found=name
-                )
+                expected, fix = ", ".join(known), nearest(name, known)
+                raise EvaluationError(f"the protocol has no such {what}", expected=expected, found=name, fix=fix)
     number, of = settings.shard
     taken: dict[str, int] = {}
     found = []

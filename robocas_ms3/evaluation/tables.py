@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
-from robocas_ms3.evaluation.results import STAGES, Outcome, Result
+from robocas_ms3.evaluation.outcomes import STAGES, Outcome
+from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, success_by
 
@@ -23,14 +24,16 @@ def title(result: Result) -> str:
 
 def markdown(result: Result) -> str:
     """The tables of a result."""
-    run = result.run
+    run, broken = result.run, result.broken_off()
     lines = [
         f"# {title(result)}",
         "",
         *([f"**{WELDED}**", ""] if run["weld"] else []),
         f"Protocol hash `{run['protocol_hash'][:16]}`, {len(result.outcomes)} episodes, {run['backend']}; "
         + ", ".join(f"{name} {number}" for name, number in run["versions"].items())
-        + ". Intervals are Clopper-Pearson's, 95 %.",
+        + ". Intervals are Clopper-Pearson's, 95 %. RA, PA: any object reached, lifted; RR: the target reached; "
+        "CO: what hid it cleared.",
+        *(["", f"**{broken} episodes were broken off by an error. They count as failures.**"] if broken else []),
         "",
         "| configuration | n | success | at the end | upstream's | " + " | ".join(STAGES) + " | steps | s |",
         "|---|---|---|---|---|" + "---|" * (len(STAGES) + 2),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
+from robocas_ms3.evaluation.outcomes import Outcome, failure_stage
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol
-from robocas_ms3.evaluation.results import Outcome, Result, failure_stage
+from robocas_ms3.evaluation.results import Result
 
 
 def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
@@ -50,9 +52,14 @@ def _of_weld(result: Result, protocol: LoadedProtocol) -> Iterator[str]:
 
 def _too_long(outcome: Outcome, protocol: LoadedProtocol, run: dict[str, Any]) -> Iterator[str]:
     rules = protocol.rules
-    limit = rules.steps(outcome.task, rules.rate_hz or run["policy"].get("wants", {}).get("rate_hz") or DEFAULT_HZ)
+    rate = rules.rate_hz or run["policy"].get("wants", {}).get("rate_hz") or DEFAULT_HZ
+    limit = rules.steps(outcome.task, rate)
     if limit is not None and outcome.steps > limit:
         yield f"{outcome.steps} steps, {limit} are allowed"
+    if rules.stepping == "timed":
+        expected = outcome.steps / rate
+        if abs(outcome.seconds - expected) > 1e-3:
+            yield f"{outcome.seconds:g} s, its {outcome.steps} steps take {expected:g}"
 
 
 def _of_retrieval(outcome: Outcome) -> Iterator[str]:
@@ -71,12 +78,28 @@ def _of_retrieval(outcome: Outcome) -> Iterator[str]:
         yield "its order of retrieval is none"
 
 
+def _of_seconds(outcome: Outcome) -> Iterator[str]:
+    flags, seconds = outcome.flags, outcome.flag_seconds
+    if flags.keys() != seconds.keys() or any((flags[name] is None) != (seconds[name] is None) for name in flags):
+        yield "flag_seconds are not of its flags"
+    late = [name for name, second in seconds.items() if second is not None and not 0 <= second <= outcome.seconds]
+    if late:
+        yield f"{', '.join(late)} held first after its {outcome.seconds:g} s"
+
+
 def _at_odds(outcome: Outcome, protocol: LoadedProtocol) -> Iterator[str]:
     """What an outcome says against itself."""
     flags = outcome.flags
     yield from _of_retrieval(outcome)
     if outcome.success != (flags.get("success") is not None):
         yield "success does not agree with its flags"
+    if outcome.success_at_end and not outcome.success:
+        yield "success_at_end, but no success"
+    if outcome.success_v0 and flags.get("success_v0") is None:
+        yield "success_v0 does not agree with its flags"
+    if any(not 0 <= value < math.inf for value in (outcome.seconds, outcome.inference_ms, *outcome.measures.values())):
+        yield "a measure is no number from 0 on"
+    yield from _of_seconds(outcome)
     stage = failure_stage(flags, outcome.error)
     if outcome.failure_stage != stage:
         yield f"failure_stage is {outcome.failure_stage or 'none'}, by its flags {stage or 'none'}"

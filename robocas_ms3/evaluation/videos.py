@@ -13,10 +13,11 @@ import torch
 
 from robocas_ms3.datasets.render import require_renderer
 from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Policy
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.failed import VIDEOS, video_name
-from robocas_ms3.evaluation.results import Outcome, Result
+from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
 from robocas_ms3.evaluation.weld import refuse

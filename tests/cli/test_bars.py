@@ -1,10 +1,12 @@
-"""Bars show on a terminal, and nothing at all does elsewhere."""
+"""Bars show on a terminal; elsewhere a line a minute does, and nothing at all of what is over sooner."""
 
 import os
 import subprocess
 import sys
 
 import pytest
+
+from robocas_ms3.cli import bars
 
 SCRIPT = """
 from robocas_ms3.cli.bars import bar, say
@@ -44,3 +46,15 @@ def test_on_a_terminal():
     assert "2/2" in shown
     assert "replaying" in shown
     assert "2/3" in shown
+
+
+def test_a_line_a_minute_in_a_log(monkeypatch, capsys):
+    now = [0.0]
+    monkeypatch.setattr(bars.time, "monotonic", lambda: now[0])
+    with bars.bar("episodes") as shown:
+        for done in range(1, 301):
+            now[0] += 1.5
+            shown.at(done, 300)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["episodes: 40 of 300, 1 min", "episodes: 80 of 300, 2 min"]
+    assert len(lines) == 7

@@ -8,8 +8,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.evaluation.outcomes import Outcome, failure_stage
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.results import OUTCOMES, RUN, Outcome, Result, failure_stage, read
+from robocas_ms3.evaluation.results import OUTCOMES, RUN, Result, read
 
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
 RUN_OF = {
@@ -29,6 +30,7 @@ def outcome(episode: int, came_to: int = 7, **others: Any) -> Outcome:
     names = (*STAGES, "success")
     flags = {name: 10 * (at + 1) if at < came_to else None for at, name in enumerate(names)} | {"fail": None}
     success = flags["success"] is not None
+    flags["success_v0"] = flags["success"]
     made = Outcome(
         episode=episode,
         task="pick",

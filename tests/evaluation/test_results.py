@@ -6,7 +6,8 @@ import pytest
 from made_up_results import RUN_OF, outcome, write
 
 from robocas_ms3.errors import EvaluationError
-from robocas_ms3.evaluation.results import OUTCOMES, append, begin, failure_stage, merge, parts_of, read
+from robocas_ms3.evaluation.outcomes import failure_stage
+from robocas_ms3.evaluation.results import OUTCOMES, append, begin, merge, parts_of, read
 
 SEARCH = dict.fromkeys(("obstacles_cleared", "reached_any", "target_grasped", "target_lifted", "success"))
 
@@ -41,7 +42,7 @@ def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
 def test_resuming_with_something_else_is_refused(tmp_path, key):
     write(tmp_path / "a", [outcome(0)])
     with pytest.raises(EvaluationError, match=f"another {key}"):
-        begin(tmp_path / "a", {**RUN_OF, key: "other"}, resume=True)
+        begin(tmp_path / "a", {**RUN_OF, key: {"name": "other"} if key == "policy" else "other"}, resume=True)
 
 
 def test_a_result_from_before_there_was_a_weld_is_one_without_it(tmp_path):
@@ -196,3 +197,40 @@ def test_a_door_that_was_never_opened_comes_before_its_objects():
 
 def test_the_clock_is_no_part_of_an_outcome():
     assert outcome(0).without_clock() == replace(outcome(0), inference_ms=3.0).without_clock()
+
+
+SERVED = {"server": {"name": "mine", "class": "m:Mine"}, "play": None, "wants": {}}
+
+
+def test_where_a_server_was_is_not_who_it_served(tmp_path):
+    """As where each of two GPUs serves a shard."""
+    write(tmp_path / "a", [outcome(0)], policy={"name": "ws://a:8001?connect_s=3", **SERVED})
+    write(tmp_path / "b", [outcome(1)], policy={"name": "ws://b:8002", **SERVED})
+    assert list(read(tmp_path / "a", tmp_path / "b").outcomes) == [0, 1]
+    assert parts_of([tmp_path / "a", tmp_path / "b"]) == [[tmp_path / "a", tmp_path / "b"]]
+    begin(tmp_path / "a", {**RUN_OF, "policy": {"name": "ws://c:1", **SERVED}}, resume=True)
+    other = {**SERVED, "server": {"name": "other"}}
+    with pytest.raises(EvaluationError, match=r"another policy.*'server': .'name': 'mine'.*'name': 'other'"):
+        begin(tmp_path / "a", {**RUN_OF, "policy": {"name": "ws://c:1", **other}}, resume=True)
+    silent = {**SERVED, "server": None}  # a plain openpi server: nobody knows what it serves
+    write(tmp_path / "c", [outcome(0)], policy={"name": "ws://a:1", **silent})
+    write(tmp_path / "d", [outcome(1)], policy={"name": "ws://a:2", **silent})
+    with pytest.raises(EvaluationError, match="another policy"):
+        read(tmp_path / "c", tmp_path / "d")
+
+
+def test_what_an_error_broke_off_is_played_again_if_that_is_asked_for(tmp_path):
+    broken = outcome(1, 0, error="no server", failure_stage="error")
+    write(tmp_path / "a", [outcome(0), broken, outcome(2)])
+    assert list(begin(tmp_path / "a", RUN_OF, resume=True)) == [0, 1, 2]
+    assert read(tmp_path / "a").broken_off() == 1
+    assert list(begin(tmp_path / "a", RUN_OF, resume=True, again=True)) == [0, 2]
+    append(tmp_path / "a", outcome(1))
+    assert read(tmp_path / "a").outcomes[1].success
+
+
+def test_a_run_that_died_before_its_first_episode_is_in_nobodys_way(tmp_path):
+    begin(tmp_path / "a", RUN_OF, resume=False)
+    begin(tmp_path / "a", {**RUN_OF, "policy": {"name": "another"}}, resume=False)
+    append(tmp_path / "a", outcome(0))
+    assert read(tmp_path / "a").run["policy"] == {"name": "another"}

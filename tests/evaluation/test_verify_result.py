@@ -52,7 +52,14 @@ def test_nothing_is_wrong_with_a_whole_result(folder, protocol):
         ({"failure_stage": "placed"}, "episode 0: failure_stage is placed, by its flags none"),
         ({"steps": 801}, "episode 0: 801 steps, 800 are allowed"),  # 40 s at 20 Hz
         ({"steps": 71}, "episode 0: it went on after success, 70 of 71 steps"),
-        ({"steps": 69}, "episode 0: success held first after its 69 steps"),
+        ({"steps": 69}, "episode 0: success, success_v0 held first after its 69 steps"),
+        ({"success_at_end": True, "success": False}, "episode 0: success_at_end, but no success"),
+        ({"flags": {"success_v0": None}}, "episode 0: success_v0 does not agree with its flags"),
+        ({"seconds": 3.0}, "episode 0: 3 s, its 70 steps take 3.5"),
+        ({"flag_seconds": {"success": 3.6}}, "episode 0: success held first after its 3.5 s"),
+        ({"flag_seconds": {}}, "episode 0: flag_seconds are not of its flags"),
+        ({"measures": {"path_length": -1.0}}, "episode 0: a measure is no number from 0 on"),
+        ({"inference_ms": float("nan")}, "episode 0: a measure is no number from 0 on"),
         ({"episode": 99}, "episode 99: the protocol has none of this number"),
         ({"episode": -1}, "episode -1: the protocol has none of this number"),
     ],
@@ -63,16 +70,19 @@ def test_a_changed_episode_is_found(folder, protocol, values, said):
 
 
 def test_a_failure_made_a_success_is_found(folder, protocol):
-    flags = read(folder).outcomes[0].flags | {"success": None}
-    tamper(folder, 0, flags=flags, success=False, failure_stage="placed")
+    before = read(folder).outcomes[0]
+    flags, seconds = before.flags | {"success": None}, before.flag_seconds | {"success": None}
+    failed = {"success": False, "success_at_end": False, "failure_stage": "placed"}
+    tamper(folder, 0, flags=flags, flag_seconds=seconds, **failed)
     assert problems(read(folder), protocol) == []
     tamper(folder, 0, success=True, failure_stage="")
-    assert len(problems(read(folder), protocol)) == 2
+    assert len(problems(read(folder), protocol)) == 2  # flags of success, and of the stage
 
 
 def test_the_policys_rate_is_that_of_its_steps(folder, protocol):
     flags = {"success": None, "reached_any": None}
-    tamper(folder, 0, steps=401, success=False, failure_stage="reached_any", flags=flags)
+    failed = {"success": False, "success_at_end": False, "success_v0": False, "failure_stage": "reached_any"}
+    tamper(folder, 0, steps=401, seconds=20.05, flags=flags, flag_seconds=flags, **failed)
     assert problems(read(folder), protocol) == []
     tamper_run(folder, policy={"name": "mine", "wants": {"rate_hz": 10}})
     assert "episode 0: 401 steps, 400 are allowed" in problems(read(folder), protocol)

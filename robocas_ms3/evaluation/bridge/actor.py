@@ -11,8 +11,8 @@ from robocas_ms3.errors import WireError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.bridge.channel import Channel
 from robocas_ms3.evaluation.bridge.proprioception import WIDTHS, Proprioception
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
-from robocas_ms3.evaluation.results import Outcome
 
 
 class Watched:

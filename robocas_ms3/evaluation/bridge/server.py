@@ -16,9 +16,9 @@ from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.bridge.actor import Abandoned, Actor, Watched
 from robocas_ms3.evaluation.bridge.channel import Channel
 from robocas_ms3.evaluation.bridge.proprioception import WIDTHS
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Reference, Wants
 from robocas_ms3.evaluation.protocol import Episode, load_protocol
-from robocas_ms3.evaluation.results import Outcome
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.run import Settings, about, chosen
 from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of

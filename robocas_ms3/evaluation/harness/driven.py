@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 from robocas_ms3.datasets.render import require_renderer
 from robocas_ms3.errors import EvaluationError, PolicyFailed
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
-from robocas_ms3.evaluation.results import Outcome
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.run import Settings, about
 from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.harness.driven import DrivenEpisodes
+from robocas_ms3.evaluation.outcomes import STAGES
 from robocas_ms3.evaluation.policy import Observations
 from robocas_ms3.evaluation.protocol import Episode, load_protocol
 from robocas_ms3.evaluation.remote.messages import actions_of, wants_of
-from robocas_ms3.evaluation.results import STAGES
 from robocas_ms3.evaluation.tracking import MEASURES
 
 # How vla-eval calls what the numbers of an action mean, where it has a word for it.

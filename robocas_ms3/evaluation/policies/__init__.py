@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import importlib
+import os
+import re
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.config.load import nearest
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policies.plain import RandomPolicy, StillPolicy
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
-from robocas_ms3.evaluation.policy import Policy
+from robocas_ms3.evaluation.policy import Policy, Wants
 
 BUILTIN: dict[str, Callable[[], Policy]] = {
     "scripted": ScriptedPolicy,
@@ -34,6 +38,19 @@ def make_policy(name: str) -> Policy:
         EvaluationError: there is no such policy.
         MissingExtraError: it is elsewhere, and the ``remote`` extra is not installed.
     """
+    policy = _made(name)
+    for what, fits in (
+        ("wants", isinstance(getattr(policy, "wants", None), Wants)),
+        ("reset", callable(getattr(policy, "reset", None))),
+        ("act", callable(getattr(policy, "act", None))),
+    ):
+        if not fits:
+            expected = "wants (robocas_ms3.evaluation.policy.Wants), reset(starts) and act(observations)"
+            raise EvaluationError(f"a policy without {what}", where=name, expected=expected)
+    return policy
+
+
+def _made(name: str) -> Policy:
     if name in BUILTIN:
         return BUILTIN[name]()
     kind, _, rest = name.partition(":")
@@ -43,14 +60,35 @@ def make_policy(name: str) -> Policy:
         return RemotePolicy(name)
     if kind == "replay" and rest:
         return ReplayPolicy(Path(rest))
-    if not kind or not rest:
+    if not re.fullmatch(r"\w+(\.\w+)*", kind) or not rest.isidentifier():
         expected = f"{', '.join(BUILTIN)}, replay:TRAJECTORY.h5, module:Class or ws://host:port"
-        raise EvaluationError("no such policy", where=name, expected=expected)
+        raise EvaluationError("no such policy", where=name, expected=expected, fix=nearest(name, BUILTIN))
+    return _own(name, kind, rest)
+
+
+def _own(name: str, module: str, of: str) -> Policy:
+    """A policy of the user's own, from an installed module or one in the folder that the command runs in."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # the last: what lies about must not stand in for what is installed
     try:
-        made: Any = getattr(importlib.import_module(kind), rest)
-    except (ImportError, AttributeError) as error:
+        made: Any = getattr(importlib.import_module(module), of)
+    except ModuleNotFoundError as error:
+        if error.name != module.partition(".")[0]:
+            raise EvaluationError("this policy's module can't be imported", where=module, found=error) from error
+        fix = "Run in its folder, or install it, or put its folder on PYTHONPATH."
+        raise EvaluationError("no such policy", where=name, found=error, fix=fix) from error
+    except AttributeError as error:
         raise EvaluationError("no such policy", where=name, found=error) from error
-    return made()
+    except Exception as error:
+        what, found = "this policy's module can't be imported", f"{type(error).__name__}: {error}"
+        raise EvaluationError(what, where=module, found=found) from error
+    try:
+        return made()
+    except TypeError as error:
+        if error.__traceback__ is not None and error.__traceback__.tb_next is None:  # it was not even begun
+            what, expected = "this policy can't be made", "a class that takes no arguments"
+            raise EvaluationError(what, where=name, expected=expected, found=error) from error
+        raise
 
 
 @contextmanager

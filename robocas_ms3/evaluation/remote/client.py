@@ -45,8 +45,12 @@ class RemotePolicy:
         metadata = link.metadata if isinstance(link.metadata, dict) else {}
         self._said: Any = metadata.get(WANTS)
         if self._said is not None and self._address.wants:
+            link.close()
             raise EvaluationError(
-                "the server says itself what it wants", where=self._address.url, found=sorted(self._address.wants)
+                "the server says itself what it wants",
+                where=self._address.url,
+                found=sorted(self._address.wants),
+                fix="Leave these out of the address.",
             )
         self.wants: Wants = wants_of(self._address.wants if self._said is None else self._said, self._address.url)
         self._about = json.loads(json.dumps(metadata.get(POLICY), default=str))
@@ -57,7 +61,8 @@ class RemotePolicy:
 
     def describe(self) -> dict[str, Any]:
         """What a result says of it: what the server says of its policy."""
-        return {"server": self._about, "play": self._address.play}
+        rename = {"rename": self._address.rename} if self._address.rename else {}
+        return {"server": self._about, "play": self._address.play, **rename}
 
     def reset(self, starts: list[Start]) -> None:
         """Begin episodes; the server is told with the first observation."""

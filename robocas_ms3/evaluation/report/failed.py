@@ -5,9 +5,10 @@ from __future__ import annotations
 from html import escape
 from pathlib import Path
 
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.report.marks import section, table
 from robocas_ms3.evaluation.report.stages import FAILURES
-from robocas_ms3.evaluation.results import Outcome, Result
+from robocas_ms3.evaluation.results import Result
 
 VIDEOS = "videos"
 

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.background import measured_with
 from robocas_ms3.evaluation.report.failed import failed_episodes
 from robocas_ms3.evaluation.report.marks import axis, bar, rate, round_up, section, spread, table
 from robocas_ms3.evaluation.report.stages import FAILURES, STAGES
-from robocas_ms3.evaluation.results import Outcome, Result
+from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, share, success_by
 from robocas_ms3.evaluation.tables import P_VIS_EDGES, WELDED, first_splits
@@ -58,7 +59,7 @@ def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
     notes = [WELDED] if result.run["weld"] else []
     if protocol is not None and count < len(protocol.episodes):
         notes.append(f"{len(protocol.episodes) - count} episodes of the protocol are missing: this is no whole result.")
-    broken = sum(bool(outcome.error) for outcome in result.outcomes.values())
+    broken = result.broken_off()
     if broken:
         notes.append(f"{broken} episodes were broken off by an error. They count as failures.")
     return f'<p class="lead">{said}</p>\n' + "".join(f'<p class="note">{note}</p>\n' for note in notes)

@@ -19,4 +19,4 @@ FAILURES = {
     "placed": "placed, at rest",
     "error": "broken off",
 }
-"""What an episode did not come to (`results.failure_stage`)."""
+"""What an episode did not come to (`outcomes.failure_stage`)."""

@@ -13,11 +13,11 @@ pytest.importorskip("msgpack")
 from remote_ends import IN_A_HURRY, StandIn, Told, a_start, serving, some_observations, talking
 
 from robocas_ms3.errors import EvaluationError, PolicyFailed
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.link import MAX_REPLY
 from robocas_ms3.evaluation.remote.wire import pack
-from robocas_ms3.evaluation.results import Outcome
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 
 GOOD = pack({"actions": np.zeros((1, 7))})

@@ -1,0 +1,108 @@
+"""What came of one episode, as results keep it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from robocas_ms3.evaluation import retrieval
+from robocas_ms3.evaluation.protocol import Episode
+from robocas_ms3.evaluation.rollout import Played
+
+# evaluation_v0.md and the paper's table: reach, pick, recognise, clear
+STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
+_ORDER = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_target", "target_grasped", "target_lifted")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of an episode.
+
+    Attributes:
+        episode: its number in the protocol.
+        task: short name.
+        config: name of its configuration.
+        seed: of its scene.
+        split: of the protocol.
+        success: the task had succeeded at some moment.
+        success_at_end: it had at the last one.
+        success_v0: upstream's rule held at the last one.
+        steps: policy steps.
+        seconds: of the scene.
+        failure_stage: see `failure_stage`; empty: it succeeded.
+        error: why.
+        flags: by stage or rule, the policy step after which it first held.
+        flag_seconds: the same in s of the scene.
+        measures: ``path_length`` m, ``contact_impulse`` N s, ``disturbed_most``, ``fallen``; ``welds`` with the weld.
+        inference_ms: clock time of the policy a step.
+        p_vis: share of the target that is seen from above.
+        retrieval: search: what was moved before the target, see `retrieval.outcome`.
+    """
+
+    episode: int
+    task: str
+    config: str
+    seed: int
+    split: str
+    success: bool
+    success_at_end: bool
+    success_v0: bool
+    steps: int
+    seconds: float
+    failure_stage: str
+    error: str = ""
+    flags: dict[str, int | None] = field(default_factory=dict)
+    flag_seconds: dict[str, float | None] = field(default_factory=dict)
+    measures: dict[str, float] = field(default_factory=dict)
+    inference_ms: float = 0.0
+    p_vis: float | None = None
+    retrieval: dict[str, Any] | None = None
+
+    @classmethod
+    def of(cls, played: Played, episode: Episode, objects: Sequence[str]) -> Outcome:
+        """What is kept of an episode that was played, with objects of these ids."""
+        flags, held_at, order = played.flags, played.flags.get("target_grasped"), None
+        if played.retrieval is not None:
+            cleared = flags.get("obstacles_cleared") is not None
+            order = retrieval.outcome(played.retrieval, objects, held_at, cleared=cleared)
+        return cls(
+            episode=episode.episode,
+            task=episode.task,
+            config=episode.config,
+            seed=episode.seed,
+            split=episode.split,
+            success=flags.get("success") is not None,
+            success_at_end=played.at_end.get("success", False),
+            success_v0=played.at_end.get("success_v0", False),
+            steps=played.steps,
+            seconds=round(played.seconds, 4),
+            failure_stage=failure_stage(flags, played.error),
+            error=played.error,
+            flags=flags,
+            flag_seconds=played.flag_seconds,
+            measures=played.measures,
+            inference_ms=round(1000 * played.inference_seconds / max(played.steps, 1), 3),
+            p_vis=episode.p_vis,
+            retrieval=order,
+        )
+
+    def without_clock(self) -> dict[str, Any]:
+        """All but what a clock said: the same for the same seed and policy."""
+        return {name: value for name, value in asdict(self).items() if name != "inference_ms"}
+
+
+def failure_stage(flags: dict[str, int | None], error: str = "") -> str:
+    """The stage an episode did not come to, next after the furthest that it did come to.
+
+    A target that is pulled out of its heap was reached though its obstacles were never cleared, so stages that were
+    left out on the way do not count. ``placed``: it was lifted; ``error``: the episode was broken off; empty: success.
+    """
+    if error:
+        return "error"
+    if flags.get("success") is not None:
+        return ""
+    stages = [stage for stage in _ORDER if stage in flags]
+    came = [number for number, stage in enumerate(stages) if flags[stage] is not None]
+    following = came[-1] + 1 if came else 0
+    return stages[following] if following < len(stages) else "placed"

@@ -1,0 +1,71 @@
+"""Policies by name, the user's own among them: found where the command runs, and refused in one line."""
+
+import sys
+
+import pytest
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.policies import make_policy
+from robocas_ms3.evaluation.policies.plain import StillPolicy
+
+GOOD = """
+from robocas_ms3.evaluation.policy import Wants
+class Mine:
+    wants = Wants()
+    def reset(self, starts): ...
+    def act(self, observations): ...
+class Picky(Mine):
+    def __init__(self, folder): ...
+class Wishless(Mine):
+    wants = {"convention": "robocas"}
+class Idle:
+    wants = Wants()
+    def reset(self, starts): ...
+class Broken(Mine):
+    def __init__(self): len(3)
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """The folder that a command runs in."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for name in ("own_policy", "own_spoilt", "own_importing"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    (tmp_path / "own_policy.py").write_text(GOOD)
+    (tmp_path / "own_spoilt.py").write_text("def (")
+    (tmp_path / "own_importing.py").write_text("import not_there_at_all")
+    return tmp_path
+
+
+def test_a_module_in_the_folder_of_the_command(here):
+    assert type(make_policy("own_policy:Mine")).__name__ == "Mine"
+    assert sys.path[-1] == str(here)  # and not before what is installed
+    assert isinstance(make_policy("still"), StillPolicy)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("scriptd", "no such policy .*Did you mean scripted"),
+        ("http://127.0.0.1:9", "no such policy .*ws://host:port"),
+        ("own_policy.py:Mine", "this policy's module can't be imported|no such policy"),
+        ("own_nowhere:Mine", "no such policy .*No module named 'own_nowhere'.*PYTHONPATH"),
+        ("own_policy:Yours", "no such policy .*Yours"),
+        ("own_spoilt:Mine", "own_spoilt: this policy's module can't be imported .*SyntaxError"),
+        ("own_importing:Mine", "own_importing: this policy's module can't be imported .*not_there_at_all"),
+        ("own_policy:Picky", "this policy can't be made .*takes no arguments"),
+        ("own_policy:Wishless", "a policy without wants"),
+        ("own_policy:Idle", "a policy without act"),
+    ],
+)
+def test_what_is_no_policy_is_one_line(here, name, message):
+    with pytest.raises(EvaluationError, match=message) as caught:
+        make_policy(name)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_error_of_the_policys_own_is_its_own(here):
+    with pytest.raises(TypeError, match="len"):
+        make_policy("own_policy:Broken")
