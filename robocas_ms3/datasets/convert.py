@@ -208,7 +208,7 @@ def embed_texts(file: TrajectoryFile, chosen: list[int]) -> dict[str, NDArray[np
     embedder = TextEmbedder()
     texts: dict[str, None] = {}
     for index in chosen:
-        recording = file.recording(index)
-        texts[recording.instruction] = None
-        texts.update(dict.fromkeys(goal.goal_description for goal in recording.subgoals))
+        entry = file.entry(index)
+        texts[entry.instruction] = None
+        texts.update(dict.fromkeys(goal.goal_description for goal in entry.subgoals))
     return dict(zip(texts, embedder(texts), strict=True))

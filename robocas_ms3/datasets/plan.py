@@ -65,7 +65,7 @@ def resumed_plan(out: Path, file: TrajectoryFile, chosen: list[int], settings: d
     check_settings(out, before, settings, "can't resume with other settings", "--overwrite, or the settings of before")
     planned = before["episodes"]
     by_recording = {entry["recording"]: int(number) for number, entry in planned.items()}
-    marks = [fingerprint(file.recording(index)) for index in chosen]
+    marks = [fingerprint(file.recording(index, bodies=False)) for index in chosen]
     unknown = [index for index, mark in zip(chosen, marks, strict=True) if mark not in by_recording]
     if unknown:
         raise DatasetError(
@@ -88,7 +88,7 @@ def appended_plan(out: Path, file: TrajectoryFile, chosen: list[int], settings: 
     by_recording = {entry["recording"]: int(number) for number, entry in before["episodes"].items()}
     known, new = [], []
     for index in chosen:
-        mark = fingerprint(file.recording(index))
+        mark = fingerprint(file.recording(index, bodies=False))
         if mark in by_recording:
             known.append((by_recording[mark], index))
         else:
@@ -158,7 +158,7 @@ def _extended(
             "seed": episode.get("episode_seed"),
             "success": succeeded(episode),
             "target": episode.get("robocas", {}).get("target"),
-            "recording": fingerprint(file.recording(index)),
+            "recording": fingerprint(file.recording(index, bodies=False)),
         }
     content = json.loads(json.dumps({**header, "episodes": {**episodes, **added}}))
     return Plan(content, tasks)

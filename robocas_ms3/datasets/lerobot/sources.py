@@ -64,7 +64,7 @@ class TrajectorySource:
                 "seed": episode.get("episode_seed"),
                 "success": succeeded(episode),
                 "target": episode.get("robocas", {}).get("target"),
-                "recording": fingerprint(self._file.recording(index)),
+                "recording": fingerprint(self._file.recording(index, bodies=False)),
             }
             found.append(entry)
         return found
