@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
-from scipy.spatial.transform import Rotation
 
 from asset_tools.quality.measure import top_grasps
 from asset_tools.studio import PAPER, Body, Colour, Studio, box_faces
 from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import Hull
 from robocas_ms3.assets.kinematics import link_poses
-from robocas_ms3.assets.manifest import FurnitureAsset, Handle, ObjectAsset
+from robocas_ms3.assets.manifest import FurnitureAsset, ObjectAsset
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
 from robocas_ms3.errors import AssetError
+from robocas_ms3.poses import from_wxyz
 
 Array = NDArray[np.float64]
 Picture = tuple[str, Image.Image]
@@ -154,7 +154,8 @@ def _furniture_pictures(studio: Studio, furniture: LoadedFurniture) -> list[Pict
         faces = box_faces((*surface.min_xy, surface.z), (*surface.max_xy, surface.z + thick))
         marks.append(_solid(faces, _hue(i), open_[surface.link]))
     for handle in asset.handles.values():
-        marks.append(_solid(gripper_faces(handle.width, thick), RED, open_[handle.link] @ _pose(handle)))
+        grasp = from_wxyz(np.array([*handle.position, *handle.wxyz]))
+        marks.append(_solid(gripper_faces(handle.width, thick), RED, open_[handle.link] @ grasp))
     points = np.concatenate([body.points for body in looks(shut)])
     edges = _solid(frame_faces(points.min(axis=0), points.max(axis=0), thick / 2), GREY)
     front, behind = ("closed", "open") if asset.links else ("front", "behind")
@@ -216,14 +217,6 @@ def frame_faces(low: Array, high: Array, half: float) -> Array:
 
 def _solid(faces: Array, colour: Colour, pose: Array | None = None) -> Body:
     return Body(faces.reshape(-1, 3), faces=faces, colour=colour, pose=np.eye(4) if pose is None else pose)
-
-
-def _pose(handle: Handle) -> Array:
-    w, x, y, z = handle.wxyz
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-    pose[:3, 3] = handle.position
-    return pose
 
 
 def _count(number: int, thing: str) -> str:

@@ -15,8 +15,8 @@ import tyro
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import load_task_config
 from robocas_ms3.errors import LayoutError
+from robocas_ms3.poses import transform
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.placement import transform
 from robocas_ms3.scenes.sample import sample_layout
 
 

@@ -22,6 +22,7 @@ from robocas_ms3.assets.physics import (
     pose_matrix,
 )
 from robocas_ms3.errors import AssetError
+from robocas_ms3.poses import inverse
 
 # The fingers of robots/mobile_panda.py and robots/urdf.py: drives in N/m and N s/m, N, m, kg, kg m2
 STIFFNESS, DAMPING, FORCE_LIMIT = 1e3, 1e2, 100.0
@@ -81,7 +82,7 @@ def hold_test(solid: Solid, grasps_tcp_in_object: Array, *, time_step: float = T
             tcp = _DOWN.copy()
             tcp[:3, 3] = place + [0, 0, _HEIGHT]
             hands.append(_add_hand(scene, tcp))
-            body = add_body(scene, solid, tcp @ _rigid_inverse(grasp))
+            body = add_body(scene, solid, tcp @ inverse(grasp))
             body.disable_gravity = True
             objects.append(body)
         for _ in range(round(CLOSING / time_step)):
@@ -119,14 +120,7 @@ def _motion(time_step: float) -> NDArray[np.float64]:
 
 def _in_hand(hands: list[_Hand], objects: list[physx.PhysxRigidDynamicComponent]) -> Array:
     """Poses (N, 4, 4) of the objects in the TCP's frame."""
-    return np.array([_rigid_inverse(pose_matrix(h.palm)) @ pose_matrix(o) for h, o in zip(hands, objects, strict=True)])
-
-
-def _rigid_inverse(pose: Array) -> Array:
-    inverse = np.eye(4)
-    inverse[:3, :3] = pose[:3, :3].T
-    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return inverse
+    return np.array([inverse(pose_matrix(h.palm)) @ pose_matrix(o) for h, o in zip(hands, objects, strict=True)])
 
 
 def _add_hand(scene: sapien.Scene, tcp_in_world: Array) -> _Hand:

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.rigid import ANGLE_TOLERANCE, NORM_TOLERANCE, POSITION_TOLERANCE, apart, same
 from robocas_ms3.datasets.tolerant import planar_motion
 from robocas_ms3.datasets.violation import Violation
 from robocas_ms3.language.templates import GOAL_TYPES
+from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import relative_motion
 
 
@@ -49,10 +49,10 @@ def check_poses(file: str, arrays: dict[str, NDArray]) -> Iterator[Violation]:
         pairs = [(arrays[position], arrays[orientation]), (arrays[rel_position], arrays[rel_orientation])]
         if any(np.linalg.norm(q, axis=1).min() < 0.5 for _, q in pairs):
             continue  # said already
-        absolute, relative = (to_matrices(p.astype(np.float64), q.astype(np.float64)) for p, q in pairs)
+        absolute, relative = (from_xyzw(p.astype(np.float64), q.astype(np.float64)) for p, q in pairs)
         if same(relative_motion(absolute), relative).all():
             continue
-        as_wxyz = [to_matrices(p.astype(np.float64), np.roll(q, -1, axis=1).astype(np.float64)) for p, q in pairs]
+        as_wxyz = [from_xyzw(p.astype(np.float64), np.roll(q, -1, axis=1).astype(np.float64)) for p, q in pairs]
         if same(relative_motion(as_wxyz[0]), as_wxyz[1]).all():
             yield Violation(file, f"{orientation}, {rel_orientation}", "quaternions xyzw", "quaternions wxyz")
             continue

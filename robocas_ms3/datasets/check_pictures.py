@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import geometry, schema
-from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.picture_files import PictureHeader, read_header
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.rigid import is_rigid
 from robocas_ms3.datasets.tolerant import first_line
 from robocas_ms3.datasets.violation import Violation
+from robocas_ms3.poses import from_xyzw
 
 _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
 _GEOMETRY_STEPS = 3
@@ -96,8 +96,8 @@ def check_depth(
     folder: Path, arrays: dict[str, NDArray], cameras: dict[str, tuple[NDArray, NDArray]], steps: int
 ) -> Iterator[Violation]:
     """Check depth at some steps against intrinsics and poses, see `geometry.check`."""
-    base = to_matrices(arrays["base_pos"].astype(np.float64), arrays["base_orn"].astype(np.float64))
-    ee = base @ to_matrices(arrays["ee_pos"].astype(np.float64), arrays["ee_orn"].astype(np.float64))
+    base = from_xyzw(arrays["base_pos"].astype(np.float64), arrays["base_orn"].astype(np.float64))
+    ee = base @ from_xyzw(arrays["ee_pos"].astype(np.float64), arrays["ee_orn"].astype(np.float64))
     chosen = sorted({round(step) for step in np.linspace(0, steps - 1, _GEOMETRY_STEPS)})
     seen: list[list[geometry.View]] = []
     for step in chosen:

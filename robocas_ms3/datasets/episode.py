@@ -18,25 +18,6 @@ from robocas_ms3.recordings.subgoals import SubGoal
 Array = NDArray[np.float64]
 
 
-def to_matrices(positions: Array, xyzw: Array) -> Array:
-    """4x4 from positions (..., 3) and quaternions (..., 4) xyzw."""
-    result = np.zeros((*positions.shape[:-1], 4, 4))
-    result[..., :3, :3] = Rotation.from_quat(xyzw.reshape(-1, 4)).as_matrix().reshape(*xyzw.shape[:-1], 3, 3)
-    result[..., :3, 3] = positions
-    result[..., 3, 3] = 1
-    return result
-
-
-def wxyz_to_xyzw(quaternions: Array) -> Array:
-    """Reorder quaternions (..., 4)."""
-    return np.roll(quaternions, -1, axis=-1)
-
-
-def xyzw_to_wxyz(quaternions: Array) -> Array:
-    """Reorder quaternions (..., 4)."""
-    return np.roll(quaternions, 1, axis=-1)
-
-
 def continuous_xyzw(poses: Array) -> Array:
     """Orientations of (T, 4, 4) as (T, 4) xyzw: w >= 0 in the first row, no jump of the sign after it."""
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)

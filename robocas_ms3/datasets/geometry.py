@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.recordings.motion import invert
+from robocas_ms3.poses import inverse
 
 Array = NDArray[np.float64]
 
@@ -161,7 +161,7 @@ def compare(points: Array, view: View, reach: Array | None = None) -> tuple[int,
     Returns:
         How many fall into the picture; which share of them the view looks through; which share lies at its depth.
     """
-    local = (points - view.camera_in_world[:3, 3]) @ invert(view.camera_in_world)[:3, :3].T
+    local = (points - view.camera_in_world[:3, 3]) @ inverse(view.camera_in_world)[:3, :3].T
     reach = np.full(len(local), np.inf) if reach is None else reach
     local, reach = local[local[:, 2] > NEAR], reach[local[:, 2] > NEAR]
     fx, fy, cx, cy = view.intrinsic

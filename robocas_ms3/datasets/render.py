@@ -14,8 +14,8 @@ import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.writer import CameraModel, Frame
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.poses import inverse
 from robocas_ms3.recordings.environment import RecordedEnv
-from robocas_ms3.recordings.motion import invert
 from robocas_ms3.recordings.reading import Recording
 
 _SAME_PLACE = 1e-3  # m
@@ -127,7 +127,7 @@ class EnvFrames:
             k = camera.get_intrinsic_matrix()[0].cpu().numpy().astype(np.float64)
             models[spec.name] = CameraModel(
                 intrinsic=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
-                camera_in_parent=invert(parent_in_world) @ invert(world_in_camera.astype(np.float64)),
+                camera_in_parent=inverse(parent_in_world) @ inverse(world_in_camera.astype(np.float64)),
             )
         return models
 

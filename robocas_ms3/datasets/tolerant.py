@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import to_matrices, wrap_angle
+from robocas_ms3.datasets.episode import wrap_angle
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import relative_motion
 
 SPECS = {spec.name: spec for spec in schema.EPISODE_INFO}
@@ -182,7 +183,7 @@ def _poses(arrays: Mapping[str, NDArray], position: str, orientation: str) -> ND
         return None
     if not (np.isfinite(p).all() and np.isfinite(q).all() and np.linalg.norm(q, axis=1).min() > 0.5):
         return None
-    return to_matrices(p, q)
+    return from_xyzw(p, q)
 
 
 def _goals_of_steps(goals: Any, steps: int) -> list[tuple[str, str]]:

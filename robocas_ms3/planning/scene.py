@@ -7,13 +7,12 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
-import torch
 from mani_skill.utils.structs import Articulation
 
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.pack import Part
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape
-from robocas_ms3.scenes.placement import transform
+from robocas_ms3.poses import from_wxyz, inverse, transform
 from robocas_ms3.tasks.transfer import TransferEnv
 
 # Upstream's: samples of the meshes at 5 mm, none farther than 1.5 m from the robot
@@ -23,30 +22,6 @@ SPACING = 0.005
 FURNITURE_SPACING = 0.01
 RADIUS = 1.5
 BASKET = "basket"  # its name among obstacles
-
-
-def matrix(raw_pose: torch.Tensor) -> Array:
-    """4x4 of a pose (7,): position m, quaternion wxyz. To the bit what SciPy gives, which takes ten times as long."""
-    px, py, pz, w, x, y, z = raw_pose.tolist()
-    length = math.sqrt(x * x + y * y + z * z + w * w)
-    w, x, y, z = w / length, x / length, y / length, z / length
-    xx, yy, zz, ww = x * x, y * y, z * z, w * w
-    return np.array(
-        (
-            (xx - yy - zz + ww, 2 * (x * y - z * w), 2 * (x * z + y * w), px),
-            (2 * (x * y + z * w), -xx + yy - zz + ww, 2 * (y * z - x * w), py),
-            (2 * (x * z - y * w), 2 * (y * z + x * w), -xx - yy + zz + ww, pz),
-            (0.0, 0.0, 0.0, 1.0),
-        )
-    )
-
-
-def inverse(pose: Array) -> Array:
-    """Inverse of a rigid 4x4."""
-    result = np.eye(4)
-    result[:3, :3] = pose[:3, :3].T
-    result[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return result
 
 
 _SHAPES: dict[int, tuple[Part, Shape]] = {}  # by the part's id, which stays its own since the part is kept
@@ -89,11 +64,11 @@ class PlanningScene:
             for link, pose in link_poses(asset.asset.links, self.joint_positions(name)).items():
                 if (name, link) != without_link:
                     yield f"{name}/{link}", asset.links[link], FURNITURE_SPACING, frame @ pose
-        yield BASKET, self.env.model.basket, SPACING, matrix(self.env.basket_pose[0])
+        yield BASKET, self.env.model.basket, SPACING, from_wxyz(self.env.basket_pose[0])
         present, poses = self.env.present[0].tolist(), self.env.object_states[0, :, :7]
         for slot, asset in enumerate(self.env.object_assets[0]):
             if present[slot] and slot not in left_out:
-                yield asset.asset.id, asset, SPACING, matrix(poses[slot])
+                yield asset.asset.id, asset, SPACING, from_wxyz(poses[slot])
 
     def sample_surfaces(self) -> None:
         """Sample now, once for each asset of a process, what clouds are made of; a branch would lose its samples."""
@@ -110,12 +85,12 @@ class PlanningScene:
     @property
     def arm_base_in_world(self) -> Array:
         """4x4 of ``panda_link0`` in the world."""
-        return matrix(self.env.agent.arm_base_link.pose.raw_pose[0])
+        return from_wxyz(self.env.agent.arm_base_link.pose.raw_pose[0])
 
     @property
     def tcp_in_base(self) -> Array:
         """4x4 of the TCP in the arm's base frame."""
-        return inverse(self.arm_base_in_world) @ matrix(self.env.agent.tcp.pose.raw_pose[0])
+        return inverse(self.arm_base_in_world) @ from_wxyz(self.env.agent.tcp.pose.raw_pose[0])
 
     @property
     def arm_qpos(self) -> Array:
@@ -124,12 +99,12 @@ class PlanningScene:
 
     def object_in_base(self, slot: int) -> Array:
         """4x4 of an object in the arm's base frame."""
-        return inverse(self.arm_base_in_world) @ matrix(self.env.object_states[0, slot, :7])
+        return inverse(self.arm_base_in_world) @ from_wxyz(self.env.object_states[0, slot, :7])
 
     @property
     def basket_in_base(self) -> Array:
         """4x4 of the basket's frame in the arm's base frame."""
-        return inverse(self.arm_base_in_world) @ matrix(self.env.basket_pose[0])
+        return inverse(self.arm_base_in_world) @ from_wxyz(self.env.basket_pose[0])
 
     def obstacles(
         self,

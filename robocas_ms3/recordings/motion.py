@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.poses import from_wxyz, inverse
 from robocas_ms3.robots.constants import FINGER_SLICE, FINGER_TARGETS, JOINTS
 from robocas_ms3.robots.forward import link_poses
 
@@ -72,19 +73,9 @@ def gripper_open(
     return widths[samples] > OPEN_WIDTH + 1e-6
 
 
-def invert(poses: Array) -> Array:
-    """Inverse of rigid transforms (..., 4, 4)."""
-    result = np.zeros_like(poses)
-    rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
-    result[..., :3, :3] = rotation
-    result[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, poses[..., :3, 3])
-    result[..., 3, 3] = 1
-    return result
-
-
 def relative_motion(poses: Array) -> Array:
     """(T, 4, 4) ``inv(pose[t]) pose[t + 1]``; the last one is the identity."""
-    return np.concatenate([invert(poses[:-1]) @ poses[1:], np.eye(4)[None]])
+    return np.concatenate([inverse(poses[:-1]) @ poses[1:], np.eye(4)[None]])
 
 
 def stored_motion(poses: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -157,7 +148,7 @@ class Motion:
     @property
     def tcp_in_base(self) -> Array:
         """(T, 4, 4)."""
-        return invert(self.arm_base_in_world) @ self.tcp_in_world
+        return inverse(self.arm_base_in_world) @ self.tcp_in_world
 
     @property
     def actions(self) -> NDArray[np.float32]:
@@ -173,13 +164,4 @@ def gripper_commands(actions: NDArray[np.floating], control_mode: str) -> NDArra
 def split_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:
     """The robot's root in the world (T, 4, 4), qpos (T, 12) and qvel (T, 12) of its states (T, 37), ManiSkill's."""
     states = np.asarray(states, dtype=np.float64)
-    return to_matrices(states[:, :7]), states[:, _POSE : _POSE + len(JOINTS)], states[:, _POSE + len(JOINTS) :]
-
-
-def to_matrices(poses: Array) -> Array:
-    """(N, 4, 4) of poses (N, 7): x, y, z, qw, qx, qy, qz."""
-    result = np.zeros((len(poses), 4, 4))
-    result[:, :3, :3] = Rotation.from_quat(poses[:, [4, 5, 6, 3]]).as_matrix()
-    result[:, :3, 3] = poses[:, :3]
-    result[:, 3, 3] = 1
-    return result
+    return from_wxyz(states[:, :7]), states[:, _POSE : _POSE + len(JOINTS)], states[:, _POSE + len(JOINTS) :]

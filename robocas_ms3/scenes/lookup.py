@@ -11,14 +11,15 @@ from robocas_ms3.assets.pack import LoadedFurniture, Pack, load_pack
 from robocas_ms3.config.relations import NEED_THREE, RELATIONS
 from robocas_ms3.config.task import OrderlyLayout, PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.errors import ConfigError
-from robocas_ms3.scenes.placement import Array, Region, planar_pose
+from robocas_ms3.poses import planar
+from robocas_ms3.scenes.placement import Array, Region
 
 OPENED_AT_MOST = {"prismatic": 0.95, "revolute": 0.8}  # share of a joint's range that scripted pulls aim at
 
 
 def fixture_pose(config: PoseConfig) -> Array:
     """4x4 of a pose in the configuration."""
-    return planar_pose(*config.position, np.deg2rad(config.yaw_deg))
+    return planar(*config.position, np.deg2rad(config.yaw_deg))
 
 
 def furniture_pose(config: PlacedConfig, furniture: LoadedFurniture) -> Array:

@@ -11,6 +11,7 @@ from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, Pack
 from robocas_ms3.config.task import TaskConfig
+from robocas_ms3.poses import transform
 from robocas_ms3.scenes.lookup import (
     check_joints,
     find_container,
@@ -22,7 +23,7 @@ from robocas_ms3.scenes.lookup import (
     fixture_pose,
     furniture_pose,
 )
-from robocas_ms3.scenes.placement import Array, Region, transform
+from robocas_ms3.scenes.placement import Array, Region
 
 
 @dataclass(frozen=True)

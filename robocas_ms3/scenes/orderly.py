@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import LayoutError
-from robocas_ms3.scenes.placement import Array, Placeable, Region, planar_pose
+from robocas_ms3.poses import planar
+from robocas_ms3.scenes.placement import Array, Placeable, Region
 
 # Builtin products show their label to their own -y, and resting poses have no yaw of their own, so that in every one
 # the label looks to -y of the plane or up, text upright for someone who stands at -y.
@@ -59,7 +60,7 @@ def sample_orderly(
     choices = [_standing(placeable) for placeable in placeables]
     low, high = np.zeros((len(placeables), 2)), np.zeros((len(placeables), 2))  # extents along the edge, and ahead
     for i, (placeable, choice, yaw) in enumerate(zip(placeables, choices, yaws, strict=True)):
-        turned = placeable.footprints[choice] @ planar_pose(0, 0, 0, yaw)[:2, :2].T @ np.column_stack([along, ahead])
+        turned = placeable.footprints[choice] @ planar(0, 0, 0, yaw)[:2, :2].T @ np.column_stack([along, ahead])
         low[i], high[i] = turned.min(axis=0), turned.max(axis=0)
 
     members = _ordered(rng, placeables, columns)
@@ -78,7 +79,7 @@ def sample_orderly(
         free = edge  # what is left of the column begins here
         for i in column:
             x, y = (center - (low[i, 0] + high[i, 0]) / 2) * along + (free - high[i, 1]) * ahead
-            poses[i] = planar_pose(x, y, region.z, yaws[i]) @ placeables[i].resting_poses[choices[i]]
+            poses[i] = planar(x, y, region.z, yaws[i]) @ placeables[i].resting_poses[choices[i]]
             free -= high[i, 1] - low[i, 1] + row_gap
             depth = edge - free - row_gap
             there[i] = depth <= edge - back

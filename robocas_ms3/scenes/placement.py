@@ -9,6 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import LayoutError
+from robocas_ms3.poses import planar
 
 Array = NDArray[np.float64]
 
@@ -43,17 +44,6 @@ class Region:
     min_xy: tuple[float, float]
     max_xy: tuple[float, float]
     z: float
-
-
-def planar_pose(x: float, y: float, z: float, yaw: float) -> Array:
-    """4x4 of a turn by ``yaw`` (rad) about the vertical, then a shift (m)."""
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, z], [0, 0, 0, 1.0]])
-
-
-def transform(pose: Array, points: Array) -> Array:
-    """Points (P, 3) moved by a 4x4."""
-    return points @ pose[:3, :3].T + pose[:3, 3]
 
 
 def sample_scattered(
@@ -99,7 +89,7 @@ def sample_scattered(
             shapely.prepare(outlines[best])
             placed.append(outlines[best])
             x, y = positions[best]
-            poses[index] = planar_pose(x, y, region.z, yaws[best]) @ placeable.resting_poses[choice]
+            poses[index] = planar(x, y, region.z, yaws[best]) @ placeable.resting_poses[choice]
         if len(placed) == len(placeables):
             return poses
     size = np.subtract(region.max_xy, region.min_xy)

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject
 from robocas_ms3.config.task import OrderlyLayout, ScatteredLayout, StackedLayout
 from robocas_ms3.errors import LayoutError
+from robocas_ms3.poses import planar, transform
 from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout, ObjectIds
 from robocas_ms3.scenes.lookup import resolve_ids
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.orderly import sample_orderly
-from robocas_ms3.scenes.placement import Array, Placeable, choose_objects, planar_pose, sample_scattered, transform
+from robocas_ms3.scenes.placement import Array, Placeable, choose_objects, sample_scattered
 from robocas_ms3.scenes.settle import settle
 from robocas_ms3.scenes.stacked import drop_heap
 from robocas_ms3.scenes.standing import place_basket, place_robot
@@ -272,4 +273,4 @@ def _presence(model: SceneModel, slots: int, rng: np.random.Generator) -> tuple[
 
 
 def _parked(slot: int, asset: LoadedObject) -> Array:
-    return planar_pose(slot * 0.5, 0, PARKING_HEIGHT, 0) @ asset.annotations.resting_poses[0]
+    return planar(slot * 0.5, 0, PARKING_HEIGHT, 0) @ asset.annotations.resting_poses[0]

@@ -24,7 +24,8 @@ from robocas_ms3.assets.physics import (
 )
 from robocas_ms3.config.task import StackedLayout
 from robocas_ms3.errors import LayoutError
-from robocas_ms3.scenes.placement import Array, Region, planar_pose, transform
+from robocas_ms3.poses import planar, transform
+from robocas_ms3.scenes.placement import Array, Region
 
 BUCKET_SECONDS = 1.0  # at most, after the last one
 SPREAD_SECONDS, OPEN_SECONDS = 2.0, 0.5  # at most: within a fence along the sides of the region, and without it
@@ -110,7 +111,7 @@ def _fill_bucket(
         room = np.maximum(half - np.abs(points[:, :2]).max(axis=0), 0)
         x, y = middle + rng.uniform(-1, 1, 2) * room * layout.drop_spread
         top = max((transform(pose_matrix(b), outlines[i])[:, 2].max() for i, b in bodies.items()), default=region.z)
-        pose = planar_pose(x, y, top + layout.drop_height - points[:, 2].min(), 0) @ pose
+        pose = planar(x, y, top + layout.drop_height - points[:, 2].min(), 0) @ pose
         bodies[index] = add_body(scene, replace(solid_of(asset), hulls=[outlines[index]]), pose)
         _run(scene, layout.fall_seconds, list(bodies.values()))
     _run(scene, BUCKET_SECONDS, list(bodies.values()))
@@ -163,7 +164,7 @@ def _falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) 
         pose[:3, 3] = -pose[:3, :3] @ np.array(asset.asset.center_of_mass)
         return pose
     choice = int(rng.choice(len(notes.resting_probabilities), p=notes.resting_probabilities))
-    return planar_pose(0, 0, 0, rng.uniform(-np.pi, np.pi)) @ notes.resting_poses[choice]
+    return planar(0, 0, 0, rng.uniform(-np.pi, np.pi)) @ notes.resting_poses[choice]
 
 
 def _add_walls(scene: sapien.Scene, middle: Array, half: Array, z: float) -> list[sapien.Entity]:

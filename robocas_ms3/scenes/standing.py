@@ -10,8 +10,9 @@ import numpy as np
 from robocas_ms3.assets.physics import TIME_STEP, Solid, add_body, add_fixed, engine_settings, new_scene, pose_matrix
 from robocas_ms3.config.task import PoseRandomisation
 from robocas_ms3.errors import LayoutError
+from robocas_ms3.poses import planar, transform
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.placement import Array, planar_pose, transform
+from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.settle import add_furniture
 
 # What turns with the robot's base, the lowest link included: half sizes in x and y, height up to which it goes, m, with
@@ -68,7 +69,7 @@ def _place(
 def _moved(pose: Array, by: PoseRandomisation, rng: np.random.Generator) -> Array:
     """Shift a pose in x and y and turn it about its own vertical."""
     shift, yaw = rng.uniform(-by.position, by.position, 2), np.deg2rad(rng.uniform(-by.yaw_deg, by.yaw_deg))
-    moved = pose @ planar_pose(0, 0, 0, yaw)
+    moved = pose @ planar(0, 0, 0, yaw)
     moved[:2, 3] += shift
     return moved
 

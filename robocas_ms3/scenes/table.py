@@ -15,11 +15,11 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import replacing
-from robocas_ms3.scenes.layout import Array, Layout, ObjectIds
+from robocas_ms3.poses import from_wxyz, to_wxyz
+from robocas_ms3.scenes.layout import Layout, ObjectIds
 
 Engine = Literal["cpu", "gpu"]
 
@@ -150,9 +150,9 @@ def as_records(
             *pair,
             states.get(pair, State.UNTRIED),
             [number[name] for name in layout.object_ids],
-            raw_poses(layout.object_poses),
-            raw_poses(layout.robot_pose),
-            raw_poses(layout.basket_pose),
+            to_wxyz(layout.object_poses),
+            to_wxyz(layout.robot_pose),
+            to_wxyz(layout.basket_pose),
             layout.target,
             layout.relation,
             layout.present,
@@ -165,9 +165,9 @@ def read_record(record: Any, names: Sequence[str]) -> Layout:
     """The layout of a record, in single precision."""
     return Layout(
         object_ids=tuple(str(names[i]) for i in record["objects"].tolist()),
-        object_poses=_matrices(record["object_poses"]),
-        robot_pose=_matrices(record["robot_pose"]),
-        basket_pose=_matrices(record["basket_pose"]),
+        object_poses=from_wxyz(record["object_poses"]),
+        robot_pose=from_wxyz(record["robot_pose"]),
+        basket_pose=from_wxyz(record["basket_pose"]),
         target=int(record["target"]),
         relation=str(record["relation"]),
         present=record["present"].copy(),
@@ -207,20 +207,3 @@ def _record(slots: int, words: int) -> np.dtype:
             ("visible_shares", "f4", (slots,)),
         ]
     )
-
-
-def raw_poses(matrices: Array) -> NDArray[np.float32]:
-    """(..., 4, 4) -> (..., 7): position, quaternion wxyz."""
-    flat = matrices.reshape(-1, 4, 4)
-    xyzw = Rotation.from_matrix(flat[:, :3, :3]).as_quat()
-    poses = np.concatenate([flat[:, :3, 3], xyzw[:, [3, 0, 1, 2]]], axis=1).astype(np.float32)
-    return poses.reshape(*matrices.shape[:-2], 7)
-
-
-def _matrices(poses: NDArray[np.float32]) -> Array:
-    """(..., 7) -> (..., 4, 4); `raw_poses` the other way round."""
-    flat = poses.reshape(-1, 7).astype(np.float64)
-    matrices = np.tile(np.eye(4), (len(flat), 1, 1))
-    matrices[:, :3, :3] = Rotation.from_quat(flat[:, [4, 5, 6, 3]]).as_matrix()
-    matrices[:, :3, 3] = flat[:, :3]
-    return matrices.reshape(*poses.shape[:-1], 4, 4)

@@ -15,7 +15,8 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import Part, VisualLevel
-from robocas_ms3.scenes.placement import Array, transform
+from robocas_ms3.poses import transform
+from robocas_ms3.scenes.placement import Array
 
 PixelBox = tuple[slice, slice]  # rows, columns
 

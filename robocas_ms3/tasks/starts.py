@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from robocas_ms3.poses import to_wxyz
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.scenes.table import LayoutTable, good, raw_poses
+from robocas_ms3.scenes.table import LayoutTable, good
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,14 @@ class Starts:
     @classmethod
     def of(cls, layouts: Sequence[Layout], device: torch.device | str) -> Starts:
         """Stack layouts, one an env."""
+
+        def poses(matrices: list[NDArray[np.float64]]) -> torch.Tensor:
+            return torch.from_numpy(to_wxyz(np.stack(matrices)).astype(np.float32)).to(device)
+
         return cls(
-            torch.from_numpy(raw_poses(np.stack([layout.object_poses for layout in layouts]))).to(device),
-            torch.from_numpy(raw_poses(np.stack([layout.robot_pose for layout in layouts]))).to(device),
-            torch.from_numpy(raw_poses(np.stack([layout.basket_pose for layout in layouts]))).to(device),
+            poses([layout.object_poses for layout in layouts]),
+            poses([layout.robot_pose for layout in layouts]),
+            poses([layout.basket_pose for layout in layouts]),
             torch.tensor([layout.target for layout in layouts], device=device),
             torch.from_numpy(np.stack([layout.present for layout in layouts])).to(device),
         )

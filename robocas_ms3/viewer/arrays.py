@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.info import runs
 from robocas_ms3.demos.ledger import Failure
+from robocas_ms3.poses import from_xyzw
 from robocas_ms3.viewer.failures import describe
 from robocas_ms3.viewer.plots import ROLL_PITCH_YAW, XYZ, base_plot, gripper_plot, motion_plots
 from robocas_ms3.viewer.source import make_episode, make_trace, plot
@@ -48,8 +48,8 @@ def show_arrays(
     recorded = scene.get("recorded") or {}
     turns = np.degrees(Rotation.from_quat(a["rel_orn"]).as_euler("xyz"))
     goals = runs([str(v) for v in a["step_goal_type"]], [str(v) for v in a["step_lang_goals"]])
-    base = to_matrices(a["base_pos"].astype(float), a["base_orn"].astype(float))
-    tcp = base @ to_matrices(a["ee_pos"].astype(float), a["ee_orn"].astype(float))
+    base = from_xyzw(a["base_pos"].astype(float), a["base_orn"].astype(float))
+    tcp = base @ from_xyzw(a["ee_pos"].astype(float), a["ee_orn"].astype(float))
     is_open = a.get("gripper_status")
     return make_episode(
         number,

@@ -14,12 +14,12 @@ from synthetic import STEPS, RayCaster, made_up_vectors, write_trajectory
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.convert import convert
-from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.validate import validate
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.files import locked_folder
+from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.reading import TrajectoryFile
 
 
@@ -71,8 +71,8 @@ def test_arrays_are_those_of_the_sampled_states(made, trajectory):
     robot, motion = recording.states["articulations"]["robocas_mobile_panda"][samples], recording.motion(samples)
     with np.load(made / "episode_0000001" / "episode_info.npz", allow_pickle=False) as arrays:
         np.testing.assert_array_equal(arrays["robot_joints"], robot[:, 16:23])
-        base = to_matrices(arrays["base_pos"], arrays["base_orn"])
-        ee = base @ to_matrices(arrays["ee_pos"], arrays["ee_orn"])
+        base = from_xyzw(arrays["base_pos"], arrays["base_orn"])
+        ee = base @ from_xyzw(arrays["ee_pos"], arrays["ee_orn"])
         # Actions 0..8 open; state 8 was reached by action 7, state 12 by action 11.
         assert arrays["gripper_status"].tolist() == [True, True, True, False, False, False, False]
     np.testing.assert_allclose(base, motion.arm_base_in_world, atol=1e-5)

@@ -4,18 +4,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import (
-    compose,
-    continuous_xyzw,
-    episode_arrays,
-    planar_base,
-    to_matrices,
-    wxyz_to_xyzw,
-    xyzw_to_wxyz,
-)
+from robocas_ms3.datasets.episode import compose, continuous_xyzw, episode_arrays, planar_base
 from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.motion import Motion, gripper_open, invert, relative_motion, sample_states, sample_stride
+from robocas_ms3.poses import from_xyzw, inverse, wxyz_to_xyzw, xyzw_to_wxyz
+from robocas_ms3.recordings.motion import Motion, gripper_open, relative_motion, sample_states, sample_stride
 from robocas_ms3.recordings.subgoals import SubGoal, sample_subgoals
 
 
@@ -24,7 +17,7 @@ def pose_sequences(draw):
     """(T, 4, 4) random poses, T from 2 to 30."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     count = draw(st.integers(2, 30))
-    return to_matrices(rng.uniform(-2, 2, (count, 3)), Rotation.random(count, random_state=rng).as_quat())
+    return from_xyzw(rng.uniform(-2, 2, (count, 3)), Rotation.random(count, random_state=rng).as_quat())
 
 
 @settings(max_examples=50, deadline=None)
@@ -44,8 +37,8 @@ def test_the_stored_arrays_compose_to_the_stored_poses(tcp, base):
         ("ee_pos", "ee_orn", "rel_pos", "rel_orn"),
         ("base_pos", "base_orn", "base_rel_pos", "base_rel_orn"),
     ):
-        absolute = to_matrices(arrays[position], arrays[orientation])
-        relative = to_matrices(arrays[rel_position], arrays[rel_orientation])
+        absolute = from_xyzw(arrays[position], arrays[orientation])
+        relative = from_xyzw(arrays[rel_position], arrays[rel_orientation])
         np.testing.assert_allclose(compose(absolute[0], relative), absolute, atol=1e-4)  # float32
 
 
@@ -59,12 +52,12 @@ def test_quaternion_orders_round_trip(quaternion):
 @settings(max_examples=30, deadline=None)
 @given(pose_sequences())
 def test_inverse(poses):
-    np.testing.assert_allclose(invert(poses) @ poses, np.broadcast_to(np.eye(4), poses.shape), atol=1e-12)
+    np.testing.assert_allclose(inverse(poses) @ poses, np.broadcast_to(np.eye(4), poses.shape), atol=1e-12)
 
 
 def test_orientations_never_flip_their_sign():
     turns = Rotation.from_euler("z", np.linspace(0, 720, 60)[:, None], degrees=True)
-    poses = to_matrices(np.zeros((60, 3)), turns.as_quat())
+    poses = from_xyzw(np.zeros((60, 3)), turns.as_quat())
     quaternions = continuous_xyzw(poses)
     assert quaternions[0, 3] > 0
     assert np.sum(quaternions[1:] * quaternions[:-1], axis=1).min() > 0.99
@@ -83,8 +76,8 @@ def arrays_of(tcp, base, *, qpos=None, subgoals=None, embed=None):
 def test_relative_motion_is_in_the_frame_of_the_hand():
     # The hand points down (x axis as the world's, y and z turned round) and moves 10 cm down: along its own +z.
     down = Rotation.from_euler("x", 180, degrees=True).as_quat()
-    tcp = to_matrices(np.array([[0.5, 0.2, 0.9], [0.5, 0.2, 0.8]]), np.array([down, down]))
-    base = to_matrices(np.tile([0.1, 0.2, 0.4], (2, 1)), np.tile([0.0, 0, 0, 1], (2, 1)))
+    tcp = from_xyzw(np.array([[0.5, 0.2, 0.9], [0.5, 0.2, 0.8]]), np.array([down, down]))
+    base = from_xyzw(np.tile([0.1, 0.2, 0.4], (2, 1)), np.tile([0.0, 0, 0, 1], (2, 1)))
     arrays = arrays_of(tcp, base)
     np.testing.assert_allclose(arrays["rel_pos"], [[0, 0, 0.1], [0, 0, 0]], atol=1e-7)
     np.testing.assert_allclose(arrays["rel_orn"], [[0, 0, 0, 1], [0, 0, 0, 1]], atol=1e-7)
@@ -112,7 +105,7 @@ def test_arrays_have_the_declared_types_and_shapes():
 
 def test_base_pose_in_the_world():
     # The root stands at (0.7, 0.15) turned by 90 deg: 0.2 along its x is 0.2 along the world's y.
-    root = to_matrices(np.array([[0.7, 0.15, 0]] * 2), Rotation.from_euler("z", [[90], [90]], degrees=True).as_quat())
+    root = from_xyzw(np.array([[0.7, 0.15, 0]] * 2), Rotation.from_euler("z", [[90], [90]], degrees=True).as_quat())
     qpos = np.zeros((2, 12))
     qpos[1, :3] = 0.2, 0.0, np.deg2rad(100)
     expected = [[0.7, 0.15, np.pi / 2], [0.7, 0.35, np.deg2rad(190)]]  # on from 90, not to -170

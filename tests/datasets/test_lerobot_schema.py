@@ -7,16 +7,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import episode_arrays, to_matrices
+from robocas_ms3.datasets.episode import episode_arrays
 from robocas_ms3.datasets.lerobot.schema import FEATURES, features_json, frame_columns, robocas_arrays, whole_rate
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import Motion
 from robocas_ms3.recordings.subgoals import SubGoal
 
 
 def made_up(steps, seed):
     rng = np.random.default_rng(seed)
-    poses = [to_matrices(rng.uniform(-1, 1, (steps, 3)), Rotation.random(steps, rng).as_quat()) for _ in range(2)]
+    poses = [from_xyzw(rng.uniform(-1, 1, (steps, 3)), Rotation.random(steps, rng).as_quat()) for _ in range(2)]
     root = np.tile(np.eye(4), (steps, 1, 1))
     qpos, qvel = rng.uniform(-2, 2, (steps, 12)), rng.uniform(-1, 1, (steps, 12))
     goals = [SubGoal("move and grasp", "grasp it", 0, 0), SubGoal("transfer object", "drop it", 1, steps - 1)]

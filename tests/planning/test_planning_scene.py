@@ -7,7 +7,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.planning.scene import FURNITURE_SPACING, SPACING, PlanningScene, matrix, seen_from
+from robocas_ms3.planning.scene import FURNITURE_SPACING, SPACING, PlanningScene, seen_from
+from robocas_ms3.poses import from_wxyz
 
 
 class Parked(PlanningScene):
@@ -65,7 +66,7 @@ def test_room_is_kept_to_furniture_and_basket_not_to_objects():
 
 def test_a_pose_becomes_the_matrix_that_scipy_gives():
     raw = torch.tensor([0.1, -0.2, 0.3, 0.5, -0.1, 0.7, 0.2])  # not quite a unit quaternion
-    pose = matrix(raw)
+    pose = from_wxyz(raw)
     values = raw.numpy().astype(float)
     assert np.array_equal(pose[:3, :3], Rotation.from_quat(values[[4, 5, 6, 3]]).as_matrix())
     assert np.array_equal(pose[:, 3], [*values[:3], 1])

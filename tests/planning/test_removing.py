@@ -21,7 +21,7 @@ from robocas_ms3.planning.skills.clearing import Heap, Move
 from robocas_ms3.planning.skills.pushing import push_away
 from robocas_ms3.planning.skills.removing import blockers, clear_grasps, remove
 from robocas_ms3.planning.solvers.search import tries
-from robocas_ms3.scenes.placement import transform
+from robocas_ms3.poses import transform
 
 pytestmark = pytest.mark.slow
 

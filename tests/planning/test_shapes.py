@@ -8,8 +8,8 @@ import torch
 from planning_scenes import corners
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.planning.scene import matrix as as_matrix
 from robocas_ms3.planning.shapes import convex_hull, inflated, matrix_to_pose
+from robocas_ms3.poses import from_wxyz as as_matrix
 
 
 def test_a_pose_of_a_matrix_turns_as_it_does():

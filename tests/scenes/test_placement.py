@@ -5,8 +5,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robocas_ms3.errors import LayoutError
+from robocas_ms3.poses import planar
 from robocas_ms3.scenes import placement
-from robocas_ms3.scenes.placement import Placeable, Region, choose_objects, planar_pose, sample_scattered
+from robocas_ms3.scenes.placement import Placeable, Region, choose_objects, sample_scattered
 
 
 def box(width: float, depth: float, height: float = 0.1) -> Placeable:
@@ -24,7 +25,7 @@ def box(width: float, depth: float, height: float = 0.1) -> Placeable:
 
 
 def test_planar_pose_turns_then_shifts():
-    assert planar_pose(1, 2, 3, np.pi / 2) @ [1, 0, 0, 1] == pytest.approx([1, 3, 3, 1])
+    assert planar(1, 2, 3, np.pi / 2) @ [1, 0, 0, 1] == pytest.approx([1, 3, 3, 1])
 
 
 @settings(max_examples=25, deadline=None)

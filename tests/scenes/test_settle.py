@@ -5,9 +5,9 @@ import pytest
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import load_task_config
+from robocas_ms3.poses import planar
 from robocas_ms3.scenes import settle as settle_module
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.placement import planar_pose
 from robocas_ms3.scenes.settle import settle
 
 
@@ -20,7 +20,7 @@ def model() -> SceneModel:
 def on_table(model, name: str, x: float, y: float, lift: float = 0.0) -> np.ndarray:
     notes = model.object_pack.objects[name].annotations
     stands = notes.resting_poses[max(notes.display_pose, 0)]
-    return planar_pose(x, y, 0.61 + lift, 0.3) @ stands
+    return planar(x, y, 0.61 + lift, 0.3) @ stands
 
 
 def run(model, names, poses):
@@ -73,7 +73,7 @@ def test_an_object_that_tips_over_did_not_stay(model):
 
 @pytest.mark.parametrize("heap", [False, True])
 def test_what_tips_in_a_heap_and_stays_is_as_put(model, monkeypatch, heap):
-    tipped = planar_pose(0, 0, 0, 0)[None]
+    tipped = planar(0, 0, 0, 0)[None]
     tipped[0, 1:3, 1:3] = [[0.8, -0.6], [0.6, 0.8]]  # by 37 deg
     monkeypatch.setattr(settle_module, "_simulate", lambda *args, **how: (tipped, np.zeros(1), np.zeros(1)))
     mug = [model.object_pack.objects["mug"]]
@@ -83,7 +83,7 @@ def test_what_tips_in_a_heap_and_stays_is_as_put(model, monkeypatch, heap):
 
 
 def test_what_moves_in_a_check_is_checked_again_from_where_it_came_to(model, monkeypatch):
-    start = planar_pose(0, 0, 0, 0)[None]
+    start = planar(0, 0, 0, 0)[None]
     places = iter([0.0, 0.01, 0.012, 0.0])  # x, m, at the end of each simulation
 
     def simulate(assets, poses, *args, **how):

@@ -6,8 +6,8 @@ import pytest
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import load_task_config
 from robocas_ms3.errors import LayoutError
+from robocas_ms3.poses import planar
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.placement import planar_pose
 from robocas_ms3.scenes.sample import sample_layout
 from robocas_ms3.scenes.standing import _moved, basket_stands, body_is_free, place_basket, place_robot
 
@@ -86,7 +86,7 @@ def test_what_nothing_moves_stays_and_draws_nothing():
 
 
 def test_the_robots_body_is_low_and_wide_high_and_narrow_and_above_the_floor():
-    root = planar_pose(1.0, 2.0, 0.0, np.pi / 2)  # ahead is +y
+    root = planar(1.0, 2.0, 0.0, np.pi / 2)  # ahead is +y
     for hit in ([1.0, 2.27, 0.2], [1.22, 2.0, 0.2], [1.0, 2.14, 0.6]):
         assert not body_is_free(root, np.array([hit]))
     for beside in ([1.0, 2.29, 0.2], [1.24, 2.0, 0.2], [1.0, 2.16, 0.6], [1.0, 2.0, 0.65], [1.0, 2.0, -5.0]):

@@ -10,7 +10,6 @@ import numpy as np
 
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.writer import CameraModel, Frame
-from robocas_ms3.recordings.motion import invert
 from robocas_ms3.robots.constants import ARM_EVALUATION_START
 
 STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one
@@ -190,4 +189,4 @@ def made_up_vectors(file, chosen):
     return {text: np.eye(384, dtype=np.float32)[number] for number, text in enumerate(sorted(texts))}
 
 
-__all__ = ["RayCaster", "invert", "made_up_vectors", "make_states", "write_trajectory"]
+__all__ = ["RayCaster", "made_up_vectors", "make_states", "write_trajectory"]

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocas_ms3.scenes.table import raw_poses
+from robocas_ms3.poses import to_wxyz
 from robocas_ms3.tasks.occlusion import Clutter, clutter, covering, moved_near, push_point, seen_from, surface_points
 
 
@@ -196,7 +196,7 @@ def test_hidden_shares_are_what_rays_say():
     differences = []
     for seed in range(3):
         layout = layout_bank(model)(seed, seed)
-        poses = torch.as_tensor(raw_poses(layout.object_poses))[None]
+        poses = torch.as_tensor(to_wxyz(layout.object_poses))[None]
         sampled = [_sample(pack.objects[i].annotations.surface_points) for i in layout.object_ids]
         points = torch.as_tensor(np.array(sampled).swapaxes(1, 2), dtype=torch.float32)[None]
         count = len(sampled)

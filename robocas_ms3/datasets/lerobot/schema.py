@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import relative_motion
 
 CODEBASE_VERSION = "v3.0"
@@ -208,7 +208,7 @@ def robocas_arrays(
         "step_goal_type": types,
     }
     for pos, orn, rel in (("ee_pos", "ee_orn", "rel"), ("base_pos", "base_orn", "base_rel")):
-        poses = to_matrices(values[pos].astype(np.float64), values[orn].astype(np.float64))
+        poses = from_xyzw(values[pos].astype(np.float64), values[orn].astype(np.float64))
         motion = relative_motion(poses)
         values.setdefault(f"{rel}_pos", motion[:, :3, 3])
         values[f"{rel}_orn"] = Rotation.from_matrix(motion[:, :3, :3]).as_quat(canonical=True)

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.episode import to_matrices
 from robocas_ms3.datasets.manage.eef import eef_turn, turn
 from robocas_ms3.datasets.manage.findings import Finding, Found, Report
 from robocas_ms3.datasets.manage.picture_check import check_pictures
@@ -18,6 +17,7 @@ from robocas_ms3.datasets.rigid import NORM_TOLERANCE, POSITION_TOLERANCE, is_ri
 from robocas_ms3.datasets.tolerant import SPECS, complete, derive_motion, load_arrays, planar_motion
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.language.templates import GOAL_TYPES
+from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import relative_motion
 
 ESSENTIAL = (
@@ -147,8 +147,8 @@ def _motion(arrays: dict[str, NDArray], keys: tuple[str, str, str, str], report:
 
     def poses(order: int) -> tuple[NDArray, NDArray]:
         quaternions = [np.roll(arrays[key], order, axis=1).astype(np.float64) for key in (orientation, rel_orientation)]
-        absolute = to_matrices(arrays[position].astype(np.float64), quaternions[0])
-        return relative_motion(absolute), to_matrices(arrays[rel_position].astype(np.float64), quaternions[1])
+        absolute = from_xyzw(arrays[position].astype(np.float64), quaternions[0])
+        return relative_motion(absolute), from_xyzw(arrays[rel_position].astype(np.float64), quaternions[1])
 
     expected, stored = poses(0)
     if _same(expected, stored):

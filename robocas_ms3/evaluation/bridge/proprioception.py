@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets.episode import episode_arrays
 from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
-from robocas_ms3.recordings.motion import Motion, gripper_open, invert, to_matrices
+from robocas_ms3.poses import from_wxyz, inverse
+from robocas_ms3.recordings.motion import Motion, gripper_open
 from robocas_ms3.robots.constants import ARM_BASE_LINK, BASE_SLICE, FINGER_SLICE
 from robocas_ms3.robots.forward import chain
 from robocas_ms3.robots.urdf import robot_files
@@ -57,7 +58,7 @@ class Proprioception:
         """
         qpos, tcp_in_base, tcp_in_world = _row(obs, env)
         base_in_root = chain(robot_files().urdf, "root", ARM_BASE_LINK, qpos[:, BASE_SLICE])
-        root = to_matrices(tcp_in_world) @ invert(to_matrices(tcp_in_base)) @ invert(base_in_root)
+        root = from_wxyz(tcp_in_world) @ inverse(from_wxyz(tcp_in_base)) @ inverse(base_in_root)
         self._robots[env] = _Robot(root, float(qpos[0, FINGER_SLICE].sum()))
 
     def read(self, env: int, obs: dict[str, Any], gripper: float | None) -> dict[str, NDArray[np.float32]]:

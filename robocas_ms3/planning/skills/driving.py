@@ -12,12 +12,12 @@ import numpy as np
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, Obstacle
-from robocas_ms3.planning.scene import matrix, seen_from
+from robocas_ms3.planning.scene import seen_from
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.timing import stopping
+from robocas_ms3.poses import from_wxyz, planar, transform
 from robocas_ms3.robots.constants import ARM_BASE_ABOVE_BASE_LINK, BASE_LIMITS, BASE_LINK_HEIGHT
 from robocas_ms3.scenes import standing
-from robocas_ms3.scenes.placement import planar_pose, transform
 
 SPEED, ACCELERATION = 0.25, 0.4  # m/s and rad/s; m/s^2 and rad/s^2
 SETTLE_SECONDS = 0.4
@@ -59,9 +59,9 @@ def base_at(arm: Arm) -> Array:
 
 def arm_base_in_world(arm: Arm, base: Array) -> Array:
     """4x4 of the arm's base with the base joints at a pose."""
-    root = matrix(arm.env.agent.robot.pose.raw_pose[0])
+    root = from_wxyz(arm.env.agent.robot.pose.raw_pose[0])
     height = BASE_LINK_HEIGHT + ARM_BASE_ABOVE_BASE_LINK
-    return root @ planar_pose(float(base[0]), float(base[1]), height, float(base[2]))
+    return root @ planar(float(base[0]), float(base[1]), height, float(base[2]))
 
 
 def drive(arm: Arm, *goals: Array) -> None:

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
-from robocas_ms3.planning.scene import SPACING, inverse
+from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.skills.arm import ROOM, Arm, moved_back, raised
+from robocas_ms3.poses import inverse
 from robocas_ms3.scenes.grasping import (
     NEIGHBOURHOOD,
     PREGRASP_DISTANCE,

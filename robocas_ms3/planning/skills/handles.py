@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.pulling import reached, track, turned_about_bar
-from robocas_ms3.planning.scene import inverse
 from robocas_ms3.planning.skills.arm import Arm, moved_back
 from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.planning.timing import through, timed
+from robocas_ms3.poses import inverse, transform
 from robocas_ms3.robots.constants import ARM_ACCELERATION_LIMIT, ARM_VELOCITY_LIMIT
 from robocas_ms3.scenes.grasping import HALF_TURN, MAX_WIDTH
-from robocas_ms3.scenes.placement import transform
 
 PULLS = 3  # with a new hold each, where one doesn't open far enough
 COMFORT = 0.15  # of the way from where it counts as opened to where a pull ends at most

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Array, Trajectory
-from robocas_ms3.planning.scene import inverse, matrix
 from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.poses import from_wxyz, inverse
 from robocas_ms3.scenes.randomise import draw_camera_shift
 from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, prepare_rays
 
@@ -86,8 +86,8 @@ def camera_in_base(arm: Arm) -> Array:
     """4x4 of the gripper's camera in the arm's base frame, where the episode has it: x forward, y left, z up."""
     config = _camera_config(arm)
     link = arm.env.agent.robot.links_map[str(config.entity_uid)]
-    camera_in_link = matrix(config.pose.raw_pose[0]) @ _shift(arm)
-    return inverse(arm.scene.arm_base_in_world) @ matrix(link.pose.raw_pose[0]) @ camera_in_link
+    camera_in_link = from_wxyz(config.pose.raw_pose[0]) @ _shift(arm)
+    return inverse(arm.scene.arm_base_in_world) @ from_wxyz(link.pose.raw_pose[0]) @ camera_in_link
 
 
 def _shift(arm: Arm) -> Array:

@@ -9,10 +9,9 @@ from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.chain import turn_between
 from robocas_ms3.planning.drops import overhangs, sample_drops
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
-from robocas_ms3.planning.scene import inverse, matrix
 from robocas_ms3.planning.skills.arm import CARRYING_ROOM, Arm, moved_back, raised
 from robocas_ms3.planning.skills.retreating import plan_step_back
-from robocas_ms3.scenes.placement import transform
+from robocas_ms3.poses import from_wxyz, inverse, transform
 
 DROPS_SAMPLED, DROPS_CHECKED, DROPS_PLANNED = 192, 64, 10
 DROP_MARGIN = 0.045  # m, as far as a robot may be off by then
@@ -150,7 +149,7 @@ def drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
     return sample_drops(
         arm.rng,
         count=DROPS_SAMPLED,
-        container_in_base=inverse(arm_base_in_world) @ matrix(arm.env.fixtures.basket.pose.raw_pose[0]),
+        container_in_base=inverse(arm_base_in_world) @ from_wxyz(arm.env.fixtures.basket.pose.raw_pose[0]),
         inner_low=low,
         inner_high=high,
         vertices_in_tcp=transform(object_in_tcp, vertices),

@@ -17,8 +17,8 @@ from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.placing import attach_held
 from robocas_ms3.planning.skills.pushing import surface_in_base
 from robocas_ms3.planning.skills.retreating import plan_step_back
+from robocas_ms3.poses import transform
 from robocas_ms3.scenes.grasping import MAX_WIDTH, directions_ok, gripper_is_clear
-from robocas_ms3.scenes.placement import transform
 
 GRID = 0.04  # m between places tried
 TURNS = 8  # of the object about the vertical

@@ -9,7 +9,8 @@ pytest.importorskip("msgpack")
 from robocas_ms3.datasets.episode import episode_arrays
 from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
 from robocas_ms3.evaluation.bridge.proprioception import KEYS, WIDTHS, Proprioception
-from robocas_ms3.recordings.motion import Motion, gripper_open, to_matrices
+from robocas_ms3.poses import from_wxyz
+from robocas_ms3.recordings.motion import Motion, gripper_open
 
 STEPS = 60
 COMMANDS = np.where(np.arange(STEPS) // 7 % 2, -1.0, 1.0)
@@ -25,7 +26,7 @@ def moving(seed: int) -> Motion:
     qpos = qpos.astype(np.float32).astype(np.float64)
     qvel = rng.normal(size=(STEPS, 12)).astype(np.float32).astype(np.float64)
     opened = gripper_open(COMMANDS, np.arange(STEPS), initial_width=0.08)
-    return Motion.of_joints(np.tile(to_matrices(root), (STEPS, 1, 1)), qpos, qvel, opened)
+    return Motion.of_joints(np.tile(from_wxyz(root), (STEPS, 1, 1)), qpos, qvel, opened)
 
 
 def observed(robots: list[Motion], step: int) -> dict:

@@ -1,0 +1,90 @@
+"""Rigid transforms in NumPy: 4x4 matrices, and the seven numbers that files and simulators have instead.
+
+``T_a_b`` maps points of frame b into frame a. Quaternions are wxyz, but for RoboCAS folders and SciPy, which have xyzw.
+Batches of quaternions that must be as ManiSkill computes them: `robots.rotations`; on tensors of envs: `tasks.terms`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+def inverse(poses: Array) -> Array:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    result = np.zeros_like(poses)
+    rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
+    result[..., :3, :3] = rotation
+    result[..., :3, 3] = -(rotation @ poses[..., :3, 3, None])[..., 0]
+    result[..., 3, 3] = 1
+    return result
+
+
+def from_wxyz(poses: Any) -> Array:
+    """(..., 4, 4) of poses (..., 7), an array or a tensor on a CPU: position, quaternion wxyz."""
+    if poses.ndim == 1:
+        return _one(*poses.tolist())
+    poses = np.asarray(poses, np.float64)
+    return from_xyzw(poses[..., :3], wxyz_to_xyzw(poses[..., 3:]))
+
+
+def to_wxyz(poses: Array) -> Array:
+    """(..., 7) of transforms (..., 4, 4): position, quaternion wxyz of either sign."""
+    xyzw = Rotation.from_matrix(poses[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*poses.shape[:-2], 4)
+    return np.concatenate([poses[..., :3, 3], xyzw_to_wxyz(xyzw)], axis=-1)
+
+
+def from_xyzw(positions: Array, xyzw: Array) -> Array:
+    """(..., 4, 4) of positions (..., 3) and quaternions (..., 4) xyzw."""
+    rotation = Rotation.from_quat(xyzw.reshape(-1, 4)).as_matrix()
+    return from_parts(positions, rotation.reshape(*xyzw.shape[:-1], 3, 3))
+
+
+def from_parts(positions: Any, rotations: Any) -> Array:
+    """(..., 4, 4) of positions (..., 3) and rotation matrices (..., 3, 3)."""
+    positions = np.asarray(positions, np.float64)
+    result = np.zeros((*positions.shape[:-1], 4, 4))
+    result[..., :3, :3], result[..., :3, 3], result[..., 3, 3] = rotations, positions, 1
+    return result
+
+
+def planar(x: float, y: float, z: float, yaw: float) -> Array:
+    """4x4 of a turn by ``yaw`` (rad) about the vertical, then a shift (m)."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, z], [0, 0, 0, 1.0]])
+
+
+def transform(pose: Array, points: Array) -> Array:
+    """Points (P, 3) moved by a 4x4."""
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def wxyz_to_xyzw(quaternions: Array) -> Array:
+    """Reorder quaternions (..., 4)."""
+    return np.roll(quaternions, -1, axis=-1)
+
+
+def xyzw_to_wxyz(quaternions: Array) -> Array:
+    """Reorder quaternions (..., 4)."""
+    return np.roll(quaternions, 1, axis=-1)
+
+
+def _one(px: float, py: float, pz: float, w: float, x: float, y: float, z: float) -> Array:
+    """To the bit what SciPy gives, which takes ten times as long."""
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    w, x, y, z = w / length, x / length, y / length, z / length
+    xx, yy, zz, ww = x * x, y * y, z * z, w * w
+    return np.array(
+        (
+            (xx - yy - zz + ww, 2 * (x * y - z * w), 2 * (x * z + y * w), px),
+            (2 * (x * y + z * w), -xx + yy - zz + ww, 2 * (y * z - x * w), py),
+            (2 * (x * z - y * w), 2 * (y * z + x * w), -xx - yy + zz + ww, pz),
+            (0.0, 0.0, 0.0, 1.0),
+        )
+    )
