@@ -1,151 +1,189 @@
-"""Seconds an episode by part, and memory, of conversions to RoboCAS and to LeRobot. Prints JSON.
+"""CPU time of conversions beside that of rendering alone; prints JSON.
 
-python benchmarks/convert.py demos/pick/trajectory.h5 --episodes 20 200 --size 64 48
+The bare loop sets each state, renders the three cameras and fetches their pictures as the shader leaves them, and does
+nothing else: it says what no conversion can be without. Conversions are whole: scenes, environment, files, previews.
+They take turns with the bare loop, over the same recordings; a case's figure is the median of its turns. CPU time is of
+this process and its children together, which other programs disturb less than the wall clock; --jobs is judged by that.
+
+Run: python benchmarks/convert.py [demos/pick/trajectory.h5] [--episodes 2] [--turns 3] [--jobs 2]
 """
 
 from __future__ import annotations
 
 import json
-import multiprocessing
+import os
 import resource
+import subprocess
+import sys
 import tempfile
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from statistics import median
+from typing import Annotated, Any
 
-import h5py
-import numpy as np
+import torch
 import tyro
+from convert_memory import repeated
 
-_MB = 1024 / 1e6  # Linux counts kilobytes
-_SHOWN = (1, 5, 10, 20, 50, 100, 200, 500, 1000)
+from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.render import EnvFrames
+from robocas_ms3.recordings.motion import sample_states, sample_stride
+from robocas_ms3.recordings.reading import TrajectoryFile
+
+ROOT = Path(__file__).resolve().parents[1]
+CASES = {  # name -> format, whether with depth
+    "png, depth": ("robocas", True),
+    "png": ("robocas", False),
+    "lerobot, depth": ("lerobot", True),
+    "lerobot": ("lerobot", False),
+}
+TEXTURES = {True: ("Color", "PositionSegmentation"), False: ("Color",)}  # of the shader "minimal"
 
 
 @dataclass
 class Benchmark:
-    """Convert so many episodes, and more: where the time goes, and whether memory grows with their number.
-
-    Where the trajectory has fewer episodes, its recordings are repeated into a temporary larger one. Each conversion is
-    a process of its own, and its peak that of the whole process: Python, torch, PhysX, the renderer and a scene are in
-    it. Full pictures take seconds an episode where rendering is done in software; --size 64 48 shows as well whether
-    memory grows, and so does --stand-in, in a minute.
-    """
-
-    trajectory: Annotated[Path, tyro.conf.Positional]
-    """F.h5, with F.json beside it."""
-    episodes: tuple[int, ...] = (20, 200)
-    """How many episodes, one conversion to each format for each number."""
-    to: tuple[Literal["robocas", "lerobot"], ...] = ("robocas", "lerobot")
-    """Formats."""
-    size: tuple[int, int] | None = None
-    """Width and height of the pictures; default: the cameras' own."""
+    trajectory: Annotated[Path | None, tyro.conf.Positional] = None
+    """F.h5, with F.json beside it; default: pick, generated first."""
+    episodes: int = 2
+    """How many of its successful recordings, which begin anew where they end."""
+    turns: int = 3
+    """Of the bare loop and of each case."""
+    cases: tuple[str, ...] = tuple(CASES)
+    """Which conversions."""
+    size: tuple[int, int] = (640, 480)
+    """Of the pictures."""
     rate: float = 5.0
     """Steps a second."""
-    jobs: int = 1
-    """Processes that render."""
-    stand_in: bool = False
-    """Do not render: grey ramps are the pictures. Everything else is done."""
-
-
-class StandIn:
-    """A ``FrameSource`` of grey ramps."""
-
-    def __init__(self, _env_info: dict[str, Any], _control_mode: str, pictures: Any) -> None:
-        self.pictures = pictures
-        width, height = pictures.size or (640, 480)
-        ramp = np.add.outer(np.arange(height), np.arange(width))
-        self.rgb, self.depth = np.repeat(ramp[..., None] % 256, 3, 2).astype(np.uint8), ramp.astype(np.uint16)
-
-    def load(self, recording: Any) -> None:
-        """Nothing to build."""
-
-    def frames(self, _recording: Any, samples: np.ndarray) -> Iterator[Any]:
-        """A ramp that moves."""
-        from robocas_ms3.datasets.writer import Frame
-
-        for sample in samples:
-            rgb = {name: np.roll(self.rgb, sample, 1) for name in self.pictures.cameras}
-            depth = {name: np.roll(self.depth, sample, 1) for name in self.pictures.cameras}
-            yield Frame(rgb, depth)
-
-    def cameras(self) -> dict[str, Any]:
-        """All in one place."""
-        from robocas_ms3.datasets.writer import CameraModel
-
-        return {name: CameraModel(np.array([24.0, 24.0, 32.0, 24.0]), np.eye(4)) for name in self.pictures.cameras}
-
-    def scene(self) -> dict[str, Any]:
-        """Nothing is known."""
-        return {"task": None, "config": None, "layout": None, "objects": None}
-
-    def close(self) -> None:
-        """Nothing is open."""
+    jobs: int = 0
+    """Convert with so many processes as well, and with one, and compare by the wall clock. 0: not."""
+    jobs_episodes: int = 8
+    """How many recordings for that: starting a process takes seconds."""
 
 
 def main(cfg: Benchmark) -> None:
     """Run it."""
-    results = []
-    for count in cfg.episodes:
-        for to in cfg.to:
-            with tempfile.TemporaryDirectory() as folder:
-                trajectory = repeated(cfg.trajectory, count, Path(folder) / "trajectory.h5")
-                # A fresh process: a peak of before does not hide this one's.
-                with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-                    results.append(pool.submit(measure, cfg, trajectory, to, Path(folder) / "out").result())
-    about = {"size": cfg.size, "rate": cfg.rate, "jobs": cfg.jobs, "stand_in": cfg.stand_in}
-    print(json.dumps({**about, "conversions": results}, indent=2))
+    with tempfile.TemporaryDirectory() as folder:
+        work = Path(folder)
+        source = cfg.trajectory or generated(work / "demos", cfg.episodes)
+        trajectory = repeated(source, cfg.episodes, work / "trajectory.h5")
+        report: dict[str, Any] = {"cores": os.cpu_count(), "load": os.getloadavg()[1], "size": cfg.size}
+        report |= in_turns(cfg, trajectory, work)
+        if cfg.jobs > 1:
+            more = repeated(source, cfg.jobs_episodes, work / "more.h5")
+            walls: dict[int, list[float]] = {1: [], cfg.jobs: []}
+            for _ in range(cfg.turns):
+                for jobs, spent in walls.items():
+                    spent.append(spent_on(partial(convert_one, cfg, more, work, "robocas", True, jobs))[1])
+            faster = median(walls[1]) / median(walls[cfg.jobs])
+            report["jobs"] = {"times as fast": round(faster, 2), "wall s": {n: rounded(w) for n, w in walls.items()}}
+    print(json.dumps(report, indent=2))
 
 
-def repeated(source: Path, count: int, target: Path) -> Path:
-    """A trajectory of so many successful recordings of another, which begin anew where they end."""
-    metadata = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
-    good = [episode for episode in metadata["episodes"] if episode["success"]]
-    episodes = []
-    with h5py.File(source) as old, h5py.File(target, "w") as new:
-        for number in range(count):
-            episode = good[number % len(good)]
-            old.copy(f"traj_{episode['episode_id']}", new, f"traj_{number}")
-            episodes.append({**episode, "episode_id": number})
-    target.with_suffix(".json").write_text(json.dumps({**metadata, "episodes": episodes}), encoding="utf-8")
-    return target
+def in_turns(cfg: Benchmark, trajectory: Path, work: Path) -> dict[str, Any]:
+    """The bare loop and the cases, each once a turn."""
+    bare: dict[bool, list[tuple[float, float]]] = {True: [], False: []}
+    cases: dict[str, list[tuple[float, float]]] = {name: [] for name in cfg.cases}
+    with TrajectoryFile(trajectory) as file:
+        steps = sum(
+            len(sample_states(file.recording(i).control_steps, _stride(cfg, file))) for i in range(cfg.episodes)
+        )
+        with closing(EnvFrames(file.env, file.recording(0).control_mode, Pictures(size=cfg.size))) as source:
+            for _ in range(cfg.turns):
+                for depth, spent in bare.items():
+                    spent.append(alone(cfg, file, source, TEXTURES[depth]))
+                for name, spent in cases.items():
+                    to, depth = CASES[name]
+                    spent.append(spent_on(partial(convert_one, cfg, trajectory, work, to, depth)))
 
+    def figures(spent: list[tuple[float, float]]) -> dict[str, Any]:
+        cpu, wall = zip(*spent, strict=True)
+        return {"cpu ms a step": round(1000 * median(cpu) / steps, 1), "cpu s": rounded(cpu), "wall s": rounded(wall)}
 
-def measure(cfg: Benchmark, trajectory: Path, to: str, out: Path) -> dict[str, Any]:
-    """One conversion, in the process that this is called in."""
-    from robocas_ms3.datasets.convert import convert, open_env
-    from robocas_ms3.datasets.pictures import Pictures
-
-    peaks: list[int] = []
-    common: dict[str, Any] = {
-        "rate_hz": cfg.rate,
-        "pictures": Pictures(size=cfg.size),
-        "jobs": cfg.jobs,
-        "on_episode": lambda _: peaks.append(_peak(resource.RUSAGE_SELF)),
-        "open_source": StandIn if cfg.stand_in else open_env,
-    }
-    if to == "lerobot":
-        from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-
-        done = convert_lerobot(trajectory, out, **common)
-    else:
-        done = convert(trajectory, out, embeddings=False, **common)
-    count = len(done.episodes)
+    per_step = {depth: median(cpu for cpu, _ in spent) for depth, spent in bare.items()}
     return {
-        "to": to,
-        "episodes": count,
-        "steps": sum(episode.steps for episode in done.episodes),
-        "seconds": round(done.seconds, 1),
-        "seconds_an_episode": {part: round(spent / count, 3) for part, spent in asdict(done.timing).items()},
-        "peak_mb": _peak(resource.RUSAGE_SELF),
-        "peak_mb_after_episode": {number: peaks[number - 1] for number in _SHOWN if number <= count},
-        "peak_mb_of_largest_child": _peak(resource.RUSAGE_CHILDREN),  # with --jobs a process that renders
+        "steps": steps,
+        "bare, depth": figures(bare[True]),
+        "bare": figures(bare[False]),
+        **{
+            name: {"over bare": round(median(cpu for cpu, _ in spent) / per_step[CASES[name][1]], 2), **figures(spent)}
+            for name, spent in cases.items()
+        },
     }
 
 
-def _peak(whose: int) -> int:
-    return round(resource.getrusage(whose).ru_maxrss * _MB)
+def alone(cfg: Benchmark, file: TrajectoryFile, source: EnvFrames, textures: tuple[str, ...]) -> tuple[float, float]:
+    """CPU and wall seconds of rendering the recordings; scenes are built outside."""
+    total = (0.0, 0.0)
+    env: Any = source.env.unwrapped
+    for index in range(cfg.episodes):
+        recording = file.recording(index)
+        source.load(recording)
+        scene = env.scene.sub_scenes[0]
+        cameras = [sensor.camera._render_cameras[0] for sensor in env._sensors.values()]
+        samples = sample_states(recording.control_steps, _stride(cfg, file))
+        states = [
+            {kind: {name: torch.from_numpy(one) for name, one in arrays.items()} for kind, arrays in state.items()}
+            for state in (recording.state(int(sample)) for sample in samples)
+        ]
+
+        def loop(states=states, cameras=cameras, scene=scene) -> None:
+            for state in states:
+                env.set_state_dict(state)
+                scene.update_render()
+                for camera in cameras:
+                    camera.take_picture()
+                for camera in cameras:
+                    for texture in textures:
+                        camera.get_picture(texture)
+
+        spent = spent_on(loop)
+        total = (total[0] + spent[0], total[1] + spent[1])
+    return total
+
+
+def convert_one(cfg: Benchmark, trajectory: Path, work: Path, to: str, depth: bool, jobs: int = 1) -> None:
+    """Convert, previews included."""
+    pictures = Pictures(size=cfg.size, depth=depth)
+    common: dict[str, Any] = {"rate_hz": cfg.rate, "pictures": pictures, "jobs": jobs}
+    with tempfile.TemporaryDirectory(dir=work) as out:
+        if to == "lerobot":
+            convert_lerobot(trajectory, Path(out) / "out", **common)
+            return
+        convert(trajectory, Path(out) / "out", embeddings=False, previews=None, **common)
+
+
+def generated(out: Path, episodes: int) -> Path:
+    """Pick demonstrations, from seed 0 on."""
+    command = [sys.executable, ROOT / "robocas_cli.py", "generate", "pick", "-n", str(episodes), "--out", out]
+    subprocess.run(command, check=True, stdout=sys.stderr)
+    return out / "trajectory.h5"
+
+
+def spent_on(call: Callable[[], object]) -> tuple[float, float]:
+    """CPU and wall seconds."""
+    before, begun = cpu(), time.perf_counter()
+    call()
+    return cpu() - before, time.perf_counter() - begun
+
+
+def cpu() -> float:
+    """Seconds of CPU time that this process and its children that have ended have used."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in used)
+
+
+def rounded(seconds: Any) -> list[float]:
+    return [round(one, 2) for one in seconds]
+
+
+def _stride(cfg: Benchmark, file: TrajectoryFile) -> int:
+    return sample_stride(file.control_freq, cfg.rate)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,9 @@ class Convert:
     embeddings: bool = True
     """Embed instruction and sub-goals (needs the extra 'language'; lerobot has none)."""
     video: bool = True
-    """Write a video of each episode and a contact sheet into OUT/preview (not for lerobot)."""
+    """Write a video of each episode and a contact sheet into OUT/preview, of at most 20 episodes (not for lerobot)."""
+    all_videos: bool = False
+    """Write them of more than 20 episodes as well."""
     cameras: tuple[Literal["base_camera", "gripper_camera", "static_camera"], ...] = (
         "base_camera",
         "gripper_camera",
@@ -76,6 +78,10 @@ def _check(cfg: Convert) -> None:
     if cfg.overwrite and len(ways) > 1:
         found = " ".join(f"--{flag}" for flag in ways)
         raise DatasetError("these exclude each other", where="convert", expected="one of them", found=found)
+    if cfg.all_videos and not cfg.video:
+        raise DatasetError(
+            "these exclude each other", where="convert", expected="one of them", found="--no-video --all-videos"
+        )
     if cfg.jobs < 1:
         raise DatasetError("not a number of processes", where="--jobs", expected="1 or more", found=cfg.jobs)
     if len(set(cfg.cameras)) < len(cfg.cameras):
@@ -88,7 +94,6 @@ def _convert(cfg: Convert) -> int:
     from robocas_ms3.datasets.convert import convert
     from robocas_ms3.datasets.described import count_of
     from robocas_ms3.datasets.pictures import Pictures
-    from robocas_ms3.datasets.video import write_previews
 
     with bar("episodes") as shown:
         common: dict[str, Any] = {
@@ -106,12 +111,14 @@ def _convert(cfg: Convert) -> int:
         else:
             rate = 5.0 if cfg.rate is None else cfg.rate
             done = convert(
-                cfg.trajectory, cfg.out, rate_hz=rate, embeddings=cfg.embeddings, append=cfg.append, **common
+                cfg.trajectory,
+                cfg.out,
+                rate_hz=rate,
+                embeddings=cfg.embeddings,
+                append=cfg.append,
+                previews=(True if cfg.all_videos else None) if cfg.video else False,
+                **common,
             )
-    if cfg.video and cfg.to == "robocas":
-        with bar("videos") as shown:
-            new = {episode.number for episode in done.episodes}
-            write_previews(cfg.out, new=new, on_start=shown.start, on_video=shown.advance)
     count = len(done.episodes)
     said = [f"{cfg.out}: {count_of(count, 'episode')}"] + ([f"{done.kept} kept"] if done.kept else [])
     if count:
@@ -121,6 +128,8 @@ def _convert(cfg: Convert) -> int:
     say(", ".join(said))
     if count:
         say(parts(done, cfg))
+    if count and cfg.video and cfg.to == "robocas" and not done.previews:
+        say("no videos of so many episodes: --all-videos makes them, and robocas video those of some")
     return 0
 
 

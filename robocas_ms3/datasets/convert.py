@@ -19,6 +19,7 @@ from robocas_ms3.datasets.info import write_info
 from robocas_ms3.datasets.output import check_overwrite, kept_if_begun, sweep
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.plan import Plan, appended_plan, dataset_settings, new_plan, resumed_plan, still_missing
+from robocas_ms3.datasets.preview import FEW, finish_previews, on_sheet
 from robocas_ms3.datasets.provenance import succeeded
 from robocas_ms3.datasets.reader import Dataset
 from robocas_ms3.datasets.timing import Timing
@@ -42,12 +43,14 @@ class Conversion:
         kept: how many of the trajectory's were there already (``resume``, ``append``).
         seconds: for everything.
         joining: of these, for what comes after the episodes.
+        previews: whether they were made.
     """
 
     episodes: list[WrittenEpisode]
     kept: int
     seconds: float
     joining: float = 0.0
+    previews: bool = False
 
     @property
     def timing(self) -> Timing:
@@ -73,6 +76,7 @@ def convert(
     overwrite: bool = False,
     resume: bool = False,
     append: bool = False,
+    previews: bool | None = False,
     jobs: int = 1,
     pack: str | Path | None = None,
     on_start: Callable[[int], None] | None = None,
@@ -95,6 +99,7 @@ def convert(
         resume: keep the episodes that are there.
         append: add to the dataset in ``out``; what is there keeps its numbers and its side of the split, and recordings
             that it holds already are not added again.
+        previews: whether to write a video of each new episode, and a contact sheet; None: where they are at most 20.
         jobs: worker processes.
         pack: name or folder of the objects' pack, instead of what the file names.
         on_start: called with the number of episodes to write.
@@ -132,15 +137,20 @@ def convert(
             claim_output(out, overwrite=overwrite and not (resume or append), resume=True)
             make_folder(out)
             sweep(out)
+            sweep(out / schema.PREVIEW_FOLDER)
             missing = [task for task in plan.tasks if not (out / schema.episode_folder(task[0])).is_dir()]
             if on_start:
                 on_start(len(missing))
-            job = Job(file.path, pack, out, stride, rate_hz, pictures, vectors, open_source, missing)
+            sheet = None
+            if previews or (previews is None and len(plan.tasks) <= FEW):
+                sheet = on_sheet(map(int, plan.content["episodes"]))
+            job = Job(file.path, pack, out, stride, rate_hz, pictures, vectors, open_source, sheet, missing)
             written = _write(job, file.env_info, plan, jobs, on_episode)
             if left := still_missing(out, plan.content):
                 _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))
     written.sort(key=lambda episode: episode.number)
-    return Conversion(written, len(plan.tasks) - len(missing), time.perf_counter() - begun)
+    kept = len(plan.tasks) - len(missing)
+    return Conversion(written, kept, time.perf_counter() - begun, previews=sheet is not None)
 
 
 def _write(
@@ -161,6 +171,8 @@ def _write(
                     on_episode(episode)
         add_failures(job.trajectory.parent, job.out, env_info)
         write_info(job.out, before)
+    if job.sheet is not None:
+        finish_previews(job.out, {episode.number: episode.row for episode in written if episode.row is not None})
     return written
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+from robocas_ms3.datasets.png import SIGNATURE
+
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 
 
@@ -49,9 +50,9 @@ def _decode(path: Path) -> PictureHeader:
 
 def _read_png(path: Path) -> PictureHeader:
     data = path.read_bytes()
-    if not data.startswith(_SIGNATURE):
+    if not data.startswith(SIGNATURE):
         raise ValueError("not a PNG")
-    offset, header, filled = len(_SIGNATURE), None, False
+    offset, header, filled = len(SIGNATURE), None, False
     while offset + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, offset)
         end = offset + 8 + length

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.png import encode_png
 from robocas_ms3.errors import DatasetError
 
 _QUALITY = {
-    "png": [cv2.IMWRITE_PNG_COMPRESSION, 1],  # level 6 takes three times as long for nearly the same size
     "jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
     "webp": [cv2.IMWRITE_WEBP_QUALITY, 90],
 }
@@ -77,16 +77,19 @@ def write_picture(path: Path, picture: NDArray) -> float:
         DatasetError: it can't be encoded or written.
     """
     begun = time.perf_counter()
-    if picture.ndim == 3:
-        picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     try:
-        encoded, data = cv2.imencode(path.suffix, picture, _QUALITY[path.suffix[1:]])
-    except cv2.error as error:
+        data = encode_png(picture) if path.suffix == ".png" else _encode(picture, path.suffix)
+    except (ValueError, cv2.error) as error:
         raise DatasetError("can't encode this picture", where=path, found=str(error).splitlines()[0]) from error
-    if not encoded:
-        raise DatasetError("can't encode this picture", where=path, found=f"{picture.dtype} {picture.shape}")
-    path.write_bytes(data.tobytes())  # unlike cv2.imwrite this says when the disk is full
+    path.write_bytes(data)  # unlike cv2.imwrite this says when the disk is full
     return time.perf_counter() - begun
+
+
+def _encode(picture: NDArray[np.uint8], suffix: str) -> bytes:
+    encoded, data = cv2.imencode(suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), _QUALITY[suffix[1:]])
+    if not encoded:
+        raise ValueError(f"{picture.dtype} {picture.shape}")
+    return data.tobytes()
 
 
 def read_picture(path: Path) -> NDArray:

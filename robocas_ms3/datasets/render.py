@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
+from mani_skill.render.shaders import ShaderConfig
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -108,11 +110,11 @@ class EnvFrames:
         """Show one state, without a step of physics."""
         tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
         self._base.set_state_dict(tensors)
-        pictures = self._base._get_obs_sensor_data()
-        wanted = self._pictures
+        textures = self._base._get_obs_sensor_data(apply_texture_transforms=False)
+        shaders = {name: self._base._sensors[name].config.shader_config for name in self._pictures.cameras}
         return Frame(
-            rgb={name: pictures[name]["rgb"][0].cpu().numpy() for name in wanted.cameras},
-            depth={name: to_millimetres(pictures[name]["depth"][0, ..., 0]) for name in wanted.cameras if wanted.depth},
+            rgb={name: rgb_of(textures[name], shader) for name, shader in shaders.items()},
+            depth={name: depth_of(textures[name], shader) for name, shader in shaders.items() if self._pictures.depth},
         )
 
     def cameras(self) -> dict[str, CameraModel]:
@@ -180,8 +182,18 @@ def require_renderer() -> None:
         ) from error
 
 
-def to_millimetres(depth: torch.Tensor) -> NDArray[np.uint16]:
-    """ManiSkill's depth, (H, W) int16 mm, as it is stored: what is behind the camera or nowhere becomes 0."""
+def rgb_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint8]:
+    """A camera's picture, (H, W, 3) RGB, contiguous, of what its shader rendered, (1, H, W, C)."""
+    colour = textures["Color"]
+    if colour.dtype == torch.uint8:  # OpenCV takes 0.03 ms to drop alpha at 640 x 480, copying a slice 2
+        return cv2.cvtColor(colour[0].cpu().numpy(), cv2.COLOR_RGBA2RGB).astype(np.uint8, copy=False)
+    return np.ascontiguousarray(shader.texture_transforms["Color"](colour)["rgb"][0].cpu().numpy())
+
+
+def depth_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint16]:
+    """A camera's depth, (H, W) mm, as it is stored: what is behind the camera or nowhere becomes 0."""
+    name = next(name for name, kinds in shader.texture_names.items() if "depth" in kinds)
+    depth = shader.texture_transforms[name](textures[name])["depth"][0, ..., 0]  # int16
     return depth.clamp(min=0).cpu().numpy().astype(np.uint16)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets.pictures import Pictures
 from robocas_ms3.datasets.pool import do_all
+from robocas_ms3.datasets.preview import Preview
 from robocas_ms3.datasets.provenance import scene_record
 from robocas_ms3.datasets.timing import Timing
 from robocas_ms3.datasets.writer import FrameSource, WrittenEpisode, write_episode
@@ -35,6 +36,7 @@ class Job:
         pictures: which ones.
         vectors: embedding (384,) of every text; None: no embeddings.
         open_source: makes what shows the states.
+        sheet: episodes on the contact sheet; None: no previews are made.
         tasks: (number in the dataset, index in the trajectory) of each episode to write.
     """
 
@@ -46,6 +48,7 @@ class Job:
     pictures: Pictures
     vectors: dict[str, NDArray[np.float32]] | None
     open_source: OpenSource
+    sheet: tuple[int, ...] | None
     tasks: list[tuple[int, int]]
 
 
@@ -84,6 +87,7 @@ class _Writer:
             pictures=job.pictures,
             describe=lambda scene: scene_record(self.file, index, recording, scene, job.rate_hz),
             embed=self._embed(),
+            open_preview=None if job.sheet is None else partial(Preview, job.out, job.rate_hz, row=number in job.sheet),
             timing=timing,
         )
 

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,16 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.drawing import Story
 from robocas_ms3.datasets.episode import episode_arrays
 from robocas_ms3.datasets.pictures import Pictures, write_picture
+from robocas_ms3.datasets.preview import Preview
 from robocas_ms3.datasets.timing import Timing
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder
 from robocas_ms3.recordings.motion import sample_states
 from robocas_ms3.recordings.reading import Recording
-from robocas_ms3.recordings.subgoals import sample_subgoals
+from robocas_ms3.recordings.subgoals import SubGoal, sample_subgoals
 
-ENCODERS = 2  # threads; OpenCV encodes outside Python's lock
+ENCODERS = 2  # threads; ISA-L and OpenCV work outside Python's lock
 _MAX_WAITING = 24  # pictures, which bounds memory
 
 
@@ -95,12 +98,21 @@ class Shown:
 
 @dataclass(frozen=True)
 class WrittenEpisode:
-    """An episode on disk: its number in the dataset, T, bytes, and what it took."""
+    """An episode on disk.
+
+    Attributes:
+        number: in the dataset.
+        steps: T.
+        size: bytes.
+        timing: what it took.
+        row: its part of the contact sheet, (H, W, 3) RGB, where one was wanted.
+    """
 
     number: int
     steps: int
     size: int
     timing: Timing
+    row: NDArray[np.uint8] | None = None
 
 
 def show_episode(
@@ -110,6 +122,7 @@ def show_episode(
     stride: int,
     embed: Callable[[list[str]], NDArray] | None,
     on_frame: Callable[[int, Frame], None],
+    on_start: Callable[[list[SubGoal], NDArray[np.bool_]], None] | None = None,
     timing: Timing | None = None,
 ) -> Shown:
     """Render a recording and hand over its pictures one step at a time.
@@ -120,6 +133,7 @@ def show_episode(
         stride: control steps a dataset step.
         embed: texts -> (N, 384); None leaves the embeddings out.
         on_frame: called with step and frame.
+        on_start: called before, with the sub-goals over the T steps and the gripper's command (T,) at each, 1 = open.
         timing: what this took is added to it.
 
     Raises:
@@ -133,13 +147,16 @@ def show_episode(
         raise DatasetError("too many steps", where=where, expected=f"<= {schema.MAX_STEPS}", found=len(samples))
     with timing.measure("load"):
         source.load(recording)
+    motion = recording.motion(samples)
+    if on_start:
+        on_start(subgoals, motion.gripper_open)
     begun = time.perf_counter()
     for step, frame in enumerate(source.frames(recording, samples)):
         timing.render += time.perf_counter() - begun
         on_frame(step, frame)
         begun = time.perf_counter()
     with timing.measure("write"):
-        arrays = episode_arrays(recording.motion(samples), recording.instruction, subgoals, embed)
+        arrays = episode_arrays(motion, recording.instruction, subgoals, embed)
     return Shown(arrays, source.cameras(), source.scene())
 
 
@@ -153,6 +170,7 @@ def write_episode(
     pictures: Pictures,
     describe: Callable[[dict[str, Any]], dict[str, Any]],
     embed: Callable[[list[str]], NDArray] | None = None,
+    open_preview: Callable[[Story], Preview] | None = None,
     timing: Timing | None = None,
 ) -> WrittenEpisode:
     """Render a recording and write its folder.
@@ -166,6 +184,7 @@ def write_episode(
         pictures: which ones.
         describe: makes ``scene.json`` of what the source says of the scene.
         embed: texts -> (N, 384); None leaves the embeddings out.
+        open_preview: begins its preview; None: there is none.
         timing: of the episode so far; what this took is added to it.
 
     Raises:
@@ -176,8 +195,22 @@ def write_episode(
         for camera in pictures.cameras:
             for kind in pictures.kinds:
                 (folder / camera / kind).mkdir(parents=True)
-        with _Encoders(folder, pictures, timing) as encoders:
-            shown = show_episode(recording, source, stride=stride, embed=embed, on_frame=encoders.add, timing=timing)
+        with ExitStack() as previews, _Encoders(folder, pictures, timing) as encoders:
+
+            def begin_preview(goals: list[SubGoal], gripper_status: NDArray[np.bool_]) -> None:
+                if open_preview:
+                    story = _story(number, recording.instruction, goals, gripper_status)
+                    encoders.preview = previews.enter_context(open_preview(story))  # finished after the encoders
+
+            shown = show_episode(
+                recording,
+                source,
+                stride=stride,
+                embed=embed,
+                on_frame=encoders.add,
+                on_start=begin_preview,
+                timing=timing,
+            )
         begun = time.perf_counter()
         write_cameras(folder, {name: shown.cameras[name] for name in pictures.cameras})
         np.savez(folder / schema.EPISODE_FILE, **shown.arrays)
@@ -186,7 +219,13 @@ def write_episode(
         size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     timing.write += time.perf_counter() - begun  # with the folder's renaming
     timing.total += time.perf_counter() - started
-    return WrittenEpisode(number, len(shown.arrays["ee_pos"]), size, timing)
+    return WrittenEpisode(number, len(shown.arrays["ee_pos"]), size, timing, encoders.preview and encoders.preview.row)
+
+
+def _story(number: int, instruction: str, goals: list[SubGoal], gripper_status: NDArray[np.bool_]) -> Story:
+    steps = [goal for goal in goals for _ in range(goal.last - goal.first + 1)]
+    types, texts = [goal.goal_type for goal in steps], [goal.goal_description for goal in steps]
+    return Story(number, instruction, types, texts, gripper_status)
 
 
 def write_cameras(folder: Path, cameras: dict[str, CameraModel]) -> None:
@@ -207,6 +246,8 @@ class _Encoders:
         self._folder, self._pictures, self._timing = folder, pictures, timing
         self._waiting: deque[Future[float]] = deque()
         self._pool = ThreadPoolExecutor(ENCODERS, thread_name_prefix="pictures")
+        self._in_order = ThreadPoolExecutor(1, thread_name_prefix="preview")  # a video's frames are
+        self.preview: Preview | None = None
 
     def __enter__(self) -> _Encoders:
         return self
@@ -216,7 +257,8 @@ class _Encoders:
             if kind is None:
                 self._collect(0)
         finally:
-            self._pool.shutdown(cancel_futures=True)
+            for pool in (self._pool, self._in_order):
+                pool.shutdown(cancel_futures=True)
 
     def add(self, step: int, frame: Frame) -> None:
         """Take a frame; waits where too many are waiting."""
@@ -225,6 +267,8 @@ class _Encoders:
             for camera in self._pictures.cameras:
                 path = schema.image_path(self._folder, camera, kind, step, self._pictures.image_format)
                 self._waiting.append(self._pool.submit(write_picture, path, shots[camera]))
+        if self.preview:
+            self._waiting.append(self._in_order.submit(self.preview.add, step, frame.rgb))
         self._collect(_MAX_WAITING)
 
     def _collect(self, limit: int) -> None:

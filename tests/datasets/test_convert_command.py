@@ -6,13 +6,10 @@ import shutil
 from functools import partial
 
 import pytest
-from PIL import Image
 from synthetic import RayCaster, write_trajectory
 
-from robocas_ms3.cli.bars import Bar
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets import convert as conversion
-from robocas_ms3.datasets import video
 from robocas_ms3.datasets.plan import still_missing
 from robocas_ms3.datasets.validate import validate
 from robocas_ms3.datasets.writer import WrittenEpisode
@@ -37,26 +34,6 @@ def test_the_parts_of_the_time_come_last(trajectory, made_up_pictures, tmp_path,
     assert printed.err == ""  # no bar, no blank line where stderr is no terminal
     assert run([*command, "--resume"]) == 0
     assert re.fullmatch(r".*: 0 episodes, 2 kept\n", capsys.readouterr().out)
-
-
-def test_videos_are_made_once(made_up_pictures, tmp_path, monkeypatch):
-    """Of what is new, or has none, as after a run that was killed; the sheet shows all."""
-    written, counts, out = [], [], tmp_path / "out"
-    write_video = video.write_video
-    monkeypatch.setattr(video, "write_video", lambda d, n, path: written.append(n) or write_video(d, n, path))
-    start = Bar.start
-    monkeypatch.setattr(Bar, "start", lambda self, n: counts.append(n) or start(self, n))
-    sheets = []
-    for name, seeds, flags in (("a", (1, 2), ()), ("b", (3,), ("--append",)), ("b", (3,), ("--append",))):
-        trajectory = write_trajectory(tmp_path / f"{name}.h5", seeds=seeds)
-        assert run(["convert", str(trajectory), "--out", str(out), "--no-embeddings", *flags]) == 0
-        sheets.append(Image.open(out / "preview" / "contact_sheet.png").height)
-    assert written == [0, 1, 2]
-    assert counts == [2, 2, 1, 1, 0, 0]  # of episodes, of videos
-    assert sheets[1] == sheets[2] == 1.5 * sheets[0]
-    (out / "preview" / "episode_0000001.mp4").unlink()
-    assert run(["convert", str(trajectory), "--out", str(out), "--no-embeddings", "--resume"]) == 0
-    assert written == [0, 1, 2, 1]
 
 
 def test_seconds_are_those_of_an_episode(monkeypatch, tmp_path, capsys):

@@ -5,7 +5,7 @@ from PIL import Image
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.video import PANEL, colour_depth, contact_sheet, video_frame, write_previews, write_video
+from robocas_ms3.datasets.video import PANEL, colour_depth, contact_sheet, video_frame, write_video
 from robocas_ms3.errors import DatasetError
 
 
@@ -62,17 +62,6 @@ def test_depth_colours():
     assert colours[0, 0].tolist() == [0, 0, 0]
     assert colours[0, 1, 0] > colours[0, 1, 2], "near is red"
     assert colours[0, 2].tolist() == colours[0, 3].tolist()
-
-
-def test_previews_leave_a_dataset_valid(dataset):
-    from robocas_ms3.datasets.validate import validate
-
-    videos, sheet = write_previews(dataset, episodes=[0])
-    assert [path.relative_to(dataset).as_posix() for path in (*videos, sheet)] == [
-        "preview/episode_0000000.mp4",
-        "preview/contact_sheet.png",
-    ]
-    assert validate(dataset).violations == []
 
 
 def test_errors(made, tmp_path):

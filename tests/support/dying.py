@@ -1,4 +1,4 @@
-"""Convert a made-up trajectory and die by SIGKILL on the way: `python dying.py MOMENT TRAJECTORY OUT`."""
+"""Convert a made-up trajectory and die by SIGKILL on the way: `python dying.py MOMENT TRAJECTORY OUT [previews]`."""
 
 import os
 import signal
@@ -31,6 +31,9 @@ def die_at(module, name, last):
 
 
 if __name__ == "__main__":
-    moment, trajectory, out = sys.argv[1:]
+    moment, trajectory, out, *previews = sys.argv[1:]
     die_at(*PLACES[moment])
-    convert.convert(trajectory, out, embeddings=False, overwrite=moment == "rmtree", open_source=RayCaster)
+    overwrite = moment == "rmtree"
+    convert.convert(
+        trajectory, out, embeddings=False, overwrite=overwrite, previews=bool(previews), open_source=RayCaster
+    )

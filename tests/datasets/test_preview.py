@@ -1,0 +1,155 @@
+"""Videos and contact sheet of `robocas convert`, made from the frames as they pass."""
+
+import signal
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+from PIL import Image
+from synthetic import RayCaster, write_trajectory
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.datasets import convert as conversion
+from robocas_ms3.datasets import preview
+from robocas_ms3.datasets.drawing import draw_frame, row_steps, stack_rows
+from robocas_ms3.datasets.preview import PANEL
+from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.video import _pictures, _story, contact_sheet
+
+SUPPORT = Path(__file__).parents[1] / "support"
+
+
+@pytest.fixture
+def made_up_pictures(monkeypatch):
+    monkeypatch.setattr(conversion, "convert", partial(conversion.convert, open_source=RayCaster))
+
+
+def converted(path, out, *flags, seeds=None):
+    trajectory = path if seeds is None else write_trajectory(path, seeds=seeds)
+    return run(["convert", str(trajectory), "--out", str(out), "--no-embeddings", *flags])
+
+
+def shown(out):
+    return sorted(path.name for path in (out / "preview").iterdir()) if (out / "preview").is_dir() else []
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_shows_what_the_dataset_holds(trajectory, tmp_path, jobs):
+    out = tmp_path / "out"
+    conversion.convert(trajectory, out, embeddings=False, previews=None, jobs=jobs, open_source=RayCaster)
+    assert shown(out) == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
+    dataset = Dataset(out)
+    for number in dataset.numbers:
+        with imageio.get_reader(out / "preview" / f"episode_{number:07d}.mp4") as video:
+            assert video.get_meta_data()["fps"] == 5
+            frames = [frame for frame in video]  # list() asks for a length that it does not have
+        assert len(frames) == 7
+        episode = dataset.episode(number)
+        for step, frame in enumerate(frames):
+            drawn = draw_frame(_story(episode, number), step, _pictures(episode, step, "rgb"), PANEL)
+            assert frame.shape == drawn.shape == (PANEL[1] + 64, 3 * PANEL[0], 3)
+            assert np.abs(frame.astype(int) - drawn).mean() < 4, "H.264 loses little"
+    of_pictures = np.asarray(Image.open(contact_sheet(out, tmp_path / "sheet.png")))
+    np.testing.assert_array_equal(np.asarray(Image.open(out / "preview" / "contact_sheet.png")), of_pictures)
+    assert validate(out).violations == []
+
+
+def test_no_picture_is_read_back(trajectory, made_up_pictures, tmp_path, monkeypatch):
+    def read(*_):
+        raise AssertionError("a picture was read")
+
+    monkeypatch.setattr("robocas_ms3.datasets.reader.read_picture", read)
+    assert converted(trajectory, tmp_path / "out") == 0
+    assert shown(tmp_path / "out") == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
+
+
+def test_of_what_is_new(made_up_pictures, tmp_path):
+    out, sheets, times = tmp_path / "out", [], []
+    for name, seeds, flags in (("a", (1, 2), ()), ("b", (3,), ("--append",)), ("b", (3,), ("--append",))):
+        assert converted(tmp_path / f"{name}.h5", out, *flags, seeds=seeds) == 0
+        sheet = out / "preview" / "contact_sheet.png"
+        sheets.append(Image.open(sheet).height)
+        times.append([path.stat().st_mtime_ns for path in sorted((out / "preview").glob("*.mp4"))])
+    assert [len(each) for each in times] == [2, 3, 3]
+    assert times[1][:2] == times[0]
+    assert times[2] == times[1]
+    assert sheets[1] == sheets[2] == 1.5 * sheets[0]
+    of_pictures = np.asarray(Image.open(contact_sheet(out, tmp_path / "sheet.png")))
+    np.testing.assert_array_equal(np.asarray(Image.open(sheet)), of_pictures)
+
+
+def test_of_many_episodes_on_request(made_up_pictures, tmp_path, monkeypatch, capsys):
+    path = write_trajectory(tmp_path / "many.h5", seeds=tuple(range(21)))
+    assert converted(path, tmp_path / "many") == 0
+    assert shown(tmp_path / "many") == []
+    hint = "no videos of so many episodes: --all-videos"
+    assert capsys.readouterr().out.splitlines()[-1].startswith(hint)
+    monkeypatch.setattr(conversion, "FEW", 2)  # of 20 they take seconds
+    monkeypatch.setattr(preview, "SHEET", 2)
+    path = write_trajectory(tmp_path / "three.h5", seeds=(1, 2, 3))
+    assert converted(path, tmp_path / "three") == 0
+    assert shown(tmp_path / "three") == []
+    assert hint in capsys.readouterr().out
+    assert converted(path, tmp_path / "three", "--all-videos", "--overwrite") == 0
+    videos = [f"episode_{number:07d}.mp4" for number in range(3)]
+    assert shown(tmp_path / "three") == ["contact_sheet.png", *videos]
+    assert hint not in capsys.readouterr().out
+    assert Image.open(tmp_path / "three" / "preview" / "contact_sheet.png").height == 2 * (30 + 3 * 163 + 10)
+    path = write_trajectory(tmp_path / "two.h5", seeds=(1, 2))
+    assert converted(path, tmp_path / "two") == 0
+    assert shown(tmp_path / "two") == ["contact_sheet.png", *videos[:2]]
+
+
+def test_none_where_they_are_not_wanted(trajectory, made_up_pictures, tmp_path, capsys):
+    assert converted(trajectory, tmp_path / "out", "--no-video") == 0
+    assert shown(tmp_path / "out") == []
+    assert "video" not in capsys.readouterr().out
+    assert converted(trajectory, tmp_path / "other", "--no-video", "--all-videos") == 1
+    assert "--no-video --all-videos" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_killed_run_leaves_nothing_half_written(trajectory, tmp_path):
+    out = tmp_path / "out"
+    command = [sys.executable, SUPPORT / "dying.py", "picture", trajectory, out, "previews"]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    assert [name for name in shown(out) if not name.startswith(".")] == ["episode_0000000.mp4"]
+    again = partial(conversion.convert, trajectory, out, embeddings=False, previews=None, open_source=RayCaster)
+    again(resume=True)
+    assert shown(out) == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
+
+
+def test_a_failed_episode_has_none(trajectory, tmp_path, monkeypatch):
+    from robocas_ms3.datasets import writer
+
+    done, write = [], writer.write_picture
+
+    def failing(path, picture):
+        done.append(path)
+        if len(done) > 50:  # in the second episode
+            raise OSError(28, "No space left on device")
+        return write(path, picture)
+
+    monkeypatch.setattr(writer, "write_picture", failing)
+    with pytest.raises(OSError, match="No space left"):
+        conversion.convert(trajectory, tmp_path / "out", embeddings=False, previews=True, open_source=RayCaster)
+    assert shown(tmp_path / "out") == ["episode_0000000.mp4"]
+
+
+def test_steps_of_a_row():
+    assert row_steps(65) == [0, 9, 18, 27, 37, 46, 55, 64]
+    assert row_steps(3, 4) == [0, 1, 1, 2]
+    assert row_steps(1, 3) == [0, 0, 0]
+
+
+def test_rows_of_different_widths():
+    sheet = stack_rows([np.full((2, 5, 3), 1, np.uint8), np.full((3, 7, 3), 2, np.uint8)])
+    assert sheet.shape == (5, 7, 3)
+    assert (sheet[:2, :5] == 1).all()
+    assert (sheet[:2, 5:] == (24, 26, 30)).all()
+    assert (sheet[2:] == 2).all()
