@@ -196,7 +196,7 @@ def test_hidden_shares_are_what_rays_say():
     differences = []
     for seed in range(3):
         layout = layout_bank(model)(seed, seed)
-        poses = torch.as_tensor(to_wxyz(layout.object_poses))[None]
+        poses = torch.as_tensor(to_wxyz(layout.object_poses), dtype=torch.float32)[None]
         sampled = [_sample(pack.objects[i].annotations.surface_points) for i in layout.object_ids]
         points = torch.as_tensor(np.array(sampled).swapaxes(1, 2), dtype=torch.float32)[None]
         count = len(sampled)
