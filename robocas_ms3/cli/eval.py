@@ -91,6 +91,7 @@ def run(cfg: Eval) -> int:
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.cli.eval_results import write_pages
     from robocas_ms3.config.load import nearest
+    from robocas_ms3.datasets.described import count_of
     from robocas_ms3.demos.checks import check_number
     from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.policies import open_policy
@@ -138,7 +139,8 @@ def run(cfg: Eval) -> int:
     say(markdown(result))
     broken = result.broken_off()
     fix = f", {broken} broken off by an error (--resume --retry-errors plays them again)" if broken else ""
-    say(f"{played} episodes played, {succeeded} succeeded; {out}: {len(result.outcomes)} episodes{fix}")
+    there = count_of(len(result.outcomes), "episode")
+    say(f"{count_of(played, 'episode')} played, {succeeded} succeeded; {out}: {there}{fix}")
     write_pages(result, out, cfg.protocol)
     return 0
 

@@ -158,8 +158,8 @@ class EpisodeGenerator:
         self.worlds: list[OpenLoop] = []
         self.trials: Trials | None = None
         if settings.replay_rate and not config.base_motion:
-            scene = {"config": settings.config, "pack": settings.pack, "layouts": settings.layouts}
-            env = RecordedEnv(TASKS[settings.task].env_id, None, scene)
+            scene = {"config": settings.config, "layouts": settings.layouts}
+            env = RecordedEnv(TASKS[settings.task].env_id, None, scene).with_pack(settings.pack)
             self.worlds = [OpenLoop(env, settings.replay_rate) for _ in range(1 + settings.noisy_trials)]
             noise = Noise(settings.noise_mm / 1000, float(np.deg2rad(settings.noise_deg)))
             stride = sample_stride(settings.control_freq, settings.replay_rate)

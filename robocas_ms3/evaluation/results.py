@@ -91,9 +91,11 @@ def begin(folder: Path, run: dict[str, Any], *, resume: bool, again: bool = Fals
     """
     make_folder(folder)
     path = folder / RUN
-    if not path.is_file() or not (folder / OUTCOMES).is_file():  # without an episode it is of nothing yet
+    if not (folder / OUTCOMES).is_file():  # without an episode it is of nothing yet
         write_json(path, run)
         return {}
+    if not path.is_file():
+        raise EvaluationError("episodes of nobody knows what", where=folder, expected=RUN, fix="Choose another --out.")
     before = {**_BEFORE, **json.loads(path.read_text(encoding="utf-8"))}
     if not resume:
         raise EvaluationError(

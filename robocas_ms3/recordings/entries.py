@@ -80,9 +80,9 @@ def read_reset(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str
     if seed is None or seed < 0:
         place, found = f"{where}, episode_seed", str(episode.get("episode_seed"))[:40]
         raise DatasetError("no such seed", where=place, expected="an integer from 0 on", found=found)
-    return seed, read_reset_options(
-        (episode.get("reset_kwargs") or {}).get("options"), f"{where}, reset_kwargs.options"
-    )
+    begins = episode.get("reset_kwargs") or {}
+    options = begins.get("options") if isinstance(begins, dict) else begins
+    return seed, read_reset_options(options, f"{where}, reset_kwargs.options")
 
 
 def read_reset_options(options: Any, where: object) -> dict[str, Any]:

@@ -15,6 +15,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
+from robocas_ms3.assets.pack import pack_folders
+from robocas_ms3.config.load import shipped_configs
 from robocas_ms3.errors import DatasetError
 
 _PREFIX = "robocas_ms3:"  # lets gymnasium import this package by itself: ManiSkill's own tools then work
@@ -83,7 +85,10 @@ class RecordedEnv:
 
     def with_pack(self, pack: str | Path | None) -> RecordedEnv:
         """The same with the objects of another pack, by name or folder, where one is given."""
-        return self if pack is None else replace(self, kwargs={**self.kwargs, "pack": str(pack)})
+        if pack is None:
+            return self
+        named = str(pack) if str(pack) in pack_folders() else str(Path(pack).absolute())
+        return replace(self, kwargs={**self.kwargs, "pack": named})
 
     def make(self, **kwargs: Any) -> Any:
         """Make it.
@@ -92,7 +97,8 @@ class RecordedEnv:
             kwargs: further ones of ``gym.make``, which win over its own.
 
         Raises:
-            DatasetError: no such task is registered.
+            DatasetError: no such task is registered, configuration shipped, or pack installed; what lies in the
+                folder where we run is none, whatever its name.
         """
         import gymnasium as gym
 
@@ -101,6 +107,15 @@ class RecordedEnv:
         known = sorted(spec.env_id for spec in TASKS.values())
         if self.env_id not in known:
             raise DatasetError("no such task", where="env_id", expected=f"one of {known}", found=self.env_id)
+        config = self.kwargs.get("config")
+        if isinstance(config, str) and config not in shipped_configs():
+            raise DatasetError("no such configuration", where="config", expected="a shipped one", found=config)
+        for key in ("pack", "furniture_pack"):
+            name = self.kwargs.get(key, "builtin")
+            if not Path(name).is_absolute() and name not in pack_folders():
+                expected = f"one of {', '.join(pack_folders())}"
+                fix = "Install it, or pass its folder with --pack." if key == "pack" else "Install it."
+                raise DatasetError("no such pack is installed", where=key, expected=expected, found=name, fix=fix)
         return gym.make(self.env_id, **{**self.kwargs, **kwargs})
 
 

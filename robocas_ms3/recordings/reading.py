@@ -141,7 +141,9 @@ class TrajectoryFile:
                 for kind in ("actors", "articulations")
                 if kind in group["env_states"]
             }
-        except (OSError, KeyError, RuntimeError, AttributeError) as error:
+            if any(array.ndim != 2 for arrays in states.values() for array in arrays.values()):
+                raise ValueError("states that are no rows of numbers")
+        except (OSError, KeyError, RuntimeError, AttributeError, ValueError, TypeError) as error:
             raise DatasetError("this episode is damaged", where=where, found=reason(error)) from error
         if actions.ndim != 2 or len(actions) == 0:
             raise DatasetError("this episode has no actions", where=where)

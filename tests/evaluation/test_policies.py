@@ -50,7 +50,7 @@ def test_a_module_in_the_folder_of_the_command(here):
     [
         ("scriptd", "no such policy .*Did you mean scripted"),
         ("http://127.0.0.1:9", "no such policy .*ws://host:port"),
-        ("own_policy.py:Mine", "this policy's module can't be imported|no such policy"),
+        ("own_policy.py:Mine", "no such policy.*Leave the .py out: own_policy:Mine"),
         ("own_nowhere:Mine", "no such policy .*No module named 'own_nowhere'.*PYTHONPATH"),
         ("own_policy:Yours", "no such policy .*Yours"),
         ("own_spoilt:Mine", "own_spoilt: this policy's module can't be imported .*SyntaxError"),

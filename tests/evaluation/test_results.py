@@ -7,7 +7,7 @@ from made_up_results import RUN_OF, outcome, write
 
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.outcomes import failure_stage
-from robocas_ms3.evaluation.results import OUTCOMES, append, begin, merge, parts_of, read
+from robocas_ms3.evaluation.results import OUTCOMES, RUN, append, begin, merge, parts_of, read
 
 SEARCH = dict.fromkeys(("obstacles_cleared", "reached_any", "target_grasped", "target_lifted", "success"))
 
@@ -234,3 +234,10 @@ def test_a_run_that_died_before_its_first_episode_is_in_nobodys_way(tmp_path):
     begin(tmp_path / "a", {**RUN_OF, "policy": {"name": "another"}}, resume=False)
     append(tmp_path / "a", outcome(0))
     assert read(tmp_path / "a").run["policy"] == {"name": "another"}
+
+
+def test_episodes_without_what_they_were_measured_with_are_not_gone_on_with(tmp_path):
+    write(tmp_path / "a", [outcome(0)])
+    (tmp_path / "a" / RUN).unlink()
+    with pytest.raises(EvaluationError, match=r"episodes of nobody knows what .*run.json"):
+        begin(tmp_path / "a", RUN_OF, resume=True)

@@ -126,6 +126,7 @@ def test_no_numbers(own, name, row):
         ({"episode_seed": [3, 4]}, "no such seed"),
         ({"episode_seed": True}, "no such seed"),
         ({"reset_kwargs": {"options": {"reset_to_env_states": {}}}}, "options: a file can't choose these"),
+        ({"reset_kwargs": [3]}, "options: a file can't choose these"),
         ({"reset_kwargs": {"options": {"reconfigure": "yes"}}}, "options: a file can't choose these"),
         ({"control_mode": 3}, "control_mode: the JSON's entry is wrong .expected text"),
         ({"elapsed_steps": 2.0}, "elapsed_steps: the JSON's entry is wrong .expected an integer"),
@@ -161,3 +162,12 @@ def test_the_robot_alone(own):
     assert alone.states["actors"] == {}
     samples = np.array([0, 4, 22])
     np.testing.assert_array_equal(whole.motion(samples).actions, alone.motion(samples).actions)
+
+
+@pytest.mark.parametrize("values", [np.zeros(23, np.float32), np.array([b"x"] * 23), np.float32(1)])
+@pytest.mark.parametrize("name", ["actors/object_1", "articulations/robocas_mobile_panda"])
+def test_states_that_are_no_rows_of_numbers(own, name, values):
+    with h5py.File(own, "a") as file:
+        del file[f"traj_0/env_states/{name}"]
+        file[f"traj_0/env_states/{name}"] = values
+    fails(own, "this episode is damaged")

@@ -1,5 +1,6 @@
 """A file chooses no code and no path."""
 
+import shutil
 import sys
 
 import pytest
@@ -7,8 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic import write_trajectory
 
+from robocas_ms3.assets.pack import MANIFEST
 from robocas_ms3.cli.main import run
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.paths import builtin_packs_dir, task_configs_dir
 from robocas_ms3.recordings.environment import RecordedEnv, read_env, recorded_id
 
 ID = "robocas_ms3:RoboCASPick-v1"
@@ -64,6 +67,20 @@ def test_the_user_may_choose_a_pack(tmp_path):
 def test_only_registered_tasks_are_made():
     with pytest.raises(DatasetError, match=r"no such task .expected one of .*RoboCASPick-v1.*found CartPole-v1"):
         read_env({"env_id": "CartPole-v1", "env_kwargs": {}}, "F.json").make()
+
+
+@pytest.mark.parametrize(("key", "name"), [("pack", "mine"), ("furniture_pack", "mine"), ("config", "mine.yaml")])
+def test_what_lies_in_the_folder_where_we_run_is_not_taken_for_what_is_installed(tmp_path, monkeypatch, key, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").mkdir()
+    shutil.copyfile(builtin_packs_dir() / "builtin" / MANIFEST, tmp_path / "mine" / MANIFEST)
+    shutil.copyfile(task_configs_dir() / "pick_table_scattered.yaml", tmp_path / "mine.yaml")
+    env = read_env({"env_id": ID, "env_kwargs": {key: name}}, "F.json")
+    with pytest.raises(DatasetError, match=f"{key}: no such .*found {name}"):
+        env.make(obs_mode="none", render_backend="none")
+    trusted = env.with_pack("mine").kwargs["pack"]  # by the user
+    assert trusted == str(tmp_path / "mine")
+    assert env.with_pack("builtin").kwargs["pack"] == "builtin"
 
 
 json_values = st.recursive(

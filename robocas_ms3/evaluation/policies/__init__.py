@@ -73,6 +73,8 @@ def _own(name: str, module: str, of: str) -> Policy:
     try:
         made: Any = getattr(importlib.import_module(module), of)
     except ModuleNotFoundError as error:
+        if module.endswith(".py"):
+            raise EvaluationError("no such policy", where=name, fix=f"Leave the .py out: {module[:-3]}:{of}") from error
         if error.name != module.partition(".")[0]:
             raise EvaluationError("this policy's module can't be imported", where=module, found=error) from error
         fix = "Run in its folder, or install it, or put its folder on PYTHONPATH."
