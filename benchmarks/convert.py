@@ -29,10 +29,10 @@ import torch
 import tyro
 from convert_memory import repeated
 
-from robocas_ms3.datasets.convert import convert
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.render import EnvFrames
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.render import EnvFrames
 from robocas_ms3.recordings.motion import sample_states, sample_stride
 from robocas_ms3.recordings.reading import TrajectoryFile
 

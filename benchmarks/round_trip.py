@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
@@ -29,9 +29,9 @@ from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.parts import open_part
 from robocas_ms3.datasets.manage.splitting import parts_by_value, write_parts
 from robocas_ms3.datasets.manage.survey import survey
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.convert import convert
 
 _NOT_UPSTREAMS = {"agv_pose", "rel_agv_pose", "language_embedding", "step_goal_embs"}
 

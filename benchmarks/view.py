@@ -24,8 +24,8 @@ from typing import Any
 import tyro
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.convert import convert
-from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.writing.convert import convert
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests" / "viewer"), str(ROOT / "tests" / "datasets")]

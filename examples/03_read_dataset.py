@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.convert import convert
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.convert import convert
 
 if len(sys.argv) != 3:
     sys.exit("python examples/03_read_dataset.py TRAJECTORY.h5 OUT")

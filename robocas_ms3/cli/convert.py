@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from robocas_ms3.datasets.convert import Conversion
+    from robocas_ms3.datasets.writing.convert import Conversion
 
 
 @dataclass
@@ -91,9 +91,9 @@ def _check(cfg: Convert) -> None:
 
 def _convert(cfg: Convert) -> int:
     from robocas_ms3.cli.bars import bar, say
-    from robocas_ms3.datasets.convert import convert
-    from robocas_ms3.datasets.described import count_of
-    from robocas_ms3.datasets.pictures import Pictures
+    from robocas_ms3.datasets.pictures.stored import Pictures
+    from robocas_ms3.datasets.statistics.described import count_of
+    from robocas_ms3.datasets.writing.convert import convert
 
     with bar("episodes") as shown:
         common: dict[str, Any] = {

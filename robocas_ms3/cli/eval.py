@@ -91,7 +91,7 @@ def run(cfg: Eval) -> int:
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.cli.eval_results import write_pages
     from robocas_ms3.config.load import nearest
-    from robocas_ms3.datasets.described import count_of
+    from robocas_ms3.datasets.statistics.described import count_of
     from robocas_ms3.demos.checks import check_number
     from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.policies import open_policy

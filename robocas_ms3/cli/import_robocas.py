@@ -48,10 +48,10 @@ def main(cfg: ImportRobocas) -> int:
     import json
 
     from robocas_ms3.cli.bars import bar, say
-    from robocas_ms3.datasets.described import count_of
     from robocas_ms3.datasets.manage.importing import import_robocas
     from robocas_ms3.datasets.manage.output import check_apart
     from robocas_ms3.datasets.manage.survey import survey
+    from robocas_ms3.datasets.statistics.described import count_of
     from robocas_ms3.files import claim_output
 
     if cfg.out is not None:
@@ -92,7 +92,7 @@ def _table(found: Survey) -> None:
     from rich.table import Table
 
     from robocas_ms3.cli.bars import say
-    from robocas_ms3.datasets.described import count_of
+    from robocas_ms3.datasets.statistics.described import count_of
 
     rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
     for finding in found.findings:

@@ -46,8 +46,8 @@ class Split:
 def main(cfg: Split) -> int:
     """Split, with a progress bar; gives the exit code."""
     from robocas_ms3.cli.bars import bar, say
-    from robocas_ms3.datasets.described import count_of
     from robocas_ms3.datasets.manage.splitting import Share, resplit, write_parts
+    from robocas_ms3.datasets.statistics.described import count_of
 
     check(cfg)
     whole = cfg.out is not None and not cfg.parts  # each part is one task or target, which can't be cut by itself

@@ -31,8 +31,8 @@ def main(cfg: Stats) -> int:
 
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER
-    from robocas_ms3.datasets.stats import collect
-    from robocas_ms3.datasets.stats_plots import write_stats
+    from robocas_ms3.datasets.statistics.collect import collect
+    from robocas_ms3.datasets.statistics.plots import write_stats
 
     with bar("episodes") as shown:
         stats = collect(cfg.path, rate_hz=cfg.rate, on_episode=shown.at)

@@ -15,8 +15,8 @@ from robocas_ms3.cli.bars import bar
 from robocas_ms3.errors import DatasetError
 
 if TYPE_CHECKING:
-    from robocas_ms3.datasets.replay_check import ReplayReport
-    from robocas_ms3.datasets.validate import Report
+    from robocas_ms3.datasets.checks.dataset import Report
+    from robocas_ms3.datasets.checks.replay import ReplayReport
 
 
 @dataclass
@@ -44,8 +44,8 @@ def main(cfg: Validate) -> int:
     """Validate; gives the exit code."""
     from rich.console import Console
 
-    from robocas_ms3.datasets.described import count_of
-    from robocas_ms3.datasets.validate import validate
+    from robocas_ms3.datasets.checks.dataset import validate
+    from robocas_ms3.datasets.statistics.described import count_of
 
     if cfg.min_share is not None and not cfg.replay:
         raise DatasetError("a share of replayed episodes needs --replay", where="--min-share")
@@ -79,8 +79,8 @@ def main(cfg: Validate) -> int:
 
 
 def _validate_lerobot(root: Path, *, on_episode: Callable[[int, int], None]) -> Report:
+    from robocas_ms3.datasets.checks.dataset import Report
     from robocas_ms3.datasets.lerobot.check import check_lerobot
-    from robocas_ms3.datasets.validate import Report
 
     counts = [0, 0]
 
@@ -95,7 +95,7 @@ def _validate_lerobot(root: Path, *, on_episode: Callable[[int, int], None]) -> 
 
 
 def _replay(root: Path, pack: str | None) -> ReplayReport:
-    from robocas_ms3.datasets.replay_check import replay_dataset
+    from robocas_ms3.datasets.checks.replay import replay_dataset
 
     with bar("replaying", transient=True) as shown:
         return replay_dataset(root, pack=pack, on_episode=lambda _, count: shown.next_of(count))

@@ -29,9 +29,9 @@ def main(cfg: Video) -> int:
     """Write them; gives the exit code."""
     from rich.console import Console
 
-    from robocas_ms3.datasets.reader import Dataset
+    from robocas_ms3.datasets.pictures.video import contact_sheet, write_video
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER, episode_folder
-    from robocas_ms3.datasets.video import contact_sheet, write_video
+    from robocas_ms3.datasets.sources.reader import Dataset
 
     dataset = Dataset(cfg.dataset)
     out = cfg.out or cfg.dataset / PREVIEW_FOLDER

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from robocas_ms3.datasets.torch_dataset import RoboCASDataset
+    from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
 
 __all__ = ["RoboCASDataset"]
 
@@ -13,7 +13,7 @@ __all__ = ["RoboCASDataset"]
 def __getattr__(name: str) -> Any:
     """Import torch only where it is asked for."""
     if name in __all__:
-        from robocas_ms3.datasets import torch_dataset
+        from robocas_ms3.datasets.training import torch_dataset
 
         return getattr(torch_dataset, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -10,7 +10,7 @@ from typing import Any
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.config.load import nearest
-from robocas_ms3.datasets.render import require_renderer
+from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.outcomes import Outcome

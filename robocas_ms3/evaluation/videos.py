@@ -11,7 +11,7 @@ from typing import Any
 import imageio.v2 as imageio
 import torch
 
-from robocas_ms3.datasets.render import require_renderer
+from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Policy

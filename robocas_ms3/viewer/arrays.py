@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.info import runs
+from robocas_ms3.datasets.writing.info import runs
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.poses import from_xyzw
 from robocas_ms3.viewer.failures import describe

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from robocas_ms3.datasets.scene_values import check_rate, sound
-from robocas_ms3.datasets.tolerant import DAMAGED
+from robocas_ms3.datasets.checks.scene_values import check_rate, sound
+from robocas_ms3.datasets.sources.tolerant import DAMAGED
 from robocas_ms3.errors import DatasetError
 
 _WRONG = (*DAMAGED, ArithmeticError, AttributeError, AssertionError, LookupError, RecursionError, TypeError)

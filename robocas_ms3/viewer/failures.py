@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from robocas_ms3.datasets.provenance import environment_of
+from robocas_ms3.datasets.sources.provenance import environment_of
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.viewer.source import row
 

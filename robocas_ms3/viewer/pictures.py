@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.video import colour_depth
+from robocas_ms3.datasets.pictures.video import colour_depth
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.source import Picture
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.reader import Dataset, Episode
-from robocas_ms3.datasets.tolerant import DAMAGED
+from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.datasets.sources.tolerant import DAMAGED
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.seeds import one_seed
 from robocas_ms3.viewer import damage

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import planar_base
-from robocas_ms3.datasets.provenance import succeeded, task_of
-from robocas_ms3.datasets.scene_values import sound
+from robocas_ms3.datasets.checks.scene_values import sound
+from robocas_ms3.datasets.sources.arrays import planar_base
+from robocas_ms3.datasets.sources.provenance import succeeded, task_of
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.recordings.seeds import one_seed

@@ -3,7 +3,7 @@ import shutil
 import pytest
 from synthetic import RayCaster, made_up_vectors, write_trajectory
 
-from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.writing.convert import convert
 
 
 @pytest.fixture(scope="session")
@@ -16,7 +16,7 @@ def made(trajectory, tmp_path_factory):
     """A dataset of two episodes that nobody may change."""
     out = tmp_path_factory.mktemp("made") / "dataset"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("robocas_ms3.datasets.convert.embed_texts", made_up_vectors)
+        patch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
         convert(trajectory, out, open_source=RayCaster)
     return out
 

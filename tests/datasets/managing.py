@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from synthetic import RayCaster, write_trajectory
 
-from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.writing.convert import convert
 
 
 def files_of(root):

@@ -12,11 +12,11 @@ from managing import change, edit, files_of, make, read
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets.convert import convert
-from robocas_ms3.datasets.info import write_info
+from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.merging import merge
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.errors import DatasetError
 
 

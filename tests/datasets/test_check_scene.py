@@ -6,8 +6,8 @@ import re
 import pytest
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.scene_values import Scene, check_values, sound
-from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.checks.scene_values import Scene, check_values, sound
 from robocas_ms3.recordings.seeds import one_seed
 
 FILE = "episode_0000001/scene.json"

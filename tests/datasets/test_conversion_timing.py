@@ -6,9 +6,9 @@ from collections import Counter
 import pytest
 from synthetic import RayCaster
 
-from robocas_ms3.datasets import convert as conversion
-from robocas_ms3.datasets import writer
-from robocas_ms3.datasets.timing import Timing
+from robocas_ms3.datasets.writing import convert as conversion
+from robocas_ms3.datasets.writing import writer
+from robocas_ms3.datasets.writing.timing import Timing
 
 
 class Clock:

@@ -13,10 +13,10 @@ import pytest
 from synthetic import STEPS, RayCaster, made_up_vectors, write_trajectory
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.convert import convert
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.files import locked_folder
 from robocas_ms3.poses import from_xyzw
@@ -331,7 +331,7 @@ def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypat
     out = tmp_path / "out"
     more = write_trajectory(tmp_path / "more.h5", seeds=(10,))
     other = write_trajectory(tmp_path / "other.h5", seeds=(11,))
-    monkeypatch.setattr("robocas_ms3.datasets.convert.embed_texts", made_up_vectors)
+    monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
     convert(trajectory, out, open_source=RayCaster)
 
     def meanwhile(file, chosen):
@@ -339,9 +339,9 @@ def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypat
             convert(other, out, append=True, open_source=RayCaster)
         return made_up_vectors(file, chosen)
 
-    monkeypatch.setattr("robocas_ms3.datasets.convert.embed_texts", meanwhile)
+    monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", meanwhile)
     convert(more, out, append=True, open_source=RayCaster)
-    monkeypatch.setattr("robocas_ms3.datasets.convert.embed_texts", made_up_vectors)
+    monkeypatch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
     convert(other, out, append=True, open_source=RayCaster)
     ledger = json.loads((out / "conversion.json").read_text())["episodes"]
     assert [entry["seed"] for entry in ledger.values()] == [3, 5, 10, 11]

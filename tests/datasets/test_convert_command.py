@@ -9,10 +9,10 @@ import pytest
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets import convert as conversion
-from robocas_ms3.datasets.plan import still_missing
-from robocas_ms3.datasets.validate import validate
-from robocas_ms3.datasets.writer import WrittenEpisode
+from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.writing import convert as conversion
+from robocas_ms3.datasets.writing.plan import still_missing
+from robocas_ms3.datasets.writing.writer import WrittenEpisode
 
 SECONDS = r"\d+\.\d"
 

@@ -15,8 +15,8 @@ from managing import files_of
 from synthetic import RayCaster
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets import convert as conversion
-from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.writing import convert as conversion
 
 
 def half(write, path, data, **_):

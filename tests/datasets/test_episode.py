@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import compose, continuous_xyzw, episode_arrays, planar_base
 from robocas_ms3.datasets.schema import EPISODE_INFO
+from robocas_ms3.datasets.sources.arrays import compose, continuous_xyzw, episode_arrays, planar_base
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw, inverse, wxyz_to_xyzw, xyzw_to_wxyz
 from robocas_ms3.recordings.motion import Motion, gripper_open, relative_motion, sample_states, sample_stride

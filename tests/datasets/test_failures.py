@@ -3,12 +3,12 @@ import json
 from managing import edit
 from synthetic import RayCaster, write_trajectory
 
-from robocas_ms3.datasets.convert import convert
-from robocas_ms3.datasets.failures import add_failures
+from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.merging import merge
-from robocas_ms3.datasets.provenance import environment_of
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.sources.provenance import environment_of
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.failures import add_failures
 from robocas_ms3.demos.ledger import Failure, Ledger
 
 SLIPPED = Failure(3, 0, "grasp", "slipped", 2.5)

@@ -1,6 +1,6 @@
 import numpy as np
 
-from robocas_ms3.datasets.geometry import View, check, compare
+from robocas_ms3.datasets.checks.depth import View, check, compare
 
 
 def overhead(height, *, depth=None, size=80, shift=0.0):

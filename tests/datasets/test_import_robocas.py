@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.cli.import_robocas import ranges
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.eef import eef_turn
 from robocas_ms3.datasets.manage.importing import import_robocas
 from robocas_ms3.datasets.manage.survey import survey
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.validate import validate
-from robocas_ms3.datasets.video import PANEL, contact_sheet, video_frame
+from robocas_ms3.datasets.pictures.video import PANEL, contact_sheet, video_frame
+from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.errors import DatasetError
 
 OURS = ("agv_pose", "rel_agv_pose")
@@ -122,7 +122,7 @@ def test_what_upstream_writes_becomes_a_valid_dataset(dataset, made, tmp_path, p
 
 
 def test_the_torch_dataset_reads_it(four, tmp_path):
-    from robocas_ms3.datasets.torch_dataset import RoboCASDataset
+    from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
 
     imported(four, tmp_path / "out")
     samples = RoboCASDataset(tmp_path / "out")

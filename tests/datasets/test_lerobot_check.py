@@ -14,7 +14,7 @@ from robocas_ms3.datasets.lerobot.check import check_lerobot, is_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.tables import column, numbers, write_texts
 from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder
-from robocas_ms3.datasets.pictures import Pictures
+from robocas_ms3.datasets.pictures.stored import Pictures
 
 DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"

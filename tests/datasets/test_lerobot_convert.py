@@ -22,8 +22,8 @@ from robocas_ms3.datasets.lerobot.folder import FolderSource
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.request import Request
 from robocas_ms3.datasets.lerobot.schema import Limits
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.files import locked_folder
 from robocas_ms3.recordings.reading import TrajectoryFile

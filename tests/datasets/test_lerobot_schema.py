@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.episode import episode_arrays
 from robocas_ms3.datasets.lerobot.schema import FEATURES, features_json, frame_columns, robocas_arrays, whole_rate
+from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import Motion

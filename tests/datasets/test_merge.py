@@ -6,14 +6,14 @@ from managing import DAMAGES, change, die, edit, files_of, make, read
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets.convert import convert
+from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.output import Placed
 from robocas_ms3.datasets.manage.parts import names_of
 from robocas_ms3.datasets.manage.splitting import Share, resplit
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.files import locked_folder
 

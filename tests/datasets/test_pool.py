@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from robocas_ms3.datasets.pool import do_all
+from robocas_ms3.datasets.writing.pool import do_all
 
 
 class Looking:

@@ -13,13 +13,13 @@ from PIL import Image
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets import convert as conversion
-from robocas_ms3.datasets import preview
-from robocas_ms3.datasets.drawing import draw_frame, row_steps, stack_rows
-from robocas_ms3.datasets.preview import PANEL
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.validate import validate
-from robocas_ms3.datasets.video import _pictures, _story, contact_sheet
+from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.pictures import preview
+from robocas_ms3.datasets.pictures.drawing import draw_frame, row_steps, stack_rows
+from robocas_ms3.datasets.pictures.preview import PANEL
+from robocas_ms3.datasets.pictures.video import _pictures, _story, contact_sheet
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing import convert as conversion
 
 SUPPORT = Path(__file__).parents[1] / "support"
 
@@ -63,7 +63,7 @@ def test_no_picture_is_read_back(trajectory, made_up_pictures, tmp_path, monkeyp
     def read(*_):
         raise AssertionError("a picture was read")
 
-    monkeypatch.setattr("robocas_ms3.datasets.reader.read_picture", read)
+    monkeypatch.setattr("robocas_ms3.datasets.sources.reader.read_picture", read)
     assert converted(trajectory, tmp_path / "out") == 0
     assert shown(tmp_path / "out") == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
 
@@ -125,7 +125,7 @@ def test_a_killed_run_leaves_nothing_half_written(trajectory, tmp_path):
 
 
 def test_a_failed_episode_has_none(trajectory, tmp_path, monkeypatch):
-    from robocas_ms3.datasets import writer
+    from robocas_ms3.datasets.writing import writer
 
     done, write = [], writer.write_picture
 

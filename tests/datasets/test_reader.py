@@ -2,9 +2,9 @@
 
 import pytest
 
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.stats import collect
-from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.statistics.collect import collect
 from robocas_ms3.errors import DatasetError
 
 

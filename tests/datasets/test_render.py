@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from robocas_ms3.cli.convert import Convert, main
-from robocas_ms3.datasets import geometry
-from robocas_ms3.datasets.convert import convert
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.render import EnvFrames
-from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.checks import depth as geometry
+from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.render import EnvFrames
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.reading import TrajectoryFile
 

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.provenance import task_of
+from robocas_ms3.datasets.sources.provenance import task_of
 from robocas_ms3.errors import DatasetError
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "dataset.md"

@@ -6,11 +6,11 @@ from hypothesis import strategies as st
 from managing import DAMAGES, edit, files_of, make, read
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets.info import split_by_seed
+from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.splitting import Share, cut, folder_names, groups_of, resplit
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.info import split_by_seed
 from robocas_ms3.errors import DatasetError
 
 

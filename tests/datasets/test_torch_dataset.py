@@ -21,8 +21,8 @@ from torch.utils.data import DataLoader, WeightedRandomSampler
 
 from robocas_ms3.datasets import RoboCASDataset
 from robocas_ms3.datasets.actions import ActionScale, episode_actions
-from robocas_ms3.datasets.sampling import SampleIndex, balancing_weights
-from robocas_ms3.datasets.windows import Window
+from robocas_ms3.datasets.training.sampling import SampleIndex, balancing_weights
+from robocas_ms3.datasets.training.windows import Window
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.motion import Motion
 from robocas_ms3.robots.constants import ARM_EVALUATION_START

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
+from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.datasets.tolerant import load_arrays
-from robocas_ms3.datasets.validate import validate
+from robocas_ms3.datasets.sources.tolerant import load_arrays
 from robocas_ms3.errors import DatasetError
 
 NPZ = "episode_0000001/episode_info.npz"

@@ -4,8 +4,8 @@ import pytest
 from PIL import Image
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.video import PANEL, colour_depth, contact_sheet, video_frame, write_video
+from robocas_ms3.datasets.pictures.video import PANEL, colour_depth, contact_sheet, video_frame, write_video
+from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.errors import DatasetError
 
 

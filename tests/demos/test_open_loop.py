@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.datasets.actions import episode_actions
-from robocas_ms3.datasets.episode import episode_arrays
+from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.errors import DatasetError

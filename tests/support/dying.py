@@ -7,7 +7,7 @@ import sys
 from synthetic import RayCaster
 
 from robocas_ms3 import files
-from robocas_ms3.datasets import convert, writer
+from robocas_ms3.datasets.writing import convert, writer
 
 PLACES = {  # moment -> (module, function, which call is the last)
     "picture": (writer, "write_picture", 50),  # in the second episode

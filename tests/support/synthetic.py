@@ -8,8 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.writer import CameraModel, Frame
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.writing.writer import CameraModel, Frame
 from robocas_ms3.robots.constants import ARM_EVALUATION_START
 
 STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one

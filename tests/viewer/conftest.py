@@ -34,7 +34,7 @@ def run_folder(made_up, tmp_path_factory):
 @pytest.fixture(scope="session")
 def folder(run_folder, made_up, tmp_path_factory):
     """The same as a RoboCAS folder of all three, small pictures, nobody may change it."""
-    from robocas_ms3.datasets.convert import convert
+    from robocas_ms3.datasets.writing.convert import convert
 
     out = tmp_path_factory.mktemp("folder") / "dataset"
     convert(run_folder / "trajectory.h5", out, open_source=made_up.RayCaster, embeddings=False, include_failed=True)

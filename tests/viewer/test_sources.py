@@ -6,8 +6,8 @@ import shutil
 import numpy as np
 import pytest
 
-from robocas_ms3.datasets.convert import convert
-from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.plots import base_plot, motion_plots
 from robocas_ms3.viewer.source import make_index, open_source, plot, rounded

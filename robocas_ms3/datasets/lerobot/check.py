@@ -12,12 +12,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_videos import TOLERANCE, check_videos
 from robocas_ms3.datasets.lerobot.stats import QUANTILES
 from robocas_ms3.datasets.lerobot.tables import numbers, read_texts
 from robocas_ms3.datasets.schema import GOAL_TYPES
-from robocas_ms3.datasets.violation import Violation
 
 _KEYS = ("codebase_version", "total_episodes", "total_frames", "total_tasks", "fps", "splits", "features", "data_path")
 

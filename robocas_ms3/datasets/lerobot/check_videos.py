@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.video import packet_times, read_frames
-from robocas_ms3.datasets.violation import Violation
 from robocas_ms3.errors import DatasetError
 
 TOLERANCE = 1e-4

@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import robocas_ms3
-from robocas_ms3.datasets.convert import Conversion, open_env
-from robocas_ms3.datasets.info import split_by_seed
 from robocas_ms3.datasets.lerobot.request import EpisodeSource, Request
 from robocas_ms3.datasets.lerobot.schema import CONTENT, CONVERSION_FILE, INFO_FILE, Limits, require_extra
 from robocas_ms3.datasets.lerobot.sources import open_request
-from robocas_ms3.datasets.output import check_overwrite, kept_if_begun, sweep
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.workers import OpenSource
-from robocas_ms3.datasets.writer import WrittenEpisode
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.writing.convert import Conversion, open_env
+from robocas_ms3.datasets.writing.info import split_by_seed
+from robocas_ms3.datasets.writing.output import check_overwrite, kept_if_begun, sweep
+from robocas_ms3.datasets.writing.workers import OpenSource
+from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
 
@@ -89,7 +89,7 @@ def convert_lerobot(
             elif overwrite:
                 check_overwrite(out, (INFO_FILE, PARTS), "a LeRobot dataset")
             if request.open_source is open_env and request.path.is_file():
-                from robocas_ms3.datasets.render import require_renderer
+                from robocas_ms3.datasets.writing.render import require_renderer
 
                 require_renderer()
             claim_output(out, overwrite=overwrite and not resume, resume=True)

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.lerobot.request import OnFrame, Request
 from robocas_ms3.datasets.lerobot.schema import needed_arrays, whole_rate
-from robocas_ms3.datasets.reader import Dataset, Episode
-from robocas_ms3.datasets.timing import Timing
-from robocas_ms3.datasets.tolerant import DAMAGED
-from robocas_ms3.datasets.writer import CameraModel, Shown
+from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.datasets.sources.tolerant import DAMAGED
+from robocas_ms3.datasets.writing.timing import Timing
+from robocas_ms3.datasets.writing.writer import CameraModel, Shown
 from robocas_ms3.errors import DatasetError
 
 

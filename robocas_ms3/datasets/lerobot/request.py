@@ -9,10 +9,10 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.timing import Timing
-from robocas_ms3.datasets.workers import OpenSource
-from robocas_ms3.datasets.writer import Shown
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.writing.timing import Timing
+from robocas_ms3.datasets.writing.workers import OpenSource
+from robocas_ms3.datasets.writing.writer import Shown
 
 OnFrame = Callable[[int, dict[str, NDArray], dict[str, NDArray]], None]
 """Takes step, and pictures by camera: (H, W, 3) uint8 RGB, (H, W) uint16 depth in mm."""

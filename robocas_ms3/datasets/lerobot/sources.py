@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from robocas_ms3.datasets.convert import choose, warn_untried
 from robocas_ms3.datasets.lerobot.folder import FolderSource
 from robocas_ms3.datasets.lerobot.request import EpisodeSource, OnFrame, Request
 from robocas_ms3.datasets.lerobot.schema import whole_rate
-from robocas_ms3.datasets.provenance import fingerprint, scene_record, succeeded
-from robocas_ms3.datasets.timing import Timing
-from robocas_ms3.datasets.writer import FrameSource, Shown, show_episode
+from robocas_ms3.datasets.sources.provenance import fingerprint, scene_record, succeeded
+from robocas_ms3.datasets.writing.convert import choose, warn_untried
+from robocas_ms3.datasets.writing.timing import Timing
+from robocas_ms3.datasets.writing.writer import FrameSource, Shown, show_episode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.motion import sample_stride
 from robocas_ms3.recordings.reading import TrajectoryFile

@@ -22,10 +22,10 @@ from robocas_ms3.datasets.lerobot.sources import open_request
 from robocas_ms3.datasets.lerobot.stats import Levels
 from robocas_ms3.datasets.lerobot.tables import column
 from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder
-from robocas_ms3.datasets.pool import do_all
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.datasets.timing import Timing
-from robocas_ms3.datasets.writer import WrittenEpisode
+from robocas_ms3.datasets.writing.pool import do_all
+from robocas_ms3.datasets.writing.timing import Timing
+from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder
 

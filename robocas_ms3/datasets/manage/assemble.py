@@ -9,12 +9,12 @@ from typing import Any, Literal
 
 import robocas_ms3
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.described import count_of
-from robocas_ms3.datasets.info import write_info
 from robocas_ms3.datasets.manage.input_check import check_episodes
 from robocas_ms3.datasets.manage.output import Placed, begun_output, check_apart
 from robocas_ms3.datasets.manage.parts import Part
-from robocas_ms3.datasets.plan import SETTINGS
+from robocas_ms3.datasets.statistics.described import count_of
+from robocas_ms3.datasets.writing.info import write_info
+from robocas_ms3.datasets.writing.plan import SETTINGS
 from robocas_ms3.files import claim_output, replacing_folder
 
 Side = Literal["train", "val"]

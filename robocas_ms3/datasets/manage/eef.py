@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.tolerant import SPECS, derive_motion
+from robocas_ms3.datasets.sources.tolerant import SPECS, derive_motion
 
 _CAMERA_OFFSET = (0.03, 0.07)  # m: the gripper camera's distance from the hand's axis, 0.05
 

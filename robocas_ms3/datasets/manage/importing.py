@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 import robocas_ms3
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.info import write_info
 from robocas_ms3.datasets.manage.eef import about_z
 from robocas_ms3.datasets.manage.findings import Found
 from robocas_ms3.datasets.manage.output import Placed, begun_output
 from robocas_ms3.datasets.manage.parts import schema_version
 from robocas_ms3.datasets.manage.reading import read_episode
 from robocas_ms3.datasets.manage.survey import Survey, read_info
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.plan import dataset_settings
-from robocas_ms3.datasets.reader import Dataset, Episode
-from robocas_ms3.datasets.writer import CameraModel, write_cameras
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.datasets.writing.info import write_info
+from robocas_ms3.datasets.writing.plan import dataset_settings
+from robocas_ms3.datasets.writing.writer import CameraModel, write_cameras
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder, write_json
 

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.check_arrays import check_shapes
-from robocas_ms3.datasets.check_pictures import check_cameras
-from robocas_ms3.datasets.check_scene import check_settings
+from robocas_ms3.datasets.checks.arrays import check_shapes
+from robocas_ms3.datasets.checks.pictures import check_cameras
+from robocas_ms3.datasets.checks.scene import check_settings
+from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.manage.parts import Part
-from robocas_ms3.datasets.picture_files import read_header
-from robocas_ms3.datasets.pictures import Pictures
-from robocas_ms3.datasets.reader import Dataset, Episode
-from robocas_ms3.datasets.tolerant import DAMAGED, PICKLED, first_line
-from robocas_ms3.datasets.violation import Violation
+from robocas_ms3.datasets.pictures.headers import read_header
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.datasets.sources.tolerant import DAMAGED, PICKLED, first_line
 from robocas_ms3.errors import DatasetError
 
 _TAIL = 32  # bytes at the end of a picture that are looked at

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.output import check_overwrite, kept_if_begun, sweep
+from robocas_ms3.datasets.writing.output import check_overwrite, kept_if_begun, sweep
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
 

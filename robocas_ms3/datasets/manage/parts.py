@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.tolerant import arrays_fingerprint
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.errors import DatasetError
 
 Sides = tuple[list[int], list[int]]

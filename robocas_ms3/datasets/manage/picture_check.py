@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from robocas_ms3.datasets.described import count_of
 from robocas_ms3.datasets.manage.findings import FULL_SIZE, Layout, Report
-from robocas_ms3.datasets.picture_files import PictureHeader, read_header
-from robocas_ms3.datasets.reader import Episode
+from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
+from robocas_ms3.datasets.sources.reader import Episode
+from robocas_ms3.datasets.statistics.described import count_of
 
 _MOST = 3  # problems named of one camera's pictures
 _READERS = 4  # threads: reading and checksums happen outside Python's lock

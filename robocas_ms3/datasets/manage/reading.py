@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.checks.rigid import NORM_TOLERANCE, POSITION_TOLERANCE, is_rigid, same
 from robocas_ms3.datasets.manage.eef import eef_turn, turn
 from robocas_ms3.datasets.manage.findings import Finding, Found, Report
 from robocas_ms3.datasets.manage.picture_check import check_pictures
-from robocas_ms3.datasets.reader import Dataset, Episode, said_of
-from robocas_ms3.datasets.rigid import NORM_TOLERANCE, POSITION_TOLERANCE, is_rigid, same
-from robocas_ms3.datasets.tolerant import SPECS, complete, derive_motion, load_arrays, planar_motion
+from robocas_ms3.datasets.sources.reader import Dataset, Episode, said_of
+from robocas_ms3.datasets.sources.tolerant import SPECS, complete, derive_motion, load_arrays, planar_motion
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.language.templates import GOAL_TYPES
 from robocas_ms3.poses import from_xyzw

@@ -13,11 +13,11 @@ from typing import Literal
 import numpy as np
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.info import info_of
 from robocas_ms3.datasets.manage.assemble import Assembled, Member, OnEpisode, OnStart, Side, assemble, check_before
 from robocas_ms3.datasets.manage.input_check import check_numbers
 from robocas_ms3.datasets.manage.parts import Part, Sides, names_of
-from robocas_ms3.datasets.reader import Dataset
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.info import info_of
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import locked_folder, write_json
 

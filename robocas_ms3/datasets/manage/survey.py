@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.described import count_of
 from robocas_ms3.datasets.manage.findings import Finding, Layout, Outcome
 from robocas_ms3.datasets.manage.reading import read_episode
-from robocas_ms3.datasets.reader import Dataset
-from robocas_ms3.datasets.tolerant import arrays_fingerprint
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
+from robocas_ms3.datasets.statistics.described import count_of
 from robocas_ms3.errors import DatasetError
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.episode import episode_arrays
 from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
+from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.poses import from_wxyz, inverse
 from robocas_ms3.recordings.motion import Motion, gripper_open
 from robocas_ms3.robots.constants import ARM_BASE_LINK, BASE_SLICE, FINGER_SLICE

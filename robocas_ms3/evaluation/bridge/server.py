@@ -9,7 +9,7 @@ from pydantic import Field, ValidationError
 
 from robocas_ms3 import __version__
 from robocas_ms3.config.task import StrictModel
-from robocas_ms3.datasets.render import require_renderer
+from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.errors import EvaluationError, WireError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.actions import CONVENTIONS

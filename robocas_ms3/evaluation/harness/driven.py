@@ -12,7 +12,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from robocas_ms3.datasets.render import require_renderer
+from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Observations, Start, Wants

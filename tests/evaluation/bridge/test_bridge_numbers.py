@@ -6,8 +6,8 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from robocas_ms3.datasets.episode import episode_arrays
 from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
+from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.evaluation.bridge.proprioception import KEYS, WIDTHS, Proprioception
 from robocas_ms3.poses import from_wxyz
 from robocas_ms3.recordings.motion import Motion, gripper_open

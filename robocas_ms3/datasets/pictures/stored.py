@@ -1,0 +1,110 @@
+"""Which pictures a dataset holds, and how they are encoded."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.pictures.png import encode_png
+from robocas_ms3.errors import DatasetError
+
+_QUALITY = {
+    "jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
+    "webp": [cv2.IMWRITE_WEBP_QUALITY, 90],
+}
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What is rendered and stored.
+
+    Attributes:
+        cameras: names, in the order of ``schema.CAMERAS``.
+        size: width and height in pixels; None: the cameras' own, 640 x 480.
+        depth: whether depth is stored beside RGB.
+        image_format: of RGB.
+    """
+
+    cameras: tuple[str, ...] = tuple(camera.name for camera in schema.CAMERAS)
+    size: tuple[int, int] | None = None
+    depth: bool = True
+    image_format: schema.ImageFormat = "png"
+
+    def __post_init__(self) -> None:
+        """Put cameras in order, and check them.
+
+        Raises:
+            DatasetError: no camera, or one that there is not; no such format; a size below 16 pixels.
+        """
+        known = [camera.name for camera in schema.CAMERAS]
+        wrong = sorted(set(self.cameras) - set(known))
+        if wrong or not self.cameras:
+            raise DatasetError("no such camera", where="cameras", expected=f"some of {', '.join(known)}", found=wrong)
+        if self.image_format not in schema.IMAGE_FORMATS:
+            raise DatasetError(
+                "no such picture format",
+                where="image_format",
+                expected=f"one of {', '.join(schema.IMAGE_FORMATS)}",
+                found=self.image_format,
+            )
+        if self.size is not None and min(self.size) < 16:
+            raise DatasetError(
+                "pictures this small show nothing", where="size", expected=">= 16 x 16", found=list(self.size)
+            )
+        object.__setattr__(self, "cameras", tuple(name for name in known if name in self.cameras))
+
+    @property
+    def specs(self) -> list[schema.CameraSpec]:
+        """What the schema says of these cameras."""
+        return [camera for camera in schema.CAMERAS if camera.name in self.cameras]
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """``rgb``, and ``depth`` where it is stored."""
+        return schema.IMAGE_KINDS if self.depth else ("rgb",)
+
+
+def write_picture(path: Path, picture: NDArray) -> float:
+    """Encode (H, W, 3) RGB or (H, W) depth by the file's suffix; gives the seconds that took.
+
+    Raises:
+        DatasetError: it can't be encoded or written.
+    """
+    begun = time.perf_counter()
+    try:
+        data = encode_png(picture) if path.suffix == ".png" else _encode(picture, path.suffix)
+    except (ValueError, cv2.error) as error:
+        raise DatasetError("can't encode this picture", where=path, found=str(error).splitlines()[0]) from error
+    path.write_bytes(data)  # unlike cv2.imwrite this says when the disk is full
+    return time.perf_counter() - begun
+
+
+def _encode(picture: NDArray[np.uint8], suffix: str) -> bytes:
+    encoded, data = cv2.imencode(suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), _QUALITY[suffix[1:]])
+    if not encoded:
+        raise ValueError(f"{picture.dtype} {picture.shape}")
+    return data.tobytes()
+
+
+def read_picture(path: Path) -> NDArray:
+    """Decode a picture: (H, W, 3) RGB uint8 or (H, W) uint16.
+
+    Raises:
+        DatasetError: it is missing or damaged.
+    """
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise DatasetError(
+            "can't read this picture", where=path, found=error.strerror, fix="robocas validate lists all that is wrong."
+        ) from error
+    picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    if picture is None:
+        raise DatasetError("this picture is damaged", where=path, fix="robocas validate lists all that is wrong.")
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if picture.ndim == 3 else picture

@@ -1,0 +1,154 @@
+"""Videos and contact sheets of a dataset, for people to look at; drawn of its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import imageio.v2 as imageio
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets.pictures.drawing import (
+    COLUMNS,
+    THUMBNAIL,
+    Pictures,
+    Size,
+    Story,
+    draw_frame,
+    draw_row,
+    row_steps,
+    stack_rows,
+)
+from robocas_ms3.datasets.pictures.png import encode_png
+from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.files import replacing
+
+PANEL = (426, 320)
+"""Width and height of one camera's picture in a video."""
+SHEET = 10
+"""Episodes on a contact sheet."""
+_NEAR_MM, _FAR_MM = 30, 5000  # colours of depth
+
+
+def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Any:
+    """Open an MP4 (H.264, yuv420p) to append (H, W, 3) RGB to, H and W even; close it, or use ``with``.
+
+    Args:
+        path: of the video.
+        fps: frames a second.
+        options: FFmpeg's, for the output.
+        quality: 0 to 10.
+    """
+    return imageio.get_writer(
+        path,
+        fps=fps,
+        codec="libx264",
+        pixelformat="yuv420p",
+        quality=quality,
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+        output_params=list(options),
+    )
+
+
+def write_video(
+    dataset: Dataset, number: int, path: Path | str, *, speed: float = 1.0, kind: str = "rgb", panel: Size = PANEL
+) -> Path:
+    """Write an episode as MP4 (H.264, yuv420p): the cameras side by side, instruction and sub-goal below.
+
+    Args:
+        dataset: the dataset.
+        number: of the episode.
+        path: of the video.
+        speed: 1 is real time.
+        kind: ``rgb``, or ``depth`` in colours.
+        panel: width and height of one camera's picture.
+
+    Raises:
+        DatasetError: no such episode, or no such speed.
+    """
+    if not 0 < speed < np.inf:
+        raise DatasetError("no such speed", where="speed", expected="> 0", found=speed)
+    path = Path(path)
+    episode = dataset.episode(number)
+    with replacing(path) as tmp, open_video(tmp, dataset.rate_hz * speed) as video:
+        for step in range(episode.steps):
+            video.append_data(video_frame(episode, step, number=number, kind=kind, panel=panel))
+    return path
+
+
+def video_frame(
+    episode: Episode, step: int, *, number: int = 0, kind: str = "rgb", panel: Size = PANEL
+) -> NDArray[np.uint8]:
+    """One picture of the video, (H, W, 3) RGB, both even."""
+    return draw_frame(_story(episode, number), step, _pictures(episode, step, kind), panel)
+
+
+def contact_sheet(
+    root: Path | str,
+    out: Path | str,
+    *,
+    episodes: Sequence[int] | None = None,
+    columns: int = COLUMNS,
+    thumbnail: Size = THUMBNAIL,
+    kind: str = "rgb",
+) -> Path:
+    """Write a PNG with a row for each episode and camera, of evenly spaced steps from first to last.
+
+    Args:
+        root: the dataset.
+        out: path of the PNG.
+        episodes: numbers; None: the first ten.
+        columns: pictures a row.
+        thumbnail: width and height of a picture.
+        kind: ``rgb``, or ``depth`` in colours.
+    """
+    dataset = Dataset(Path(root))
+    numbers = dataset.numbers[:SHEET] if episodes is None else list(episodes)
+    return write_sheet([sheet_row(dataset, number, columns, thumbnail, kind) for number in numbers], out)
+
+
+def sheet_row(
+    dataset: Dataset, number: int, columns: int = COLUMNS, thumbnail: Size = THUMBNAIL, kind: str = "rgb"
+) -> NDArray[np.uint8]:
+    """An episode's part of a contact sheet, (H, W, 3) RGB."""
+    episode = dataset.episode(number)
+    shown = {step: _pictures(episode, step, kind) for step in row_steps(episode.steps, columns)}
+    return draw_row(_story(episode, number), shown, dataset.rate_hz, columns, thumbnail)
+
+
+def write_sheet(rows: Sequence[NDArray[np.uint8]], path: Path | str) -> Path:
+    """Write a contact sheet as PNG."""
+    with replacing(path) as tmp:
+        tmp.write_bytes(encode_png(stack_rows(rows)))
+    return Path(path)
+
+
+def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """Depth as colours, (H, W, 3) RGB, on a logarithmic scale: near is red, far is blue, nothing is black."""
+    near, far = np.log(_NEAR_MM), np.log(_FAR_MM)
+    share = np.clip((far - np.log(np.maximum(depth, 1))) / (far - near), 0, 1)
+    colours = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    colours[depth == 0] = 0
+    return colours.astype(np.uint8)
+
+
+def _story(episode: Episode, number: int) -> Story:
+    arrays = episode.arrays
+    return Story(
+        number=number,
+        instruction=str(arrays["language_goal"]),
+        goal_types=arrays["step_goal_type"].tolist(),
+        goals=arrays["step_lang_goals"].tolist(),
+        gripper_open=arrays["gripper_status"],
+    )
+
+
+def _pictures(episode: Episode, step: int, kind: str) -> Pictures:
+    if kind == "rgb":
+        return {camera: episode.rgb(camera, step) for camera in episode.cameras}
+    return {camera: colour_depth(episode.depth(camera, step)) for camera in episode.cameras}

@@ -1,0 +1,191 @@
+"""What an episode was about: task, configuration, instruction, objects and where they stood."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.config import load_task_config
+from robocas_ms3.datasets.formats import Source
+from robocas_ms3.datasets.sources.provenance import succeeded, task_of
+from robocas_ms3.datasets.sources.trajectory import TrajectorySource
+from robocas_ms3.errors import DatasetError, RobocasError
+from robocas_ms3.recordings.reading import Recording, TrajectoryFile
+from robocas_ms3.scenes.layout import PARKING_HEIGHT
+
+Array = NDArray[np.float64]
+UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What a layout's objects stand on.
+
+    Attributes:
+        label: furniture and name of the surface.
+        x, y, yaw: the furniture in the world, m and rad.
+        region: [min_xy, max_xy] in the furniture's frame, m; None: all of the surface.
+    """
+
+    label: str
+    x: float
+    y: float
+    yaw: float
+    region: list[list[float]] | None
+
+    def place(self, xy: Array) -> Array:
+        """(N, 2) in the world -> in the furniture's frame."""
+        cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
+        return (xy - [self.x, self.y]) @ np.array([[cosine, -sine], [sine, cosine]])
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What an episode was about; empty where nothing says so.
+
+    Attributes:
+        task, config: names.
+        success: whether the recording succeeded; None: not known.
+        instruction, template, relation: what was said.
+        object_ids: of those that took part.
+        names: of objects, by id.
+        positions: (N, 2) of those in the world at the beginning, m.
+        target_id: asset.
+        target_index: of the target in ``positions``.
+        surface: see there.
+    """
+
+    instruction: str
+    task: str = UNKNOWN
+    config: str = UNKNOWN
+    success: bool | None = None
+    template: str = ""
+    relation: str = ""
+    object_ids: list[str] = field(default_factory=list)
+    names: dict[str, str] = field(default_factory=dict)
+    positions: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    target_id: str = ""
+    target_index: int | None = None
+    surface: Surface | None = None
+
+
+@contextmanager
+def facts_reader(source: Source) -> Iterator[Callable[[int], Facts]]:
+    """Yield what reads the facts of an episode by its number."""
+    if isinstance(source, TrajectorySource):
+        with TrajectoryFile(source.path) as file:  # the source numbers all of them, failed ones too, in this order
+            yield lambda number: of_recording(file, number)
+    else:
+        yield lambda number: of_folder(source, number)
+
+
+def of_folder(source: Source, number: int) -> Facts:
+    """Facts of an episode on disk, from its ``scene.json``.
+
+    Raises:
+        DatasetError: that file is damaged.
+    """
+    instruction = str(source.arrays(number, ["language_goal"])["language_goal"])
+    episode = source.episode(number)
+    try:
+        scene = episode.scene
+        if not scene:
+            return Facts(instruction)
+        layout, said, target = scene.get("layout") or {}, scene.get("recorded") or {}, scene.get("target") or {}
+        ids = layout.get("object_ids", [])
+        poses = np.array(layout.get("poses", []), dtype=np.float64).reshape(-1, 7)
+        slots = [slot for slot, there in enumerate(layout.get("present", [True] * len(ids))) if there]
+        return Facts(
+            instruction,
+            task=scene.get("task") or UNKNOWN,
+            config=_config_name(scene.get("env_info") or {}, scene.get("task")),
+            success=scene.get("success"),
+            template=said.get("instruction_template") or "",
+            relation=said.get("relation") or "",
+            object_ids=[ids[slot] for slot in slots],
+            names={entry["id"]: entry["name"] for entry in scene.get("objects") or []},
+            positions=poses[slots, :2] if len(poses) else np.zeros((0, 2)),
+            target_id=target.get("asset_id") or "",
+            target_index=_place(slots, target.get("slot")) if len(poses) else None,
+            surface=_surface(scene.get("config") or {}),
+        )
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise DatasetError(
+            "this description of a scene is damaged",
+            where=episode.folder / "scene.json",
+            found=f"{type(error).__name__}: {error}",
+            fix="robocas validate says what is wrong.",
+        ) from error
+
+
+def of_recording(file: TrajectoryFile, index: int) -> Facts:
+    """Facts of a recorded episode, from the JSON's entry and its first state."""
+    recording = file.recording(index)
+    entry = file.episodes[index]
+    said = entry["robocas"]
+    target = said.get("target") or {}
+    ids = said.get("objects") or []
+    slots, positions = _standing(recording, len(ids))
+    config = file.env_info["env_kwargs"].get("config")
+    return Facts(
+        recording.instruction,
+        task=task_of(str(file.env_info["env_id"])) or UNKNOWN,
+        config=_config_name(file.env_info, None),
+        success=succeeded(entry),
+        template=said.get("instruction_template") or "",
+        relation=said.get("relation") or "",
+        object_ids=[ids[slot] for slot in slots],
+        names={target["asset_id"]: target["name"]} if {"asset_id", "name"} <= set(target) else {},
+        positions=positions,
+        target_id=target.get("asset_id") or "",
+        target_index=_place(slots, target.get("slot")),
+        surface=_surface(config if isinstance(config, Mapping) else _shipped(str(config))),
+    )
+
+
+def _standing(recording: Recording, count: int) -> tuple[list[int], Array]:
+    """Slots of the objects that take part, and where they stand at the beginning; the others wait below the floor."""
+    actors = recording.states.get("actors", {})
+    found = {slot: actors[f"object_{slot}"][0, :3] for slot in range(count) if f"object_{slot}" in actors}
+    there = [slot for slot, at in found.items() if at[2] > PARKING_HEIGHT / 2]
+    return there, np.array([found[slot][:2] for slot in there], dtype=np.float64).reshape(-1, 2)
+
+
+def _place(slots: list[int], slot: int | None) -> int | None:
+    return slots.index(slot) if slot in slots else None
+
+
+def _config_name(env_info: Mapping[str, Any], task: str | None) -> str:
+    config = (env_info.get("env_kwargs") or {}).get("config")
+    if isinstance(config, str):
+        return Path(config).stem
+    name = task or task_of(str(env_info.get("env_id"))) or UNKNOWN
+    return f"{name} (own configuration)" if config else name
+
+
+def _surface(config: Mapping[str, Any]) -> Surface | None:
+    surface = config.get("surface")
+    if not surface:
+        return None
+    pose = config["furniture"][surface["furniture"]]["pose"]
+    region = [list(surface[key]) for key in ("min_xy", "max_xy")] if surface.get("min_xy") else None
+    x, y, _ = pose["position"]
+    return Surface(
+        f"{surface['furniture']}, {surface['name']}", x, y, float(np.deg2rad(pose.get("yaw_deg", 0.0))), region
+    )
+
+
+@cache
+def _shipped(name: str) -> Mapping[str, Any]:
+    """A configuration by its name; empty where it can't be found any more."""
+    try:
+        return load_task_config(name).model_dump(mode="json")
+    except RobocasError:
+        return {}

@@ -1,0 +1,1 @@
+"""What is in a dataset, counted and drawn."""

@@ -1,0 +1,267 @@
+"""Pictures of a dataset's statistics, with matplotlib and without a display."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robocas_ms3.datasets.actions import ACTION_NAMES
+from robocas_ms3.datasets.statistics.collect import Stats
+from robocas_ms3.datasets.statistics.described import count_of, counted, histogram
+from robocas_ms3.datasets.statistics.layout_map import LayoutMap
+from robocas_ms3.errors import MissingExtraError
+from robocas_ms3.files import make_folder, replacing, write_json
+
+DPI = 110
+BLUE, ORANGE, GREY = "#2f6fa8", "#e08a2e", "#9aa3ab"
+MAX_ROWS = 50  # bars of one picture; the rest is in stats.json
+_TEXT = 84  # letters of a label
+
+
+def write_stats(stats: Stats, out: Path) -> list[Path]:
+    """Write ``stats.json`` and a PNG of each kind into a folder; gives their paths.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
+    figure_of = _matplotlib()  # before anything is written
+    make_folder(out)
+    paths = [out / "stats.json"]
+    write_json(paths[0], stats.as_json())
+    for name, draw in PICTURES.items():
+        figure = draw(stats, figure_of)
+        if figure is None:
+            (out / f"{name}.png").unlink(missing_ok=True)  # of an earlier run
+            continue
+        paths.append(out / f"{name}.png")
+        with replacing(paths[-1]) as tmp:
+            figure.savefig(tmp, dpi=DPI)
+    return paths
+
+
+FigureOf = Callable[[float, float], Any]
+
+
+def _matplotlib() -> FigureOf:
+    try:
+        from matplotlib import rc_context
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtraError(
+            "statistics are drawn with matplotlib", found=error.name or error, fix='pip install "robocas-ms3[plots]"'
+        ) from error
+
+    def figure_of(width: float, height: float) -> Any:
+        with rc_context({"font.size": 9, "axes.titlesize": 10}):
+            figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        return figure
+
+    return figure_of
+
+
+def _axes(figure: Any, rows: int, columns: int, count: int) -> list[Any]:
+    """Some axes in a grid, bare of what says nothing."""
+    grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
+    for axes in grid[count:]:
+        axes.remove()
+    for axes in grid[:count]:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.set_axisbelow(True)
+    return list(grid[:count])
+
+
+def _shape(count: int, columns: int) -> tuple[int, int]:
+    columns = min(count, columns)
+    return -(-count // columns), columns
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _TEXT else text[: _TEXT - 1].rstrip() + "…"
+
+
+def _whole_numbers(axis: Any) -> None:
+    axis.get_major_locator().set_params(integer=True)
+
+
+def draw_lengths(stats: Stats, figure_of: FigureOf) -> Any:
+    """Histogram of episode lengths, a panel a task."""
+    rows, columns = _shape(len(stats.lengths), 2)
+    figure = figure_of(4.6 * columns + 0.4, 2.7 * rows + 0.3)
+    panels = _axes(figure, rows, columns, len(stats.lengths))
+    for axes, (task, lengths) in zip(panels, sorted(stats.lengths.items()), strict=True):
+        low, high = min(lengths), max(lengths)
+        edges = np.linspace(low - 0.5, high + 0.5, min(30, high - low + 1) + 1)
+        axes.hist(lengths, bins=edges, color=BLUE, edgecolor="white", linewidth=0.5)
+        median = float(np.median(lengths))
+        axes.axvline(median, color=ORANGE, linestyle="--", linewidth=1)
+        about = f"median {median:.0f} steps = {median / stats.rate_hz:.0f} s"
+        axes.set_title(f"{task}: {count_of(len(lengths), 'episode')}, {about}")
+        axes.set(xlabel=f"steps of {stats.rate_hz:g} Hz", ylabel="episodes")
+        _whole_numbers(axes.xaxis)
+        _whole_numbers(axes.yaxis)
+    return figure
+
+
+def _named(asset: str, name: str) -> str:
+    plain = asset.replace("_", " ")
+    return plain if name in {"", plain} else f"{name} ({plain})"
+
+
+def draw_objects(stats: Stats, figure_of: FigureOf) -> Any:
+    """Bars: in how many episodes each object took part, and of how many it was the target."""
+    if not stats.objects and not stats.targets:
+        return None
+    everything = counted(stats.objects | stats.targets)
+    ids = list(everything)[:MAX_ROWS]
+    figure = figure_of(7, 1.2 + 0.2 * len(ids))
+    axes = _axes(figure, 1, 1, 1)[0]
+    rows = np.arange(len(ids))
+    names = [_short(_named(i, stats.names.get(i, ""))) for i in ids]
+    axes.barh(rows, [stats.objects[i] for i in ids], color=GREY, height=0.8, label="took part")
+    axes.barh(rows, [stats.targets[i] for i in ids], color=ORANGE, height=0.45, label="was the target")
+    axes.set_yticks(rows, names)
+    axes.set_ylim(len(ids) - 0.4, -0.6)
+    _whole_numbers(axes.xaxis)
+    more = f", the first {len(ids)} of {len(everything)}" if len(everything) > len(ids) else ""
+    never = sum(1 for asset in everything if not stats.targets[asset])
+    axes.set(xlabel="episodes", title=f"Objects{more}; {never} never the target")
+    axes.grid(axis="x", color="#dddddd", linewidth=0.6)
+    axes.legend(frameon=False, loc="lower right")
+    return figure
+
+
+def draw_layouts(stats: Stats, figure_of: FigureOf) -> Any:
+    """Heat maps of where objects stood, with the targets, one of each configuration; x goes up, y to the left."""
+    if not stats.layouts:
+        return None
+    rows, columns = _shape(len(stats.layouts), 3)
+    figure = figure_of(4.2 * columns, 2.6 * rows + 0.3)
+    panels = _axes(figure, rows, columns, len(stats.layouts))
+    for axes, (name, layout) in zip(panels, sorted(stats.layouts.items()), strict=True):
+        _draw_layout(figure, axes, name, layout)
+    figure.suptitle("Objects in a cell at the beginning; dots: targets", fontsize=9)
+    return figure
+
+
+def _draw_layout(figure: Any, axes: Any, name: str, layout: LayoutMap) -> None:
+    shown = np.ma.masked_equal(layout.counts, 0)
+    mesh = axes.pcolormesh(
+        layout.y_edges,
+        layout.x_edges,
+        shown,
+        cmap="YlGnBu",
+        vmin=0,
+        vmax=max(5, layout.counts.max()),  # a single object is no hot spot
+        edgecolor="#eeeeee",
+        linewidth=0.4,
+    )
+    if len(layout.targets):
+        size = float(np.clip(600 / len(layout.targets), 5, 25))
+        axes.scatter(layout.targets[:, 1], layout.targets[:, 0], s=size, color=ORANGE, linewidth=0)
+    if layout.region:
+        (x0, y0), (x1, y1) = layout.region
+        axes.plot([y0, y1, y1, y0, y0], [x0, x0, x1, x1, x0], color="#444444", linewidth=1)
+    axes.set_aspect("equal")
+    axes.set_xlim(layout.y_edges[-1], layout.y_edges[0])
+    axes.set_ylim(layout.x_edges[0], layout.x_edges[-1])
+    axes.locator_params(nbins=5)
+    covered = "" if layout.coverage is None else f", {layout.coverage:.0%} covered"
+    axes.set_title(f"{_short(name)}\n{count_of(layout.episodes, 'episode')}{covered}")
+    axes.set(xlabel=f"y of {layout.frame} (m)", ylabel="x (m)")
+    bar = figure.colorbar(mesh, cax=axes.inset_axes((1.04, 0.0, 0.04, 1.0)))  # as high as the map
+    bar.ax.set_ylim(0, max(1, layout.counts.max()))
+    _whole_numbers(bar.ax.yaxis)
+
+
+def draw_instructions(stats: Stats, figure_of: FigureOf) -> Any:
+    """Bars of instructions, and of templates and relations where they are known."""
+    tables = {
+        f"Instructions, {len(stats.instructions)} different": stats.instructions,
+        f"Templates, {len(stats.templates)} different": stats.templates,
+        "Relations": stats.relations,
+    }
+    tables = {title: list(counted(table).items())[: MAX_ROWS // 2] for title, table in tables.items() if table}
+    heights = [0.8 + 0.2 * len(rows) for rows in tables.values()]
+    figure = figure_of(10, sum(heights))
+    panels = np.atleast_1d(figure.subplots(len(tables), 1, height_ratios=heights))
+    for axes, (title, rows) in zip(panels, tables.items(), strict=True):
+        axes.spines[["top", "right"]].set_visible(False)
+        places = np.arange(len(rows))
+        axes.barh(places, [count for _, count in rows], color=BLUE, height=0.7)
+        axes.set_yticks(places, [_short(text) for text, _ in rows])
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        _whole_numbers(axes.xaxis)
+        axes.set_title(title, loc="left")
+    panels[-1].set_xlabel("episodes")
+    return figure
+
+
+def draw_actions(stats: Stats, figure_of: FigureOf) -> Any:
+    """Histograms of the seven numbers of the action; dashed: 1st and 99th percentile."""
+    if not len(stats.actions):
+        return None
+    figure = figure_of(11, 5.2)
+    units = ("m", "m", "m", "rad", "rad", "rad", "")
+    for axes, name, column, unit in zip(_axes(figure, 2, 4, 7), ACTION_NAMES, stats.actions.T, units, strict=True):
+        bins = histogram(column)
+        edges, counts = np.array(bins["edges"]), np.array(bins["counts"])
+        if name == "gripper":
+            axes.bar([0, 1], counts, color=BLUE, width=0.6)
+            axes.set_xticks([0, 1], ["closed", "open"])
+            axes.set(title=f"gripper: {counts[1] / counts.sum():.0%} open", ylabel="steps")
+            continue
+        axes.stairs(counts, edges, fill=True, color=BLUE)
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=0.7)
+        axes.locator_params(axis="x", nbins=4)
+        for percentile in np.percentile(column, [1, 99]):
+            axes.axvline(percentile, color=ORANGE, linestyle="--", linewidth=1)
+        axes.set(title=f"{name} ({unit})", ylabel="steps (log)")
+    figure.suptitle(f"Actions of a step at {stats.rate_hz:g} Hz, in the EEF frame; dashed: 1st and 99th percentile")
+    return figure
+
+
+def draw_subgoals(stats: Stats, figure_of: FigureOf) -> Any:
+    """Box plots of how long the sub-goals of each type took."""
+    if not stats.subgoals:
+        return None
+    kinds = sorted(stats.subgoals, key=lambda kind: -len(stats.subgoals[kind]))
+    figure = figure_of(7.5, 1.2 + 0.55 * len(kinds))
+    axes = _axes(figure, 1, 1, 1)[0]
+    seconds = [np.array(stats.subgoals[kind]) / stats.rate_hz for kind in kinds]
+    boxes = axes.boxplot(
+        seconds,
+        orientation="horizontal",
+        widths=0.5,
+        patch_artist=True,
+        medianprops={"color": "black"},
+        flierprops={"marker": ".", "markersize": 3, "markeredgecolor": GREY},
+    )
+    for box in boxes["boxes"]:
+        box.set(facecolor="#b9d3ea", edgecolor=BLUE)
+    labels = [
+        f"{kind}\n{count_of(len(s), 'time')}, median {np.median(s):.1f} s"
+        for kind, s in zip(kinds, seconds, strict=True)
+    ]
+    axes.set_yticks(np.arange(1, len(kinds) + 1), labels)
+    axes.invert_yaxis()
+    axes.set_xlim(left=0)
+    axes.grid(axis="x", color="#dddddd", linewidth=0.6)
+    axes.set(xlabel="s", title="How long sub-goals take")
+    return figure
+
+
+PICTURES: dict[str, Callable[[Stats, FigureOf], Any]] = {
+    "lengths": draw_lengths,
+    "objects": draw_objects,
+    "layouts": draw_layouts,
+    "instructions": draw_instructions,
+    "actions": draw_actions,
+    "subgoals": draw_subgoals,
+}
+"""Name of the PNG -> what draws it, or gives None where there is nothing to draw."""

@@ -1,0 +1,233 @@
+"""From a ManiSkill trajectory to a RoboCAS dataset."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.pictures.preview import FEW, finish_previews, on_sheet
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.provenance import succeeded
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.failures import add_failures
+from robocas_ms3.datasets.writing.info import write_info
+from robocas_ms3.datasets.writing.output import check_overwrite, kept_if_begun, sweep
+from robocas_ms3.datasets.writing.plan import (
+    Plan,
+    appended_plan,
+    dataset_settings,
+    new_plan,
+    resumed_plan,
+    still_missing,
+)
+from robocas_ms3.datasets.writing.timing import Timing
+from robocas_ms3.datasets.writing.workers import Job, OpenSource, write_all
+from robocas_ms3.datasets.writing.writer import FrameSource, WrittenEpisode
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
+from robocas_ms3.recordings.environment import RecordedEnv
+from robocas_ms3.recordings.motion import sample_stride
+from robocas_ms3.recordings.reading import TrajectoryFile
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """What was done.
+
+    Attributes:
+        episodes: the new ones, by number.
+        kept: how many of the trajectory's were there already (``resume``, ``append``).
+        seconds: for everything.
+        joining: of these, for what comes after the episodes.
+        previews: whether they were made.
+    """
+
+    episodes: list[WrittenEpisode]
+    kept: int
+    seconds: float
+    joining: float = 0.0
+    previews: bool = False
+
+    @property
+    def timing(self) -> Timing:
+        """Sum over the new episodes, whichever process wrote them; ``write`` with the joining."""
+        return sum((episode.timing for episode in self.episodes), start=Timing(write=self.joining))
+
+
+def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> FrameSource:
+    """Show states through the environment that recorded them."""
+    from robocas_ms3.datasets.writing.render import EnvFrames
+
+    return EnvFrames(env, control_mode, pictures)
+
+
+def convert(
+    trajectory: str | Path,
+    out: str | Path,
+    *,
+    rate_hz: float = 5.0,
+    pictures: Pictures | None = None,
+    embeddings: bool = True,
+    include_failed: bool = False,
+    overwrite: bool = False,
+    resume: bool = False,
+    append: bool = False,
+    previews: bool | None = False,
+    jobs: int = 1,
+    pack: str | Path | None = None,
+    on_start: Callable[[int], None] | None = None,
+    on_episode: Callable[[WrittenEpisode], None] | None = None,
+    open_source: OpenSource = open_env,
+) -> Conversion:
+    """Write a RoboCAS dataset from a trajectory file.
+
+    Killed at any moment, it goes on with ``resume`` (or the same ``append`` again), and ends as if it had not been.
+    Warns where the actions were tried at another rate than that of the dataset.
+
+    Args:
+        trajectory: ``F.h5`` with ``F.json`` beside it; a ``failures.jsonl`` in the same folder goes along.
+        out: the dataset's folder.
+        rate_hz: steps a second; divides the control frequency.
+        pictures: which ones; default: RGB as PNG and depth of all cameras, 640 x 480.
+        embeddings: whether to embed the texts.
+        include_failed: also convert episodes without success.
+        overwrite: replace what is in ``out``.
+        resume: keep the episodes that are there.
+        append: add to the dataset in ``out``; what is there keeps its numbers and its side of the split, and recordings
+            that it holds already are not added again.
+        previews: whether to write a video of each new episode, and a contact sheet; None: where they are at most 20.
+        jobs: worker processes.
+        pack: name or folder of the objects' pack, instead of what the file names.
+        on_start: called with the number of episodes to write.
+        on_episode: called after each.
+        open_source: what shows the states; must be importable by workers.
+
+    Raises:
+        DatasetError: the input is unusable, nothing to convert, no render device, another conversion is at it.
+        OutputExistsError: ``out`` is not empty and no flag is set.
+        MissingExtraError: embeddings are wanted and the ``language`` extra is not installed.
+    """
+    begun = time.perf_counter()
+    out, pictures = Path(out), pictures or Pictures()
+    with TrajectoryFile(trajectory, pack=pack) as file:
+        stride = sample_stride(file.control_freq, rate_hz)
+        chosen = choose(file, include_failed)
+        settings = dataset_settings(rate_hz, pictures, embeddings)
+        with locked_folder(out):  # from the plan on: it numbers after what is there
+            # Everything that may fail comes before the output is touched.
+            claim_output(out, resume=resume or append or overwrite)
+            if append:
+                plan = appended_plan(out, file, chosen, settings)
+            elif resume:
+                plan = resumed_plan(out, file, chosen, settings)
+            else:
+                plan = new_plan(file, chosen, settings)
+                if overwrite:
+                    check_overwrite(out)
+            if open_source is open_env:
+                from robocas_ms3.datasets.writing.render import require_renderer
+
+                require_renderer()
+            warn_untried(file, chosen, rate_hz)
+            vectors = embed_texts(file, chosen) if embeddings else None
+            claim_output(out, overwrite=overwrite and not (resume or append), resume=True)
+            make_folder(out)
+            sweep(out)
+            sweep(out / schema.PREVIEW_FOLDER)
+            missing = [task for task in plan.tasks if not (out / schema.episode_folder(task[0])).is_dir()]
+            if on_start:
+                on_start(len(missing))
+            sheet = None
+            if previews or (previews is None and len(plan.tasks) <= FEW):
+                sheet = on_sheet(map(int, plan.content["episodes"]))
+            job = Job(file.path, pack, out, stride, rate_hz, pictures, vectors, open_source, sheet, missing)
+            written = _write(job, file.env_info, plan, jobs, on_episode)
+            if left := still_missing(out, plan.content):
+                _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))
+    written.sort(key=lambda episode: episode.number)
+    kept = len(plan.tasks) - len(missing)
+    return Conversion(written, kept, time.perf_counter() - begun, previews=sheet is not None)
+
+
+def _write(
+    job: Job,
+    env_info: dict[str, Any],
+    plan: Plan,
+    jobs: int,
+    on_episode: Callable[[WrittenEpisode], None] | None,
+) -> list[WrittenEpisode]:
+    written: list[WrittenEpisode] = []
+    before = _split_before(job.out)
+    with kept_if_begun(job.out):
+        write_json(job.out / schema.CONVERSION_FILE, plan.content)
+        with closing(write_all(job, jobs)) as episodes:
+            for episode in episodes:
+                written.append(episode)
+                if on_episode:
+                    on_episode(episode)
+        add_failures(job.trajectory.parent, job.out, env_info)
+        write_info(job.out, before)
+    if job.sheet is not None:
+        finish_previews(job.out, {episode.number: episode.row for episode in written if episode.row is not None})
+    return written
+
+
+def _split_before(out: Path) -> tuple[list[int], list[int]]:
+    """Training and validation episodes of the dataset that is there, if one is."""
+    if not (out / schema.DATA_INFO_FILE).is_file():
+        return [], []
+    return Dataset(out).sides
+
+
+def choose(file: TrajectoryFile, include_failed: bool) -> list[int]:
+    """Indices of the episodes to convert.
+
+    Raises:
+        DatasetError: there are none.
+    """
+    chosen = [i for i, episode in enumerate(file.episodes) if include_failed or succeeded(episode)]
+    if not chosen:
+        some = bool(file.episodes)
+        raise DatasetError(
+            "no successful episodes to convert" if some else "no episodes to convert",
+            where=file.path,
+            found=f"{len(file.episodes)} episodes",
+            fix="Pass --include-failed to convert them all the same." if some else "",
+        )
+    return chosen
+
+
+def warn_untried(file: TrajectoryFile, chosen: list[int], rate_hz: float) -> None:
+    """Say so where the recordings' actions were tried open loop, but at another rate than the dataset's."""
+    said = [file.episodes[index].get("robocas", {}).get("replay_rate") for index in chosen]
+    tried = {float(rate) for rate in said if isinstance(rate, int | float) and rate}  # else not tried, or not known
+    others = sorted(rate for rate in tried if abs(rate - rate_hz) > 1e-9)
+    if others:
+        _log.warning(
+            "actions were tried at %s Hz; at %g Hz they were not: robocas validate --replay tells (of RoboCAS folders)",
+            *(" and ".join(f"{rate:g}" for rate in others), rate_hz),
+        )
+
+
+def embed_texts(file: TrajectoryFile, chosen: list[int]) -> dict[str, NDArray[np.float32]]:
+    """Embed every distinct text here, so that no worker has to load the model."""
+    from robocas_ms3.language.embed import TextEmbedder
+
+    embedder = TextEmbedder()
+    texts: dict[str, None] = {}
+    for index in chosen:
+        entry = file.entry(index)
+        texts[entry.instruction] = None
+        texts.update(dict.fromkeys(goal.goal_description for goal in entry.subgoals))
+    return dict(zip(texts, embedder(texts), strict=True))

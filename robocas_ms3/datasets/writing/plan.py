@@ -1,0 +1,174 @@
+"""``conversion.json``: a dataset's settings, and which recording becomes which episode.
+
+It is written before the first episode, so that a conversion killed at any moment can go on with the same numbers.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import robocas_ms3
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.provenance import fingerprint, succeeded
+from robocas_ms3.datasets.writing.info import SPLIT_RULE
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.reading import TrajectoryFile
+
+SETTINGS = ("rate_hz", "cameras", "image_size", "image_format", "depth", "embeddings")
+"""What all episodes of a dataset share."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a dataset will be.
+
+    Attributes:
+        content: of ``conversion.json``.
+        tasks: (episode number, index in the trajectory) of all of this trajectory's episodes in it, written or not.
+    """
+
+    content: dict[str, Any]
+    tasks: list[tuple[int, int]]
+
+
+def dataset_settings(rate_hz: float, pictures: Pictures, embeddings: bool) -> dict[str, Any]:
+    """The settings part of ``conversion.json``."""
+    return {
+        "rate_hz": float(rate_hz),
+        "cameras": list(pictures.cameras),
+        "image_size": list(pictures.size) if pictures.size else None,
+        "image_format": pictures.image_format,
+        "depth": pictures.depth,
+        "embeddings": embeddings,
+    }
+
+
+def new_plan(file: TrajectoryFile, chosen: list[int], settings: dict[str, Any]) -> Plan:
+    """Number a trajectory's chosen episodes from 0 on."""
+    return _extended(_header(settings), {}, file, chosen, first=0)
+
+
+def resumed_plan(out: Path, file: TrajectoryFile, chosen: list[int], settings: dict[str, Any]) -> Plan:
+    """Go on with what was begun; where nothing was, begin.
+
+    Raises:
+        DatasetError: another conversion was begun there.
+    """
+    if not out.is_dir() or not any(out.iterdir()):
+        return new_plan(file, chosen, settings)
+    before = _read(out, missing="can't resume: no conversion was begun here", fix="Pass --overwrite.")
+    check_settings(out, before, settings, "can't resume with other settings", "--overwrite, or the settings of before")
+    planned = before["episodes"]
+    by_recording = {entry["recording"]: int(number) for number, entry in planned.items()}
+    marks = [fingerprint(file.recording(index, bodies=False)) for index in chosen]
+    unknown = [index for index, mark in zip(chosen, marks, strict=True) if mark not in by_recording]
+    if unknown:
+        raise DatasetError(
+            "can't resume: these recordings are not what was begun here",
+            where=out / schema.CONVERSION_FILE,
+            found=f"{len(unknown)} of {len(chosen)} are new",
+            fix="Pass --append to add them, --overwrite to begin again.",
+        )
+    return Plan(before, [(by_recording[mark], index) for index, mark in zip(chosen, marks, strict=True)])
+
+
+def appended_plan(out: Path, file: TrajectoryFile, chosen: list[int], settings: dict[str, Any]) -> Plan:
+    """Number what is new after what is there; what is there already keeps its number.
+
+    Raises:
+        DatasetError: there is no dataset of ours, or of other settings.
+    """
+    before = _read(out, missing="no dataset to append to", fix="Convert without --append first.")
+    check_settings(out, before, settings, "can't append with other settings", "the settings of before")
+    by_recording = {entry["recording"]: int(number) for number, entry in before["episodes"].items()}
+    known, new = [], []
+    for index in chosen:
+        mark = fingerprint(file.recording(index, bodies=False))
+        if mark in by_recording:
+            known.append((by_recording[mark], index))
+        else:
+            new.append(index)
+    first = max((int(number) for number in before["episodes"]), default=-1) + 1
+    plan = _extended(before, before["episodes"], file, new, first)
+    return Plan(plan.content, [*known, *plan.tasks])
+
+
+def still_missing(out: Path, content: Mapping[str, Any]) -> list[str]:
+    """Which planned episodes are not there: ``episodes 4-6 of select.h5``, one text a trajectory."""
+    missing: dict[str, list[int]] = {}
+    for number, entry in content["episodes"].items():
+        if not (out / schema.episode_folder(int(number))).is_dir():
+            missing.setdefault(str(entry.get("trajectory") or "?"), []).append(int(number))
+    return [f"episodes {_spans(numbers)} of {name}" for name, numbers in missing.items()]
+
+
+def _spans(numbers: list[int]) -> str:
+    """``0, 4-6``."""
+    spans: list[list[int]] = []
+    for number in sorted(numbers):
+        if spans and number == spans[-1][1] + 1:
+            spans[-1][1] = number
+        else:
+            spans.append([number, number])
+    return ", ".join(f"{first}-{last}" if first < last else str(first) for first, last in spans)
+
+
+def check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any], what: str, fix: str) -> None:
+    """Compare the settings of two conversions.
+
+    Raises:
+        DatasetError: they differ.
+    """
+    different = [key for key in SETTINGS if before.get(key) != now[key]]
+    if different:
+        raise DatasetError(
+            what,
+            where=out / schema.CONVERSION_FILE,
+            expected=", ".join(f"{key} {before.get(key)}" for key in different),
+            found=", ".join(f"{key} {now[key]}" for key in different),
+            fix=f"Pass {fix}.",
+        )
+
+
+def _header(settings: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "format": "robocas",
+        "schema_version": schema.SCHEMA_VERSION,
+        "made_with": {"robocas_ms3": robocas_ms3.__version__},
+        **settings,
+        "split": SPLIT_RULE,
+    }
+
+
+def _extended(
+    header: Mapping[str, Any], episodes: Mapping[str, Any], file: TrajectoryFile, chosen: list[int], first: int
+) -> Plan:
+    tasks = list(enumerate(chosen, start=first))
+    added = {}
+    for number, index in tasks:
+        episode = file.episodes[index]
+        added[str(number)] = {
+            "trajectory": file.path.name,
+            "trajectory_episode": episode["episode_id"],
+            "seed": episode.get("episode_seed"),
+            "success": succeeded(episode),
+            "target": episode.get("robocas", {}).get("target"),
+            "recording": fingerprint(file.recording(index, bodies=False)),
+        }
+    content = json.loads(json.dumps({**header, "episodes": {**episodes, **added}}))
+    return Plan(content, tasks)
+
+
+def _read(out: Path, missing: str, fix: str) -> dict[str, Any]:
+    path = out / schema.CONVERSION_FILE
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DatasetError(missing, where=path, fix=fix) from error
+    schema.check_version(content.get("schema_version", 1), path)
+    return content

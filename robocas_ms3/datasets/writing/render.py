@@ -1,0 +1,201 @@
+"""Shows recorded states through ManiSkill's cameras: the scene is rebuilt from its seed, physics never steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from mani_skill.render.shaders import ShaderConfig
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import robocas_ms3.tasks  # noqa: F401  (registers the environments)
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.writing.writer import CameraModel, Frame
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.poses import inverse
+from robocas_ms3.recordings.environment import RecordedEnv
+from robocas_ms3.recordings.reading import Recording
+
+_SAME_PLACE = 1e-3  # m
+
+
+class EnvFrames:
+    """A ``FrameSource`` made of the environment that recorded a trajectory.
+
+    Attributes:
+        env: the environment.
+    """
+
+    def __init__(self, env: RecordedEnv, control_mode: str, pictures: Pictures | None = None) -> None:
+        """Make the environment, with cameras.
+
+        Args:
+            env: what the trajectory was recorded in.
+            control_mode: of its actions.
+            pictures: which ones to render; default: all.
+
+        Raises:
+            DatasetError: there is no render device, or no such environment.
+        """
+        sensors = dict(env.kwargs.get("sensor_configs") or {})
+        self._pictures = pictures or Pictures()
+        if self._pictures.size is not None:
+            sensors["width"], sensors["height"] = self._pictures.size
+        require_renderer()
+        self.env = env.make(
+            obs_mode="+".join(self._pictures.kinds),
+            control_mode=control_mode,
+            num_envs=1,
+            sim_backend="physx_cpu",
+            sensor_configs=sensors,
+        )
+        self._base: Any = self.env.unwrapped
+        self._loaded = False
+
+    def close(self) -> None:
+        """Free the renderer."""
+        self.env.close()
+
+    def load(self, recording: Recording) -> None:
+        """Rebuild a recording's scene.
+
+        Raises:
+            DatasetError: the scene is not the recorded one: another pack, configuration or version.
+        """
+        self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
+        for name in set(self._base._sensors) - set(self._pictures.cameras):
+            del self._base._sensors[name]  # they are made anew at each reset; what is there is rendered
+        self._check_scene(recording)
+
+    def _check_scene(self, recording: Recording) -> None:
+        where = f"episode {recording.episode_id}, seed {recording.seed}"
+        fix = "Use the pack, configuration and versions it was recorded with."
+        built = self._base.get_state_dict()
+        for kind in ("actors", "articulations"):
+            mine, theirs = set(built.get(kind, {})), set(recording.states.get(kind, {}))
+            if mine != theirs:
+                raise DatasetError(
+                    "the seed builds another scene", where=where, expected=sorted(theirs), found=sorted(mine), fix=fix
+                )
+        for name, states in recording.states.get("actors", {}).items():
+            distance = float(np.linalg.norm(built["actors"][name][0, :3].cpu().numpy() - states[0, :3]))
+            if distance > _SAME_PLACE:
+                raise DatasetError(
+                    "the seed builds another scene",
+                    where=f"{where}, {name}",
+                    expected="the recorded place",
+                    found=f"{distance * 1000:.1f} mm away",
+                    fix=fix,
+                )
+        instruction = self._base.get_language_instruction()[0]
+        if instruction != recording.instruction:
+            raise DatasetError(
+                "the seed builds another scene",
+                where=where,
+                expected=recording.instruction,
+                found=instruction,
+                fix=fix,
+            )
+
+    def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[Frame]:
+        """Show some of the states, in order; ``load`` comes first."""
+        for index in samples:
+            yield self._frame(recording.state(int(index)))
+
+    def _frame(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> Frame:
+        """Show one state, without a step of physics."""
+        tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
+        self._base.set_state_dict(tensors)
+        textures = self._base._get_obs_sensor_data(apply_texture_transforms=False)
+        shaders = {name: self._base._sensors[name].config.shader_config for name in self._pictures.cameras}
+        return Frame(
+            rgb={name: rgb_of(textures[name], shader) for name, shader in shaders.items()},
+            depth={name: depth_of(textures[name], shader) for name, shader in shaders.items() if self._pictures.depth},
+        )
+
+    def cameras(self) -> dict[str, CameraModel]:
+        """Intrinsics, and poses in the parents, at the state shown last."""
+        agent = self._base.agent
+        parents = {"ee": agent.tcp.pose, "arm_base": agent.arm_base_link.pose}
+        models = {}
+        for spec in self._pictures.specs:
+            camera = self._base.scene.sensors[spec.name].camera
+            world_in_camera = np.vstack([camera.get_extrinsic_matrix()[0].cpu().numpy(), [0, 0, 0, 1]])
+            parent_in_world = _matrix(parents[spec.parent]) if spec.parent in parents else np.eye(4)
+            k = camera.get_intrinsic_matrix()[0].cpu().numpy().astype(np.float64)
+            models[spec.name] = CameraModel(
+                intrinsic=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
+                camera_in_parent=inverse(parent_in_world) @ inverse(world_in_camera.astype(np.float64)),
+            )
+        return models
+
+    def scene(self) -> dict[str, Any]:
+        """Task, configuration, layout and objects, for ``scene.json``."""
+        return describe_scene(self._base)
+
+
+def describe_scene(env: Any) -> dict[str, Any]:
+    """Task, configuration, layout and objects of an environment (one env)."""
+    layout = env.layout()
+    return {
+        "task": env.SPEC.name,
+        "config": env.task_config.model_dump(mode="json"),
+        "layout": {
+            "object_ids": list(layout.object_ids),
+            "poses": [_numbers(pose) for pose in layout.object_poses],
+            "present": layout.present.tolist(),
+            "robot_pose": _numbers(layout.robot_pose),
+            "basket_pose": _numbers(layout.basket_pose),
+            "relation": layout.relation,
+        },
+        "objects": [
+            {"slot": slot, "id": asset.asset.id, "name": asset.asset.name}
+            for slot, asset in enumerate(env.object_assets[0])
+            if layout.present[slot]
+        ],
+    }
+
+
+def _numbers(pose: NDArray[np.float64]) -> list[float]:
+    """x, y, z, qw, qx, qy, qz of a 4x4."""
+    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
+    return [round(float(value), 9) for value in (*pose[:3, 3], quaternion[3], *quaternion[:3])]
+
+
+def require_renderer() -> None:
+    """Check that SAPIEN finds a device to render with.
+
+    Raises:
+        DatasetError: it finds none.
+    """
+    import sapien
+
+    try:
+        sapien.render.RenderMaterial()  # the cheapest thing that needs the device
+    except RuntimeError as error:
+        raise DatasetError(
+            "no render device", fix="Run scripts/setup.sh or install a Vulkan driver; robocas doctor says more."
+        ) from error
+
+
+def rgb_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint8]:
+    """A camera's picture, (H, W, 3) RGB, contiguous, of what its shader rendered, (1, H, W, C)."""
+    colour = textures["Color"]
+    if colour.dtype == torch.uint8:  # OpenCV takes 0.03 ms to drop alpha at 640 x 480, copying a slice 2
+        return cv2.cvtColor(colour[0].cpu().numpy(), cv2.COLOR_RGBA2RGB).astype(np.uint8, copy=False)
+    return np.ascontiguousarray(shader.texture_transforms["Color"](colour)["rgb"][0].cpu().numpy())
+
+
+def depth_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint16]:
+    """A camera's depth, (H, W) mm, as it is stored: what is behind the camera or nowhere becomes 0."""
+    name = next(name for name, kinds in shader.texture_names.items() if "depth" in kinds)
+    depth = shader.texture_transforms[name](textures[name])["depth"][0, ..., 0]  # int16
+    return depth.clamp(min=0).cpu().numpy().astype(np.uint16)
+
+
+def _matrix(pose: Any) -> NDArray[np.float64]:
+    return pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64)
