@@ -63,7 +63,7 @@ class StandIn:
 
     def frames(self, _recording: Any, samples: np.ndarray) -> Iterator[Any]:
         """A ramp that moves."""
-        from robocas_ms3.datasets.writing.writer import Frame
+        from robocas_ms3.datasets.writing.frames import Frame
 
         for sample in samples:
             rgb = {name: np.roll(self.rgb, sample, 1) for name in self.pictures.cameras}
@@ -72,7 +72,7 @@ class StandIn:
 
     def cameras(self) -> dict[str, Any]:
         """All in one place."""
-        from robocas_ms3.datasets.writing.writer import CameraModel
+        from robocas_ms3.datasets.writing.frames import CameraModel
 
         return {name: CameraModel(np.array([24.0, 24.0, 32.0, 24.0]), np.eye(4)) for name in self.pictures.cameras}
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.motion import stored_actions
@@ -25,6 +26,22 @@ def episode_actions(arrays: Mapping[str, NDArray]) -> NDArray[np.float32]:
     "xyz", the convention of ``action_space``); the gripper command is ``gripper_status[t + 1]``.
     """
     return stored_actions(arrays["rel_pos"], arrays["rel_orn"], arrays["gripper_status"])
+
+
+def action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray]) -> dict[str, list[list[float]]]:
+    """Range of the relative motions: 1st and 99th percentile of each axis over all episodes.
+
+    Args:
+        rel_pos: (T, 3) of each episode; the last row, which is no motion, does not count.
+        rel_orn: (T, 4) xyzw of each episode.
+    """
+    positions = np.concatenate([rows[:-1] for rows in rel_pos]).astype(np.float64)
+    quaternions = np.concatenate([rows[:-1] for rows in rel_orn]).astype(np.float64)
+    angles = Rotation.from_quat(quaternions).as_euler("xyz")
+    return {
+        "relative_position": np.percentile(positions, [1, 99], axis=0).tolist(),
+        "relative_rotation": np.percentile(angles, [1, 99], axis=0).tolist(),
+    }
 
 
 @dataclass(frozen=True)

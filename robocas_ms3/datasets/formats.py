@@ -1,87 +1,139 @@
-"""Where training samples come from: a RoboCAS folder, or a trajectory file, which holds no pictures.
+"""The formats of episodes, in one table: what lies on disk tells which one it is.
 
-A source reads an overview when it is made and everything else when it is asked for; it keeps no file open, so it may
-be pickled and forked.
+Another package adds one through an entry point of the group ``robocas_ms3.formats`` that names a `Format`;
+docs/extending.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any
 
-from numpy.typing import NDArray
-
-from robocas_ms3.datasets.sources.folder import FolderSource
-from robocas_ms3.datasets.sources.reader import Episode
-from robocas_ms3.datasets.sources.trajectory import TrajectorySource
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.subgoals import SubGoal
 
-Split = Literal["train", "val", "all"]
+GROUP = "robocas_ms3.formats"
 
 
-class Source(Protocol):
-    """Episodes by number.
+@dataclass(frozen=True)
+class Format:
+    """A format. What it does is named, ``module:function``, and imported when it is asked for.
 
     Attributes:
-        path: the folder or file.
-        rate_hz: steps a second.
-        lengths: number -> T.
-        cameras: that there are pictures of.
-        has_depth: whether depth is there.
-        has_embeddings: of texts.
+        name: of ``robocas convert --to``.
+        title: for people.
+        holds: whether a path holds such episodes, whole or not; reads little.
+        reader: (path, *, rate_hz=None, include_failed=False) -> `EpisodeSource`.
+        writer: converts a trajectory file, see `writing.convert.convert` for its parameters up to ``on_episode`` and
+            what it gives; empty: it can't be written.
+        checker: (root, *, on_episode=None) -> `checks.dataset.Report`; empty: there is none.
+        options: further keyword arguments of the writer -> what they are for those who ask.
     """
 
-    path: Path
-    rate_hz: float
-    lengths: dict[int, int]
-    cameras: tuple[str, ...]
-    has_depth: bool
-    has_embeddings: bool
+    name: str
+    title: str
+    holds: Callable[[Path], bool]
+    reader: str
+    writer: str = ""
+    checker: str = ""
+    options: Mapping[str, str] = field(default_factory=dict)
 
-    def split(self, side: Split) -> list[int]:
-        """Numbers of the episodes of one side."""
-        ...
+    def part(self, name: str) -> Callable[..., Any]:
+        """Import ``reader``, ``writer`` or ``checker``.
 
-    def goals(self, number: int) -> list[SubGoal]:
-        """Sub-goals of an episode; empty where they are not known."""
-        ...
-
-    def arrays(self, number: int, keys: Sequence[str]) -> dict[str, NDArray]:
-        """Some of an episode's arrays, by the schema's keys."""
-        ...
-
-    def action_space(self) -> dict[str, Any]:
-        """As in ``data_info.json``."""
-        ...
-
-    def episode(self, number: int) -> Episode:
-        """An episode's pictures."""
-        ...
+        Raises:
+            DatasetError: the format has none, or it can't be imported.
+        """
+        path: str = getattr(self, name)
+        if not path:
+            raise DatasetError(f"this format has no {name}", where=self.title)
+        module, _, function = path.partition(":")
+        try:
+            return getattr(import_module(module), function)
+        except (ImportError, AttributeError) as error:
+            raise DatasetError(f"the {name} of this format can't be imported", where=path, found=error) from error
 
 
-def open_source(path: Path | str, *, rate_hz: float | None = None, include_failed: bool = False) -> Source:
-    """Open a RoboCAS folder or a trajectory file.
+def _is_trajectory(path: Path) -> bool:
+    return path.is_file() or path.suffix in {".h5", ".hdf5"}
+
+
+def _is_lerobot(path: Path) -> bool:
+    return (path / "meta" / "info.json").is_file()
+
+
+def _is_robocas(path: Path) -> bool:
+    marked = (path / schema.CONVERSION_FILE).is_file() or (path / schema.DATA_INFO_FILE).is_file()
+    return marked or (path.is_dir() and any(path.glob("episode_" + "[0-9]" * 7)))
+
+
+_PACKAGE = "robocas_ms3.datasets"
+_BUILTIN = (
+    Format("trajectory", "trajectory file", _is_trajectory, f"{_PACKAGE}.sources.trajectory:TrajectorySource"),
+    Format(
+        "lerobot",
+        "LeRobot dataset",
+        _is_lerobot,
+        f"{_PACKAGE}.lerobot.reader:open_lerobot",
+        f"{_PACKAGE}.lerobot.convert:convert_lerobot",
+        f"{_PACKAGE}.lerobot.check:report_lerobot",
+        {"codec": "of the videos"},
+    ),
+    Format(
+        "robocas",
+        "RoboCAS folder",
+        _is_robocas,
+        f"{_PACKAGE}.sources.reader:open_folder",
+        f"{_PACKAGE}.writing.convert:convert",
+        f"{_PACKAGE}.checks.dataset:validate",
+        {"append": "add", "embeddings": "of texts", "previews": "videos", "image_format": "of RGB"},
+    ),
+)
+
+
+@cache
+def formats() -> dict[str, Format]:
+    """All formats by name; those of other packages come first, so that they see their own folders before others do.
+
+    Raises:
+        DatasetError: an entry point names something else.
+    """
+    found = {}
+    for point in entry_points(group=GROUP):
+        where = f"{GROUP}, {point.value}"
+        try:
+            found[point.name] = point.load()
+        except (ImportError, AttributeError) as error:
+            raise DatasetError(
+                "a dataset format can't be imported", where=f"{GROUP}, {point.value}", found=error
+            ) from error
+        if not isinstance(found[point.name], Format):
+            raise DatasetError("not a dataset format", where=where, expected="a Format")
+    return {**found, **{one.name: one for one in _BUILTIN}}
+
+
+def format_of(path: Path) -> Format | None:
+    """Which format lies there; None: none."""
+    return next((one for one in formats().values() if one.holds(path)), None)
+
+
+def open_source(path: Path | str, *, rate_hz: float | None = None, include_failed: bool = False) -> EpisodeSource:
+    """Open a trajectory file or dataset of any format.
 
     Args:
-        path: of it; a file is taken for a trajectory.
-        rate_hz: steps a second, for trajectories (default 5); a folder has its own.
+        path: of it.
+        rate_hz: steps a second, for trajectories (default 5); a dataset has its own.
         include_failed: for trajectories: also episodes without success.
 
     Raises:
-        DatasetError: it can't be read, or the folder is of another rate.
+        DatasetError: it can't be read, or the dataset is of another rate.
     """
     path = Path(path)
-    if path.is_file() or path.suffix in {".h5", ".hdf5"}:
-        return TrajectorySource(path, rate_hz=5.0 if rate_hz is None else rate_hz, include_failed=include_failed)
-    source = FolderSource(path)
-    if rate_hz is not None and rate_hz != source.rate_hz:
-        raise DatasetError(
-            "the dataset has another rate",
-            where=path,
-            expected=f"{source.rate_hz:g} Hz",
-            found=f"{rate_hz:g}",
-            fix="Convert the trajectory again with this --rate.",
-        )
-    return source
+    found = format_of(path) or formats()["robocas"]  # which says what is wrong, and what may have been meant
+    return found.part("reader")(path, rate_hz=rate_hz, include_failed=include_failed)

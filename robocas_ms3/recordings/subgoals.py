@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -103,3 +104,12 @@ def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> 
         if len(steps):
             result.append(SubGoal(goal.goal_type, goal.goal_description, int(steps[0]), int(steps[-1])))
     return result
+
+
+def subgoal_runs(types: Sequence[str], texts: Sequence[str]) -> list[SubGoal]:
+    """Sub-goals of steps that follow each other."""
+    goals: list[SubGoal] = []
+    for (kind, text), steps in groupby(range(len(types)), key=lambda step: (types[step], texts[step])):
+        inside = list(steps)
+        goals.append(SubGoal(kind, text, inside[0], inside[-1]))
+    return goals

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.writing.info import runs
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.poses import from_xyzw
+from robocas_ms3.recordings.subgoals import subgoal_runs
 from robocas_ms3.viewer.failures import describe
 from robocas_ms3.viewer.plots import ROLL_PITCH_YAW, XYZ, base_plot, gripper_plot, motion_plots
 from robocas_ms3.viewer.source import make_episode, make_trace, plot
@@ -47,7 +47,7 @@ def show_arrays(
         raise ValueError(f"arrays of different lengths: {sorted(lengths)}")
     recorded = scene.get("recorded") or {}
     turns = np.degrees(Rotation.from_quat(a["rel_orn"]).as_euler("xyz"))
-    goals = runs([str(v) for v in a["step_goal_type"]], [str(v) for v in a["step_lang_goals"]])
+    goals = subgoal_runs([str(v) for v in a["step_goal_type"]], [str(v) for v in a["step_lang_goals"]])
     base = from_xyzw(a["base_pos"].astype(float), a["base_orn"].astype(float))
     tcp = base @ from_xyzw(a["ee_pos"].astype(float), a["ee_orn"].astype(float))
     is_open = a.get("gripper_status")

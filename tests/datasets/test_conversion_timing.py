@@ -89,8 +89,9 @@ def test_of_a_robocas_dataset(trajectory, tmp_path, monkeypatch, clock):
 def test_of_a_lerobot_dataset(trajectory, made, tmp_path, monkeypatch, clock):
     pytest.importorskip("av", reason="needs the extra 'lerobot'")
     pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
-    from robocas_ms3.datasets.lerobot import assemble, folder, stage
+    from robocas_ms3.datasets.lerobot import assemble, stage
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+    from robocas_ms3.datasets.sources.episode import Episode
 
     monkeypatch.setattr(stage.Encoder, "add", slow(stage.Encoder.add, clock, 0.5))
     monkeypatch.setattr(stage.pq, "write_table", slow(stage.pq.write_table, clock, 0.25))
@@ -101,6 +102,6 @@ def test_of_a_lerobot_dataset(trajectory, made, tmp_path, monkeypatch, clock):
     assert done.timing == Timing(load=11, render=28, **parts, total=11 + 28 + 42 + 0.5)
     assert done.seconds == done.timing.total + done.joining
     # of a dataset pictures are read, not rendered
-    monkeypatch.setattr(folder.Episode, "rgb", slow(folder.Episode.rgb, clock, 1))
+    monkeypatch.setattr(Episode, "rgb", slow(Episode.rgb, clock, 1))
     done = convert_lerobot(made, tmp_path / "again")
     assert done.timing == Timing(load=2 * 7 * 3, **parts, total=42 + 42 + 0.5)

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.datasets.sources.arrays import compose, continuous_xyzw, episode_arrays, planar_base
+from robocas_ms3.datasets.sources.arrays import compose, continuous_xyzw, episode_arrays, planar_base, with_embeddings
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw, inverse, wxyz_to_xyzw, xyzw_to_wxyz
 from robocas_ms3.recordings.motion import Motion, gripper_open, relative_motion, sample_states, sample_stride
@@ -70,7 +70,8 @@ def arrays_of(tcp, base, *, qpos=None, subgoals=None, embed=None):
     root = np.broadcast_to(np.eye(4), (count, 4, 4))
     motion = Motion(qpos, np.zeros((count, 12)), root, tcp, base, np.ones(count, bool))
     subgoals = subgoals or [SubGoal("move and grasp", "grasp it", 0, count - 1)]
-    return episode_arrays(motion, "do it", subgoals, embed)
+    arrays = episode_arrays(motion, "do it", subgoals)
+    return with_embeddings(arrays, embed) if embed else arrays
 
 
 def test_relative_motion_is_in_the_frame_of_the_hand():

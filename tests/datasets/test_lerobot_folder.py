@@ -16,8 +16,8 @@ from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.manage.splitting import Share, resplit
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.datasets.writing.info import split_by_seed
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.source import open_source
 

@@ -15,9 +15,9 @@ from synthetic import RayCaster, write_trajectory
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures import preview
-from robocas_ms3.datasets.pictures.drawing import draw_frame, row_steps, stack_rows
+from robocas_ms3.datasets.pictures.drawing import Story, draw_frame, row_steps, stack_rows
 from robocas_ms3.datasets.pictures.preview import PANEL
-from robocas_ms3.datasets.pictures.video import _pictures, _story, contact_sheet
+from robocas_ms3.datasets.pictures.video import _pictures, contact_sheet
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing import convert as conversion
 
@@ -51,7 +51,7 @@ def test_shows_what_the_dataset_holds(trajectory, tmp_path, jobs):
         assert len(frames) == 7
         episode = dataset.episode(number)
         for step, frame in enumerate(frames):
-            drawn = draw_frame(_story(episode, number), step, _pictures(episode, step, "rgb"), PANEL)
+            drawn = draw_frame(Story.of(number, episode.arrays), step, _pictures(episode, step, "rgb"), PANEL)
             assert frame.shape == drawn.shape == (PANEL[1] + 64, 3 * PANEL[0], 3)
             assert np.abs(frame.astype(int) - drawn).mean() < 4, "H.264 loses little"
     of_pictures = np.asarray(Image.open(contact_sheet(out, tmp_path / "sheet.png")))
@@ -63,7 +63,7 @@ def test_no_picture_is_read_back(trajectory, made_up_pictures, tmp_path, monkeyp
     def read(*_):
         raise AssertionError("a picture was read")
 
-    monkeypatch.setattr("robocas_ms3.datasets.sources.reader.read_picture", read)
+    monkeypatch.setattr("robocas_ms3.datasets.sources.episode.read_picture", read)
     assert converted(trajectory, tmp_path / "out") == 0
     assert shown(tmp_path / "out") == ["contact_sheet.png", "episode_0000000.mp4", "episode_0000001.mp4"]
 

@@ -47,11 +47,23 @@ def recording(root):
     (root / "trajectory.h5").touch()
 
 
+@pytest.mark.parametrize("ask", [Dataset, validate])
+def test_what_takes_robocas_folders_says_what_else_lies_there(tmp_path, ask):
+    lerobot(tmp_path / "here")
+    with pytest.raises(DatasetError, match="here: a LeRobot dataset; this takes RoboCAS folders$"):
+        ask(tmp_path / "here")
+
+
+def test_a_lerobot_dataset_is_counted_as_one(tmp_path):
+    lerobot(tmp_path / "here")
+    with pytest.raises(DatasetError, match="a LeRobot dataset of another version"):
+        collect(tmp_path / "here")
+
+
 @pytest.mark.parametrize("ask", [Dataset, collect, validate])
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lerobot, "here: a LeRobot dataset; this takes RoboCAS folders$"),
         (datasets, "here: no dataset here .*Did you mean .*here/part_0[?]$"),
         (recording, "here: no dataset here .*Did you mean .*here/trajectory.h5[?]$"),
     ],

@@ -10,7 +10,7 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.splitting import Share, cut, folder_names, groups_of, resplit
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.writing.info import split_by_seed
+from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.errors import DatasetError
 
 

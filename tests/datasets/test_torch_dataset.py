@@ -224,6 +224,8 @@ def test_split_is_the_overviews(dataset):
 def test_opening_reads_the_overview_only(made, tmp_path):
     for name in ("data_info.json", "conversion.json"):
         (tmp_path / name).write_bytes((made / name).read_bytes())
+    for number in (0, 1):
+        (tmp_path / f"episode_{number:07d}").mkdir()
     data = RoboCASDataset(tmp_path, split="all", depth=True, embedding=True, subgoals=True, normalize=True)
     assert len(data) == 12
     assert data.weights().sum() == pytest.approx(1)

@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.writing.writer import CameraModel, Frame
+from robocas_ms3.datasets.writing.frames import CameraModel, Frame
 from robocas_ms3.robots.constants import ARM_EVALUATION_START
 
 STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one
@@ -179,13 +179,9 @@ def write_trajectory(path: Path, seeds=(3, 4, 5), failed=(), steps=STEPS):
     return path
 
 
-def made_up_vectors(file, chosen):
+def made_up_vectors(player, entries):
     """Unit vectors in place of sentence embeddings, which take seconds to load."""
-    texts = {
-        text
-        for index in chosen
-        for text in [file.recording(index).instruction, *(g.goal_description for g in file.recording(index).subgoals)]
-    }
+    texts = {text for entry in entries for text in player.texts(entry["source"])}
     return {text: np.eye(384, dtype=np.float32)[number] for number, text in enumerate(sorted(texts))}
 
 

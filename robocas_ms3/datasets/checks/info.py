@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.sources.tolerant import SPECS, first_line, is_declared
-from robocas_ms3.datasets.writing.info import action_space
 from robocas_ms3.language.templates import GOAL_TYPES
 
 FILE = schema.DATA_INFO_FILE

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import robocas_ms3
-from robocas_ms3.datasets.lerobot.request import EpisodeSource, Request
-from robocas_ms3.datasets.lerobot.schema import CONTENT, CONVERSION_FILE, INFO_FILE, Limits, require_extra
-from robocas_ms3.datasets.lerobot.sources import open_request
+from robocas_ms3.datasets.lerobot.schema import CONTENT, CONVERSION_FILE, INFO_FILE, Limits, require_extra, whole_rate
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.writing.convert import Conversion, open_env
-from robocas_ms3.datasets.writing.info import split_by_seed
+from robocas_ms3.datasets.sources.split import split_by_seed
+from robocas_ms3.datasets.writing.convert import Conversion
+from robocas_ms3.datasets.writing.dataset_player import open_player
+from robocas_ms3.datasets.writing.frames import OpenSource, open_env
 from robocas_ms3.datasets.writing.output import check_overwrite, kept_if_begun, sweep
-from robocas_ms3.datasets.writing.workers import OpenSource
+from robocas_ms3.datasets.writing.players import Player, Request
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
@@ -79,8 +79,9 @@ def convert_lerobot(
     begun = time.perf_counter()
     out, limits = Path(out), limits or Limits()
     request = Request(Path(source), rate_hz, pictures or Pictures(), include_failed, open_source, pack)
-    with closing(open_request(request)) as opened:
-        plan = _plan(opened, opened.entries(), codec)
+    with closing(open_player(request)) as player:
+        fps = whole_rate(player.rate_hz)
+        plan = _plan(player, fps, codec)
         with locked_folder(out):
             # Everything that may fail comes before the output is touched.
             claim_output(out, resume=resume or overwrite)
@@ -88,7 +89,7 @@ def convert_lerobot(
                 _check_resume(out, plan)
             elif overwrite:
                 check_overwrite(out, (INFO_FILE, PARTS), "a LeRobot dataset")
-            if request.open_source is open_env and request.path.is_file():
+            if request.renders:
                 from robocas_ms3.datasets.writing.render import require_renderer
 
                 require_renderer()
@@ -102,27 +103,28 @@ def convert_lerobot(
                         write_json(parts / _PLAN, plan)
                     written = _stage(request, parts, plan, jobs, on_start, on_episode)
                     staged = time.perf_counter()
-                    _join(out, plan, opened.fps, limits)
+                    _join(out, plan, fps, limits)
                     joining = time.perf_counter() - staged
             for name in (PARTS, _JOINED):
                 shutil.rmtree(out / name, ignore_errors=True)
     return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - begun, joining)
 
 
-def _plan(source: EpisodeSource, entries: list[dict[str, Any]], codec: str) -> dict[str, Any]:
+def _plan(player: Player, fps: int, codec: str) -> dict[str, Any]:
+    entries, pictures = player.entries(), player.pictures
     place = {entry["source"]: i for i, entry in enumerate(entries)}
-    before_train, before_val = ([place[n] for n in side if n in place] for side in source.sides())
+    before_train, before_val = ([place[n] for n in side if n in place] for side in player.sides())
     seeds = {i: i if e["seed"] is None else _seed(e["seed"]) for i, e in enumerate(entries)}
     train, val = split_by_seed(seeds, (before_train, before_val))
     plan = {
         "format": "lerobot",
         "made_with": {"robocas_ms3": robocas_ms3.__version__},
         "settings": {
-            "rate_hz": source.fps,
-            "cameras": list(source.cameras),
-            "depth": source.depth,
+            "rate_hz": fps,
+            "cameras": list(pictures.cameras),
+            "depth": pictures.depth,
             "codec": codec,
-            "size": source.size,
+            "size": pictures.size,
         },
         "train_eps": train,
         "val_eps": val,

@@ -1,9 +1,9 @@
-"""Opens a LeRobot dataset made here, with the face of the reader of RoboCAS datasets; needs no ``lerobot``."""
+"""Opens a LeRobot dataset; needs no ``lerobot``. What only those made here have is read where it is there."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,24 +14,26 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.tables import numbers, read_texts
 from robocas_ms3.datasets.lerobot.video import read_frames
+from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side, SourceEpisode
+from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
 
 
-@dataclass(frozen=True)
-class LeRobotDataset:
-    """A dataset's folder."""
+class LeRobotDataset(EpisodeSource):
+    """A dataset's folder, an `EpisodeSource`.
 
-    root: Path
+    Raises:
+        DatasetError: no LeRobot dataset there, or one of another version.
+        MissingExtraError: pyarrow or av is missing.
+    """
 
-    def __post_init__(self) -> None:
-        """Check that there is something.
-
-        Raises:
-            DatasetError: no LeRobot dataset there, or one of another version.
-        """
+    def __init__(self, root: Path) -> None:
+        self.root = root
         schema.require_extra()
         version = self.info.get("codebase_version")
         if version != schema.CODEBASE_VERSION:
@@ -69,6 +71,11 @@ class LeRobotDataset:
         """Whether depth is there."""
         return bool(self.rows) and any(f"depth/{camera}/file_index" in self.rows[0] for camera in self.cameras[:1])
 
+    @property
+    def is_ours(self) -> bool:
+        """Whether it has the columns of those written here."""
+        return set(schema.OUR_KEYS) <= set(self.info["features"])
+
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
         """What ``meta/episodes`` says of each episode, but statistics."""
@@ -80,9 +87,35 @@ class LeRobotDataset:
         return found
 
     @property
+    def has_embeddings(self) -> bool:
+        """They are not stored."""
+        return False
+
+    @property
     def numbers(self) -> list[int]:
         """Numbers of the episodes."""
         return [row["episode_index"] for row in self.rows]
+
+    @property
+    def lengths(self) -> dict[int, int]:
+        """Number -> T."""
+        return {row["episode_index"]: int(row["length"]) for row in self.rows}
+
+    def split(self, side: Side) -> list[int]:
+        """Numbers of one side, as the conversion divided them; all of another's dataset train."""
+        if side == "all" or (side == "train" and "train_eps" not in self.settings):
+            return self.numbers
+        return list(self.settings.get(f"{side}_eps", []))
+
+    def entry(self, number: int) -> dict[str, Any]:
+        """What the conversion said of it."""
+        entries = self.settings.get("episodes", [])
+        return entries[number] if number < len(entries) else {}
+
+    def action_space(self) -> dict[str, Any]:
+        """Percentiles over all episodes, whose tables are read for it."""
+        parts = [self.episode(number).read(("rel_pos", "rel_orn")) for number in self.numbers]
+        return action_space([part["rel_pos"] for part in parts], [part["rel_orn"] for part in parts])
 
     @cached_property
     def tasks(self) -> list[str]:
@@ -106,11 +139,16 @@ class LeRobotDataset:
 
 
 @dataclass(frozen=True)
-class LeRobotEpisode:
-    """One episode."""
+class LeRobotEpisode(SourceEpisode):
+    """One episode, a `SourceEpisode`."""
 
     dataset: LeRobotDataset
     number: int
+
+    @property
+    def where(self) -> str:
+        """Dataset and number."""
+        return f"{self.dataset.root}, episode {self.number}"
 
     @property
     def row(self) -> dict[str, Any]:
@@ -149,10 +187,39 @@ class LeRobotEpisode:
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
-        """Arrays of ``episode_info.npz`` but the embeddings, by the schema's keys."""
+        """Arrays of ``episode_info.npz`` but the embeddings, by the schema's keys.
+
+        Raises:
+            DatasetError: the dataset has other columns than those written here.
+        """
+        if not self.dataset.is_ours:
+            raise DatasetError("not of our columns", where=self.where, expected=", ".join(schema.OUR_KEYS))
         texts = [self.dataset.subtasks[i] for i in self.columns[schema.SUBTASK_INDEX.key][:, 0]]
         types = self.table.column(schema.SUBGOAL_TYPE.key).to_pylist()
         return schema.robocas_arrays(self.columns, self.row["tasks"][0], texts, types)
+
+    def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
+        """Some of them.
+
+        Raises:
+            DatasetError: one is not there.
+        """
+        missing = [key for key in keys if key not in self.arrays]
+        if missing:
+            raise DatasetError("a LeRobot dataset does not hold this", where=self.where, found=", ".join(missing))
+        return {key: self.arrays[key] for key in keys}
+
+    @property
+    def goals(self) -> list[SubGoal]:
+        """Sub-goals over the steps; none where the dataset is not one of ours."""
+        if not self.dataset.is_ours:
+            return []
+        return subgoal_runs(self.arrays["step_goal_type"].tolist(), self.arrays["step_lang_goals"].tolist())
+
+    @property
+    def layout(self) -> dict[str, Any]:
+        """As its ``scene.json`` has it."""
+        return self.scene.get("layout") or {}
 
     @cached_property
     def _ours(self) -> dict[str, Any]:
@@ -199,3 +266,15 @@ class LeRobotEpisode:
     def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
         """(H, W) mm, 0 = nothing."""
         return next(iter(list(self.frames(camera, "depth", step, 1))))
+
+
+def open_lerobot(root: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> LeRobotDataset:
+    """Open a dataset; failed episodes are in it where it was made so.
+
+    Raises:
+        DatasetError: there is none, or it is of another version or rate.
+        MissingExtraError: pyarrow or av is missing.
+    """
+    dataset = LeRobotDataset(root)
+    check_rate(dataset, rate_hz)
+    return dataset

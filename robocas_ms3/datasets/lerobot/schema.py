@@ -121,6 +121,9 @@ FEATURES: tuple[Feature, ...] = (
 )
 """Numeric features. The keys in their meanings are those of ``episode_info.npz``."""
 
+OUR_KEYS = tuple(feature.key for feature in FEATURES)
+"""By which a dataset written here is known."""
+
 SUBGOAL_TYPE = Feature("subgoal_type", ("type",), "type of the sub-goal pursued at this step", "string")
 SUBTASK_INDEX = Feature("subtask_index", ("index",), "row of meta/subtasks.parquet: text of that sub-goal", "int64")
 INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -217,11 +220,6 @@ def robocas_arrays(
 
 def _next(values: NDArray) -> NDArray:
     return np.concatenate([values[1:], values[-1:]])
-
-
-def needed_arrays() -> set[str]:
-    """Keys of ``episode_info.npz`` that an episode must have to be converted."""
-    return {spec.name for spec in EPISODE_INFO if not spec.embedding} - {"base_rel_pos", "base_rel_orn"}
 
 
 def require_extra() -> None:

@@ -16,13 +16,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.lerobot.request import EpisodeSource, Request
-from robocas_ms3.datasets.lerobot.schema import SUBGOAL_TYPE, frame_columns
-from robocas_ms3.datasets.lerobot.sources import open_request
+from robocas_ms3.datasets.lerobot.schema import SUBGOAL_TYPE, frame_columns, whole_rate
 from robocas_ms3.datasets.lerobot.stats import Levels
 from robocas_ms3.datasets.lerobot.tables import column
 from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder
 from robocas_ms3.datasets.schema import episode_folder
+from robocas_ms3.datasets.writing.dataset_player import open_player
+from robocas_ms3.datasets.writing.frames import Frame
+from robocas_ms3.datasets.writing.players import Player, Request
 from robocas_ms3.datasets.writing.pool import do_all
 from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
@@ -71,50 +72,52 @@ def stage_all(job: StageJob, processes: int) -> Generator[WrittenEpisode, None, 
 
 
 class _Stager:
-    """One process's share: keeps the source open from one episode to the next."""
+    """One process's share: keeps what plays the episodes open from one episode to the next."""
 
     def __init__(self, job: StageJob) -> None:
-        self.job, self.source = job, open_request(job.request)
+        self.job, self.player = job, open_player(job.request)
 
     def do(self, task: tuple[int, int]) -> WrittenEpisode:
-        return stage_episode(self.job, self.source, *task)
+        return stage_episode(self.job, self.player, *task)
 
     def close(self) -> None:
-        self.source.close()
+        self.player.close()
 
 
-def stage_episode(job: StageJob, source: EpisodeSource, index: int, number: int) -> WrittenEpisode:
+def stage_episode(job: StageJob, player: Player, index: int, number: int) -> WrittenEpisode:
     """Write one episode's part.
 
     Raises:
         DatasetError: it can't be shown or written.
     """
-    started, timing = time.perf_counter(), Timing()
+    started, timing, fps = time.perf_counter(), Timing(), whole_rate(player.rate_hz)
     with replacing_folder(part_folder(job.parts, index)) as folder:
-        with _Videos(folder, job.codec, source.fps, timing) as videos:
-            shown = source.play(number, videos.add, timing)
-        begun, arrays = time.perf_counter(), shown.arrays
+        played = player.open(number, timing)
+        with _Videos(folder, job.codec, fps, timing) as videos:
+            for frame in played.frames():
+                videos.add(frame)
+        begun, arrays, cameras = time.perf_counter(), played.arrays, played.cameras()
         steps = int(arrays["episode_length"])
         if videos.steps != steps:
             raise DatasetError("pictures and arrays differ in length", where=number, expected=steps, found=videos.steps)
         columns: dict[str, Any] = {key: column(values) for key, values in frame_columns(arrays).items()}
         columns[SUBGOAL_TYPE.key] = pa.array(arrays["step_goal_type"].tolist(), pa.string())
-        columns["timestamp"] = pa.array((np.arange(steps) / source.fps).astype(np.float32))
+        columns["timestamp"] = pa.array((np.arange(steps) / fps).astype(np.float32))
         columns["frame_index"] = pa.array(np.arange(steps))
         columns[SUBGOAL] = pa.array(arrays["step_lang_goals"].tolist(), pa.string())
         pq.write_table(pa.table(columns), folder / FRAMES_FILE)
         about = {
             "steps": steps,
             "instruction": str(arrays["language_goal"]),
-            "scene": shown.scene,
+            "scene": played.scene(),
             "cameras": {
                 name: {
-                    "intrinsic": np.asarray(shown.cameras[name].intrinsic).tolist(),
-                    "camera_in_parent": np.asarray(shown.cameras[name].camera_in_parent).tolist(),
+                    "intrinsic": np.asarray(cameras[name].intrinsic).tolist(),
+                    "camera_in_parent": np.asarray(cameras[name].camera_in_parent).tolist(),
                 }
-                for name in source.cameras
+                for name in player.pictures.cameras
             },
-            "depth": source.depth,
+            "depth": player.pictures.depth,
             "levels": {name: levels.counts.tolist() for name, levels in videos.levels.items()},
         }
         (folder / EPISODE_FILE).write_text(json.dumps(about, ensure_ascii=False), encoding="utf-8")
@@ -141,14 +144,14 @@ class _Videos:
         with self._timing.measure("encode"):
             self._stack.__exit__(*error)
 
-    def add(self, step: int, rgb: dict[str, NDArray], depth: dict[str, NDArray]) -> None:
+    def add(self, frame: Frame) -> None:
         with self._timing.measure("encode"):
-            for kind, shots in (("rgb", rgb), ("depth", depth)):
-                for camera, picture in shots.items():
-                    self._encoder(kind, camera, picture).add(picture)
-                    if kind == "rgb":
-                        self.levels.setdefault(camera, Levels()).add(picture)
-        self.steps = step + 1
+            for camera, picture in frame.rgb.items():
+                self._encoder("rgb", camera, picture).add(picture)
+                self.levels.setdefault(camera, Levels()).add(picture)
+            for camera, picture in frame.depth.items():
+                self._encoder("depth", camera, picture).add(picture)
+        self.steps += 1
 
     def _encoder(self, kind: str, camera: str, picture: NDArray) -> Encoder:
         if (kind, camera) not in self._encoders:

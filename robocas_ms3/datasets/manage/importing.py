@@ -19,10 +19,12 @@ from robocas_ms3.datasets.manage.parts import schema_version
 from robocas_ms3.datasets.manage.reading import read_episode
 from robocas_ms3.datasets.manage.survey import Survey, read_info
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.episode import Overview
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.datasets.writing.frames import CameraModel
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings
-from robocas_ms3.datasets.writing.writer import CameraModel, write_cameras
+from robocas_ms3.datasets.writing.writer import write_cameras
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder, write_json
 
@@ -116,7 +118,7 @@ def _plan(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any]:
     }
 
 
-def _format(dataset: Dataset) -> str:
+def _format(dataset: Overview) -> str:
     return f"robocas v{schema_version(dataset)}"
 
 

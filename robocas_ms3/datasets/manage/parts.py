@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.sources.episode import Overview
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.errors import DatasetError
@@ -47,7 +48,7 @@ class Part:
         return mark or f"arrays {arrays_fingerprint(self.dataset.episode(number).arrays)}"
 
 
-def schema_version(dataset: Dataset) -> object:
+def schema_version(dataset: Overview) -> object:
     """Version of a dataset's schema: 0 is upstream's."""
     return dataset.settings.get("schema_version", 1) if dataset.settings else 0
 

@@ -13,7 +13,8 @@ from robocas_ms3.datasets.checks.rigid import NORM_TOLERANCE, POSITION_TOLERANCE
 from robocas_ms3.datasets.manage.eef import eef_turn, turn
 from robocas_ms3.datasets.manage.findings import Finding, Found, Report
 from robocas_ms3.datasets.manage.picture_check import check_pictures
-from robocas_ms3.datasets.sources.reader import Dataset, Episode, said_of
+from robocas_ms3.datasets.sources.files import said_of
+from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.tolerant import SPECS, complete, derive_motion, load_arrays, planar_motion
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.language.templates import GOAL_TYPES

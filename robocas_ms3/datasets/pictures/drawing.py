@@ -43,6 +43,12 @@ class Story:
     goals: Sequence[str]
     gripper_open: NDArray[np.bool_]
 
+    @classmethod
+    def of(cls, number: int, arrays: Mapping[str, NDArray]) -> Story:
+        """Of an episode's arrays, by the schema's keys."""
+        types, texts = arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist()
+        return cls(number, str(arrays["language_goal"]), types, texts, arrays["gripper_status"])
+
     @property
     def steps(self) -> int:
         """T."""

@@ -85,7 +85,7 @@ def video_frame(
     episode: Episode, step: int, *, number: int = 0, kind: str = "rgb", panel: Size = PANEL
 ) -> NDArray[np.uint8]:
     """One picture of the video, (H, W, 3) RGB, both even."""
-    return draw_frame(_story(episode, number), step, _pictures(episode, step, kind), panel)
+    return draw_frame(Story.of(number, episode.arrays), step, _pictures(episode, step, kind), panel)
 
 
 def contact_sheet(
@@ -118,7 +118,7 @@ def sheet_row(
     """An episode's part of a contact sheet, (H, W, 3) RGB."""
     episode = dataset.episode(number)
     shown = {step: _pictures(episode, step, kind) for step in row_steps(episode.steps, columns)}
-    return draw_row(_story(episode, number), shown, dataset.rate_hz, columns, thumbnail)
+    return draw_row(Story.of(number, episode.arrays), shown, dataset.rate_hz, columns, thumbnail)
 
 
 def write_sheet(rows: Sequence[NDArray[np.uint8]], path: Path | str) -> Path:
@@ -135,17 +135,6 @@ def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     colours = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
     colours[depth == 0] = 0
     return colours.astype(np.uint8)
-
-
-def _story(episode: Episode, number: int) -> Story:
-    arrays = episode.arrays
-    return Story(
-        number=number,
-        instruction=str(arrays["language_goal"]),
-        goal_types=arrays["step_goal_type"].tolist(),
-        goals=arrays["step_lang_goals"].tolist(),
-        gripper_open=arrays["gripper_status"],
-    )
 
 
 def _pictures(episode: Episode, step: int, kind: str) -> Pictures:

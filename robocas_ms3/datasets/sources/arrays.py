@@ -5,7 +5,7 @@ Which states are kept, and the motion between them: `robocas_ms3.recordings.moti
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,15 +56,13 @@ def episode_arrays(
     motion: Motion,
     instruction: str,
     subgoals: Sequence[SubGoal],
-    embed=None,
 ) -> dict[str, np.ndarray]:
-    """Every array of ``episode_info.npz``.
+    """Every array of ``episode_info.npz`` but the embeddings of its texts, see `with_embeddings`.
 
     Args:
         motion: at the T sampled states.
         instruction: the whole episode's.
         subgoals: from ``sample_subgoals``.
-        embed: texts -> (N, 384); None leaves the embeddings out.
     """
     ee_in_base, base = motion.tcp_in_base, motion.arm_base_in_world
     rel_pos, rel_orn = stored_motion(ee_in_base)
@@ -93,7 +91,14 @@ def episode_arrays(
         "step_lang_goals": texts,
         "step_goal_type": [goal.goal_type for goal in subgoals for _ in range(goal.last - goal.first + 1)],
     }
-    if embed is not None:
-        values["language_embedding"] = embed([instruction])[0]
-        values["step_goal_embs"] = embed(texts)
     return {spec.name: spec.cast(values[spec.name]) for spec in EPISODE_INFO if spec.name in values}
+
+
+def with_embeddings(arrays: Mapping[str, NDArray], embed: Callable[[list[str]], NDArray]) -> dict[str, NDArray]:
+    """The same and the embeddings of instruction and sub-goals, in the schema's order; embed: texts -> (N, 384)."""
+    made = {
+        **arrays,
+        "language_embedding": embed([str(arrays["language_goal"])])[0],
+        "step_goal_embs": embed(arrays["step_lang_goals"].tolist()),
+    }
+    return {spec.name: spec.cast(made[spec.name]) for spec in EPISODE_INFO if spec.name in made}

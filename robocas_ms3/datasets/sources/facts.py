@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.config import load_task_config
-from robocas_ms3.datasets.formats import Source
-from robocas_ms3.datasets.sources.provenance import succeeded, task_of
-from robocas_ms3.datasets.sources.trajectory import TrajectorySource
-from robocas_ms3.errors import DatasetError, RobocasError
-from robocas_ms3.recordings.reading import Recording, TrajectoryFile
-from robocas_ms3.scenes.layout import PARKING_HEIGHT
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.sources.protocol import SourceEpisode
+from robocas_ms3.datasets.sources.provenance import task_of
+from robocas_ms3.errors import DatasetError
 
 Array = NDArray[np.float64]
 UNKNOWN = "unknown"
@@ -76,32 +71,24 @@ class Facts:
     surface: Surface | None = None
 
 
-@contextmanager
-def facts_reader(source: Source) -> Iterator[Callable[[int], Facts]]:
-    """Yield what reads the facts of an episode by its number."""
-    if isinstance(source, TrajectorySource):
-        with TrajectoryFile(source.path) as file:  # the source numbers all of them, failed ones too, in this order
-            yield lambda number: of_recording(file, number)
-    else:
-        yield lambda number: of_folder(source, number)
-
-
-def of_folder(source: Source, number: int) -> Facts:
-    """Facts of an episode on disk, from its ``scene.json``.
+def facts_of(episode: SourceEpisode) -> Facts:
+    """Facts of an episode, as far as its scene tells them.
 
     Raises:
-        DatasetError: that file is damaged.
+        DatasetError: what is said of the scene is damaged.
     """
-    instruction = str(source.arrays(number, ["language_goal"])["language_goal"])
-    episode = source.episode(number)
+    instruction = str(episode.read(["language_goal"])["language_goal"])
     try:
         scene = episode.scene
         if not scene:
             return Facts(instruction)
-        layout, said, target = scene.get("layout") or {}, scene.get("recorded") or {}, scene.get("target") or {}
+        layout, said, target = episode.layout, scene.get("recorded") or {}, scene.get("target") or {}
         ids = layout.get("object_ids", [])
         poses = np.array(layout.get("poses", []), dtype=np.float64).reshape(-1, 7)
         slots = [slot for slot, there in enumerate(layout.get("present", [True] * len(ids))) if there]
+        names = {entry["id"]: entry["name"] for entry in scene.get("objects") or []}
+        if not names and {"asset_id", "name"} <= set(target):
+            names = {target["asset_id"]: target["name"]}
         return Facts(
             instruction,
             task=scene.get("task") or UNKNOWN,
@@ -110,7 +97,7 @@ def of_folder(source: Source, number: int) -> Facts:
             template=said.get("instruction_template") or "",
             relation=said.get("relation") or "",
             object_ids=[ids[slot] for slot in slots],
-            names={entry["id"]: entry["name"] for entry in scene.get("objects") or []},
+            names=names,
             positions=poses[slots, :2] if len(poses) else np.zeros((0, 2)),
             target_id=target.get("asset_id") or "",
             target_index=_place(slots, target.get("slot")) if len(poses) else None,
@@ -119,43 +106,10 @@ def of_folder(source: Source, number: int) -> Facts:
     except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise DatasetError(
             "this description of a scene is damaged",
-            where=episode.folder / "scene.json",
+            where=f"{episode.where}/{schema.SCENE_FILE}",
             found=f"{type(error).__name__}: {error}",
             fix="robocas validate says what is wrong.",
         ) from error
-
-
-def of_recording(file: TrajectoryFile, index: int) -> Facts:
-    """Facts of a recorded episode, from the JSON's entry and its first state."""
-    recording = file.recording(index)
-    entry = file.episodes[index]
-    said = entry["robocas"]
-    target = said.get("target") or {}
-    ids = said.get("objects") or []
-    slots, positions = _standing(recording, len(ids))
-    config = file.env_info["env_kwargs"].get("config")
-    return Facts(
-        recording.instruction,
-        task=task_of(str(file.env_info["env_id"])) or UNKNOWN,
-        config=_config_name(file.env_info, None),
-        success=succeeded(entry),
-        template=said.get("instruction_template") or "",
-        relation=said.get("relation") or "",
-        object_ids=[ids[slot] for slot in slots],
-        names={target["asset_id"]: target["name"]} if {"asset_id", "name"} <= set(target) else {},
-        positions=positions,
-        target_id=target.get("asset_id") or "",
-        target_index=_place(slots, target.get("slot")),
-        surface=_surface(config if isinstance(config, Mapping) else _shipped(str(config))),
-    )
-
-
-def _standing(recording: Recording, count: int) -> tuple[list[int], Array]:
-    """Slots of the objects that take part, and where they stand at the beginning; the others wait below the floor."""
-    actors = recording.states.get("actors", {})
-    found = {slot: actors[f"object_{slot}"][0, :3] for slot in range(count) if f"object_{slot}" in actors}
-    there = [slot for slot, at in found.items() if at[2] > PARKING_HEIGHT / 2]
-    return there, np.array([found[slot][:2] for slot in there], dtype=np.float64).reshape(-1, 2)
 
 
 def _place(slots: list[int], slot: int | None) -> int | None:
@@ -180,12 +134,3 @@ def _surface(config: Mapping[str, Any]) -> Surface | None:
     return Surface(
         f"{surface['furniture']}, {surface['name']}", x, y, float(np.deg2rad(pose.get("yaw_deg", 0.0))), region
     )
-
-
-@cache
-def _shipped(name: str) -> Mapping[str, Any]:
-    """A configuration by its name; empty where it can't be found any more."""
-    try:
-        return load_task_config(name).model_dump(mode="json")
-    except RobocasError:
-        return {}

@@ -22,6 +22,39 @@ def fingerprint(recording: Recording) -> str:
     return digest.hexdigest()
 
 
+def recording_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
+    """Which recording an episode is of, as ``conversion.json`` has it."""
+    episode = file.episodes[index]
+    return {
+        "trajectory": file.path.name,
+        "trajectory_episode": episode["episode_id"],
+        "seed": episode.get("episode_seed"),
+        "success": succeeded(episode),
+        "target": episode.get("robocas", {}).get("target"),
+        "recording": fingerprint(file.recording(index, bodies=False)),
+    }
+
+
+def recorded_scene(file: TrajectoryFile, index: int) -> dict[str, Any]:
+    """What the JSON beside a trajectory says of how an episode was made, by keys of ``schema.SCENE``."""
+    entry, said = file.entry(index), file.episodes[index].get("robocas", {})
+    known = {"target", "instruction", "subgoals", "objects"}  # said elsewhere
+    return {
+        "schema_version": schema.SCHEMA_VERSION,
+        "task": task_of(file.env_info["env_id"]),
+        "env_info": {key: file.env_info[key] for key in ("env_id", "env_kwargs")},
+        "seed": entry.seed,
+        "reset_options": entry.reset_options,
+        "target": said.get("target"),
+        "success": succeeded(file.episodes[index]),
+        "control_mode": entry.control_mode,
+        "control_freq": file.control_freq,
+        "source": {"trajectory": file.path.name, "episode_id": entry.episode_id},
+        "recorded": {key: value for key, value in said.items() if key not in known},
+        "versions": file.versions,
+    }
+
+
 def scene_record(
     file: TrajectoryFile, index: int, recording: Recording, scene: dict[str, Any], rate_hz: float
 ) -> dict[str, Any]:
@@ -31,30 +64,11 @@ def scene_record(
         file: the trajectory.
         index: of the episode in it.
         recording: the episode.
-        scene: ``task``, ``config``, ``layout`` and ``objects``, as the scene's source gives them.
+        scene: ``task``, ``config``, ``layout`` and ``objects``, as what shows it gives them.
         rate_hz: of the dataset.
     """
-    entry = dict(file.episodes[index].get("robocas", {}))
-    known = {"target", "instruction", "subgoals", "objects"}  # said elsewhere
-    record = {
-        **scene,
-        "schema_version": schema.SCHEMA_VERSION,
-        "env_info": {key: file.env_info[key] for key in ("env_id", "env_kwargs")},
-        "seed": recording.seed,
-        "reset_options": recording.reset_options,
-        "target": entry.get("target"),
-        "success": succeeded(file.episodes[index]),
-        "control_mode": recording.control_mode,
-        "control_freq": file.control_freq,
-        "rate_hz": rate_hz,
-        "source": {
-            "trajectory": file.path.name,
-            "episode_id": recording.episode_id,
-            "recording": fingerprint(recording),
-        },
-        "recorded": {key: value for key, value in entry.items() if key not in known},
-        "versions": file.versions,
-    }
+    record = {**recorded_scene(file, index), **scene, "rate_hz": rate_hz}
+    record["source"]["recording"] = fingerprint(recording)
     return {key: record.get(key) for key in schema.SCENE}
 
 

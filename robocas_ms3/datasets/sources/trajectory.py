@@ -1,82 +1,179 @@
-"""Training samples of a trajectory file, which holds no pictures."""
+"""Episodes of a trajectory file of ``robocas generate``: states, which are no pictures until they are rendered."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.config import load_task_config
+from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.sources.arrays import episode_arrays
-from robocas_ms3.datasets.sources.provenance import succeeded
-from robocas_ms3.datasets.sources.reader import Episode
-from robocas_ms3.datasets.writing.info import action_space, split_by_seed
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.datasets.sources.episode import DEFAULT_RATE
+from robocas_ms3.datasets.sources.protocol import Side, SourceEpisode
+from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry, succeeded
+from robocas_ms3.datasets.sources.split import split_by_seed
+from robocas_ms3.errors import DatasetError, RobocasError
 from robocas_ms3.recordings.motion import sample_states, sample_stride
-from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.recordings.subgoals import SubGoal, sample_subgoals
-
-if TYPE_CHECKING:
-    from robocas_ms3.datasets.formats import Split
+from robocas_ms3.scenes.layout import PARKING_HEIGHT
 
 
 class TrajectorySource:
-    """A trajectory file of ``robocas generate``: its episodes as ``robocas convert`` would number and sample them.
+    """An `EpisodeSource`, a trajectory file: its episodes as ``robocas convert`` would number and sample them.
+
+    Args:
+        path: of the HDF5 file.
+        rate_hz: steps a second; divides the control frequency.
+        include_failed: also episodes without success.
 
     Raises:
-        DatasetError: it can't be read, holds no (successful) episode, or the rate does not divide its frequency.
+        DatasetError: it can't be read, or the rate does not divide its frequency.
     """
 
     cameras: tuple[str, ...] = ()
     has_depth = False
     has_embeddings = False
 
-    def __init__(self, path: Path, *, rate_hz: float = 5.0, include_failed: bool = False) -> None:
-        self.path, self.rate_hz = path, rate_hz
+    def __init__(self, path: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> None:
+        self.root, self.rate_hz = path, DEFAULT_RATE if rate_hz is None else rate_hz
         with TrajectoryFile(path) as file:
-            self._stride = sample_stride(file.control_freq, rate_hz)
-            self._index = [n for n, e in enumerate(file.episodes) if include_failed or succeeded(e)]
-            self._entries = [file.entry(index) for index in self._index]
-        self.lengths = {n: len(sample_states(e.control_steps, self._stride)) for n, e in enumerate(self._entries)}
-        train, val = split_by_seed({n: entry.seed for n, entry in enumerate(self._entries)})
-        self._split = {"train": train, "val": val, "all": list(self.lengths)}
+            self.stride = sample_stride(file.control_freq, self.rate_hz)
+            self.index = [n for n, e in enumerate(file.episodes) if include_failed or succeeded(e)]
+            self.entries = [file.entry(index) for index in self.index]
+            self._scenes = [recorded_scene(file, index) for index in self.index]
+            self.objects = [list(file.episodes[i]["robocas"].get("objects") or ()) for i in self.index]
+        self.numbers = list(range(len(self.index)))
+        self.lengths = {n: len(sample_states(e.control_steps, self.stride)) for n, e in enumerate(self.entries)}
+        train, val = split_by_seed({n: entry.seed for n, entry in enumerate(self.entries)})
+        self._split = {"train": train, "val": val, "all": self.numbers}
 
-    def split(self, side: Split) -> list[int]:
+    def split(self, side: Side) -> list[int]:
         """Numbers of the episodes of one side, by the rule of ``robocas convert``."""
         return self._split[side]
 
-    def goals(self, number: int) -> list[SubGoal]:
-        """Sub-goals of an episode, over the sampled steps."""
-        entry = self._entries[number]
-        return sample_subgoals(entry.subgoals, sample_states(entry.control_steps, self._stride))
+    def entry(self, number: int) -> Mapping[str, Any]:
+        """Which recording it is."""
+        with TrajectoryFile(self.root) as file:
+            return recording_entry(file, self.index[number])
 
-    def arrays(self, number: int, keys: Sequence[str]) -> dict[str, NDArray]:
-        """Compute an episode's arrays from its states, by forward kinematics.
+    def action_space(self) -> dict[str, Any]:
+        """Percentiles over all episodes, which are read for it."""
+        parts = [self.episode(number).read(("rel_pos", "rel_orn")) for number in self.numbers]
+        return action_space([part["rel_pos"] for part in parts], [part["rel_orn"] for part in parts])
+
+    def episode(self, number: int) -> RecordedEpisode:
+        """Open an episode.
+
+        Raises:
+            DatasetError: there is none of this number.
+        """
+        if number not in self.lengths:
+            raise DatasetError("no such episode", where=self.root, expected=f"0 to {len(self.index) - 1}", found=number)
+        return RecordedEpisode(self, number)
+
+    def scene(self, number: int) -> dict[str, Any]:
+        """What the JSON says of how an episode was made."""
+        scene = self._scenes[number]
+        config = scene["env_info"]["env_kwargs"].get("config")
+        return {**scene, "config": config if isinstance(config, Mapping) else _shipped(str(config))}
+
+
+class RecordedEpisode(SourceEpisode):
+    """A `SourceEpisode`; its arrays are computed from the states, by forward kinematics."""
+
+    def __init__(self, source: TrajectorySource, number: int) -> None:
+        self._source, self._number = source, number
+        self._entry = source.entries[number]
+
+    @property
+    def where(self) -> str:
+        """File and recording."""
+        return f"{self._source.root}, traj_{self._entry.episode_id}"
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return self._source.lengths[self._number]
+
+    @cached_property
+    def arrays(self) -> dict[str, NDArray]:
+        """All but the embeddings.
 
         Raises:
             DatasetError: it is damaged, or the states are those of another robot.
         """
-        with TrajectoryFile(self.path) as file:
-            recording = file.recording(self._index[number], bodies=False)
-        samples = sample_states(recording.control_steps, self._stride)
-        made = episode_arrays(recording.motion(samples), recording.instruction, self.goals(number))
-        missing = [key for key in keys if key not in made]
+        recording = self._recording(bodies=False)
+        samples = sample_states(recording.control_steps, self._source.stride)
+        return episode_arrays(recording.motion(samples), recording.instruction, self.goals)
+
+    def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
+        """Some of them; see `arrays`."""
+        missing = [key for key in keys if key not in self.arrays]
         if missing:
-            raise DatasetError("a trajectory file does not hold this", where=self.path, found=", ".join(missing))
-        return {key: made[key] for key in keys}
+            raise DatasetError("a trajectory file does not hold this", where=self.where, found=", ".join(missing))
+        return {key: self.arrays[key] for key in keys}
 
-    def action_space(self) -> dict[str, Any]:
-        """Percentiles over all episodes, which are read for it."""
-        parts = [self.arrays(number, ("rel_pos", "rel_orn")) for number in self.lengths]
-        return action_space([part["rel_pos"] for part in parts], [part["rel_orn"] for part in parts])
+    @property
+    def goals(self) -> list[SubGoal]:
+        """Sub-goals over the sampled steps."""
+        samples = sample_states(self._entry.control_steps, self._source.stride)
+        return sample_subgoals(self._entry.subgoals, samples)
 
-    def episode(self, number: int) -> Episode:
-        """Not here.
+    @property
+    def scene(self) -> dict[str, Any]:
+        """What the JSON says."""
+        return self._source.scene(self._number)
 
-        Raises:
-            DatasetError: always.
-        """
-        raise DatasetError(
-            "a trajectory file holds no pictures", where=self.path, fix="Convert it with robocas convert."
-        )
+    @cached_property
+    def layout(self) -> dict[str, Any]:
+        """Objects at the first state; those that take no part wait below the floor."""
+        ids = self._source.objects[self._number]
+        actors = self._recording(bodies=True).states.get("actors", {})
+        poses = [actors[f"object_{slot}"][0, :7] if f"object_{slot}" in actors else None for slot in range(len(ids))]
+        there = [pose is not None and bool(pose[2] > PARKING_HEIGHT / 2) for pose in poses]
+        known = [[0.0] * 7 if pose is None else pose.tolist() for pose in poses]
+        return {"object_ids": ids, "poses": known, "present": there}
+
+    def _recording(self, *, bodies: bool) -> Recording:
+        with TrajectoryFile(self._source.root) as file:
+            return file.recording(self._source.index[self._number], bodies=bodies)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """None."""
+        return ()
+
+    def _no_pictures(self) -> DatasetError:
+        fix = "Convert it with robocas convert."
+        return DatasetError("a trajectory file holds no pictures", where=self._source.root, fix=fix)
+
+    def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
+        """Not here: raises."""
+        raise self._no_pictures()
+
+    def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
+        """Not here: raises."""
+        raise self._no_pictures()
+
+    def intrinsic(self, camera: str) -> NDArray[np.float64]:
+        """Not here: raises."""
+        raise self._no_pictures()
+
+    def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
+        """Not here: raises."""
+        raise self._no_pictures()
+
+
+@cache
+def _shipped(name: str) -> Mapping[str, Any]:
+    """A configuration by its name; empty where it can't be found any more."""
+    try:
+        return load_task_config(name).model_dump(mode="json")
+    except RobocasError:
+        return {}

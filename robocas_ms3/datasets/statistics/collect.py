@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.sources.facts import Facts, facts_reader
+from robocas_ms3.datasets.sources.facts import Facts, facts_of
 from robocas_ms3.datasets.statistics.described import count_of, counted, described, histogram, rounded
 from robocas_ms3.datasets.statistics.layout_map import LayoutMap, layout_map
 from robocas_ms3.datasets.training.sample_arrays import checked_actions
@@ -128,7 +128,7 @@ class Stats:
 def collect(
     path: Path | str, *, rate_hz: float | None = None, on_episode: Callable[[int, int], None] | None = None
 ) -> Stats:
-    """Read a RoboCAS folder or a trajectory file (failed episodes too), without pictures.
+    """Read a dataset or a trajectory file (failed episodes too), without pictures.
 
     Args:
         path: of it.
@@ -142,23 +142,23 @@ def collect(
     numbers = source.split("all")
     if not numbers:
         raise DatasetError("no episodes to count", where=path)
-    stats = Stats(source.path, source.rate_hz, {side: len(source.split(side)) for side in ("train", "val")})
+    stats = Stats(source.root, source.rate_hz, {side: len(source.split(side)) for side in ("train", "val")})
     actions: list[NDArray[np.float32]] = []
     places: dict[str, list[Facts]] = defaultdict(list)
-    with facts_reader(source) as read:
-        for done, number in enumerate(numbers, start=1):
-            facts = read(number)
-            _count(stats, facts)
-            for goal in source.goals(number):
-                stats.subgoals[goal.goal_type].append(goal.last - goal.first + 1)
-            moves = checked_actions(source.arrays(number, ACTION_ARRAYS), f"{source.path}, episode {number}")[:-1]
-            actions.append(moves)
-            stats.gripper_changes.append(int(np.count_nonzero(np.diff(moves[:, 6]))))
-            stats.lengths[facts.task].append(source.lengths[number])
-            if len(facts.positions):
-                places[facts.config].append(facts)
-            if on_episode:
-                on_episode(done, len(numbers))
+    for done, number in enumerate(numbers, start=1):
+        episode = source.episode(number)
+        facts = facts_of(episode)
+        _count(stats, facts)
+        for goal in episode.goals:
+            stats.subgoals[goal.goal_type].append(goal.last - goal.first + 1)
+        moves = checked_actions(episode.read(ACTION_ARRAYS), f"{source.root}, episode {number}")[:-1]
+        actions.append(moves)
+        stats.gripper_changes.append(int(np.count_nonzero(np.diff(moves[:, 6]))))
+        stats.lengths[facts.task].append(source.lengths[number])
+        if len(facts.positions):
+            places[facts.config].append(facts)
+        if on_episode:
+            on_episode(done, len(numbers))
     if actions:
         stats.actions = np.concatenate(actions)
     stats.layouts = {config: layout_map(parts) for config, parts in places.items()}

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, episode_actions
-from robocas_ms3.datasets.formats import Source
+from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.datasets.sources.tolerant import first_line
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.language.templates import GOAL_TYPES
 
 
-def check_holds(source: Source, cameras: Sequence[str], *, depth: bool, embedding: bool) -> None:
+def check_holds(source: EpisodeSource, cameras: Sequence[str], *, depth: bool, embedding: bool) -> None:
     """Check that a source holds what samples are to be made of.
 
     Raises:
@@ -27,21 +27,21 @@ def check_holds(source: Source, cameras: Sequence[str], *, depth: bool, embeddin
     if wrong and not pictures:
         raise DatasetError(
             "there are no pictures here",
-            where=source.path,
+            where=source.root,
             expected="cameras=()",
             found=f"cameras={cameras}",
             fix="Pass cameras=(), or make pictures with robocas convert.",
         )
     if wrong or len(set(cameras)) < len(cameras):
         expected = f"some of {', '.join(pictures)}, each once"
-        raise DatasetError("no such camera", where=source.path, expected=expected, found=", ".join(cameras))
+        raise DatasetError("no such camera", where=source.root, expected=expected, found=", ".join(cameras))
     if depth and not (source.has_depth and cameras):
         found = "no cameras" if source.has_depth else "no depth"
-        raise DatasetError("there is no depth here", where=source.path, found=found, fix="Pass depth=False.")
+        raise DatasetError("there is no depth here", where=source.root, found=found, fix="Pass depth=False.")
     if embedding and not source.has_embeddings:
         raise DatasetError(
             "there are no embeddings here",
-            where=source.path,
+            where=source.root,
             fix="Pass embedding=False, or convert the trajectory with embeddings.",
         )
 
@@ -72,7 +72,7 @@ def checked_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.flo
 
 
 def read_episode(
-    source: Source, number: int, state: Sequence[str], *, embedding: bool, subgoals: bool
+    source: EpisodeSource, number: int, state: Sequence[str], *, embedding: bool, subgoals: bool
 ) -> dict[str, Any]:
     """Read what an episode's samples are made of, all but the pictures.
 
@@ -93,9 +93,9 @@ def read_episode(
     keys = (*ACTION_ARRAYS, *state, "language_goal")
     keys += ("step_lang_goals", "step_goal_type") * subgoals
     keys += ("language_embedding",) * embedding + ("step_goal_embs",) * (embedding and subgoals)
-    arrays = source.arrays(number, keys)
+    arrays = source.episode(number).read(keys)
     length = source.lengths[number]
-    where = f"{source.path}, episode {number}"
+    where = f"{source.root}, episode {number}"
     for key, array in arrays.items():
         if key not in {"language_goal", "language_embedding"} and len(array) != length:
             raise DatasetError(

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import get_worker_info
 
-from robocas_ms3.datasets.sources.reader import Episode
+from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.errors import DatasetError
 
 _settled = -1  # the process that was settled last
@@ -33,7 +33,7 @@ class PictureStack:
     float_images: bool
 
     def read(
-        self, episode: Episode, observed: NDArray[np.int64], kind: Literal["rgb", "depth"], *, zero: bool
+        self, episode: SourceEpisode, observed: NDArray[np.int64], kind: Literal["rgb", "depth"], *, zero: bool
     ) -> torch.Tensor:
         """Read the pictures of some steps: (H, C, 3, h, w) or (H, C, h, w).
 
@@ -51,15 +51,13 @@ class PictureStack:
         decoded = {int(s): self._stack(episode, int(s), kind) for s in np.unique(steps)}
         shapes = {picture.shape for picture in decoded.values()}
         if len(shapes) > 1:
-            raise DatasetError(
-                "pictures differ in size", where=episode.folder, found=sorted(shapes), fix="Pass a size."
-            )
+            raise DatasetError("pictures differ in size", where=episode.where, found=sorted(shapes), fix="Pass a size.")
         stack = np.stack([decoded[int(step)] for step in steps])
         if zero:
             stack[observed < 0] = 0
         return torch.from_numpy(stack)
 
-    def _stack(self, episode: Episode, step: int, kind: Literal["rgb", "depth"]) -> NDArray:
+    def _stack(self, episode: SourceEpisode, step: int, kind: Literal["rgb", "depth"]) -> NDArray:
         """One step's pictures, cameras first: (C, 3, h, w) or (C, h, w)."""
         shots = []
         for camera in self.cameras:
@@ -67,14 +65,14 @@ class PictureStack:
             if (picture.ndim, picture.dtype) != ((3, np.uint8) if kind == "rgb" else (2, np.uint16)):
                 raise DatasetError(
                     "not a picture of this kind",
-                    where=episode.image_path(camera, kind, step),
+                    where=f"{episode.where}/{camera}/{kind}, step {step}",
                     expected="(H, W, 3) uint8" if kind == "rgb" else "(H, W) uint16",
                     found=f"{picture.shape} {picture.dtype}",
                 )
             shots.append(_resize(picture, self.size))
         if len({shot.shape for shot in shots}) > 1:
             found = [shot.shape for shot in shots]
-            raise DatasetError("cameras differ in size", where=episode.folder, found=found, fix="Pass a size.")
+            raise DatasetError("cameras differ in size", where=episode.where, found=found, fix="Pass a size.")
         stack = np.stack(shots)
         if kind == "depth":
             return stack.astype(np.float32) / 1000

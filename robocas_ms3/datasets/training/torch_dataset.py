@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import ActionScale
-from robocas_ms3.datasets.formats import Split, open_source
+from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.sources.protocol import Side
 from robocas_ms3.datasets.training.sample_arrays import check_holds, read_episode, type_index
 from robocas_ms3.datasets.training.sample_pictures import PictureStack
 from robocas_ms3.datasets.training.sampling import SampleIndex, balancing_weights
@@ -83,7 +84,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
         self,
         path: Path | str,
         *,
-        split: Split = "train",
+        split: Side = "train",
         observation_horizon: int = 6,
         action_horizon: int = 1,
         padding: Padding = "hold",
@@ -105,7 +106,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
         self.cameras, self.size, self.depth, self.float_images = tuple(cameras), size, depth, float_images
         self.state, self.embedding, self.subgoals = tuple(state), embedding, subgoals
         self.transform = transform
-        _check_choice("split", split, get_args(Split))
+        _check_choice("split", split, get_args(Side))
         for key in self.state:
             _check_choice("state", key, STATE_KEYS)
         if size is not None and (len(size) != 2 or min(size) < 1):
@@ -141,7 +142,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
 
     def _stages_of(self, number: int, steps: range) -> NDArray[np.int8]:
         stages = np.full(self.source.lengths[number], -1, dtype=np.int8)
-        for goal in self.source.goals(number):
+        for goal in self.source.episode(number).goals:
             stages[goal.first : goal.last + 1] = type_index(goal.goal_type)
         return stages[steps.start : steps.stop]
 
@@ -184,7 +185,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
             DatasetError: no sub-goals are known.
         """
         if (self._stages < 0).all():
-            raise DatasetError("no sub-goals are known here", where=self.source.path, expected="step_goals")
+            raise DatasetError("no sub-goals are known here", where=self.source.root, expected="step_goals")
         return torch.from_numpy(balancing_weights(self._stages))
 
     def __getitem__(self, index: int) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.preview import FEW, finish_previews, on_sheet
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.sources.provenance import succeeded
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.failures import add_failures
+from robocas_ms3.datasets.writing.frames import OpenSource, open_env
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.output import check_overwrite, kept_if_begun, sweep
 from robocas_ms3.datasets.writing.plan import (
@@ -29,14 +29,11 @@ from robocas_ms3.datasets.writing.plan import (
     resumed_plan,
     still_missing,
 )
+from robocas_ms3.datasets.writing.players import Player, RecordingPlayer, Request
 from robocas_ms3.datasets.writing.timing import Timing
-from robocas_ms3.datasets.writing.workers import Job, OpenSource, write_all
-from robocas_ms3.datasets.writing.writer import FrameSource, WrittenEpisode
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.datasets.writing.workers import Job, write_all
+from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
-from robocas_ms3.recordings.environment import RecordedEnv
-from robocas_ms3.recordings.motion import sample_stride
-from robocas_ms3.recordings.reading import TrajectoryFile
 
 _log = logging.getLogger(__name__)
 
@@ -65,18 +62,11 @@ class Conversion:
         return sum((episode.timing for episode in self.episodes), start=Timing(write=self.joining))
 
 
-def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> FrameSource:
-    """Show states through the environment that recorded them."""
-    from robocas_ms3.datasets.writing.render import EnvFrames
-
-    return EnvFrames(env, control_mode, pictures)
-
-
 def convert(
     trajectory: str | Path,
     out: str | Path,
     *,
-    rate_hz: float = 5.0,
+    rate_hz: float | None = None,
     pictures: Pictures | None = None,
     embeddings: bool = True,
     include_failed: bool = False,
@@ -98,7 +88,7 @@ def convert(
     Args:
         trajectory: ``F.h5`` with ``F.json`` beside it; a ``failures.jsonl`` in the same folder goes along.
         out: the dataset's folder.
-        rate_hz: steps a second; divides the control frequency.
+        rate_hz: steps a second; divides the control frequency; None: 5.
         pictures: which ones; default: RGB as PNG and depth of all cameras, 640 x 480.
         embeddings: whether to embed the texts.
         include_failed: also convert episodes without success.
@@ -119,28 +109,27 @@ def convert(
         MissingExtraError: embeddings are wanted and the ``language`` extra is not installed.
     """
     begun = time.perf_counter()
-    out, pictures = Path(out), pictures or Pictures()
-    with TrajectoryFile(trajectory, pack=pack) as file:
-        stride = sample_stride(file.control_freq, rate_hz)
-        chosen = choose(file, include_failed)
-        settings = dataset_settings(rate_hz, pictures, embeddings)
+    out = Path(out)
+    request = Request(Path(trajectory), rate_hz, pictures or Pictures(), include_failed, open_source, pack)
+    with closing(RecordingPlayer(request)) as player:
+        entries = player.entries()
+        settings = dataset_settings(player.rate_hz, player.pictures, embeddings)
         with locked_folder(out):  # from the plan on: it numbers after what is there
             # Everything that may fail comes before the output is touched.
             claim_output(out, resume=resume or append or overwrite)
             if append:
-                plan = appended_plan(out, file, chosen, settings)
+                plan = appended_plan(out, entries, settings)
             elif resume:
-                plan = resumed_plan(out, file, chosen, settings)
+                plan = resumed_plan(out, entries, settings)
             else:
-                plan = new_plan(file, chosen, settings)
+                plan = new_plan(entries, settings)
                 if overwrite:
                     check_overwrite(out)
-            if open_source is open_env:
+            if request.renders:
                 from robocas_ms3.datasets.writing.render import require_renderer
 
                 require_renderer()
-            warn_untried(file, chosen, rate_hz)
-            vectors = embed_texts(file, chosen) if embeddings else None
+            vectors = embed_texts(player, entries) if embeddings else None
             claim_output(out, overwrite=overwrite and not (resume or append), resume=True)
             make_folder(out)
             sweep(out)
@@ -151,8 +140,7 @@ def convert(
             sheet = None
             if previews or (previews is None and len(plan.tasks) <= FEW):
                 sheet = on_sheet(map(int, plan.content["episodes"]))
-            job = Job(file.path, pack, out, stride, rate_hz, pictures, vectors, open_source, sheet, missing)
-            written = _write(job, file.env_info, plan, jobs, on_episode)
+            written = _write(Job(request, out, vectors, sheet, missing), player.file.env_info, plan, jobs, on_episode)
             if left := still_missing(out, plan.content):
                 _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))
     written.sort(key=lambda episode: episode.number)
@@ -176,7 +164,7 @@ def _write(
                 written.append(episode)
                 if on_episode:
                     on_episode(episode)
-        add_failures(job.trajectory.parent, job.out, env_info)
+        add_failures(job.request.path.parent, job.out, env_info)
         write_info(job.out, before)
     if job.sheet is not None:
         finish_previews(job.out, {episode.number: episode.row for episode in written if episode.row is not None})
@@ -190,44 +178,10 @@ def _split_before(out: Path) -> tuple[list[int], list[int]]:
     return Dataset(out).sides
 
 
-def choose(file: TrajectoryFile, include_failed: bool) -> list[int]:
-    """Indices of the episodes to convert.
-
-    Raises:
-        DatasetError: there are none.
-    """
-    chosen = [i for i, episode in enumerate(file.episodes) if include_failed or succeeded(episode)]
-    if not chosen:
-        some = bool(file.episodes)
-        raise DatasetError(
-            "no successful episodes to convert" if some else "no episodes to convert",
-            where=file.path,
-            found=f"{len(file.episodes)} episodes",
-            fix="Pass --include-failed to convert them all the same." if some else "",
-        )
-    return chosen
-
-
-def warn_untried(file: TrajectoryFile, chosen: list[int], rate_hz: float) -> None:
-    """Say so where the recordings' actions were tried open loop, but at another rate than the dataset's."""
-    said = [file.episodes[index].get("robocas", {}).get("replay_rate") for index in chosen]
-    tried = {float(rate) for rate in said if isinstance(rate, int | float) and rate}  # else not tried, or not known
-    others = sorted(rate for rate in tried if abs(rate - rate_hz) > 1e-9)
-    if others:
-        _log.warning(
-            "actions were tried at %s Hz; at %g Hz they were not: robocas validate --replay tells (of RoboCAS folders)",
-            *(" and ".join(f"{rate:g}" for rate in others), rate_hz),
-        )
-
-
-def embed_texts(file: TrajectoryFile, chosen: list[int]) -> dict[str, NDArray[np.float32]]:
+def embed_texts(player: Player, entries: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float32]]:
     """Embed every distinct text here, so that no worker has to load the model."""
     from robocas_ms3.language.embed import TextEmbedder
 
     embedder = TextEmbedder()
-    texts: dict[str, None] = {}
-    for index in chosen:
-        entry = file.entry(index)
-        texts[entry.instruction] = None
-        texts.update(dict.fromkeys(goal.goal_description for goal in entry.subgoals))
+    texts = list(dict.fromkeys(text for entry in entries for text in player.texts(entry["source"])))
     return dict(zip(texts, embedder(texts), strict=True))

@@ -2,69 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.sources.tolerant import DAMAGED, first_line
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import write_json
 from robocas_ms3.recordings.seeds import one_seed
-from robocas_ms3.recordings.subgoals import SubGoal
-
-SPLIT_RULE = (
-    "seeds in the order of sha256(seed), the first tenth validates; episodes of one seed stay together; what is"
-    " appended changes no earlier episode's side"
-)
-
-
-def split_by_seed(
-    seeds: Mapping[int, int], before: tuple[Iterable[int], Iterable[int]] = ((), ())
-) -> tuple[list[int], list[int]]:
-    """Split episodes 90 : 10. A seed's place depends on no order and no generator, only on the other seeds.
-
-    Args:
-        seeds: episode number -> seed.
-        before: training and validation episodes so far; they and their seeds keep their side, and of the new seeds as
-            many validate as make up a tenth of all.
-
-    Returns:
-        Training and validation episodes, sorted. At least one seed validates where there are two.
-    """
-    old = [{seeds[number] for number in numbers if number in seeds} for numbers in before]
-    ranked = sorted(set(seeds.values()), key=lambda seed: hashlib.sha256(str(seed).encode()).hexdigest())
-    count = max(1, round(len(ranked) / 10)) if len(ranked) > 1 else 0
-    new = [seed for seed in ranked if seed not in old[0] | old[1]]
-    chosen = old[1] | set(new[: max(0, count - len(old[1]))])
-    kept = set(before[0])  # an episode that trains goes on to, whatever others of its seed do
-    val = sorted(number for number, seed in seeds.items() if seed in chosen and number not in kept)
-    return sorted(set(seeds) - set(val)), val
-
-
-def action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray]) -> dict[str, list[list[float]]]:
-    """Range of the relative motions: 1st and 99th percentile of each axis over all episodes.
-
-    Args:
-        rel_pos: (T, 3) of each episode; the last row, which is no motion, does not count.
-        rel_orn: (T, 4) xyzw of each episode.
-    """
-    positions = np.concatenate([rows[:-1] for rows in rel_pos]).astype(np.float64)
-    quaternions = np.concatenate([rows[:-1] for rows in rel_orn]).astype(np.float64)
-    angles = Rotation.from_quat(quaternions).as_euler("xyz")
-    return {
-        "relative_position": np.percentile(positions, [1, 99], axis=0).tolist(),
-        "relative_rotation": np.percentile(angles, [1, 99], axis=0).tolist(),
-    }
+from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
 
 
 @dataclass(frozen=True)
@@ -113,22 +68,13 @@ def summarize(episode: Episode, number: int) -> Summary:
         number if seed is None else seed,
         int(arrays["episode_length"]),
         str(arrays["language_goal"]),
-        runs(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist()),
+        subgoal_runs(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist()),
         arrays["rel_pos"],
         arrays["rel_orn"],
     )
 
 
 _NEEDED = ("episode_length", "language_goal", "step_goal_type", "step_lang_goals", "rel_pos", "rel_orn")
-
-
-def runs(types: Sequence[str], texts: Sequence[str]) -> list[SubGoal]:
-    """Sub-goals of steps that follow each other."""
-    goals: list[SubGoal] = []
-    for (kind, text), steps in groupby(range(len(types)), key=lambda step: (types[step], texts[step])):
-        inside = list(steps)
-        goals.append(SubGoal(kind, text, inside[0], inside[-1]))
-    return goals
 
 
 def write_info(root: Path, before: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:

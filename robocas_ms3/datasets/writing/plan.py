@@ -6,7 +6,7 @@ It is written before the first episode, so that a conversion killed at any momen
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,11 @@ from typing import Any
 import robocas_ms3
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.sources.provenance import fingerprint, succeeded
-from robocas_ms3.datasets.writing.info import SPLIT_RULE
+from robocas_ms3.datasets.sources.split import SPLIT_RULE
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.reading import TrajectoryFile
+
+Entries = Sequence[dict[str, Any]]
+"""What is to be converted, see `players.Player.entries`."""
 
 SETTINGS = ("rate_hz", "cameras", "image_size", "image_format", "depth", "embeddings")
 """What all episodes of a dataset share."""
@@ -29,7 +30,7 @@ class Plan:
 
     Attributes:
         content: of ``conversion.json``.
-        tasks: (episode number, index in the trajectory) of all of this trajectory's episodes in it, written or not.
+        tasks: (episode number, number in the source) of all of this source's episodes in it, written or not.
     """
 
     content: dict[str, Any]
@@ -48,36 +49,33 @@ def dataset_settings(rate_hz: float, pictures: Pictures, embeddings: bool) -> di
     }
 
 
-def new_plan(file: TrajectoryFile, chosen: list[int], settings: dict[str, Any]) -> Plan:
-    """Number a trajectory's chosen episodes from 0 on."""
-    return _extended(_header(settings), {}, file, chosen, first=0)
+def new_plan(entries: Entries, settings: dict[str, Any]) -> Plan:
+    """Number a source's episodes from 0 on."""
+    return _extended(header(settings), {}, entries, first=0)
 
 
-def resumed_plan(out: Path, file: TrajectoryFile, chosen: list[int], settings: dict[str, Any]) -> Plan:
+def resumed_plan(out: Path, entries: Entries, settings: dict[str, Any]) -> Plan:
     """Go on with what was begun; where nothing was, begin.
 
     Raises:
         DatasetError: another conversion was begun there.
     """
     if not out.is_dir() or not any(out.iterdir()):
-        return new_plan(file, chosen, settings)
+        return new_plan(entries, settings)
     before = _read(out, missing="can't resume: no conversion was begun here", fix="Pass --overwrite.")
     check_settings(out, before, settings, "can't resume with other settings", "--overwrite, or the settings of before")
-    planned = before["episodes"]
-    by_recording = {entry["recording"]: int(number) for number, entry in planned.items()}
-    marks = [fingerprint(file.recording(index, bodies=False)) for index in chosen]
-    unknown = [index for index, mark in zip(chosen, marks, strict=True) if mark not in by_recording]
-    if unknown:
+    known, new = _divided(before, entries)
+    if new:
         raise DatasetError(
             "can't resume: these recordings are not what was begun here",
             where=out / schema.CONVERSION_FILE,
-            found=f"{len(unknown)} of {len(chosen)} are new",
+            found=f"{len(new)} of {len(entries)} are new",
             fix="Pass --append to add them, --overwrite to begin again.",
         )
-    return Plan(before, [(by_recording[mark], index) for index, mark in zip(chosen, marks, strict=True)])
+    return Plan(before, known)
 
 
-def appended_plan(out: Path, file: TrajectoryFile, chosen: list[int], settings: dict[str, Any]) -> Plan:
+def appended_plan(out: Path, entries: Entries, settings: dict[str, Any]) -> Plan:
     """Number what is new after what is there; what is there already keeps its number.
 
     Raises:
@@ -85,17 +83,17 @@ def appended_plan(out: Path, file: TrajectoryFile, chosen: list[int], settings: 
     """
     before = _read(out, missing="no dataset to append to", fix="Convert without --append first.")
     check_settings(out, before, settings, "can't append with other settings", "the settings of before")
-    by_recording = {entry["recording"]: int(number) for number, entry in before["episodes"].items()}
-    known, new = [], []
-    for index in chosen:
-        mark = fingerprint(file.recording(index, bodies=False))
-        if mark in by_recording:
-            known.append((by_recording[mark], index))
-        else:
-            new.append(index)
+    known, new = _divided(before, entries)
     first = max((int(number) for number in before["episodes"]), default=-1) + 1
-    plan = _extended(before, before["episodes"], file, new, first)
+    plan = _extended(before, before["episodes"], new, first)
     return Plan(plan.content, [*known, *plan.tasks])
+
+
+def _divided(before: Mapping[str, Any], entries: Entries) -> tuple[list[tuple[int, int]], list[dict[str, Any]]]:
+    """(Number, number in the source) of the episodes that are planned already, and the entries that are not."""
+    planned = {entry["recording"]: int(number) for number, entry in before["episodes"].items()}
+    known = [(planned[entry["recording"]], entry["source"]) for entry in entries if entry["recording"] in planned]
+    return known, [entry for entry in entries if entry["recording"] not in planned]
 
 
 def still_missing(out: Path, content: Mapping[str, Any]) -> list[str]:
@@ -135,33 +133,24 @@ def check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any],
         )
 
 
-def _header(settings: dict[str, Any]) -> dict[str, Any]:
+def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[str, Any]:
+    """What ``conversion.json`` says of a dataset as a whole."""
     return {
         "format": "robocas",
         "schema_version": schema.SCHEMA_VERSION,
         "made_with": {"robocas_ms3": robocas_ms3.__version__},
         **settings,
-        "split": SPLIT_RULE,
+        "split": split_rule,
     }
 
 
-def _extended(
-    header: Mapping[str, Any], episodes: Mapping[str, Any], file: TrajectoryFile, chosen: list[int], first: int
-) -> Plan:
-    tasks = list(enumerate(chosen, start=first))
-    added = {}
-    for number, index in tasks:
-        episode = file.episodes[index]
-        added[str(number)] = {
-            "trajectory": file.path.name,
-            "trajectory_episode": episode["episode_id"],
-            "seed": episode.get("episode_seed"),
-            "success": succeeded(episode),
-            "target": episode.get("robocas", {}).get("target"),
-            "recording": fingerprint(file.recording(index, bodies=False)),
-        }
-    content = json.loads(json.dumps({**header, "episodes": {**episodes, **added}}))
-    return Plan(content, tasks)
+def _extended(head: Mapping[str, Any], episodes: Mapping[str, Any], entries: Entries, first: int) -> Plan:
+    tasks = [(number, entry["source"]) for number, entry in enumerate(entries, start=first)]
+    added = {
+        str(number): {key: value for key, value in entry.items() if key != "source"}
+        for number, entry in enumerate(entries, start=first)
+    }
+    return Plan(json.loads(json.dumps({**head, "episodes": {**episodes, **added}})), tasks)
 
 
 def _read(out: Path, missing: str, fix: str) -> dict[str, Any]:

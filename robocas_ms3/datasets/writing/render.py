@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.writing.writer import CameraModel, Frame
+from robocas_ms3.datasets.writing.frames import CameraModel, Frame
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import inverse
 from robocas_ms3.recordings.environment import RecordedEnv

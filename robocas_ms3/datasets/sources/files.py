@@ -1,0 +1,73 @@
+"""What lies in a dataset's folder, read with errors that say where: JSON, arrays, and folders that are no dataset."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.errors import DatasetError
+
+SEE_VALIDATE = "robocas validate lists all that is wrong."
+
+
+def no_dataset(root: Path, expected: str) -> DatasetError:
+    """What to say of a folder that is no dataset, with what may have been meant."""
+    if (root / "meta" / "info.json").is_file():
+        return DatasetError("a LeRobot dataset; this takes RoboCAS folders", where=root)
+    meant = near(root)
+    fix = f"Did you mean {meant}?" if meant else "Make one with robocas convert."
+    return DatasetError("no dataset here", where=root, expected=expected, fix=fix)
+
+
+def near(root: Path) -> Path | None:
+    """The first dataset or recording in a folder."""
+    if not root.is_dir():
+        return None
+    datasets = sorted(root.glob(f"*/{schema.CONVERSION_FILE}")) or sorted(root.glob(f"*/{schema.DATA_INFO_FILE}"))
+    return next(iter([path.parent for path in datasets] or sorted(root.glob("*.h5"))), None)
+
+
+def said_of(info: Mapping[str, Any], number: int | None) -> dict[str, Any]:
+    """What ``data_info.json`` says of an episode: its entry under each key that has entries of episodes."""
+    tables = {key: info.get(key) for key in ("ep_length", "language_goal", "step_goals")}
+    return {k: table[str(number)] for k, table in tables.items() if isinstance(table, dict) and str(number) in table}
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object; empty where there is no such file.
+
+    Raises:
+        DatasetError: it is damaged, or no object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise DatasetError("this JSON is damaged", where=path, found=str(error).splitlines()[0]) from error
+    if not isinstance(content, dict):
+        raise DatasetError("this JSON is damaged", where=path, expected="an object", found=type(content).__name__)
+    return content
+
+
+def read_array(path: Path) -> NDArray[np.float64]:
+    """An array of numbers.
+
+    Raises:
+        DatasetError: the file is missing or damaged, or holds something else.
+    """
+    try:
+        array = np.load(path, allow_pickle=False)
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+            raise ValueError("no array of numbers")
+    except (OSError, ValueError, EOFError) as error:
+        raise DatasetError(
+            "this array can't be read", where=path, found=str(error).splitlines()[0], fix=SEE_VALIDATE
+        ) from error
+    return array
