@@ -9,20 +9,24 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 if TYPE_CHECKING:
+    from robocas_ms3.datasets.formats import Format
     from robocas_ms3.datasets.writing.convert import Conversion
 
 
 @dataclass
 class Convert:
-    """Write a dataset from a trajectory file made by ``robocas generate``; LeRobot's also from a RoboCAS dataset."""
+    """Write a dataset from a trajectory file made by ``robocas generate``; LeRobot's also from a RoboCAS dataset.
+
+    Formats of other packages are named by --to as well; docs/extending.md.
+    """
 
     trajectory: Annotated[Path, tyro.conf.Positional]
     """F.h5, with F.json beside it, which is rendered; for --to lerobot also the folder of a RoboCAS dataset, whose
     pictures are taken."""
     out: Path
     """Folder of the dataset."""
-    to: Literal["robocas", "lerobot"] = "robocas"
-    """Format of the dataset; lerobot is LeRobot's v3.0 and needs the extra 'lerobot'."""
+    to: str = "robocas"
+    """Format of the dataset: robocas, lerobot (LeRobot's v3.0, needs the extra 'lerobot'), or another package's."""
     codec: Literal["h264", "av1"] = "h264"
     """Of lerobot's videos; AV1 takes half the space."""
     rate: float | None = None
@@ -89,36 +93,53 @@ def _check(cfg: Convert) -> None:
         raise DatasetError("a camera is named twice", where="--cameras", expected="each once", found=found)
 
 
+def _format(cfg: Convert) -> Format:
+    """What is written.
+
+    Raises:
+        DatasetError: there is no such format, or a flag does not suit it.
+    """
+    from robocas_ms3.datasets.formats import formats
+    from robocas_ms3.errors import DatasetError
+
+    known = {name: one for name, one in formats().items() if one.writer}
+    if cfg.to not in known:
+        raise DatasetError("no such format", where="--to", expected=f"one of {', '.join(known)}", found=cfg.to)
+    flags = {"append": cfg.append, "image_format": cfg.image_format != "png", "codec": cfg.codec != "h264"}
+    for option, given in flags.items():
+        if given and option not in known[cfg.to].options:
+            flag = f"--{option.replace('_', '-')}"
+            raise DatasetError(f"not for {known[cfg.to].title}s", where=flag, fix="Leave it out.")
+    return known[cfg.to]
+
+
 def _convert(cfg: Convert) -> int:
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.datasets.pictures.stored import Pictures
     from robocas_ms3.datasets.statistics.described import count_of
-    from robocas_ms3.datasets.writing.convert import convert
 
+    chosen = _format(cfg)
     with bar("episodes") as shown:
-        common: dict[str, Any] = {
-            "pictures": Pictures(cfg.cameras, cfg.size, cfg.depth, cfg.image_format),
-            "include_failed": cfg.include_failed,
-            "overwrite": cfg.overwrite,
-            "resume": cfg.resume,
-            "jobs": cfg.jobs,
-            "pack": cfg.pack,
-            "on_start": shown.start,
-            "on_episode": shown.advance,
+        options: dict[str, Any] = {
+            "append": cfg.append,
+            "embeddings": cfg.embeddings,
+            "previews": (True if cfg.all_videos else None) if cfg.video else False,
+            "codec": cfg.codec,
         }
-        if cfg.to == "lerobot":
-            done = _to_lerobot(cfg, common)
-        else:
-            rate = 5.0 if cfg.rate is None else cfg.rate
-            done = convert(
-                cfg.trajectory,
-                cfg.out,
-                rate_hz=rate,
-                embeddings=cfg.embeddings,
-                append=cfg.append,
-                previews=(True if cfg.all_videos else None) if cfg.video else False,
-                **common,
-            )
+        done: Conversion = chosen.part("writer")(
+            cfg.trajectory,
+            cfg.out,
+            rate_hz=cfg.rate,
+            pictures=Pictures(cfg.cameras, cfg.size, cfg.depth, cfg.image_format),
+            include_failed=cfg.include_failed,
+            overwrite=cfg.overwrite,
+            resume=cfg.resume,
+            jobs=cfg.jobs,
+            pack=cfg.pack,
+            on_start=shown.start,
+            on_episode=shown.advance,
+            **{name: value for name, value in options.items() if name in chosen.options},
+        )
     count = len(done.episodes)
     said = [f"{cfg.out}: {count_of(count, 'episode')}"] + ([f"{done.kept} kept"] if done.kept else [])
     if count:
@@ -146,13 +167,3 @@ def parts(done: Conversion, cfg: Convert) -> str:
         f"load {spent.load / count:.1f}, render {spent.render / count:.1f}, encode {spent.encode / count:.1f}{beside},"
         f" write {spent.write / count:.1f} s an episode{shared}"
     )
-
-
-def _to_lerobot(cfg: Convert, common: dict[str, Any]) -> Conversion:
-    from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-    from robocas_ms3.errors import DatasetError
-
-    for flag, given in (("--append", cfg.append), ("--image-format", cfg.image_format != "png")):
-        if given:
-            raise DatasetError("not for LeRobot datasets", where=flag, fix="Leave it out.")
-    return convert_lerobot(cfg.trajectory, cfg.out, rate_hz=cfg.rate, codec=cfg.codec, **common)

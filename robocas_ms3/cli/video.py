@@ -11,7 +11,7 @@ import tyro
 
 @dataclass
 class Video:
-    """Write videos and a contact sheet of a RoboCAS dataset."""
+    """Write videos and a contact sheet of a dataset."""
 
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset."""
@@ -29,11 +29,11 @@ def main(cfg: Video) -> int:
     """Write them; gives the exit code."""
     from rich.console import Console
 
+    from robocas_ms3.datasets.formats import open_source
     from robocas_ms3.datasets.pictures.video import contact_sheet, write_video
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER, episode_folder
-    from robocas_ms3.datasets.sources.reader import Dataset
 
-    dataset = Dataset(cfg.dataset)
+    dataset = open_source(cfg.dataset)
     out = cfg.out or cfg.dataset / PREVIEW_FOLDER
     numbers = list(cfg.episodes) or dataset.numbers
     for number in numbers:  # before anything is written
@@ -44,5 +44,5 @@ def main(cfg: Video) -> int:
         path = out / f"{episode_folder(number)}{suffix}.mp4"
         console.print(str(write_video(dataset, number, path, speed=cfg.speed, kind=cfg.kind)))
     sheet = out / f"contact_sheet{suffix}.png"
-    console.print(str(contact_sheet(cfg.dataset, sheet, episodes=cfg.episodes or None, kind=cfg.kind)))
+    console.print(str(contact_sheet(dataset, sheet, episodes=cfg.episodes or None, kind=cfg.kind)))
     return 0

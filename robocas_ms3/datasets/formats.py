@@ -6,8 +6,8 @@ docs/extending.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -33,7 +33,7 @@ class Format:
         writer: converts a trajectory file, see `writing.convert.convert` for its parameters up to ``on_episode`` and
             what it gives; empty: it can't be written.
         checker: (root, *, on_episode=None) -> `checks.dataset.Report`; empty: there is none.
-        options: further keyword arguments of the writer -> what they are for those who ask.
+        options: further keyword arguments of the writer, of those that ``robocas convert`` has flags for.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Format:
     reader: str
     writer: str = ""
     checker: str = ""
-    options: Mapping[str, str] = field(default_factory=dict)
+    options: tuple[str, ...] = ()
 
     def part(self, name: str) -> Callable[..., Any]:
         """Import ``reader``, ``writer`` or ``checker``.
@@ -83,7 +83,7 @@ _BUILTIN = (
         f"{_PACKAGE}.lerobot.reader:open_lerobot",
         f"{_PACKAGE}.lerobot.convert:convert_lerobot",
         f"{_PACKAGE}.lerobot.check:report_lerobot",
-        {"codec": "of the videos"},
+        ("codec",),
     ),
     Format(
         "robocas",
@@ -92,7 +92,7 @@ _BUILTIN = (
         f"{_PACKAGE}.sources.reader:open_folder",
         f"{_PACKAGE}.writing.convert:convert",
         f"{_PACKAGE}.checks.dataset:validate",
-        {"append": "add", "embeddings": "of texts", "previews": "videos", "image_format": "of RGB"},
+        ("append", "embeddings", "previews", "image_format"),
     ),
 )
 

@@ -117,7 +117,7 @@ def test_what_upstream_writes_becomes_a_valid_dataset(dataset, made, tmp_path, p
         assert scene["source"]["format"] == "robocas v0"
         assert scene["source"]["derived"] == {"agv_pose": "base_pos, base_orn", "rel_agv_pose": "agv_pose"}
     assert read(out / "import_report.json")["taken"] == 2
-    contact_sheet(out, tmp_path / "sheet.png", columns=2)
+    contact_sheet(Dataset(out), tmp_path / "sheet.png", columns=2)
     assert files_of(root) == before
 
 
@@ -377,7 +377,7 @@ def test_rgb_alone_and_fewer_cameras(four, tmp_path):
     assert (new.settings["cameras"], new.settings["depth"]) == (["base_camera", "gripper_camera"], False)
     assert validate(new.root).violations == []
     assert video_frame(new.episode(2), 3).shape[1] == 2 * PANEL[0]
-    contact_sheet(new.root, tmp_path / "sheet.png", columns=2)
+    contact_sheet(new, tmp_path / "sheet.png", columns=2)
 
 
 def test_the_overview(four, tmp_path):

@@ -54,7 +54,7 @@ def test_shows_what_the_dataset_holds(trajectory, tmp_path, jobs):
             drawn = draw_frame(Story.of(number, episode.arrays), step, _pictures(episode, step, "rgb"), PANEL)
             assert frame.shape == drawn.shape == (PANEL[1] + 64, 3 * PANEL[0], 3)
             assert np.abs(frame.astype(int) - drawn).mean() < 4, "H.264 loses little"
-    of_pictures = np.asarray(Image.open(contact_sheet(out, tmp_path / "sheet.png")))
+    of_pictures = np.asarray(Image.open(contact_sheet(Dataset(out), tmp_path / "sheet.png")))
     np.testing.assert_array_equal(np.asarray(Image.open(out / "preview" / "contact_sheet.png")), of_pictures)
     assert validate(out).violations == []
 
@@ -79,7 +79,7 @@ def test_of_what_is_new(made_up_pictures, tmp_path):
     assert times[1][:2] == times[0]
     assert times[2] == times[1]
     assert sheets[1] == sheets[2] == 1.5 * sheets[0]
-    of_pictures = np.asarray(Image.open(contact_sheet(out, tmp_path / "sheet.png")))
+    of_pictures = np.asarray(Image.open(contact_sheet(Dataset(out), tmp_path / "sheet.png")))
     np.testing.assert_array_equal(np.asarray(Image.open(sheet)), of_pictures)
 
 

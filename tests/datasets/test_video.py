@@ -48,7 +48,7 @@ def test_long_texts_stay_inside(made, tmp_path):
 
 
 def test_contact_sheet(made, tmp_path):
-    sheet = np.asarray(Image.open(contact_sheet(made, tmp_path / "sheet.png", columns=4, thumbnail=(64, 48))))
+    sheet = np.asarray(Image.open(contact_sheet(Dataset(made), tmp_path / "sheet.png", columns=4, thumbnail=(64, 48))))
     assert sheet.shape == (2 * (30 + 3 * 51 + 10), 110 + 4 * 67, 3)
     # Row of episode 1, static camera, last column: its last step.
     top, left = 193 + 30 + 2 * 51, 110 + 3 * 67

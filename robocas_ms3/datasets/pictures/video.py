@@ -23,7 +23,7 @@ from robocas_ms3.datasets.pictures.drawing import (
     stack_rows,
 )
 from robocas_ms3.datasets.pictures.png import encode_png
-from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.datasets.sources.protocol import EpisodeSource, SourceEpisode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing
 
@@ -56,7 +56,7 @@ def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Any
 
 
 def write_video(
-    dataset: Dataset, number: int, path: Path | str, *, speed: float = 1.0, kind: str = "rgb", panel: Size = PANEL
+    dataset: EpisodeSource, number: int, path: Path | str, *, speed: float = 1.0, kind: str = "rgb", panel: Size = PANEL
 ) -> Path:
     """Write an episode as MP4 (H.264, yuv420p): the cameras side by side, instruction and sub-goal below.
 
@@ -82,14 +82,14 @@ def write_video(
 
 
 def video_frame(
-    episode: Episode, step: int, *, number: int = 0, kind: str = "rgb", panel: Size = PANEL
+    episode: SourceEpisode, step: int, *, number: int = 0, kind: str = "rgb", panel: Size = PANEL
 ) -> NDArray[np.uint8]:
     """One picture of the video, (H, W, 3) RGB, both even."""
     return draw_frame(Story.of(number, episode.arrays), step, _pictures(episode, step, kind), panel)
 
 
 def contact_sheet(
-    root: Path | str,
+    dataset: EpisodeSource,
     out: Path | str,
     *,
     episodes: Sequence[int] | None = None,
@@ -100,20 +100,19 @@ def contact_sheet(
     """Write a PNG with a row for each episode and camera, of evenly spaced steps from first to last.
 
     Args:
-        root: the dataset.
+        dataset: the dataset.
         out: path of the PNG.
         episodes: numbers; None: the first ten.
         columns: pictures a row.
         thumbnail: width and height of a picture.
         kind: ``rgb``, or ``depth`` in colours.
     """
-    dataset = Dataset(Path(root))
     numbers = dataset.numbers[:SHEET] if episodes is None else list(episodes)
     return write_sheet([sheet_row(dataset, number, columns, thumbnail, kind) for number in numbers], out)
 
 
 def sheet_row(
-    dataset: Dataset, number: int, columns: int = COLUMNS, thumbnail: Size = THUMBNAIL, kind: str = "rgb"
+    dataset: EpisodeSource, number: int, columns: int = COLUMNS, thumbnail: Size = THUMBNAIL, kind: str = "rgb"
 ) -> NDArray[np.uint8]:
     """An episode's part of a contact sheet, (H, W, 3) RGB."""
     episode = dataset.episode(number)
@@ -137,7 +136,7 @@ def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return colours.astype(np.uint8)
 
 
-def _pictures(episode: Episode, step: int, kind: str) -> Pictures:
+def _pictures(episode: SourceEpisode, step: int, kind: str) -> Pictures:
     if kind == "rgb":
         return {camera: episode.rgb(camera, step) for camera in episode.cameras}
     return {camera: colour_depth(episode.depth(camera, step)) for camera in episode.cameras}

@@ -180,14 +180,13 @@ class Dataset(EpisodeSource, Overview):
 
 
 def open_folder(path: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> Dataset:
-    """Open a folder of episodes that are done; failed ones are in it where it was made so.
+    """Open a folder; failed episodes are in it where it was made so.
 
     Raises:
-        DatasetError: there is none, it is unfinished or damaged, or of another rate.
+        DatasetError: there is none, or it is of another rate.
     """
     dataset = Dataset(path)
     check_rate(dataset, rate_hz)
-    _ = dataset.lengths, dataset.rate_hz, dataset.cameras
     return dataset
 
 

@@ -112,6 +112,8 @@ class RoboCASDataset(torch.utils.data.Dataset):
         if size is not None and (len(size) != 2 or min(size) < 1):
             raise DatasetError("no such size", where="size", expected="width and height >= 1", found=size)
         self.source = open_source(path, rate_hz=rate_hz, include_failed=include_failed)
+        self.rate_hz = self.source.rate_hz
+        """Steps a second."""
         check_holds(self.source, self.cameras, depth=depth, embedding=embedding)
         self._pictures = PictureStack(self.cameras, size, float_images)
         self.episodes: list[int] = self.source.split(split)

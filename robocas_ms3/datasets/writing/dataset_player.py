@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, SourceEpisode
-from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import DAMAGED, arrays_fingerprint
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame
 from robocas_ms3.datasets.writing.players import Played, Player, RecordingPlayer, Request
@@ -169,11 +169,11 @@ def _arrays(episode: SourceEpisode) -> dict[str, NDArray]:
 
 
 def open_player(request: Request) -> Player:
-    """Open what is to be converted: the folder of a dataset, or a trajectory file.
+    """Open what is to be converted: a trajectory file, or a dataset of any format.
 
     Raises:
         DatasetError: it is neither, can't be read, or the options don't suit it.
     """
     if not request.path.is_dir():
         return RecordingPlayer(request)
-    return DatasetPlayer(Dataset(request.path), request)
+    return DatasetPlayer(open_source(request.path), request)
