@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Validate:
-    """Check a RoboCAS or LeRobot dataset and list every violation; exit code 1 if there is any.
+    """Check a RoboCAS or LeRobot dataset, or another package's, and list every violation; exit code 1 if there is any.
 
     With --replay also play every episode's own 7-D actions open loop in its rebuilt scene, and say how many succeed
     again and how far the gripper strays. That changes the exit code only with --min-share.
@@ -45,18 +44,19 @@ def main(cfg: Validate) -> int:
     from rich.console import Console
 
     from robocas_ms3.datasets.checks.dataset import validate
+    from robocas_ms3.datasets.formats import format_of
     from robocas_ms3.datasets.statistics.described import count_of
 
     if cfg.min_share is not None and not cfg.replay:
         raise DatasetError("a share of replayed episodes needs --replay", where="--min-share")
     if cfg.min_share is not None and not 0 <= cfg.min_share <= 1:
         raise DatasetError("no such share", where="--min-share", expected="0 to 1", found=cfg.min_share)
-    is_lerobot = (cfg.dataset / "meta" / "info.json").is_file()
-    if is_lerobot and cfg.replay:
+    found = format_of(cfg.dataset)
+    if found and found.name != "robocas" and cfg.replay:
         raise DatasetError("only RoboCAS folders can be replayed", where=cfg.dataset)
     with bar("checking", transient=True) as shown:
-        check = _validate_lerobot if is_lerobot else validate
-        report = check(cfg.dataset, on_episode=shown.at)
+        check = found.part("checker") if found and cfg.dataset.is_dir() else validate
+        report: Report = check(cfg.dataset, on_episode=shown.at)
     console = Console(soft_wrap=True, highlight=False, markup=False)
     if not cfg.json:
         for violation in report.violations:
@@ -76,22 +76,6 @@ def main(cfg: Validate) -> int:
     if cfg.json:
         console.print(json.dumps(content, indent=2, ensure_ascii=False))
     return 1 if wrong else 0
-
-
-def _validate_lerobot(root: Path, *, on_episode: Callable[[int, int], None]) -> Report:
-    from robocas_ms3.datasets.checks.dataset import Report
-    from robocas_ms3.datasets.lerobot.check import check_lerobot
-
-    counts = [0, 0]
-
-    def count(done: int, total: int) -> None:
-        counts[0] = done
-        on_episode(done, total)
-
-    violations = check_lerobot(root, on_episode=count)
-    with suppress(OSError, ValueError, KeyError, TypeError):  # told among the violations
-        counts[1] = int(json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))["total_frames"])
-    return Report(counts[0], counts[1], violations)
 
 
 def _replay(root: Path, pack: str | None) -> ReplayReport:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from robocas_ms3.datasets.checks.dataset import Report
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_videos import TOLERANCE, check_videos
@@ -274,3 +276,19 @@ def _rows_of(path: Path, episode: int) -> pa.Table:
 def _say(error: Exception) -> str:
     text = str(error).strip() or type(error).__name__
     return text.splitlines()[0]
+
+
+def report_lerobot(root: Path, *, on_episode: Callable[[int, int], None] | None = None) -> Report:
+    """`check_lerobot`, with how many episodes and steps were looked at."""
+    looked = 0
+
+    def count(done: int, total: int) -> None:
+        nonlocal looked
+        looked = done
+        if on_episode:
+            on_episode(done, total)
+
+    violations, steps = check_lerobot(root, on_episode=count), 0
+    with suppress(OSError, ValueError, KeyError, TypeError):  # told among the violations
+        steps = int(json.loads((root / schema.INFO_FILE).read_text(encoding="utf-8"))["total_frames"])
+    return Report(looked, steps, violations)

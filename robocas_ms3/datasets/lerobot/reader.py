@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,18 +14,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.tables import numbers, read_texts
 from robocas_ms3.datasets.lerobot.video import read_frames
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side, SourceEpisode
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
+from robocas_ms3.recordings.subgoals import SubGoal
 
 
 class LeRobotDataset(EpisodeSource):
-    """A dataset's folder, an `EpisodeSource`.
+    """A dataset's folder.
 
     Raises:
         DatasetError: no LeRobot dataset there, or one of another version.
@@ -87,11 +86,6 @@ class LeRobotDataset(EpisodeSource):
         return found
 
     @property
-    def has_embeddings(self) -> bool:
-        """They are not stored."""
-        return False
-
-    @property
     def numbers(self) -> list[int]:
         """Numbers of the episodes."""
         return [row["episode_index"] for row in self.rows]
@@ -111,11 +105,6 @@ class LeRobotDataset(EpisodeSource):
         """What the conversion said of it."""
         entries = self.settings.get("episodes", [])
         return entries[number] if number < len(entries) else {}
-
-    def action_space(self) -> dict[str, Any]:
-        """Percentiles over all episodes, whose tables are read for it."""
-        parts = [self.episode(number).read(("rel_pos", "rel_orn")) for number in self.numbers]
-        return action_space([part["rel_pos"] for part in parts], [part["rel_orn"] for part in parts])
 
     @cached_property
     def tasks(self) -> list[str]:
@@ -140,7 +129,7 @@ class LeRobotDataset(EpisodeSource):
 
 @dataclass(frozen=True)
 class LeRobotEpisode(SourceEpisode):
-    """One episode, a `SourceEpisode`."""
+    """One of its episodes."""
 
     dataset: LeRobotDataset
     number: int
@@ -198,28 +187,10 @@ class LeRobotEpisode(SourceEpisode):
         types = self.table.column(schema.SUBGOAL_TYPE.key).to_pylist()
         return schema.robocas_arrays(self.columns, self.row["tasks"][0], texts, types)
 
-    def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
-        """Some of them.
-
-        Raises:
-            DatasetError: one is not there.
-        """
-        missing = [key for key in keys if key not in self.arrays]
-        if missing:
-            raise DatasetError("a LeRobot dataset does not hold this", where=self.where, found=", ".join(missing))
-        return {key: self.arrays[key] for key in keys}
-
     @property
     def goals(self) -> list[SubGoal]:
         """Sub-goals over the steps; none where the dataset is not one of ours."""
-        if not self.dataset.is_ours:
-            return []
-        return subgoal_runs(self.arrays["step_goal_type"].tolist(), self.arrays["step_lang_goals"].tolist())
-
-    @property
-    def layout(self) -> dict[str, Any]:
-        """As its ``scene.json`` has it."""
-        return self.scene.get("layout") or {}
+        return super().goals if self.dataset.is_ours else []
 
     @cached_property
     def _ours(self) -> dict[str, Any]:

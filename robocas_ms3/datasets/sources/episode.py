@@ -47,7 +47,7 @@ class Overview(Protocol):
 
 @dataclass(frozen=True)
 class Episode(SourceEpisode):
-    """One episode's folder, a `SourceEpisode`.
+    """One episode's folder.
 
     Attributes:
         folder: its path.
@@ -85,7 +85,7 @@ class Episode(SourceEpisode):
                 found = {key: content[key] for key in keys if key in content.files}
             if all(key in found and is_declared(key, found[key]) for key in keys):
                 return found
-            made = self.arrays  # slower; casts and completes what was made elsewhere
+            return super().read(keys)  # slower; casts and completes what was made elsewhere
         except (*DAMAGED, KeyError) as error:
             raise DatasetError(
                 "this episode can't be read",
@@ -93,10 +93,6 @@ class Episode(SourceEpisode):
                 found=getattr(error, "strerror", None) or first_line(error),
                 fix="robocas validate says what is wrong.",
             ) from error
-        missing = [key for key in keys if key not in made]
-        if missing:
-            raise DatasetError("arrays are missing", where=path, expected=", ".join(missing))
-        return {key: made[key] for key in keys}
 
     @property
     def goals(self) -> list[SubGoal]:
@@ -131,11 +127,6 @@ class Episode(SourceEpisode):
     def scene(self) -> dict[str, Any]:
         """``scene.json``; empty where there is none."""
         return read_json(self.folder / schema.SCENE_FILE)
-
-    @property
-    def layout(self) -> dict[str, Any]:
-        """As ``scene.json`` has it."""
-        return self.scene.get("layout") or {}
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:

@@ -13,7 +13,11 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.recordings.subgoals import SubGoal
+from robocas_ms3.datasets.actions import action_space
+from robocas_ms3.datasets.sources.split import split_by_seed
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.seeds import one_seed
+from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
 
 Side = Literal["train", "val", "all"]
 """Of the split into training and validation."""
@@ -22,19 +26,21 @@ Side = Literal["train", "val", "all"]
 class SourceEpisode(Protocol):
     """What is known of an episode.
 
-    Arrays are those of ``schema.EPISODE_INFO``, of its types and shapes; what else is read raises ``DatasetError``
-    where it is missing or damaged.
+    Arrays are those of ``schema.EPISODE_INFO``, of its types and shapes; what is read raises ``DatasetError`` where it
+    is missing or damaged. Who derives from this class gets what follows from arrays and scene.
+
+    Attributes:
+        where: it lies, for messages.
+        cameras: that there are pictures of.
     """
 
-    @property
-    def where(self) -> object:
-        """What it lies in, for messages."""
-        ...
+    where: Any
+    cameras: tuple[str, ...]
 
     @property
     def steps(self) -> int:
         """T."""
-        ...
+        return int(self.arrays["episode_length"])
 
     @property
     def arrays(self) -> dict[str, NDArray]:
@@ -42,28 +48,32 @@ class SourceEpisode(Protocol):
         ...
 
     def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
-        """Some of the arrays, all of which have to be there."""
-        ...
+        """Some of the arrays.
+
+        Raises:
+            DatasetError: one is not there.
+        """
+        arrays = self.arrays
+        missing = [key for key in keys if key not in arrays]
+        if missing:
+            raise DatasetError("arrays are missing", where=self.where, expected=", ".join(missing))
+        return {key: arrays[key] for key in keys}
 
     @property
     def goals(self) -> list[SubGoal]:
         """Sub-goals over the steps; empty where they are not known."""
-        ...
+        arrays = self.read(("step_goal_type", "step_lang_goals"))
+        return subgoal_runs(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist())
 
     @property
     def scene(self) -> dict[str, Any]:
         """How it was made, by the keys of ``schema.SCENE`` that are known; empty where none is."""
-        ...
+        return {}
 
     @property
     def layout(self) -> dict[str, Any]:
         """What stood where at its beginning, as ``layout`` of ``schema.SCENE``; empty where it is not known."""
-        ...
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """That there are pictures of."""
-        ...
+        return self.scene.get("layout") or {}
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
         """(H, W, 3) RGB."""
@@ -87,51 +97,41 @@ class EpisodeSource(Protocol):
 
     Attributes:
         root: the folder or file.
+        rate_hz: steps a second.
+        numbers: of its episodes, sorted.
+        cameras: that there are pictures of; empty where there are none.
+        has_depth: whether depth is there.
+        has_embeddings: whether embeddings of the texts are.
     """
 
     root: Path
-
-    @property
-    def rate_hz(self) -> float:
-        """Steps a second."""
-        ...
-
-    @property
-    def numbers(self) -> list[int]:
-        """Of its episodes, sorted."""
-        ...
+    rate_hz: float
+    numbers: list[int]
+    cameras: tuple[str, ...]
+    has_depth: bool
+    has_embeddings: bool = False
 
     @property
     def lengths(self) -> Mapping[int, int]:
-        """Number -> T, without opening the episodes."""
-        ...
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """That there are pictures of; empty where there are none."""
-        ...
-
-    @property
-    def has_depth(self) -> bool:
-        """Whether depth is there."""
-        ...
-
-    @property
-    def has_embeddings(self) -> bool:
-        """Whether embeddings of the texts are there."""
-        ...
+        """Number -> T."""
+        return {number: self.episode(number).steps for number in self.numbers}
 
     def split(self, side: Side) -> list[int]:
-        """Numbers of the episodes of one side."""
-        ...
+        """Numbers of the episodes of one side; of what knows none by the seeds, or else the numbers."""
+        if side == "all":
+            return self.numbers
+        seeds = {number: one_seed(self.entry(number).get("seed")) for number in self.numbers}
+        sides = split_by_seed({number: number if seed is None else seed for number, seed in seeds.items()})
+        return sides[side == "val"]
 
     def entry(self, number: int) -> Mapping[str, Any]:
         """Which recording an episode is of, see ``provenance.recording_entry``; empty where that is not known."""
-        ...
+        return {}
 
     def action_space(self) -> dict[str, Any]:
-        """Range of the motion, as in ``data_info.json``."""
-        ...
+        """Range of the motion, as in ``data_info.json``; where it is not known all episodes are read for it."""
+        parts = [self.episode(number).read(("rel_pos", "rel_orn")) for number in self.numbers]
+        return action_space([part["rel_pos"] for part in parts], [part["rel_orn"] for part in parts])
 
     def episode(self, number: int) -> SourceEpisode:
         """Open an episode."""

@@ -20,7 +20,7 @@ _SPLIT = "robocas split --in-place --val-share 0.1 makes a new one."
 
 
 class Dataset(EpisodeSource, Overview):
-    """A dataset's folder, an `EpisodeSource`.
+    """A dataset's folder.
 
     Raises:
         DatasetError: no episodes there.

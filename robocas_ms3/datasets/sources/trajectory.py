@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.config import load_task_config
-from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.datasets.sources.episode import DEFAULT_RATE
-from robocas_ms3.datasets.sources.protocol import Side, SourceEpisode
+from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side, SourceEpisode
 from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry, succeeded
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.errors import DatasetError, RobocasError
@@ -24,8 +23,8 @@ from robocas_ms3.recordings.subgoals import SubGoal, sample_subgoals
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 
 
-class TrajectorySource:
-    """An `EpisodeSource`, a trajectory file: its episodes as ``robocas convert`` would number and sample them.
+class TrajectorySource(EpisodeSource):
+    """A trajectory file: its episodes as ``robocas convert`` would number and sample them.
 
     Args:
         path: of the HDF5 file.
@@ -38,7 +37,6 @@ class TrajectorySource:
 
     cameras: tuple[str, ...] = ()
     has_depth = False
-    has_embeddings = False
 
     def __init__(self, path: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> None:
         self.root, self.rate_hz = path, DEFAULT_RATE if rate_hz is None else rate_hz
@@ -49,9 +47,13 @@ class TrajectorySource:
             self._scenes = [recorded_scene(file, index) for index in self.index]
             self.objects = [list(file.episodes[i]["robocas"].get("objects") or ()) for i in self.index]
         self.numbers = list(range(len(self.index)))
-        self.lengths = {n: len(sample_states(e.control_steps, self.stride)) for n, e in enumerate(self.entries)}
         train, val = split_by_seed({n: entry.seed for n, entry in enumerate(self.entries)})
         self._split = {"train": train, "val": val, "all": self.numbers}
+
+    @cached_property
+    def lengths(self) -> dict[int, int]:
+        """Number -> T, by the JSON."""
+        return {n: len(sample_states(e.control_steps, self.stride)) for n, e in enumerate(self.entries)}
 
     def split(self, side: Side) -> list[int]:
         """Numbers of the episodes of one side, by the rule of ``robocas convert``."""
@@ -61,11 +63,6 @@ class TrajectorySource:
         """Which recording it is."""
         with TrajectoryFile(self.root) as file:
             return recording_entry(file, self.index[number])
-
-    def action_space(self) -> dict[str, Any]:
-        """Percentiles over all episodes, which are read for it."""
-        parts = [self.episode(number).read(("rel_pos", "rel_orn")) for number in self.numbers]
-        return action_space([part["rel_pos"] for part in parts], [part["rel_orn"] for part in parts])
 
     def episode(self, number: int) -> RecordedEpisode:
         """Open an episode.
@@ -85,7 +82,9 @@ class TrajectorySource:
 
 
 class RecordedEpisode(SourceEpisode):
-    """A `SourceEpisode`; its arrays are computed from the states, by forward kinematics."""
+    """One of its episodes; arrays are computed from the states, by forward kinematics."""
+
+    cameras = ()
 
     def __init__(self, source: TrajectorySource, number: int) -> None:
         self._source, self._number = source, number
@@ -112,13 +111,6 @@ class RecordedEpisode(SourceEpisode):
         samples = sample_states(recording.control_steps, self._source.stride)
         return episode_arrays(recording.motion(samples), recording.instruction, self.goals)
 
-    def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
-        """Some of them; see `arrays`."""
-        missing = [key for key in keys if key not in self.arrays]
-        if missing:
-            raise DatasetError("a trajectory file does not hold this", where=self.where, found=", ".join(missing))
-        return {key: self.arrays[key] for key in keys}
-
     @property
     def goals(self) -> list[SubGoal]:
         """Sub-goals over the sampled steps."""
@@ -143,11 +135,6 @@ class RecordedEpisode(SourceEpisode):
     def _recording(self, *, bodies: bool) -> Recording:
         with TrajectoryFile(self._source.root) as file:
             return file.recording(self._source.index[self._number], bodies=bodies)
-
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """None."""
-        return ()
 
     def _no_pictures(self) -> DatasetError:
         fix = "Convert it with robocas convert."

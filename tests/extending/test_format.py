@@ -1,0 +1,105 @@
+"""A dataset format of another package: the page's code, installed, through every command that takes datasets."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+from strangers import install
+from synthetic import RayCaster, write_trajectory
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.datasets import RoboCASDataset
+from robocas_ms3.datasets.formats import format_of, formats, open_source
+from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+from robocas_ms3.datasets.writing import convert as conversion
+from robocas_ms3.errors import DatasetError
+
+
+@pytest.fixture
+def stranger(tmp_path, monkeypatch):
+    """Its package is installed; nothing of it is left behind."""
+    folder = install("A dataset format", tmp_path / "site")
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setattr("robocas_ms3.datasets.writing.render.EnvFrames", RayCaster)
+    formats.cache_clear()
+    yield folder
+    formats.cache_clear()
+    sys.modules.pop("toy_format", None)
+
+
+@pytest.fixture
+def both(stranger, tmp_path, capsys):
+    """The same recordings as a toy, by the command line, and as a RoboCAS folder."""
+    file = write_trajectory(tmp_path / "F.h5", seeds=(3, 4, 5))
+    assert run(["convert", str(file), "--to", "toy", "--out", str(tmp_path / "toy")]) == 0
+    assert "3 episodes, 21 steps" in capsys.readouterr().out
+    conversion.convert(file, tmp_path / "folder", embeddings=False, open_source=RayCaster)
+    return tmp_path / "toy", tmp_path / "folder"
+
+
+def test_it_is_three_files_and_known_by_them(both):
+    toy, folder = both
+    assert sorted(path.name for path in toy.iterdir()) == ["about.json", "arrays.npz", "pictures.npz"]
+    assert (format_of(toy).name, format_of(folder).name) == ("toy", "robocas")
+
+
+def test_it_trains_as_a_robocas_folder_does(both):
+    ours, theirs = (RoboCASDataset(root, split="all", size=None, depth=True, subgoals=True) for root in both[::-1])
+    assert len(theirs) == len(ours) > 0
+    for one, other in zip(ours, theirs, strict=True):
+        for key, value in one.items():
+            assert torch.equal(value, other[key]) if torch.is_tensor(value) else value == other[key], key
+    split = {root: (open_source(root).split("train"), open_source(root).split("val")) for root in both}
+    assert split[both[0]] == split[both[1]]  # by the seeds
+    ranges = [open_source(root).action_space()["relative_position"] for root in both]
+    np.testing.assert_allclose(*ranges)
+
+
+def test_it_is_counted_checked_shown_and_converted(both, tmp_path, capsys):
+    toy, folder = both
+    counted = {}
+    for root in (folder, toy):
+        assert run(["stats", str(root), "--json"]) == 0
+        counted[root] = {**json.loads(capsys.readouterr().out), "path": "", "split": {}}
+    assert counted[toy] == counted[folder]
+    assert run(["validate", str(toy)]) == 0
+    assert "3 episodes, 21 steps, valid" in capsys.readouterr().out
+    assert run(["video", str(toy), "--out", str(tmp_path / "video")]) == 0
+    assert len(list((tmp_path / "video").glob("*.mp4"))) == 3
+    made = [convert_lerobot(root, tmp_path / root.name.upper()).episodes for root in (toy, folder)]
+    assert [[e.steps for e in episodes] for episodes in made] == [[7, 7, 7]] * 2
+    files = [
+        {p.relative_to(root): p.read_bytes() for p in root.rglob("*.mp4")}
+        for root in (tmp_path / "TOY", tmp_path / "FOLDER")
+    ]
+    assert files[0] == files[1] != {}
+
+
+def test_what_is_wrong_with_it_is_said(both, capsys):
+    toy, _ = both
+    with np.load(toy / "arrays.npz") as content:
+        arrays = dict(content)
+    arrays["1/rel_pos"] = arrays["1/rel_pos"][:-1]
+    np.savez(toy / "arrays.npz", **arrays)
+    assert run(["validate", str(toy)]) == 1
+    assert "arrays.npz, 1, rel_pos: expected shape (7, 3), found shape (6, 3)" in capsys.readouterr().out
+
+
+def test_a_format_that_there_is_not(stranger, tmp_path, capsys):
+    file = write_trajectory(tmp_path / "F.h5")
+    assert run(["convert", str(file), "--to", "rlds", "--out", str(tmp_path / "out")]) == 1
+    assert "--to: no such format (expected one of toy, lerobot, robocas, found rlds)" in capsys.readouterr().err
+    assert run(["convert", str(file), "--to", "toy", "--append", "--out", str(tmp_path / "out")]) == 1
+    assert "--append: not for toy datasets" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("what", "said"), [("missing_module:FORMAT", "can't be imported"), ("json:dumps", "not a dataset format")]
+)
+def test_a_broken_entry_point_is_said(stranger, what, said):
+    (stranger / "toy_format-1.0.dist-info" / "entry_points.txt").write_text(f"[robocas_ms3.formats]\ntoy = {what}\n")
+    formats.cache_clear()
+    with pytest.raises(DatasetError, match=f"robocas_ms3.formats, {what}: .*{said}"):
+        formats()
