@@ -227,6 +227,16 @@ def test_quaternions_wxyz(upstream, tmp_path):
     assert validate(tmp_path / "out").violations == []
 
 
+def test_values_that_are_taken_as_they_are(upstream, tmp_path):
+    widths = arrays_of(upstream / "episode_0000000")["gripper_width"]
+    change(upstream / "episode_0000000", gripper_width=np.full_like(widths, 0.5))
+    found = (0, "episode_info.npz, gripper_width", "0.500 to 0.500, not 0 to 0.08 m", "noted")
+    assert found in problems(upstream)
+    assert imported(upstream, tmp_path / "out").numbers == [0, 1]
+    (violation,) = validate(tmp_path / "out").violations
+    assert (violation.key, violation.found) == ("gripper_width", "0.500 to 0.500")
+
+
 def test_a_last_row_that_is_no_identity(upstream):
     motion = arrays_of(upstream / "episode_0000000")["base_rel_pos"]
     motion[-1] = 1
@@ -352,6 +362,15 @@ def test_pictures_of_another_kind(four, tmp_path):
     text = f"pictures of {cameras}, 64 x 40 png, with depth; most are of {cameras}, 64 x 48 png, with depth"
     assert (1, "episode_0000001", text, "left out") in found
     assert imported(root, tmp_path / "out").numbers == [2, 3]
+
+
+def test_pictures_too_small_to_show_anything(four, tmp_path):
+    root = shutil.copytree(four, tmp_path / "four")
+    for path in (root / "episode_0000001").glob("*/*/*.png"):
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:9, :9])
+    found = (1, "episode_0000001", "pictures this small show nothing: [9, 9]", "left out")
+    assert found in problems(root)
+    assert sorted(survey(root).taken) == [0, 2, 3]
 
 
 def test_cameras(four, tmp_path):

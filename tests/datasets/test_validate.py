@@ -104,6 +104,8 @@ def test_unknown_keys(dataset):
         ("episode_length", np.array(0), "expected 1 to 10000 steps, found 0"),
         ("rel_pos", np.array(0, np.float32), "expected shape (7, 3), found shape ()"),
         ("step_goal_type", np.array(3), "expected str, found int64"),
+        ("step_goal_type", np.array(["grasp"] * 6), "expected shape (7,), found shape (6,)"),
+        ("episode_length", np.array(6), "expected 7, as the arrays have, found 6"),
     ],
 )
 def test_types_and_shapes(dataset, key, value, text):

@@ -84,7 +84,7 @@ def test_what_is_wrong_with_it_is_said(both, capsys):
     arrays["1/rel_pos"] = arrays["1/rel_pos"][:-1]
     np.savez(toy / "arrays.npz", **arrays)
     assert run(["validate", str(toy)]) == 1
-    assert "arrays.npz, 1, rel_pos: expected shape (7, 3), found shape (6, 3)" in capsys.readouterr().out
+    assert "arrays.npz/1, rel_pos: expected shape (7, 3), found shape (6, 3)" in capsys.readouterr().out
 
 
 def test_a_format_that_there_is_not(stranger, tmp_path, capsys):

@@ -1,8 +1,8 @@
-"""Checks the arrays of an episode: shapes and types, poses and the motion between them, values."""
+"""Checks the arrays of an episode: file, keys, shapes and types; poses and the motion between them; values."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,78 +10,138 @@ from numpy.typing import NDArray
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.rigid import ANGLE_TOLERANCE, NORM_TOLERANCE, POSITION_TOLERANCE, apart, same
 from robocas_ms3.datasets.checks.violation import Violation
-from robocas_ms3.datasets.sources.tolerant import planar_motion
+from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays, planar_motion
 from robocas_ms3.language.templates import GOAL_TYPES
 from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import relative_motion
 
+Check = Callable[[EpisodeArrays], Iterator[Violation]]
+"""What is wrong with arrays, by one law; what is absent is told by `check_keys` alone."""
 
-def check_shapes(file: str, arrays: dict[str, NDArray], steps: int) -> Iterator[Violation]:
-    """Check that the arrays are those of the schema, of ``steps`` rows, and numbers."""
-    embedded = any(spec.name in arrays for spec in schema.EPISODE_INFO if spec.embedding)
+
+def check_file(stored: EpisodeArrays) -> Iterator[Violation]:
+    """Check that the file and all of its arrays could be read."""
+    for key, error in stored.unreadable.items():
+        if isinstance(error, FileNotFoundError):
+            yield Violation(stored.file, "", "this file", "no file")
+        elif key and isinstance(error, (ValueError, MemoryError)):  # pickled, of no such shape, of too many numbers
+            yield Violation(stored.file, key, "an array without pickles", stored.reason(key))
+        else:
+            found = f"{key}: {stored.reason(key)}" if key else stored.reason()
+            yield Violation(stored.file, "", "a numpy archive without pickles", found)
+
+
+def check_keys(stored: EpisodeArrays) -> Iterator[Violation]:
+    """Check that the keys are those of the schema; embeddings are there all or none."""
+    if "" in stored.unreadable:
+        return
+    embedded = any(spec.name in stored.arrays for spec in schema.EPISODE_INFO if spec.embedding)
+    there = {*stored.arrays, *stored.unreadable, *stored.ignored}
     for spec in schema.EPISODE_INFO:
-        if spec.name not in arrays:
-            if not spec.embedding or embedded:
-                yield Violation(file, spec.name, "this key", "no such key")
-            continue
-        array = arrays[spec.name]
+        if spec.name not in there and (embedded or not spec.embedding):
+            yield Violation(stored.file, spec.name, "this key", "no such key")
+    for key in sorted(there - set(SPECS)):
+        yield Violation(stored.file, key, "keys of the schema only", "an unknown key")
+
+
+def check_shapes(stored: EpisodeArrays) -> Iterator[Violation]:
+    """Check types and shapes, and that ``episode_length`` is that of the arrays."""
+    for spec, array in _known(stored):
         if not spec.has_dtype(array):
-            yield Violation(file, spec.name, spec.dtype, str(array.dtype))
-        if array.shape != spec.shape_for(steps):
-            yield Violation(file, spec.name, f"shape {spec.shape_for(steps)}", f"shape {array.shape}")
-        elif array.dtype.kind == "f" and not np.isfinite(array).all():
-            yield Violation(file, spec.name, "finite numbers", f"{np.sum(~np.isfinite(array))} others")
-        elif spec.name == "episode_length" and spec.has_dtype(array) and not 0 < array <= schema.MAX_STEPS:
-            yield Violation(file, spec.name, f"1 to {schema.MAX_STEPS} steps", str(array))
-    for key in sorted(set(arrays) - {spec.name for spec in schema.EPISODE_INFO}):
-        yield Violation(file, key, "keys of the schema only", "an unknown key")
+            yield Violation(stored.file, spec.name, spec.dtype, str(array.dtype))
+        if array.shape != spec.shape_for(stored.steps):
+            yield Violation(stored.file, spec.name, f"shape {spec.shape_for(stored.steps)}", f"shape {array.shape}")
+        elif spec.name == "episode_length" and not 0 < array <= schema.MAX_STEPS:
+            yield Violation(stored.file, spec.name, f"1 to {schema.MAX_STEPS} steps", str(array))
+        elif spec.name == "episode_length" and array != stored.steps:
+            yield Violation(stored.file, spec.name, f"{stored.steps}, as the arrays have", str(array))
 
 
-def check_poses(file: str, arrays: dict[str, NDArray]) -> Iterator[Violation]:
-    """Check that quaternions are xyzw of unit length, and relative poses the motion between absolute ones."""
-    for spec in schema.EPISODE_INFO:
-        if spec.quaternion:
-            error = np.abs(np.linalg.norm(arrays[spec.name], axis=1) - 1)
+def check_finite(stored: EpisodeArrays) -> Iterator[Violation]:
+    """Check that numbers are finite, also those of unknown keys."""
+    for key, array in stored.arrays.items():
+        wrong = np.sum(~np.isfinite(array)) if array.dtype.kind == "f" else 0
+        if wrong:
+            yield Violation(stored.file, key, "finite numbers", f"{wrong} others")
+
+
+def check_units(stored: EpisodeArrays) -> Iterator[Violation]:
+    """Check that quaternions and embeddings are of unit length."""
+    for spec, array in _known(stored):
+        if spec.quaternion or spec.embedding:
+            error = np.abs(np.linalg.norm(array, axis=-1) - 1)
             if error.max() > NORM_TOLERANCE:
-                row = int(error.argmax())
-                yield Violation(file, spec.name, "unit quaternions", f"off by {error.max():.2g} in row {row}")
-    for position, orientation, rel_position, rel_orientation in schema.RELATIVE_PAIRS:
-        pairs = [(arrays[position], arrays[orientation]), (arrays[rel_position], arrays[rel_orientation])]
-        if any(np.linalg.norm(q, axis=1).min() < 0.5 for _, q in pairs):
-            continue  # said already
-        absolute, relative = (from_xyzw(p.astype(np.float64), q.astype(np.float64)) for p, q in pairs)
-        if same(relative_motion(absolute), relative).all():
-            continue
-        as_wxyz = [from_xyzw(p.astype(np.float64), np.roll(q, -1, axis=1).astype(np.float64)) for p, q in pairs]
-        if same(relative_motion(as_wxyz[0]), as_wxyz[1]).all():
-            yield Violation(file, f"{orientation}, {rel_orientation}", "quaternions xyzw", "quaternions wxyz")
-            continue
-        shift, turn = apart(relative_motion(absolute), relative)
-        for key, error, limit, unit in (
-            (rel_position, shift, POSITION_TOLERANCE, "m"),
-            (rel_orientation, turn, ANGLE_TOLERANCE, "rad"),
-        ):
-            if error.max() > limit:
-                wrong = int(np.sum(error > limit))
-                row = int(error.argmax())
-                found = f"{wrong} of {len(error)} rows off, by {error.max():.3g} {unit} in row {row}"
-                yield Violation(file, key, f"the motion between rows of {position}, {orientation}", found)
+                expected = "unit quaternions" if spec.quaternion else "unit length"
+                row = f" in row {int(error.argmax())}" if error.ndim else ""
+                yield Violation(stored.file, spec.name, expected, f"off by {error.max():.2g}{row}")
 
 
-def check_values(file: str, arrays: dict[str, NDArray]) -> Iterator[Violation]:
-    """Check base motion, gripper width, texts and embeddings."""
-    error = np.abs(planar_motion(arrays["agv_pose"]) - arrays["rel_agv_pose"]).max()
-    if error > POSITION_TOLERANCE:
-        yield Violation(file, "rel_agv_pose", "differences of agv_pose", f"off by {error:.3g}")
-    width = arrays["gripper_width"]
-    if width.min() < -0.005 or width.max() > 0.085:
-        yield Violation(file, "gripper_width", "0 to 0.08 m", f"{width.min():.3f} to {width.max():.3f}")
-    for kind in sorted(set(arrays["step_goal_type"].tolist()) - set(GOAL_TYPES)):
-        yield Violation(file, "step_goal_type", f"one of {', '.join(GOAL_TYPES)}", kind)
-    if not str(arrays["language_goal"]).strip():
-        yield Violation(file, "language_goal", "an instruction", "nothing")
-    for spec in schema.EPISODE_INFO:
-        if spec.embedding and spec.name in arrays:
-            error = np.abs(np.linalg.norm(arrays[spec.name], axis=-1) - 1).max()
-            if error > NORM_TOLERANCE:
-                yield Violation(file, spec.name, "unit length", f"off by {error:.2g}")
+def check_motion(stored: EpisodeArrays) -> Iterator[Violation]:
+    """Check that relative poses are the motion between absolute ones, all xyzw."""
+    for keys in schema.RELATIVE_PAIRS:
+        yield from check_pair(stored, keys)
+
+
+def check_pair(stored: EpisodeArrays, keys: tuple[str, str, str, str]) -> Iterator[Violation]:
+    """Check the relative poses of one of ``schema.RELATIVE_PAIRS``."""
+    position, orientation, rel_position, rel_orientation = keys
+    if not set(keys) <= stored.arrays.keys():
+        return
+    if any(np.linalg.norm(stored.arrays[key], axis=1).min() < 0.5 for key in (orientation, rel_orientation)):
+        return  # no quaternions: said already
+    expected, found = motion_of(stored, keys)
+    if same(expected, found).all():
+        return
+    if same(*motion_of(stored, keys, order=-1)).all():
+        yield Violation(stored.file, f"{orientation}, {rel_orientation}", "quaternions xyzw", "quaternions wxyz")
+        return
+    shift, turn = apart(expected, found)
+    for key, error, limit, unit in (
+        (rel_position, shift, POSITION_TOLERANCE, "m"),
+        (rel_orientation, turn, ANGLE_TOLERANCE, "rad"),
+    ):
+        if error.max() > limit:
+            rows = f"{int(np.sum(error > limit))} of {len(error)} rows off"
+            text = f"{rows}, by {error.max():.3g} {unit} in row {int(error.argmax())}"
+            yield Violation(stored.file, key, f"the motion between rows of {position}, {orientation}", text)
+
+
+def motion_of(stored: EpisodeArrays, keys: tuple[str, str, str, str], order: int = 0) -> tuple[NDArray, NDArray]:
+    """(T, 4, 4) the motion between absolute poses, and that which is stored; ``order`` -1: of quaternions wxyz."""
+    arrays = [stored.arrays[key].astype(np.float64) for key in keys]
+    absolute, relative = (from_xyzw(arrays[i], np.roll(arrays[i + 1], order, axis=1)) for i in (0, 2))
+    return relative_motion(absolute), relative
+
+
+def check_base_motion(stored: EpisodeArrays) -> Iterator[Violation]:
+    """Check that ``rel_agv_pose`` are the differences of ``agv_pose``."""
+    if {"agv_pose", "rel_agv_pose"} <= stored.arrays.keys():
+        error = np.abs(planar_motion(stored.arrays["agv_pose"]) - stored.arrays["rel_agv_pose"]).max()
+        if error > POSITION_TOLERANCE:
+            yield Violation(stored.file, "rel_agv_pose", "differences of agv_pose", f"off by {error:.3g}")
+
+
+def check_values(stored: EpisodeArrays) -> Iterator[Violation]:
+    """Check that the gripper can be that wide, sub-goals are of known types, and there is an instruction."""
+    width = stored.arrays.get("gripper_width")
+    if width is not None and (width.min() < -0.005 or width.max() > 0.085):
+        yield Violation(stored.file, "gripper_width", "0 to 0.08 m", f"{width.min():.3f} to {width.max():.3f}")
+    kinds = stored.arrays.get("step_goal_type", np.zeros(0, np.str_))
+    for kind in sorted(set(kinds.tolist()) - set(GOAL_TYPES)):
+        yield Violation(stored.file, "step_goal_type", f"one of {', '.join(GOAL_TYPES)}", kind)
+    if "language_goal" in stored.arrays and not str(stored.arrays["language_goal"]).strip():
+        yield Violation(stored.file, "language_goal", "an instruction", "nothing")
+
+
+FORM: tuple[Check, ...] = (check_file, check_keys, check_shapes, check_finite)
+"""What the other laws ask of arrays before they can be looked at."""
+CONTENT: tuple[Check, ...] = (check_motion, check_base_motion, check_values)
+
+
+def violations_of(stored: EpisodeArrays, checks: tuple[Check, ...]) -> Iterator[Violation]:
+    """What is wrong by some laws, one after the other."""
+    return (violation for check in checks for violation in check(stored))
+
+
+def _known(stored: EpisodeArrays) -> Iterator[tuple[schema.ArraySpec, NDArray]]:
+    return ((SPECS[key], array) for key, array in stored.arrays.items() if key in SPECS)

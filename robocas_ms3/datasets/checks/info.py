@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,35 +11,32 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
+from robocas_ms3.datasets.checks.content import NO_FILE, EpisodeContent, JsonObject, read_object
 from robocas_ms3.datasets.checks.violation import Violation
-from robocas_ms3.datasets.sources.tolerant import SPECS, first_line, is_declared
+from robocas_ms3.datasets.sources.tolerant import SPECS, is_declared
 from robocas_ms3.language.templates import GOAL_TYPES
 
 FILE = schema.DATA_INFO_FILE
 RANGE_TOLERANCE = 1e-4
 
 
-def check_info(root: Path, episodes: Mapping[int, Mapping[str, NDArray]]) -> Iterator[Violation]:
+def read_info(root: Path) -> JsonObject:
+    """Read the overview."""
+    unfinished = (root / schema.CONVERSION_FILE).is_file()
+    return read_object(root, FILE, missing=NO_FILE + (": not finished, convert with --resume" if unfinished else ""))
+
+
+def check_info(overview: JsonObject, episodes: Mapping[int, EpisodeContent]) -> Iterator[Violation]:
     """Check the overview.
 
     Args:
-        root: the dataset.
-        episodes: number -> arrays of the episodes on disk, as far as they could be read.
+        overview: ``data_info.json``.
+        episodes: number -> content of the episodes on disk.
     """
-    try:
-        info = json.loads((root / FILE).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        unfinished = (root / schema.CONVERSION_FILE).is_file()
-        yield Violation(
-            FILE, "", "this file", "no file" + (": not finished, convert with --resume" if unfinished else "")
-        )
+    if overview.wrong:
+        yield overview.wrong
         return
-    except (OSError, ValueError) as error:
-        yield Violation(FILE, "", "JSON", first_line(error))
-        return
-    if not isinstance(info, dict):
-        yield Violation(FILE, "", "an object", type(info).__name__)
-        return
+    info, arrays = overview.content, {number: content.stored.arrays for number, content in episodes.items()}
     for key in schema.DATA_INFO:
         if key not in info:
             yield Violation(FILE, key, "this key", "no such key")
@@ -55,12 +51,12 @@ def check_info(root: Path, episodes: Mapping[int, Mapping[str, NDArray]]) -> Ite
         if wanted != found:
             yield Violation(FILE, key, "the episodes on disk", f"{len(wanted ^ found)} others or missing")
         for number in sorted(wanted & found, key=int):
-            yield from _entry(key, number, info[key][number], episodes[int(number)])
+            yield from _entry(key, number, info[key][number], arrays[int(number)])
     if "action_space" in info:
-        yield from _ranges(info["action_space"], episodes)
+        yield from _ranges(info["action_space"], arrays)
 
 
-def _split(info: dict[str, Any], there: set[int]) -> Iterator[Violation]:
+def _split(info: Mapping[str, Any], there: set[int]) -> Iterator[Violation]:
     parts = {key: info[key] for key in ("train_eps", "val_eps") if key in info}
     for key, numbers in parts.items():
         if not isinstance(numbers, list) or not all(type(number) is int for number in numbers):
@@ -100,6 +96,8 @@ def _entry(key: str, number: str, value: Any, arrays: Mapping[str, NDArray]) -> 
 
 def _goals(shown: str, goals: list[tuple[str, str, int, int]], arrays: Mapping[str, NDArray]) -> Iterator[Violation]:
     texts, kinds = arrays["step_lang_goals"].tolist(), arrays["step_goal_type"].tolist()
+    if len(texts) != len(kinds):
+        return  # said already
     next_step = 0
     for kind, text, first, last in goals:
         if kind not in GOAL_TYPES:

@@ -2,26 +2,51 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from robocas_ms3.datasets.checks import arrays as laws
+from robocas_ms3.datasets.checks.content import read_object
 from robocas_ms3.datasets.checks.dataset import Report
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_videos import TOLERANCE, check_videos
+from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.stats import QUANTILES
-from robocas_ms3.datasets.lerobot.tables import numbers, read_texts
-from robocas_ms3.datasets.schema import GOAL_TYPES
+from robocas_ms3.datasets.lerobot.tables import numbers
+from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
 
 _KEYS = ("codebase_version", "total_episodes", "total_frames", "total_tasks", "fps", "splits", "features", "data_path")
+_UNREADABLE = (OSError, pa.ArrowException, KeyError)
+Ranges = Mapping[str, tuple[NDArray, NDArray, int]]
+"""Feature -> least and greatest of each of its numbers, and how many frames."""
+Texts = Mapping[str, list[str]]
+"""Index feature -> texts that it is of."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """An episode's frames: where they are, its row, numeric features (T, D) and types of sub-goals (T,) or none."""
+
+    file: str
+    row: Mapping[str, Any]
+    count: int
+    columns: Mapping[str, NDArray]
+    types: list[Any]
+
+    def violation(self, key: str, expected: object, found: object) -> Violation:
+        """One of this episode."""
+        where = f"episode {self.row['episode_index']}"
+        return Violation(self.file, f"{where}, {key}" if key else where, str(expected), str(found))
 
 
 def is_lerobot(root: Path) -> bool:
@@ -41,241 +66,218 @@ def check_lerobot(
         on_episode: called with the number of episodes done and of all.
 
     Returns:
-        What is wrong, in the order of discovery; empty for a valid dataset.
+        What is wrong; empty for a valid dataset.
 
     Raises:
         MissingExtraError: the ``lerobot`` extra is not installed.
     """
     schema.require_extra()
-    return list(_Check(Path(root), decode, on_episode or (lambda *_: None)).run())
+    root = Path(root)
+    info = read_object(root, schema.INFO_FILE, absent="JSON")
+    wrong = [info.wrong] if info.wrong else list(_check_info(info.content))
+    if wrong:
+        return wrong
+    try:
+        dataset = LeRobotDataset(root)
+        subtasks = dataset.subtasks if schema.SUBTASK_INDEX.key in dataset.info["features"] else []
+        texts = {"task_index": dataset.tasks, schema.SUBTASK_INDEX.key: subtasks}
+        totals = list(_check_totals(dataset))
+    except _UNREADABLE as error:
+        return [Violation("meta", "", "readable tables", first_line(error))]
+    data, ranges = _check_data(dataset, texts, on_episode or (lambda *_: None))
+    videos = [key for key, feature in dataset.info["features"].items() if feature["dtype"] == "video"]
+    return [
+        *totals,
+        *data,
+        *(wrong for key in videos for wrong in check_videos(dataset, key, decode)),
+        *_check_statistics(dataset, ranges),
+        *_check_checksums(root),
+    ]
 
 
-class _Check:
-    def __init__(self, root: Path, decode: bool, on_episode: Callable[[int, int], None]) -> None:
-        self.root, self.decode, self.on_episode = root, decode, on_episode
-        self.info: dict[str, Any] = {}
-        self.ranges: dict[str, tuple[np.ndarray, np.ndarray, int]] = {}
+def _check_info(info: Mapping[str, Any]) -> Iterator[Violation]:
+    missing = [key for key in _KEYS if key not in info]
+    if missing:
+        yield Violation(schema.INFO_FILE, ", ".join(missing), "a value", "nothing")
+    elif info["codebase_version"] != schema.CODEBASE_VERSION:
+        found = str(info["codebase_version"])
+        yield Violation(schema.INFO_FILE, "codebase_version", schema.CODEBASE_VERSION, found)
+    elif not isinstance(info["fps"], int):
+        yield Violation(schema.INFO_FILE, "fps", "a whole number", str(info["fps"]))
 
-    def run(self) -> Iterator[Violation]:
-        """Everything; what can't be read ends it."""
+
+def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
+    rows, info, tasks = dataset.rows, dataset.info, dataset.tasks
+    found = {"total_episodes": len(rows), "total_frames": sum(row["length"] for row in rows), "total_tasks": len(tasks)}
+    for key, value in found.items():
+        if info[key] != value:
+            yield Violation(schema.INFO_FILE, key, str(value), str(info[key]))
+    if len(set(tasks)) != len(tasks):
+        yield Violation(schema.TASKS_FILE, "", "each text once", "some twice")
+    start = 0
+    for index, row in enumerate(rows):
+        end = start + row["length"]
+        for key, value in (("episode_index", index), ("dataset_from_index", start), ("dataset_to_index", end)):
+            if row[key] != value:
+                yield Violation("meta/episodes", f"episode {index}, {key}", str(value), str(row[key]))
+        start = end
+
+
+def _check_data(
+    dataset: LeRobotDataset, texts: Texts, on_episode: Callable[[int, int], None]
+) -> tuple[list[Violation], Ranges]:
+    """What is wrong with the frames, each file opened once, and the ranges of their numbers."""
+    root, features = dataset.root, dataset.info["features"]
+    wanted = sorted(key for key, feature in features.items() if feature["dtype"] != "video")
+    by_file: dict[Path, list[dict[str, Any]]] = defaultdict(list)
+    for row in dataset.rows:
+        place = row["data/chunk_index"], row["data/file_index"]
+        by_file[schema.data_file(root, dataset.info["data_path"], *place)].append(row)
+    violations: list[Violation] = []
+    ranges: Ranges = {}
+    done = 0
+    for path, inside in by_file.items():
+        name, count = str(path.relative_to(root)), sum(row["length"] for row in inside)
         try:
-            self.info = json.loads((self.root / schema.INFO_FILE).read_text(encoding="utf-8"))
-            missing = [key for key in _KEYS if key not in self.info]
-        except (OSError, ValueError) as error:
-            yield Violation(schema.INFO_FILE, "", "JSON", _say(error))
-            return
-        if missing:
-            yield Violation(schema.INFO_FILE, ", ".join(missing), "a value", "nothing")
-            return
-        if self.info["codebase_version"] != schema.CODEBASE_VERSION:
-            found = str(self.info["codebase_version"])
-            yield Violation(schema.INFO_FILE, "codebase_version", schema.CODEBASE_VERSION, found)
-            return
-        if not isinstance(self.info["fps"], int):
-            yield Violation(schema.INFO_FILE, "fps", "a whole number", str(self.info["fps"]))
-            return
-        try:
-            self.tasks = read_texts(self.root / schema.TASKS_FILE)
-            subtasks = schema.SUBTASK_INDEX.key in self.info["features"]
-            self.subtasks = read_texts(self.root / schema.SUBTASKS_FILE) if subtasks else []
-            rows = self._episodes()
-        except (OSError, pa.ArrowException, KeyError) as error:
-            yield Violation("meta", "", "readable tables", _say(error))
-            return
-        yield from self._totals(rows)
-        yield from self._each(rows)
-        yield from self._statistics()
-        yield from self._checksums()
-
-    def _episodes(self) -> list[dict[str, Any]]:
-        found: list[dict[str, Any]] = []
-        for path in sorted((self.root / "meta/episodes").glob("*/*.parquet")):
             with pq.ParquetFile(path) as file:
-                names = [n for n in file.schema_arrow.names if not n.startswith("stats/") or n.endswith("/count")]
-                found += file.read(columns=names).to_pylist()
-        return found
-
-    def _totals(self, rows: list[dict[str, Any]]) -> Iterator[Violation]:
-        found = {"total_episodes": len(rows), "total_frames": sum(row["length"] for row in rows)}
-        found["total_tasks"] = len(self.tasks)
-        for key, value in found.items():
-            if self.info[key] != value:
-                yield Violation(schema.INFO_FILE, key, str(value), str(self.info[key]))
-        if len(set(self.tasks)) != len(self.tasks):
-            yield Violation(schema.TASKS_FILE, "", "each text once", "some twice")
-        start = 0
-        for index, row in enumerate(rows):
-            expected = {
-                "episode_index": index,
-                "dataset_from_index": start,
-                "dataset_to_index": start + row["length"],
-            }
-            for key, value in expected.items():
-                if row[key] != value:
-                    yield Violation("meta/episodes", f"episode {index}, {key}", str(value), str(row[key]))
-            start += row["length"]
-
-    def _each(self, rows: list[dict[str, Any]]) -> Iterator[Violation]:
-        """Data files and videos, each opened once."""
-        features = self.info["features"]
-        by_file: dict[tuple[int, int], list[dict[str, Any]]] = defaultdict(list)
-        for row in rows:
-            by_file[row["data/chunk_index"], row["data/file_index"]].append(row)
-        done = 0
-        for place, inside in by_file.items():
-            path = schema.data_file(self.root, self.info["data_path"], *place)
-            name = str(path.relative_to(self.root))
-            try:
-                with pq.ParquetFile(path) as file:
-                    yield from self._columns(name, file.schema_arrow.names)
-                    if file.metadata.num_rows != sum(row["length"] for row in inside):
-                        expected = str(sum(row["length"] for row in inside))
-                        yield Violation(name, "rows", expected, str(file.metadata.num_rows))
-                        continue
-                for row in inside:  # one at a time: memory does not grow with the file
-                    yield from self._episode(name, row, _rows_of(path, row["episode_index"]))
-                    done += 1
-                    self.on_episode(done, len(rows))
-            except (OSError, pa.ArrowException, KeyError) as error:
-                yield Violation(name, "", "a readable table", _say(error))
-        files = {str(p.relative_to(self.root)) for p in (self.root / "data").rglob("*") if p.is_file()}
-        files -= {
-            str(schema.data_file(self.root, self.info["data_path"], *place).relative_to(self.root)) for place in by_file
-        }
-        yield from (Violation(name, "", "files of episodes only", "of none") for name in sorted(files))
-        for key, feature in features.items():
-            if feature["dtype"] == "video":
-                yield from check_videos(self.root, self.info, rows, key, self.decode)
-
-    def _columns(self, name: str, found: list[str]) -> Iterator[Violation]:
-        expected = {key for key, feature in self.info["features"].items() if feature["dtype"] != "video"}
-        if set(found) != expected:
-            yield Violation(name, "columns", ", ".join(sorted(expected)), ", ".join(sorted(found)))
-
-    def _episode(self, name: str, row: dict[str, Any], table: pa.Table) -> Iterator[Violation]:
-        index, length, start = row["episode_index"], row["length"], row["dataset_from_index"]
-        where = f"episode {index}"
-        if len(table) != length:
-            yield Violation(name, where, f"{length} frames", str(len(table)))
-            return
-        if length == 0:
-            yield Violation(name, where, "frames", "none")
-            return
-        columns = {}
-        for key, feature in self.info["features"].items():
-            if feature["dtype"] in ("video", "string", "image"):
+                names, found = sorted(file.schema_arrow.names), file.metadata.num_rows
+            if names != wanted:
+                violations.append(Violation(name, "columns", ", ".join(wanted), ", ".join(names)))
+            if found != count:
+                violations.append(Violation(name, "rows", str(count), str(found)))
                 continue
-            values = columns[key] = numbers(table.column(key))
-            if values.shape[1] != int(np.prod(feature["shape"])):
-                yield Violation(name, f"{where}, {key}", f"{feature['shape']} numbers", str(values.shape[1]))
-            elif not np.isfinite(values).all():
-                step = int(np.argwhere(~np.isfinite(values))[0, 0])
-                yield Violation(name, f"{where}, {key}", "finite numbers", f"{values[step]} at frame {step}")
-            else:
-                self._widen(key, values)
-        steps = np.arange(length)
-        expected = {"frame_index": steps, "index": start + steps, "episode_index": np.full(length, index)}
-        for key, values in expected.items():
-            if not np.array_equal(columns[key][:, 0], values):
-                yield Violation(name, f"{where}, {key}", f"{values[0]} to {values[-1]}", "others")
-        late = np.abs(columns["timestamp"][:, 0] - steps / self.info["fps"])
-        if not (late < TOLERANCE).all():
-            step = int(late.argmax())
-            found = f"{columns['timestamp'][step, 0]} s"
-            yield Violation(name, f"{where}, timestamp {step}", f"{step / self.info['fps']} s", found)
-        yield from self._texts(name, where, row, table, columns)
-        yield from self._actions(name, where, columns)
+            for row in inside:  # one at a time: memory does not grow with the file
+                frames = _read_frames(path, name, row, features)
+                violations += check_frames(frames, dataset.info, texts)
+                ranges = _widened(ranges, frames, features)
+                done += 1
+                on_episode(done, len(dataset.rows))
+        except _UNREADABLE as error:
+            violations.append(Violation(name, "", "a readable table", first_line(error)))
+    others = sorted(path for path in (root / "data").rglob("*") if path.is_file() and path not in by_file)
+    extra = (Violation(str(path.relative_to(root)), "", "files of episodes only", "of none") for path in others)
+    return [*violations, *extra], ranges
 
-    def _widen(self, key: str, values: np.ndarray) -> None:
-        low, high, count = values.min(axis=0), values.max(axis=0), len(values)
-        if key in self.ranges:
-            before = self.ranges[key]
-            low, high, count = np.minimum(low, before[0]), np.maximum(high, before[1]), count + before[2]
-        self.ranges[key] = low, high, count
 
-    def _texts(
-        self, name: str, where: str, row: dict[str, Any], table: pa.Table, columns: dict[str, np.ndarray]
-    ) -> Iterator[Violation]:
-        numbered = {"task_index": self.tasks, schema.SUBTASK_INDEX.key: self.subtasks}
-        for key, texts in numbered.items():
-            if key in columns:
-                used = set(columns[key][:, 0].tolist())
-                if not used <= set(range(len(texts))):
-                    yield Violation(name, f"{where}, {key}", f"0 to {len(texts) - 1}", str(sorted(used)))
-                elif key == "task_index" and {texts[i] for i in used} != set(row["tasks"]):
-                    yield Violation(
-                        "meta/episodes", f"{where}, tasks", str([texts[i] for i in used]), str(row["tasks"])
-                    )
-        if schema.SUBGOAL_TYPE.key in table.column_names:
-            unknown = set(table.column(schema.SUBGOAL_TYPE.key).to_pylist()) - set(GOAL_TYPES)
-            if unknown:
-                expected = "one of " + ", ".join(GOAL_TYPES)
-                yield Violation(name, f"{where}, {schema.SUBGOAL_TYPE.key}", expected, str(sorted(map(str, unknown))))
+def _read_frames(path: Path, name: str, row: Mapping[str, Any], features: Mapping[str, Any]) -> Frames:
+    table = pq.read_table(path, filters=[("episode_index", "=", row["episode_index"])])
+    numeric = [key for key, feature in features.items() if feature["dtype"] not in ("video", "string", "image")]
+    key = schema.SUBGOAL_TYPE.key
+    types = table.column(key).to_pylist() if key in table.column_names else []
+    return Frames(name, row, len(table), {key: numbers(table.column(key)) for key in numeric}, types)
 
-    def _actions(self, name: str, where: str, columns: dict[str, np.ndarray]) -> Iterator[Violation]:
-        """What `action` says must be what the next state shows; only datasets of ours have these columns."""
-        if not {feature.key for feature in schema.FEATURES} <= set(columns):
+
+def _widened(ranges: Ranges, frames: Frames, features: Mapping[str, Any]) -> Ranges:
+    """Ranges with another episode's; what is no finite number does not count."""
+    wide = dict(ranges)
+    for key, values in frames.columns.items():
+        if len(values) and not _fault(values, features[key]):
+            low, high, count = ranges.get(key, (values[0], values[0], 0))
+            wide[key] = np.minimum(low, values.min(axis=0)), np.maximum(high, values.max(axis=0)), count + len(values)
+    return wide
+
+
+def _fault(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str] | None:
+    """What is expected of numbers, and found."""
+    if values.shape[1] != int(np.prod(feature["shape"])):
+        return f"{feature['shape']} numbers", str(values.shape[1])
+    wrong = np.argwhere(~np.isfinite(values))
+    return ("finite numbers", f"{values[wrong[0, 0]]} at frame {wrong[0, 0]}") if len(wrong) else None
+
+
+def check_frames(frames: Frames, info: Mapping[str, Any], texts: Texts) -> Iterator[Violation]:
+    """Check an episode's frames: what they count, when, of what; and that they agree with each other."""
+    length, columns = frames.row["length"], frames.columns
+    if frames.count != length or length == 0:
+        yield frames.violation("", f"{length} frames" if length else "frames", frames.count or "none")
+        return
+    faults = [(key, fault) for key, found in columns.items() if (fault := _fault(found, info["features"][key]))]
+    yield from (frames.violation(key, *fault) for key, fault in faults)
+    steps = np.arange(length)
+    start, index = frames.row["dataset_from_index"], frames.row["episode_index"]
+    expected = {"frame_index": steps, "index": start + steps, "episode_index": np.full(length, index)}
+    for key, values in expected.items():
+        if not np.array_equal(columns[key][:, 0], values):
+            yield frames.violation(key, f"{values[0]} to {values[-1]}", "others")
+    late = np.abs(columns["timestamp"][:, 0] - steps / info["fps"])
+    if not (late < TOLERANCE).all():
+        step = int(late.argmax())
+        found = f"{columns['timestamp'][step, 0]} s"
+        yield frames.violation(f"timestamp {step}", f"{step / info['fps']} s", found)
+    unknown = list(_check_texts(frames, texts))
+    yield from unknown
+    if not faults and not unknown:
+        yield from _check_content(frames)
+
+
+def _check_texts(frames: Frames, texts: Texts) -> Iterator[Violation]:
+    for key, known in texts.items():
+        used = set(frames.columns[key][:, 0].tolist()) if key in frames.columns else set()
+        if not used <= set(range(len(known))):
+            yield frames.violation(key, f"0 to {len(known) - 1}", sorted(used))
+        elif key == "task_index" and {known[i] for i in used} != set(frames.row["tasks"]):
+            expected = str([known[i] for i in used])
+            yield replace(frames.violation("tasks", expected, frames.row["tasks"]), file="meta/episodes")
+
+
+def _check_content(frames: Frames) -> Iterator[Violation]:
+    """Check what frames of ours say as the arrays of a RoboCAS folder are, and that actions lead to the next state."""
+    columns, key = frames.columns, schema.SUBGOAL_TYPE.key
+    arrays: dict[str, NDArray] = {"step_goal_type": np.array([str(kind) for kind in frames.types], np.str_)}
+    if {feature.key for feature in schema.FEATURES} <= set(columns):
+        state, command, status = columns["observation.state"], columns["action"], columns["observation.gripper_open"]
+        if not np.array_equal(command[:, 6], np.append(status[1:], status[-1:])):
+            yield frames.violation("action", "the gripper's command of the next step", "another")
+        if not np.array_equal(columns["action.joint"][:, :7], np.concatenate([state[1:, 7:14], state[-1:, 7:14]])):
+            yield frames.violation("action.joint", "the next step's joints", "others")
+        quaternions = np.linalg.norm([state[:, 3:7], columns["observation.arm_base"][:, 3:]], axis=-1)
+        if quaternions.min() < 0.5:
+            yield frames.violation("observation.state, observation.arm_base", "unit quaternions", "others")
             return
-        state, command = columns["observation.state"], columns["action"][:, 6]
-        status = columns["observation.gripper_open"][:, 0]
-        if not np.array_equal(command, np.append(status[1:], status[-1:])):
-            yield Violation(name, f"{where}, action", "the gripper's command of the next step", "another")
-        joints = columns["action.joint"][:, :7]
-        if not np.array_equal(joints, np.concatenate([state[1:, 7:14], state[-1:, 7:14]])):
-            yield Violation(name, f"{where}, action.joint", "the next step's joints", "others")
-
-    def _statistics(self) -> Iterator[Violation]:
-        """``stats.json`` has every feature, and the ranges that the data have."""
-        try:
-            stats = json.loads((self.root / schema.STATS_FILE).read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            yield Violation(schema.STATS_FILE, "", "JSON", _say(error))
-            return
-        for key, feature in self.info["features"].items():
-            if feature["dtype"] == "string":
-                continue
-            found = stats.get(key, {})
-            missing = {"min", "max", "mean", "std", "count", *QUANTILES} - set(found)
-            if missing:
-                yield Violation(schema.STATS_FILE, key, ", ".join(sorted(missing)), "nothing")
-                continue
-            shape = (3, 1, 1) if feature["dtype"] == "video" else tuple(feature["shape"])
-            wrong = [name for name, value in found.items() if name != "count" and np.shape(value) != shape]
-            if wrong:
-                yield Violation(
-                    schema.STATS_FILE, f"{key}, {wrong[0]}", f"shape {shape}", f"{np.shape(found[wrong[0]])}"
-                )
-            elif key in self.ranges:
-                low, high, count = self.ranges[key]
-                same = np.allclose(found["min"], low, atol=1e-6) and np.allclose(found["max"], high, atol=1e-6)
-                if not same or found["count"] != [count]:
-                    expected = f"min {low.tolist()}, max {high.tolist()}, count {count}"
-                    text = f"min {found['min']}, max {found['max']}, count {found['count'][0]}"
-                    yield Violation(schema.STATS_FILE, key, expected, text)
-
-    def _checksums(self) -> Iterator[Violation]:
-        path = self.root / schema.CHECKSUMS_FILE
-        if not path.is_file():
-            return
-        try:
-            sums = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            yield Violation(schema.CHECKSUMS_FILE, "", "JSON", _say(error))
-            return
-        for name, expected in sums.items():
-            if not (self.root / name).is_file():
-                yield Violation(name, "", "a file", "none")
-            elif (found := schema.checksum(self.root / name)) != expected:
-                yield Violation(name, "", f"the bytes that were written, SHA-256 {expected[:12]}", found[:12])
+        turns = Rotation.from_euler("xyz", command[:, 3:6]).as_quat()
+        instruction, types = next(iter(frames.row["tasks"]), ""), arrays["step_goal_type"].tolist()
+        arrays = {**schema.robocas_arrays(dict(columns), instruction, [], types), "rel_orn": turns}
+    for wrong in laws.violations_of(EpisodeArrays(Path(frames.file), arrays), (laws.check_units, *laws.CONTENT)):
+        yield frames.violation(key if wrong.key == "step_goal_type" else wrong.key, wrong.expected, wrong.found)
 
 
-def _rows_of(path: Path, episode: int) -> pa.Table:
-    return pq.read_table(path, filters=[("episode_index", "=", episode)])
+def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Violation]:
+    """``stats.json`` has every feature, and the ranges that the data have."""
+    stats = read_object(dataset.root, schema.STATS_FILE, absent="JSON")
+    if stats.wrong:
+        yield stats.wrong
+        return
+    for key, feature in dataset.info["features"].items():
+        if feature["dtype"] == "string":
+            continue
+        found = stats.content.get(key, {})
+        missing = {"min", "max", "mean", "std", "count", *QUANTILES} - set(found)
+        if missing:
+            yield Violation(schema.STATS_FILE, key, ", ".join(sorted(missing)), "nothing")
+            continue
+        shape = (3, 1, 1) if feature["dtype"] == "video" else tuple(feature["shape"])
+        wrong = [name for name, value in found.items() if name != "count" and np.shape(value) != shape]
+        if wrong:
+            shown = f"{np.shape(found[wrong[0]])}"
+            yield Violation(schema.STATS_FILE, f"{key}, {wrong[0]}", f"shape {shape}", shown)
+        elif key in ranges:
+            low, high, count = ranges[key]
+            same = np.allclose(found["min"], low, atol=1e-6) and np.allclose(found["max"], high, atol=1e-6)
+            if not same or found["count"] != [count]:
+                expected = f"min {low.tolist()}, max {high.tolist()}, count {count}"
+                text = f"min {found['min']}, max {found['max']}, count {found['count'][0]}"
+                yield Violation(schema.STATS_FILE, key, expected, text)
 
 
-def _say(error: Exception) -> str:
-    text = str(error).strip() or type(error).__name__
-    return text.splitlines()[0]
+def _check_checksums(root: Path) -> Iterator[Violation]:
+    sums = read_object(root, schema.CHECKSUMS_FILE)
+    if sums.wrong and (root / schema.CHECKSUMS_FILE).is_file():
+        yield sums.wrong
+    for name, expected in sums.content.items():
+        if not (root / name).is_file():
+            yield Violation(name, "", "a file", "none")
+        elif (found := schema.checksum(root / name)) != expected:
+            yield Violation(name, "", f"the bytes that were written, SHA-256 {expected[:12]}", found[:12])
 
 
 def report_lerobot(root: Path, *, on_episode: Callable[[int, int], None] | None = None) -> Report:
@@ -288,7 +290,6 @@ def report_lerobot(root: Path, *, on_episode: Callable[[int, int], None] | None 
         if on_episode:
             on_episode(done, total)
 
-    violations, steps = check_lerobot(root, on_episode=count), 0
-    with suppress(OSError, ValueError, KeyError, TypeError):  # told among the violations
-        steps = int(json.loads((root / schema.INFO_FILE).read_text(encoding="utf-8"))["total_frames"])
-    return Report(looked, steps, violations)
+    violations = check_lerobot(root, on_episode=count)
+    steps = read_object(root, schema.INFO_FILE).content.get("total_frames")
+    return Report(looked, steps if isinstance(steps, int) else 0, violations)

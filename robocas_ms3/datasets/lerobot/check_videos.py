@@ -9,6 +9,7 @@ from typing import Any
 
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.video import packet_times, read_frames
 from robocas_ms3.errors import DatasetError
 
@@ -17,18 +18,15 @@ TOLERANCE = 1e-4
 _MILLISECONDS = 0.6e-3  # Matroska rounds to them
 
 
-def check_videos(
-    root: Path, info: dict[str, Any], rows: list[dict[str, Any]], key: str, decode: bool
-) -> Iterator[Violation]:
+def check_videos(dataset: LeRobotDataset, key: str, decode: bool) -> Iterator[Violation]:
     """Check a camera's videos, and its depth where there is any.
 
     Args:
-        root: the dataset.
-        info: ``meta/info.json``.
-        rows: of ``meta/episodes``.
+        dataset: it is in.
         key: of the camera's feature.
         decode: whether to decode the frames, or to count them only.
     """
+    root, info, rows = dataset.root, dataset.info, dataset.rows
     camera, feature = schema.camera_of(key), info["features"][key]
     kinds = [(f"videos/{key}", info["video_path"], {"video_key": key})]
     if rows and f"depth/{camera}/file_index" in rows[0]:

@@ -40,7 +40,7 @@ class Member:
 
 
 @dataclass(frozen=True)
-class Assembled:
+class Assembly:
     """What was done: episodes, how many of them were there already, files linked and copied."""
 
     out: Path
@@ -88,7 +88,7 @@ def assemble(
     resume: bool = False,
     on_start: OnStart | None = None,
     on_episode: OnEpisode | None = None,
-) -> Assembled:
+) -> Assembly:
     """Write a dataset of these episodes, in this order, numbered from 0; `check_before` has seen them.
 
     Killed at any moment, it goes on with ``resume``, and ends as if it had not been. Hard links share the files with
@@ -122,7 +122,7 @@ def assemble(
                 on_episode(number)
         sides = [[n for n, member in enumerate(members) if member.side == side] for side in ("train", "val")]
         write_info(out, (sides[0], sides[1]))
-    return Assembled(out, len(members), len(members) - len(missing), placed.linked, placed.copied)
+    return Assembly(out, len(members), len(members) - len(missing), placed.linked, placed.copied)
 
 
 def _plan(members: Sequence[Member], split_rule: str) -> dict[str, Any]:

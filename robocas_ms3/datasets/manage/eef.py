@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.sources.tolerant import SPECS, derive_motion
+from robocas_ms3.datasets.sources.arrays import continuous_xyzw
+from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays, motion_arrays
 
 _CAMERA_OFFSET = (0.03, 0.07)  # m: the gripper camera's distance from the hand's axis, 0.05
 
@@ -33,11 +36,8 @@ def about_z(degrees: float) -> NDArray[np.float64]:
     return matrix
 
 
-def turn(arrays: dict[str, NDArray], degrees: float) -> None:
-    """Turn the EEF frame of an episode about its own z."""
-    turned = Rotation.from_quat(arrays["ee_orn"]) * Rotation.from_euler("z", degrees, degrees=True)
-    quaternions = turned.as_quat()
-    kept = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
-    quaternions[1:] *= np.where(np.cumsum(kept) % 2, -1.0, 1.0)[:, None]
-    arrays["ee_orn"] = SPECS["ee_orn"].cast(quaternions * (1 if quaternions[0, 3] >= 0 else -1))
-    derive_motion(arrays, schema.RELATIVE_PAIRS[0])
+def turned(stored: EpisodeArrays, degrees: float) -> EpisodeArrays:
+    """The same with the EEF frame turned about its own z."""
+    turns = Rotation.from_quat(stored.arrays["ee_orn"]) * Rotation.from_euler("z", degrees, degrees=True)
+    arrays = {**stored.arrays, "ee_orn": SPECS["ee_orn"].cast(continuous_xyzw(turns.as_matrix()))}
+    return replace(stored, arrays={**arrays, **motion_arrays(arrays, schema.RELATIVE_PAIRS[0])})

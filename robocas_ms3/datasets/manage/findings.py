@@ -1,15 +1,17 @@
-"""What is found out about a dataset made elsewhere: problems, and episodes that can be taken."""
+"""What is found out about a dataset made elsewhere: problems, and episodes as they would be taken."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
-from numpy.typing import NDArray
-
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.tolerant import EpisodeArrays
 
-FULL_SIZE = (640, 480)
+ESSENTIAL = ("ee_pos", "ee_orn", "gripper_status", "language_goal", "step_lang_goals", "step_goal_type")
+"""Without one of these an episode is of no use; relative motion follows from ee_pos and ee_orn."""
+EMBEDDINGS = tuple(spec.name for spec in schema.EPISODE_INFO if spec.embedding)
 Outcome = Literal["left out", "mended", "noted"]
 
 
@@ -31,80 +33,41 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Layout:
-    """What all episodes of a dataset share. ``size`` is None where cameras differ or it is 640 x 480."""
-
-    cameras: tuple[str, ...]
-    depth: bool
-    image_format: schema.ImageFormat
-    size: tuple[int, int] | None
-
-    def __str__(self) -> str:
-        size = "{} x {}".format(*(self.size or FULL_SIZE))
-        return f"{', '.join(self.cameras)}, {size} {self.image_format}, {'with' if self.depth else 'without'} depth"
-
-
-@dataclass
-class Found:
-    """An episode that can be taken.
+class EpisodeImport:
+    """An episode made elsewhere, with what could be put right.
 
     Attributes:
         number: of it.
-        arrays: all of them, as the schema wants them.
-        derived: key -> what it was made of.
-        missing: keys that could not be made.
-        mended: what was put right, in words.
+        stored: its arrays, as the schema wants them.
+        findings: what is not, or was not.
         turn_deg: its EEF frame was turned by this about z, to be ManiSkill's.
-        layout: of its pictures.
+        pictures: that it has; None where they were not looked at.
     """
 
     number: int
-    arrays: dict[str, NDArray] = field(default_factory=dict)
-    derived: dict[str, str] = field(default_factory=dict)
-    missing: list[str] = field(default_factory=list)
-    mended: list[str] = field(default_factory=list)
+    stored: EpisodeArrays
+    findings: tuple[Finding, ...]
     turn_deg: int = 0
-    layout: Layout | None = None
+    pictures: Pictures | None = None
 
     @property
-    def steps(self) -> int:
-        """T."""
-        return int(self.arrays["episode_length"])
+    def usable(self) -> bool:
+        """Whether it can be taken."""
+        return all(finding.outcome != "left out" for finding in self.findings)
 
     @property
     def embedded(self) -> bool:
         """Whether all embeddings are there."""
-        return all(spec.name in self.arrays for spec in schema.EPISODE_INFO if spec.embedding)
+        return set(EMBEDDINGS) <= self.stored.arrays.keys()
 
+    @property
+    def missing(self) -> list[str]:
+        """Keys that could not be made."""
+        wanted = (spec.name for spec in schema.EPISODE_INFO if not spec.embedding)
+        return [key for key in wanted if key not in self.stored.arrays]
 
-@dataclass
-class Report:
-    """Collects the findings of one episode.
-
-    Attributes:
-        number: of it.
-        folder: its path in the dataset, with a slash.
-        findings: they are added here.
-        usable: whether it can be taken, as far as is known.
-        mendings: what was put right, in words.
-    """
-
-    number: int
-    folder: str
-    findings: list[Finding]
-    usable: bool = True
-    mendings: list[str] = field(default_factory=list)
-
-    def bad(self, file: str, problem: str) -> None:
-        """The episode can't be taken."""
-        self.usable = False
-        self.findings.append(Finding(self.number, self.folder + file, problem, "left out"))
-
-    def mended(self, file: str, problem: str) -> None:
-        """Something was put right."""
-        self.mendings.append(f"{file}: {problem}")
-        self.findings.append(Finding(self.number, self.folder + file, problem, "mended"))
-
-    def noted(self, file: str, problem: str) -> None:
-        """Something is taken, or left, as it is."""
-        self.findings.append(Finding(self.number, self.folder + file, problem, "noted"))
+    @property
+    def mended(self) -> list[str]:
+        """What was put right, in words."""
+        mended = (finding for finding in self.findings if finding.outcome == "mended")
+        return [f"{finding.file.split('/', 1)[1]}: {finding.problem}" for finding in mended]

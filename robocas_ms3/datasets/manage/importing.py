@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,14 @@ from numpy.typing import NDArray
 import robocas_ms3
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.eef import about_z
-from robocas_ms3.datasets.manage.findings import Found
+from robocas_ms3.datasets.manage.findings import EMBEDDINGS, EpisodeImport
 from robocas_ms3.datasets.manage.output import Placed, begun_output
 from robocas_ms3.datasets.manage.parts import schema_version
 from robocas_ms3.datasets.manage.reading import read_episode
 from robocas_ms3.datasets.manage.survey import Survey, read_info
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.episode import Overview
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
 from robocas_ms3.datasets.writing.frames import CameraModel
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings
@@ -63,7 +64,7 @@ def import_robocas(
         DatasetError: nothing can be taken, or the output is the input or something else was begun there.
         OutputExistsError: ``out`` is not empty and neither flag is set.
     """
-    if not surveyed.taken or surveyed.layout is None:
+    if not surveyed.taken or surveyed.pictures is None:
         raise DatasetError(
             "no episode can be taken",
             where=surveyed.root,
@@ -71,7 +72,7 @@ def import_robocas(
             fix="robocas import-robocas without --out says what is wrong.",
         )
     dataset = Dataset(surveyed.root)
-    info = read_info(dataset, [])
+    info, _ = read_info(dataset)
     embedded = surveyed.embeddings or embed is not None
     plan = _plan(dataset, surveyed, embedded)
     with begun_output(out, plan, inputs=[surveyed.root], overwrite=overwrite, resume=resume):
@@ -80,16 +81,15 @@ def import_robocas(
         if on_start:
             on_start(len(missing))
         for number in missing:
-            found = read_episode(
-                dataset, number, info, [], rate_hz=surveyed.rate_hz, turn_eef=surveyed.turn_eef, pictures=False
+            read = read_episode(
+                dataset, number, info, rate_hz=surveyed.rate_hz, turn_eef=surveyed.turn_eef, pictures=False
             )
-            if found is None:
-                raise DatasetError(
-                    "this episode changed meanwhile", where=surveyed.root / schema.episode_folder(number)
-                )
-            _embeddings(found, embedded, embed)
+            if not read.usable:
+                where = surveyed.root / schema.episode_folder(number)
+                raise DatasetError("this episode changed meanwhile", where=where)
+            taken = replace(read, stored=_embedded(read, embedded, embed))
             with replacing_folder(out / schema.episode_folder(number)) as folder:
-                _write(folder, dataset.episode(number), found, surveyed, placed)
+                _write(folder, dataset.episode(number), taken, surveyed, placed)
             if on_episode:
                 on_episode(number)
         write_json(out / REPORT_FILE, surveyed.as_json())
@@ -98,9 +98,7 @@ def import_robocas(
 
 
 def _plan(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any]:
-    assert surveyed.layout is not None
-    layout = surveyed.layout
-    pictures = Pictures(layout.cameras, layout.size, layout.depth, layout.image_format)
+    assert surveyed.pictures is not None
     unknown = dict.fromkeys(("trajectory", "trajectory_episode", "seed", "success", "target", "recording"))
     before = dataset.settings.get("episodes", {})  # of one that is ours
     name = surveyed.root.resolve().name
@@ -111,7 +109,7 @@ def _plan(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any]:
         "format": "robocas",
         "schema_version": schema.SCHEMA_VERSION,
         "made_with": {"robocas_ms3": robocas_ms3.__version__},
-        **dataset_settings(surveyed.rate_hz, pictures, embedded),
+        **dataset_settings(surveyed.rate_hz, surveyed.pictures, embedded),
         "split": SPLIT_RULE,
         "source": {"format": _format(dataset), "dataset": name},
         "episodes": episodes,
@@ -122,46 +120,50 @@ def _format(dataset: Overview) -> str:
     return f"robocas v{schema_version(dataset)}"
 
 
-def _embeddings(found: Found, wanted: bool, embed: Embed | None) -> None:
-    """Add the embeddings of an episode, or take them away."""
-    if wanted and not found.embedded:
-        assert embed is not None
-        found.arrays["language_embedding"] = embed([str(found.arrays["language_goal"])])[0]
-        found.arrays["step_goal_embs"] = embed(found.arrays["step_lang_goals"].tolist())
-        found.derived |= {"language_embedding": "language_goal", "step_goal_embs": "step_lang_goals"}
-    for spec in schema.EPISODE_INFO:
-        if spec.embedding and not wanted:
-            found.arrays.pop(spec.name, None)
+def _embedded(read: EpisodeImport, wanted: bool, embed: Embed | None) -> EpisodeArrays:
+    """The arrays of an episode with their embeddings, or without."""
+    stored = read.stored
+    if not wanted:
+        return replace(stored, arrays={key: array for key, array in stored.arrays.items() if key not in EMBEDDINGS})
+    if read.embedded:
+        return stored
+    assert embed is not None
+    made = {
+        "language_embedding": embed([str(stored.arrays["language_goal"])])[0],
+        "step_goal_embs": embed(stored.arrays["step_lang_goals"].tolist()),
+    }
+    sources = {"language_embedding": "language_goal", "step_goal_embs": "step_lang_goals"}
+    return replace(stored, arrays={**stored.arrays, **made}, derived={**stored.derived, **sources})
 
 
-def _write(folder: Path, episode: Episode, found: Found, surveyed: Survey, placed: Placed) -> None:
-    assert surveyed.layout is not None
-    layout = surveyed.layout
+def _write(folder: Path, episode: Episode, taken: EpisodeImport, surveyed: Survey, placed: Placed) -> None:
+    assert surveyed.pictures is not None
+    pictures = surveyed.pictures
     cameras = {
         camera: CameraModel(
             np.asarray(episode.intrinsic(camera), dtype=np.float64),
             np.asarray(episode.camera_in_parent(camera), dtype=np.float64),
         )
-        for camera in layout.cameras
+        for camera in pictures.cameras
     }
-    if found.turn_deg:
+    if taken.turn_deg:
         gripper = cameras["gripper_camera"]
-        pose = about_z(-found.turn_deg) @ gripper.camera_in_parent
+        pose = about_z(-taken.turn_deg) @ gripper.camera_in_parent
         cameras["gripper_camera"] = CameraModel(gripper.intrinsic, pose)
-    for camera in layout.cameras:
-        for kind in ("rgb", "depth") if layout.depth else ("rgb",):
+    for camera in pictures.cameras:
+        for kind in pictures.kinds:
             (folder / camera / kind).mkdir(parents=True)
-            for step in range(found.steps):
+            for step in range(taken.stored.steps):
                 source = episode.image_path(camera, kind, step)
-                placed.file(source, schema.image_path(folder, camera, kind, step, layout.image_format))
+                placed.file(source, schema.image_path(folder, camera, kind, step, pictures.image_format))
     write_cameras(folder, cameras)
-    arrays = {spec.name: found.arrays[spec.name] for spec in schema.EPISODE_INFO if spec.name in found.arrays}
+    arrays = {key: taken.stored.arrays[key] for key in SPECS if key in taken.stored.arrays}
     np.savez(folder / schema.EPISODE_FILE, **arrays)
-    text = json.dumps(_scene(episode, found, surveyed), indent=1, ensure_ascii=False)
+    text = json.dumps(_scene(episode, taken, surveyed), indent=1, ensure_ascii=False)
     (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
 
 
-def _scene(episode: Episode, found: Found, surveyed: Survey) -> dict[str, Any]:
+def _scene(episode: Episode, taken: EpisodeImport, surveyed: Survey) -> dict[str, Any]:
     """``scene.json``: nearly all of it is not known, unless the episode said it already."""
     assert episode.dataset is not None
     before = episode.scene if episode.scene.get("schema_version") == schema.SCHEMA_VERSION else {}
@@ -170,10 +172,10 @@ def _scene(episode: Episode, found: Found, surveyed: Survey) -> dict[str, Any]:
         **(before.get("source") or {}),
         "format": _format(episode.dataset),
         "dataset": surveyed.root.resolve().name,
-        "episode": found.number,
-        "derived": found.derived,
-        "missing": found.missing,
-        "mended": found.mended,
+        "episode": taken.number,
+        "derived": taken.stored.derived,
+        "missing": taken.missing,
+        "mended": taken.mended,
     }
     known = {"schema_version": schema.SCHEMA_VERSION, "rate_hz": float(surveyed.rate_hz), "source": source}
     return {key: known.get(key, before.get(key)) for key in schema.SCENE}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.manage.assemble import Assembled, Member, OnEpisode, OnStart, Side, assemble, check_before
+from robocas_ms3.datasets.manage.assemble import Assembly, Member, OnEpisode, OnStart, Side, assemble, check_before
 from robocas_ms3.datasets.manage.parts import Part, names_of, open_part, shown
 from robocas_ms3.datasets.writing.plan import SETTINGS
 from robocas_ms3.errors import DatasetError
@@ -16,10 +16,10 @@ SPLIT_RULE = "every episode keeps the side it had in the dataset it is from"
 
 
 @dataclass(frozen=True)
-class Merged:
+class MergeResult:
     """What was done: the new dataset, and how many duplicates were left out."""
 
-    written: Assembled
+    written: Assembly
     skipped: int
 
 
@@ -33,18 +33,14 @@ def merge(
     resume: bool = False,
     on_start: OnStart | None = None,
     on_episode: OnEpisode | None = None,
-) -> Merged:
+) -> MergeResult:
     """Write a dataset of all episodes of others, in the order given, numbered anew; the split stays as it was.
 
     Args:
         roots: the datasets, of the same schema version and settings.
         out: folder of the new one.
         skip_duplicates: take an episode that is there already once, instead of refusing.
-        link: see `assemble`.
-        overwrite: see `assemble`.
-        resume: see `assemble`.
-        on_start: see `assemble`.
-        on_episode: see `assemble`.
+        link, overwrite, resume, on_start, on_episode: see `assemble`.
 
     Raises:
         DatasetError: they do not fit together, are not finished, or an episode is damaged.
@@ -86,7 +82,7 @@ def merge(
         on_start=on_start,
         on_episode=on_episode,
     )
-    return Merged(written, len(duplicates))
+    return MergeResult(written, len(duplicates))
 
 
 def _check_settings(parts: Sequence[Part]) -> None:

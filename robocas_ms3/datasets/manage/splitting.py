@@ -7,13 +7,14 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.manage.assemble import Assembled, Member, OnEpisode, OnStart, Side, assemble, check_before
+from robocas_ms3.datasets.manage.assemble import Assembly, Member, OnEpisode, OnStart, Side, assemble, check_before
 from robocas_ms3.datasets.manage.input_check import check_numbers
 from robocas_ms3.datasets.manage.parts import Part, Sides, names_of
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -183,16 +184,14 @@ def write_parts(
     resume: bool = False,
     on_start: OnStart | None = None,
     on_episode: OnEpisode | None = None,
-) -> list[Assembled]:
+) -> list[Assembly]:
     """Write the datasets that a split makes.
 
     Args:
         part: the dataset that is split.
         pieces: output -> training and validation episodes of ``part``.
         share: how the sides were chosen; None: as they were.
-        link: see `assemble`.
-        overwrite: see `assemble`.
-        resume: see `assemble`.
+        link, overwrite, resume: see `assemble`.
         on_start: called with the number of episodes of all pieces.
         on_episode: called after each.
 
@@ -212,22 +211,9 @@ def write_parts(
     check_before(members, everything, go_on=overwrite or resume)
     if on_start:
         on_start(len(everything))
-    counts: list[int] = []
-    done = []
-    for out, chosen in members.items():
-        done.append(
-            assemble(
-                out,
-                chosen,
-                split_rule=share.rule if share else KEEP_RULE,
-                link=link,
-                overwrite=overwrite,
-                resume=resume,
-                on_start=counts.append,
-                on_episode=on_episode,
-            )
-        )
-    return done
+    rule = share.rule if share else KEEP_RULE
+    write = partial(assemble, split_rule=rule, link=link, overwrite=overwrite, resume=resume, on_episode=on_episode)
+    return [write(out, chosen) for out, chosen in members.items()]
 
 
 def _within(part: Part, numbers: list[int], share: Share | None) -> Sides:

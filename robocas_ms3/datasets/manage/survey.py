@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.manage.findings import Finding, Layout, Outcome
-from robocas_ms3.datasets.manage.reading import read_episode
+from robocas_ms3.datasets.manage.findings import Finding, Outcome
+from robocas_ms3.datasets.manage.reading import FULL_SIZE, read_episode
+from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.statistics.described import count_of
@@ -27,7 +28,7 @@ class Survey:
         turn_eef: see `reading.read_episode`.
         episodes: how many there are.
         taken: number -> T of those that can be taken.
-        layout: of their pictures; None where there are none.
+        pictures: that they have; None where there are none.
         embeddings: whether all of them have embeddings.
         findings: everything worth telling.
     """
@@ -37,7 +38,7 @@ class Survey:
     turn_eef: bool
     episodes: int
     taken: dict[int, int]
-    layout: Layout | None
+    pictures: Pictures | None
     embeddings: bool
     findings: list[Finding]
 
@@ -51,7 +52,7 @@ class Survey:
             "taken": len(self.taken),
             "steps": sum(self.taken.values()),
             "left_out": left_out,
-            "pictures": asdict(self.layout) if self.layout else None,
+            "pictures": asdict(self.pictures) if self.pictures else None,
             "embeddings": self.embeddings,
             "findings": [asdict(finding) for finding in self.findings],
         }
@@ -79,32 +80,32 @@ def survey(
     rate_hz = dataset.rate_hz if rate_hz is None else rate_hz
     if rate_hz <= 0:
         raise DatasetError("no such rate", where="rate", expected="> 0 Hz", found=rate_hz)
-    findings: list[Finding] = []
-    info = read_info(dataset, findings)
-    layouts: dict[int, Layout] = {}
+    info, findings = read_info(dataset)
+    pictures: dict[int, Pictures] = {}
     lengths: dict[int, int] = {}
     embedded: set[int] = set()
     marks: dict[int, str] = {}
     for done, number in enumerate(dataset.numbers):
-        found = read_episode(dataset, number, info, findings, rate_hz=rate_hz, turn_eef=turn_eef)
-        if found is not None and found.layout is not None:
-            lengths[number], layouts[number] = found.steps, found.layout
-            marks[number] = arrays_fingerprint(found.arrays)
-            embedded |= {number} if found.embedded else set()
+        read = read_episode(dataset, number, info, rate_hz=rate_hz, turn_eef=turn_eef)
+        findings += read.findings
+        if read.usable and read.pictures is not None:
+            lengths[number], pictures[number] = read.stored.steps, read.pictures
+            marks[number] = arrays_fingerprint(read.stored.arrays)
+            embedded |= {number} if read.embedded else set()
         if on_episode:
             on_episode(done + 1, len(dataset.numbers))
-    layout = Counter(layouts.values()).most_common(1)[0][0] if layouts else None
-    for number, other in layouts.items():
-        if other != layout:
-            name = schema.episode_folder(number)
-            findings.append(Finding(number, name, f"pictures of {other}; most are of {layout}", "left out"))
+    most = Counter(pictures.values()).most_common(1)[0][0] if pictures else None
+    for number, other in pictures.items():
+        if most is not None and other != most:
+            text = f"pictures of {_in_words(other)}; most are of {_in_words(most)}"
+            findings.append(Finding(number, schema.episode_folder(number), text, "left out"))
             del lengths[number]
     firsts: dict[str, int] = {}
     for number in list(lengths):  # of those that can be taken the first one is
         first = firsts.setdefault(marks[number], number)
         if first != number:
-            name = schema.episode_folder(number)
-            findings.append(Finding(number, name, f"the same as episode {first}", "left out"))
+            text = f"the same as episode {first}"
+            findings.append(Finding(number, schema.episode_folder(number), text, "left out"))
             del lengths[number]
     embeddings = bool(lengths) and embedded >= set(lengths)
     if not embeddings and embedded & set(lengths):
@@ -112,7 +113,13 @@ def survey(
         findings.append(Finding(None, f"{schema.EPISODE_FILE}, embeddings", lacking, "mended"))
     findings += _files(dataset, list(lengths), rate_hz)
     findings.sort(key=lambda finding: -1 if finding.episode is None else finding.episode)
-    return Survey(root, rate_hz, turn_eef, len(dataset.numbers), lengths, layout, embeddings, findings)
+    return Survey(root, rate_hz, turn_eef, len(dataset.numbers), lengths, most, embeddings, findings)
+
+
+def _in_words(pictures: Pictures) -> str:
+    size = "{} x {}".format(*(pictures.size or FULL_SIZE))
+    depth = "with" if pictures.depth else "without"
+    return f"{', '.join(pictures.cameras)}, {size} {pictures.image_format}, {depth} depth"
 
 
 def _files(dataset: Dataset, taken: Sequence[int], rate_hz: float) -> Iterator[Finding]:
@@ -138,27 +145,25 @@ def _files(dataset: Dataset, taken: Sequence[int], rate_hz: float) -> Iterator[F
             yield from (Finding(n, f"{schema.episode_folder(n)}/{file}", problem, outcome) for n in numbers)
 
 
-def read_info(dataset: Dataset, findings: list[Finding]) -> dict[str, Any]:
-    """``data_info.json`` as far as it can be read; what is wrong with it is added to the findings."""
+def read_info(dataset: Dataset) -> tuple[dict[str, Any], list[Finding]]:
+    """``data_info.json`` as far as it can be used, and what is wrong with it."""
     file = schema.DATA_INFO_FILE
     try:
         info = dataset.info
     except DatasetError as error:
-        findings.append(Finding(None, file, f"damaged: {error.found}", "mended"))
-        return {}
+        return {}, [Finding(None, file, f"damaged: {error.found}", "mended")]
     if not info:
-        findings.append(Finding(None, file, "no file: made of the episodes, with a split of its own", "mended"))
-        return {}
-    sides = {key: [n for n in _numbers(info.get(key)) if n in dataset.numbers] for key in ("train_eps", "val_eps")}
-    listed = [n for key in ("train_eps", "val_eps") for n in _numbers(info.get(key))]
-    for number in sorted(set(listed) - set(dataset.numbers)):
-        findings.append(Finding(number, file, "listed, but there is no such folder", "mended"))
-    for number in sorted({n for n in listed if listed.count(n) > 1}):
-        findings.append(Finding(number, f"{file}, train_eps, val_eps", "listed twice: it trains", "mended"))
-    unlisted = sorted(set(dataset.numbers) - set(listed))
-    findings += [Finding(n, f"{file}, train_eps, val_eps", "not listed: added", "mended") for n in unlisted]
-    sides["val_eps"] = [n for n in sides["val_eps"] if n not in set(sides["train_eps"])]
-    return {**info, **sides}
+        return {}, [Finding(None, file, "no file: made of the episodes, with a split of its own", "mended")]
+    there, train, val = set(dataset.numbers), _numbers(info.get("train_eps")), _numbers(info.get("val_eps"))
+    listed = Counter([*train, *val])
+    lists = f"{file}, train_eps, val_eps"
+    findings = [
+        *(Finding(n, file, "listed, but there is no such folder", "mended") for n in sorted(set(listed) - there)),
+        *(Finding(n, lists, "listed twice: it trains", "mended") for n in sorted(listed) if listed[n] > 1),
+        *(Finding(n, lists, "not listed: added", "mended") for n in sorted(there - set(listed))),
+    ]
+    sides = {"train_eps": [n for n in train if n in there], "val_eps": [n for n in val if n in there - set(train)]}
+    return {**info, **sides}, findings
 
 
 def _numbers(values: Any) -> list[int]:

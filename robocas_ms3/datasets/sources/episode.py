@@ -7,7 +7,7 @@ what is there (`tolerant`), either name of a camera's pose will do.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,7 +19,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import read_picture
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE, read_array, read_json, said_of
 from robocas_ms3.datasets.sources.protocol import SourceEpisode
-from robocas_ms3.datasets.sources.tolerant import DAMAGED, complete, first_line, is_declared, load_arrays
+from robocas_ms3.datasets.sources.tolerant import completed, is_declared, load_arrays, read_arrays
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.subgoals import SubGoal, read_subgoals
 
@@ -67,11 +67,11 @@ class Episode(SourceEpisode):
         path = self.folder / schema.EPISODE_FILE
         loaded = load_arrays(path)
         if any(spec.name not in loaded.arrays for spec in schema.EPISODE_INFO if not spec.embedding):
-            complete(loaded, self._said(), self.dataset.rate_hz if self.dataset else DEFAULT_RATE)
-        for key, reason in loaded.unreadable.items():
-            if key not in loaded.derived:
-                raise DatasetError("this array can't be read", where=f"{path}, {key}", found=reason, fix=SEE_VALIDATE)
-        return loaded.arrays
+            loaded = completed(loaded, self._said(), self.dataset.rate_hz if self.dataset else DEFAULT_RATE)
+        for key in set(loaded.unreadable) - set(loaded.derived):
+            where, found = f"{path}, {key}", loaded.reason(key)
+            raise DatasetError("this array can't be read", where=where, found=found, fix=SEE_VALIDATE)
+        return dict(loaded.arrays)
 
     def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
         """Some of the arrays.
@@ -79,20 +79,10 @@ class Episode(SourceEpisode):
         Raises:
             DatasetError: the file or one of them is missing or damaged.
         """
-        path = self.folder / schema.EPISODE_FILE
-        try:
-            with np.load(path, allow_pickle=False) as content:
-                found = {key: content[key] for key in keys if key in content.files}
-            if all(key in found and is_declared(key, found[key]) for key in keys):
-                return found
-            return super().read(keys)  # slower; casts and completes what was made elsewhere
-        except (*DAMAGED, KeyError) as error:
-            raise DatasetError(
-                "this episode can't be read",
-                where=path,
-                found=getattr(error, "strerror", None) or first_line(error),
-                fix="robocas validate says what is wrong.",
-            ) from error
+        found = read_arrays(self.folder / schema.EPISODE_FILE, keys)
+        if found.unreadable or all(key in found.arrays and is_declared(key, found.arrays[key]) for key in keys):
+            return found.needed(keys)
+        return replace(found, arrays=self.arrays).needed(keys)  # slower; casts and completes what was made elsewhere
 
     @property
     def goals(self) -> list[SubGoal]:

@@ -1,24 +1,24 @@
-"""Reads ``episode_info.npz`` of datasets made elsewhere: other types, missing keys, extra axes; never pickles."""
+"""Reads ``episode_info.npz``, also of datasets made elsewhere: other types, missing keys, extra axes; no pickles."""
 
 from __future__ import annotations
 
 import hashlib
 import zipfile
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.arrays import wrap_angle
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw
-from robocas_ms3.recordings.motion import relative_motion
+from robocas_ms3.recordings.motion import stored_motion
 
 SPECS = {spec.name: spec for spec in schema.EPISODE_INFO}
 DAMAGED = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError)
@@ -32,58 +32,118 @@ def first_line(error: Exception) -> str:
     return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
-@dataclass
-class Loaded:
-    """What could be read.
+@dataclass(frozen=True)
+class EpisodeArrays:
+    """What an ``episode_info.npz`` holds, as far as it could be read.
 
     Attributes:
-        arrays: by the schema's keys, of its types and numbers of axes.
-        unreadable: key of the schema -> why it could not be read.
-        derived: key -> what it was made of, see `complete`.
-        ignored: keys that the schema does not know; they were not read.
+        path: of the file.
+        arrays: by key.
+        unreadable: key -> why it could not be read; "": the file as a whole.
+        derived: key -> what it was made of, see `completed`.
+        ignored: keys that were not asked for.
     """
 
-    arrays: dict[str, NDArray] = field(default_factory=dict)
-    unreadable: dict[str, str] = field(default_factory=dict)
-    derived: dict[str, str] = field(default_factory=dict)
-    ignored: list[str] = field(default_factory=list)
+    path: Path
+    arrays: Mapping[str, NDArray]
+    unreadable: Mapping[str, Exception] = field(default_factory=dict)
+    derived: Mapping[str, str] = field(default_factory=dict)
+    ignored: tuple[str, ...] = ()
+
+    @property
+    def file(self) -> str:
+        """Path in the dataset."""
+        return f"{self.path.parent.name}/{self.path.name}"
+
+    @property
+    def steps(self) -> int:
+        """T: as ``ee_pos`` has, else as most arrays have; 0 where none has any."""
+        lengths = {key: len(array) for key, array in self.arrays.items() if array.ndim}
+        most = Counter(lengths.values()).most_common(1)
+        return lengths.get("ee_pos", most[0][0] if most else 0)
+
+    def reason(self, key: str = "") -> str:
+        """Why a key could not be read, in words."""
+        error = self.unreadable[key]
+        text = getattr(error, "strerror", None) or first_line(error)
+        pickled = PICKLED if key else f"another file, or {PICKLED}"
+        return pickled if "pickle" in text else text
+
+    def needed(self, keys: Iterable[str]) -> dict[str, NDArray]:
+        """The arrays of these keys.
+
+        Raises:
+            DatasetError: one is missing, or something could not be read.
+        """
+        fix = "robocas validate says what is wrong."
+        for key, error in self.unreadable.items():
+            where = f"{self.path}, {key}" if key else self.path
+            raise DatasetError("this episode can't be read", where=where, found=self.reason(key), fix=fix) from error
+        missing = [key for key in keys if key not in self.arrays]
+        if missing:
+            raise DatasetError("arrays are missing", where=self.path, expected=", ".join(missing), fix=fix)
+        return {key: self.arrays[key] for key in keys}
 
 
-def load_arrays(path: Path) -> Loaded:
-    """Read the arrays that the schema knows, cast to its types.
+def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays:
+    """Read arrays as they are stored; damage is recorded, not raised.
+
+    Args:
+        path: of ``episode_info.npz``.
+        keys: those to read; None: all.
+    """
+    arrays: dict[str, NDArray] = {}
+    unreadable: dict[str, Exception] = {}
+    ignored: list[str] = []
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            for key in content.files:
+                if keys is not None and key not in keys:
+                    ignored.append(key)
+                    continue
+                try:
+                    arrays[key] = _array(content[key])
+                except (*DAMAGED, MemoryError) as error:
+                    unreadable[key] = error
+    except (*DAMAGED, TypeError) as error:  # TypeError: a single array is no context
+        unreadable[""] = error
+    return EpisodeArrays(path, arrays, unreadable, ignored=tuple(ignored))
+
+
+def load_arrays(path: Path) -> EpisodeArrays:
+    """Read the arrays that the schema knows, cast to its types; those that can't be are unreadable.
 
     Raises:
         DatasetError: the file is missing, damaged, or no numpy archive.
     """
-    loaded = Loaded()
-    try:
-        with np.load(path, allow_pickle=False) as content:
-            for key in content.files:
-                if key not in SPECS:
-                    loaded.ignored.append(key)
-                    continue
-                try:
-                    loaded.arrays[key] = cast(SPECS[key], content[key])
-                except (*DAMAGED, MemoryError) as error:
-                    text = first_line(error)
-                    loaded.unreadable[key] = PICKLED if "allow_pickle" in text else text
-    except FileNotFoundError as error:
-        raise DatasetError("no such file", where=path) from error
-    except (*DAMAGED, TypeError) as error:  # TypeError: a single array is no context
-        text = first_line(error)
-        found = PICKLED if "pickle" in text else text
-        raise DatasetError("not a numpy archive, or a damaged one", where=path, found=found) from error
-    return loaded
+    stored = read_arrays(path, SPECS)
+    if "" in stored.unreadable:
+        error = stored.unreadable[""]
+        if isinstance(error, FileNotFoundError):
+            raise DatasetError("no such file", where=path) from error
+        raise DatasetError("not a numpy archive, or a damaged one", where=path, found=stored.reason()) from error
+    arrays: dict[str, NDArray] = {}
+    unreadable = dict(stored.unreadable)
+    for key, array in stored.arrays.items():
+        try:
+            arrays[key] = cast(SPECS[key], array)
+        except (ValueError, MemoryError) as error:
+            unreadable[key] = error
+    return replace(stored, arrays=arrays, unreadable=unreadable)
 
 
-def cast(spec: schema.ArraySpec, array: Any) -> NDArray:
+def _array(value: Any) -> NDArray:
+    if not isinstance(value, np.ndarray):  # a member that is no array is read as bytes
+        raise ValueError("no array")
+    return value
+
+
+def cast(spec: schema.ArraySpec, array: NDArray) -> NDArray:
     """An array of the schema's type and number of axes; axes of length 1 too many are dropped.
 
     Raises:
         ValueError: it says something else.
     """
-    if not isinstance(array, np.ndarray):
-        raise ValueError("no array")
     for axis in reversed(range(array.ndim)):
         if array.ndim > len(spec.shape) and array.shape[axis] == 1:
             array = array.squeeze(axis)
@@ -106,20 +166,20 @@ def is_declared(key: str, array: NDArray) -> bool:
     return SPECS[key].has_dtype(array) and array.ndim == len(SPECS[key].shape)
 
 
-def complete(loaded: Loaded, said: Mapping[str, Any], rate_hz: float) -> None:
-    """Make what is missing of what is there; it is named in ``loaded.derived``.
+def completed(loaded: EpisodeArrays, said: Mapping[str, Any], rate_hz: float) -> EpisodeArrays:
+    """The same with what is missing made of what is there; ``derived`` says of what.
 
     Args:
-        loaded: what could be read.
+        loaded: what could be read, of the schema's types.
         said: ``language_goal`` and ``step_goals`` of the episode in ``data_info.json``, where they are there.
         rate_hz: steps a second.
     """
-    arrays = loaded.arrays
+    arrays, derived = dict(loaded.arrays), dict(loaded.derived)
 
     def put(key: str, values: Any, source: str) -> None:
         if key not in arrays:
             arrays[key] = SPECS[key].cast(values)
-            loaded.derived[key] = source
+            derived[key] = source
 
     if "ee_pos" in arrays:
         put("episode_length", len(arrays["ee_pos"]), "the arrays' length")
@@ -129,30 +189,27 @@ def complete(loaded: Loaded, said: Mapping[str, Any], rate_hz: float) -> None:
     if goals:
         put("step_goal_type", [kind for kind, _ in goals], schema.DATA_INFO_FILE)
         put("step_lang_goals", [text for _, text in goals], schema.DATA_INFO_FILE)
-    for position, orientation, rel_position, rel_orientation in schema.RELATIVE_PAIRS:
-        if {position, orientation} <= arrays.keys() and not {rel_position, rel_orientation} <= arrays.keys():
-            if _poses(arrays, position, orientation) is None:
-                continue
-            derive_motion(arrays, (position, orientation, rel_position, rel_orientation))
-            loaded.derived |= dict.fromkeys((rel_position, rel_orientation), f"{position}, {orientation}")
+    for keys in schema.RELATIVE_PAIRS:
+        if not set(keys[2:]) <= arrays.keys() and _poses(arrays, *keys[:2]) is not None:
+            arrays |= motion_arrays(arrays, keys)
+            derived |= dict.fromkeys(keys[2:], ", ".join(keys[:2]))
     base = _poses(arrays, "base_pos", "base_orn")
     if base is not None:
         yaw = np.arctan2(base[:, 1, 0], base[:, 0, 0])
         put("agv_pose", np.column_stack([base[:, :2, 3], np.unwrap(yaw)]), "base_pos, base_orn")
-    if "agv_pose" in arrays:
+    if arrays.get("agv_pose", np.zeros(0)).shape[1:] == (3,):
         put("rel_agv_pose", planar_motion(arrays["agv_pose"]), "agv_pose")
     joints = arrays.get("robot_joints", np.zeros((0, 7)))
     if len(joints) > 1:
         put("arm_joint_vel", np.gradient(joints.astype(np.float64), axis=0) * rate_hz, "differences of robot_joints")
+    return replace(loaded, arrays=arrays, derived=derived)
 
 
-def derive_motion(arrays: dict[str, NDArray], keys: tuple[str, str, str, str]) -> None:
-    """Put the relative motion between absolute poses into its two keys (one of ``schema.RELATIVE_PAIRS``)."""
+def motion_arrays(arrays: Mapping[str, NDArray], keys: tuple[str, str, str, str]) -> dict[str, NDArray]:
+    """The relative motion between absolute poses, under its two keys (``keys`` are of ``schema.RELATIVE_PAIRS``)."""
     poses = _poses(arrays, keys[0], keys[1])
     assert poses is not None
-    motion = relative_motion(poses)
-    arrays[keys[2]] = SPECS[keys[2]].cast(motion[:, :3, 3])
-    arrays[keys[3]] = SPECS[keys[3]].cast(Rotation.from_matrix(motion[:, :3, :3]).as_quat(canonical=True))
+    return dict(zip(keys[2:], stored_motion(poses), strict=True))
 
 
 def planar_motion(agv_pose: NDArray) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.datasets.sources.tolerant import DAMAGED, first_line
+from robocas_ms3.datasets.sources.tolerant import first_line, read_arrays
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import write_json
 from robocas_ms3.recordings.seeds import one_seed
@@ -48,16 +48,7 @@ def summarize(episode: Episode, number: int) -> Summary:
     Raises:
         DatasetError: its arrays can't be read, or its motion is no numbers.
     """
-    try:
-        with np.load(episode.folder / schema.EPISODE_FILE, allow_pickle=False) as content:
-            arrays = {key: content[key] for key in _NEEDED}
-    except (*DAMAGED, KeyError, TypeError) as error:  # TypeError: a single array, not an archive
-        raise DatasetError(
-            "this episode can't be read",
-            where=episode.folder / schema.EPISODE_FILE,
-            found=first_line(error),
-            fix="robocas validate says what is wrong.",
-        ) from error
+    arrays = read_arrays(episode.folder / schema.EPISODE_FILE, _NEEDED).needed(_NEEDED)
     for key in ("rel_pos", "rel_orn"):
         if not np.isfinite(arrays[key]).all():
             where = f"{episode.folder / schema.EPISODE_FILE}, {key}"

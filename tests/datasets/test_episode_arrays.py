@@ -1,0 +1,92 @@
+"""Arrays as a record: damage is noted in it, and mends make another one."""
+
+import numpy as np
+import pytest
+from managing import arrays_of, change
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.checks import arrays as laws
+from robocas_ms3.datasets.manage.mends import mend_all
+from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, load_arrays, motion_arrays, read_arrays
+from robocas_ms3.errors import DatasetError
+
+FILE = "episode_0000001/episode_info.npz"
+KEYS = ("ee_pos", "ee_orn", "rel_pos", "rel_orn")
+
+
+def said(violations):
+    return [(violation.key, violation.expected, violation.found) for violation in violations]
+
+
+def moved(quaternions, positions):
+    """Two rows, and the motion between them."""
+    arrays = {"ee_pos": np.array(positions, "f4"), "ee_orn": np.array(quaternions, "f4")}
+    return {**arrays, **motion_arrays(arrays, KEYS)}
+
+
+def test_damage_is_noted_and_refused_by_who_needs_it(dataset):
+    episode = dataset / "episode_0000001"
+    change(episode, ee_pos=np.array([{}] * 7, object), speed=np.zeros(3))
+    stored = read_arrays(episode / "episode_info.npz")
+    assert (stored.file, stored.steps, list(stored.unreadable)) == (FILE, 7, ["ee_pos"])
+    assert stored.reason("ee_pos") == "pickled objects, which are never loaded"
+    assert "speed" in stored.arrays
+    with pytest.raises(DatasetError, match="episode_info.npz, ee_pos: this episode can't be read .*pickled"):
+        stored.needed(["rel_pos"])
+    some = read_arrays(episode / "episode_info.npz", ("rel_pos", "none"))
+    assert list(some.arrays) == ["rel_pos"] and "speed" in some.ignored
+    with pytest.raises(DatasetError, match="arrays are missing .expected none"):
+        some.needed(["rel_pos", "none"])
+
+
+def test_what_is_not_there(tmp_path):
+    stored = read_arrays(tmp_path / "episode_info.npz")
+    assert (stored.steps, list(stored.unreadable)) == (0, [""])
+    assert said(laws.violations_of(stored, laws.FORM)) == [("", "this file", "no file")]
+    with pytest.raises(DatasetError, match="this episode can't be read .found No such file"):
+        stored.needed([])
+    with pytest.raises(DatasetError, match="no such file"):
+        load_arrays(tmp_path / "episode_info.npz")
+
+
+def test_motion_by_hand(tmp_path):
+    """A quarter turn about z, then 1 m along what was y and is x now."""
+    half = np.sqrt(0.5)
+    arrays = moved([[0, 0, 0, 1], [0, 0, half, half]], [[0, 0, 0], [0, 1, 0]])
+    np.testing.assert_allclose(arrays["rel_pos"], [[0, 1, 0], [0, 0, 0]], atol=1e-7)
+    np.testing.assert_allclose(arrays["rel_orn"], [[0, 0, half, half], [0, 0, 0, 1]], atol=1e-7)
+    stored = EpisodeArrays(tmp_path, arrays)
+    assert said(laws.check_motion(stored)) == []
+    arrays["rel_pos"] = np.array([[0, 1.5, 0], [0, 0, 0]], "f4")
+    expected = "the motion between rows of ee_pos, ee_orn"
+    assert said(laws.check_motion(stored)) == [("rel_pos", expected, "1 of 2 rows off, by 0.5 m in row 0")]
+
+
+def test_what_is_absent_breaks_no_law_but_one(tmp_path):
+    empty = EpisodeArrays(tmp_path, {})
+    assert (
+        said(laws.violations_of(empty, (laws.check_shapes, laws.check_finite, laws.check_units, *laws.CONTENT))) == []
+    )
+    absent = [key for key, *_ in said(laws.check_keys(empty))]
+    assert absent == [spec.name for spec in schema.EPISODE_INFO if not spec.embedding]
+
+
+def test_mends_leave_what_they_are_given(made):
+    episode = made / "episode_0000001"
+    arrays = arrays_of(episode)
+    arrays |= {key: np.roll(arrays[key], 1, axis=0) for key in ("rel_pos", "rel_orn")}
+    arrays |= {"rel_agv_pose": arrays["rel_agv_pose"] + 1, "language_embedding": np.ones(384, "f4")}
+    before = {key: array.copy() for key, array in arrays.items()}
+    stored = EpisodeArrays(episode / "episode_info.npz", arrays)
+    mended, findings = mend_all(stored)
+    assert [(finding.file.split(", ", 1)[1], finding.outcome) for finding in findings] == [
+        ("language_embedding", "noted"),
+        ("rel_pos, rel_orn", "mended"),
+        ("rel_agv_pose", "mended"),
+    ]
+    assert {finding.episode for finding in findings} == {1}
+    assert list(stored.arrays) == list(before)
+    for key, array in before.items():
+        np.testing.assert_array_equal(stored.arrays[key], array)
+    assert mend_all(mended) == (mended, [])
+    assert "language_embedding" not in mended.arrays
