@@ -5,18 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import re
 import shutil
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
@@ -25,8 +20,10 @@ from scipy.spatial import QhullError
 from robocas_ms3.assets.cooking import cooking_faults
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, Asset, FurnitureAsset, ObjectAsset, PackManifest
 from robocas_ms3.assets.pack import MANIFEST, sha256
-from robocas_ms3.errors import AssetError, OutputExistsError, RobocasError
+from robocas_ms3.errors import AssetError, RobocasError
 from robocas_ms3.files import replacing_folder, write_json
+from robocas_ms3.outputs import check_overwrite
+from robocas_ms3.processes import Calls, Pool
 
 MADE_FROM = "made_from.json"  # of a pack: asset id -> hash of what it was made from
 ENTRY = "asset.json"  # what the manifest says of a kept asset; written last
@@ -137,60 +134,32 @@ def _code(package: str) -> str:
 
 
 def _run(todo: list[tuple[Job, Path]], processes: int) -> Iterator[tuple[Made, Path]]:
-    if processes <= 1 or len(todo) <= 1:
-        yield from ((_make(job, place), place) for job, place in todo)
-        return
-    left = {job.id: (job, place) for job, place in todo}
-    with _pool(min(processes, len(todo))) as pool:
-        futures: dict[Future[Made], Path] = {pool.submit(_make, job, place): place for job, place in todo}
-        try:
-            for future in as_completed(futures):
-                made = future.result()
-                del left[made.id]
-                yield made, futures[future]
-        except BrokenProcessPool:
-            pass  # one of them took its process down; which one will show
-        finally:
-            pool.shutdown(cancel_futures=True)
-    for job, place in left.values():
-        with _pool(1) as pool:
-            try:
-                made = pool.submit(_make, job, place).result()
-            except BrokenProcessPool:
-                made = Made(job.id, None, f"{job.id}: the process that made it was killed; is there memory enough?")
-        yield made, place
+    with Pool(partial(Calls, _make), min(processes, len(todo)), died=_died) as pool:
+        yield from pool.do(todo)
 
 
-def _pool(processes: int) -> ProcessPoolExecutor:
-    # spawned: a renderer, and locks that threads of this process hold, don't survive a fork
-    return ProcessPoolExecutor(processes, get_context("spawn"), _die_with_parent, (os.getpid(),))
+def _died(task: tuple[Job, Path]) -> tuple[Made, Path]:
+    job, place = task
+    return Made(job.id, None, f"{job.id}: the process that made it was killed; is there memory enough?"), place
 
 
-def _die_with_parent(parent: int) -> None:
-    """A worker whose parent was killed would go on to the end of the queue."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _make(job: Job, place: Path) -> Made:
+def _make(task: tuple[Job, Path]) -> tuple[Made, Path]:
+    job, place = task
     start = time.perf_counter()
     try:
         with replacing_folder(place) as tmp:
             asset = job.make(tmp)
             (tmp / ENTRY).write_text(asset.model_dump_json(), encoding="utf-8")
     except RobocasError as error:
-        return _failed(job, str(error))
+        made = _failed(job, str(error))
     except QhullError:
-        return _failed(job, "it is flat, or has too few points")
+        made = _failed(job, "it is flat, or has too few points")
     except Exception as error:  # whatever a mesh library trips over: one asset fails, with its name, not the run
         log.exception("%s failed", job.id)
-        return _failed(job, f"{type(error).__name__}: {' '.join(str(error).split())}")
-    return Made(job.id, asset, seconds=time.perf_counter() - start)
+        made = _failed(job, f"{type(error).__name__}: {' '.join(str(error).split())}")
+    else:
+        made = Made(job.id, asset, seconds=time.perf_counter() - start)
+    return made, place
 
 
 def _failed(job: Job, message: str) -> Made:
@@ -286,8 +255,7 @@ def check_target(folder: Path) -> None:
     if not re.fullmatch(PACK_NAME, folder.name):
         expected = "small letters, digits, _ and -"
         raise AssetError("this is no name for a pack", where=folder, expected=expected, found=folder.name)
-    if folder.exists() and not (folder / MANIFEST).is_file() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputExistsError("there is something there that is no asset pack", where=folder, fix="Choose another.")
+    check_overwrite(folder, (MANIFEST,), "an asset pack")
 
 
 def made_of(jobs: Sequence[Job], folder: Path, *, skip_bad: bool = False) -> bool:

@@ -44,7 +44,7 @@ class SimulationError(RobocasError):
 
 
 class OutputExistsError(RobocasError):
-    """The output is already there and neither ``--resume`` nor ``--overwrite`` was given."""
+    """The output is there already and may not be replaced: no flag said so, or it is not what the command makes."""
 
 
 class DatasetError(RobocasError):

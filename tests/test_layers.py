@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "robocas_ms3"
 # Lowest first; a module imports from its own layer and those before it.
 LAYERS = (
-    ("errors", "paths", "files", "arrays", "poses"),
+    ("errors", "paths", "files", "outputs", "arrays", "poses", "processes", "strict", "ledger"),
     ("config",),
     ("assets",),
     ("scenes",),
@@ -165,7 +165,7 @@ def test_the_builtin_formulas_are_imported_by_their_command_alone():
 
 
 def test_mesh_tools_know_only_the_lowest_layers():
-    allowed = {"errors", "paths", "files", "poses", "assets"}
+    allowed = {"errors", "paths", "files", "outputs", "poses", "processes", "strict", "assets"}
     for module, path in MESH_TOOLS.items():
         for name, _ in imports(module, path):
             if name.startswith("robocas_ms3"):

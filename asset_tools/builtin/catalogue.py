@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import zlib
 from collections.abc import Callable, Iterable
 from functools import cache
@@ -13,13 +12,14 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_type_hints
 import numpy as np
 import trimesh
 import yaml
-from pydantic import Field, ValidationError, create_model, model_validator
+from pydantic import Field, create_model, model_validator
 
 from asset_tools.builtin import animals, bottles, fruits, labels, planes, shapes, skins, tools, toys
 from asset_tools.builtin.mesh import Shape
 from asset_tools.builtin.models import Model
-from robocas_ms3.assets.manifest import Name, Positive, Share, StrictModel
+from robocas_ms3.assets.manifest import Name, Positive, Share
 from robocas_ms3.errors import AssetError
+from robocas_ms3.strict import StrictModel, parse
 
 FOLDER = Path(__file__).parent / "products"
 
@@ -149,14 +149,5 @@ def load_products(folder: Path) -> dict[str, Product]:
         for id_, entry in entries.items():
             if id_ in found:
                 raise AssetError("this product is there twice", where=f"{path}, {id_}")
-            try:
-                # JSON mode: strict about types, yet lists serve as tuples and whole numbers as floats, as in YAML
-                text = json.dumps({**entry, "id": id_}, default=str)  # of dates: no key takes any
-                found[id_] = Product.model_validate_json(text, strict=True)
-            except ValidationError as error:
-                first = error.errors()[0]
-                where = ".".join(map(str, (id_, *first["loc"])))
-                found_there = "" if isinstance(first["input"], dict) else repr(first["input"])
-                what = first["msg"].removeprefix("Value error, ")
-                raise AssetError(what, where=f"{path}, {where}", found=found_there) from error
+            found[id_] = parse(Product, {**entry, "id": id_}, AssetError, where=f"{path}, {id_}")
     return found

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from robocas_ms3.assets.manifest import Name, NotNegative, Positive, Quaternion, StrictModel, Surface, Vec3
+from robocas_ms3.assets.manifest import Name, NotNegative, Positive, Quaternion, Surface, Vec3
 from robocas_ms3.errors import AssetError
+from robocas_ms3.strict import StrictModel, parse
 
 SHIPPED = Path(__file__).parent / "annotations"
 
@@ -79,9 +80,4 @@ def load_annotation(path: Path) -> Annotation:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise AssetError("the annotation can't be read", where=path, found=" ".join(str(error).split())) from error
-    try:
-        return Annotation.model_validate(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"])) or "the top"
-        raise AssetError("the annotation is wrong", where=path, expected=first["msg"], found=f"at {key}") from error
+    return parse(Annotation, data, AssetError, where=path, about="the annotation is wrong")

@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from functools import partial
+from typing import NoReturn
 
 from asset_tools.quality.furniture import measure_furniture
 from asset_tools.quality.measure import HULL_VERTICES, Violation, remeasure
 from robocas_ms3.assets.manifest import FurnitureQuality, ObjectQuality
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
+from robocas_ms3.errors import AssetError
+from robocas_ms3.processes import Calls
+from robocas_ms3.processes import Pool as Processes
 
 Quality = ObjectQuality | FurnitureQuality
 
 
 def remeasure_pack(pack: Pack, processes: int = 1) -> Iterator[tuple[str, Quality]]:
-    """Yield the id and the quality of each asset of a pack, objects first, in the pack's order."""
-    assets = {**pack.objects, **pack.furniture}
-    if processes <= 1:
-        yield from ((name, _measure(asset)) for name, asset in assets.items())
-        return
-    # spawned: locks that threads of this process hold would stay locked in a fork
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        yield from zip(assets, pool.map(_measure, assets.values()), strict=True)
+    """Yield the id and the quality of each asset of a pack, objects first, in the pack's order.
+
+    Raises:
+        AssetError: the process that measured one died.
+    """
+    assets = [*pack.objects.values(), *pack.furniture.values()]
+    with Processes(partial(Calls, _measure), min(processes, len(assets)), died=_died) as pool:
+        yield from pool.do(assets, in_order=True)
 
 
 FURNITURE_HEADER = ("furniture", "hulls", "vertices", "joints that work %", "surfaces that hold %")
@@ -52,5 +55,10 @@ def judge_furniture(qualities: Mapping[str, FurnitureQuality]) -> list[Violation
     return found
 
 
-def _measure(asset: LoadedObject | LoadedFurniture) -> Quality:
-    return remeasure(asset) if isinstance(asset, LoadedObject) else measure_furniture(asset)
+def _measure(asset: LoadedObject | LoadedFurniture) -> tuple[str, Quality]:
+    return asset.asset.id, remeasure(asset) if isinstance(asset, LoadedObject) else measure_furniture(asset)
+
+
+def _died(asset: LoadedObject | LoadedFurniture) -> NoReturn:
+    fix = "Is memory short? Use fewer --jobs."
+    raise AssetError("the process that measured it died", where=asset.asset.id, fix=fix)

@@ -7,10 +7,9 @@ which can shrink a hull by millimetres without a word.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from sapien import physx
@@ -19,6 +18,8 @@ from scipy.spatial import ConvexHull
 from robocas_ms3.assets.hulls import Array, box_of, read_hulls, slenderness
 from robocas_ms3.assets.pack import HULLS
 from robocas_ms3.assets.physics import cook
+from robocas_ms3.errors import AssetError
+from robocas_ms3.processes import Calls, Pool
 
 # m that a hull may lose anywhere: PhysX leaves out vertices, and makes faces one, within 0.7 mm each
 SHRINKAGE = 0.0015
@@ -70,7 +71,7 @@ def cooking_faults(folder: Path) -> list[CookingFault]:
     Boxes are not cooked, in simulation neither. The GPU's way needs no GPU, but a process of its own.
 
     Raises:
-        AssetError: a file of hulls can't be read.
+        AssetError: a file of hulls can't be read, or the process died.
     """
     named: list[tuple[str, int, Array]] = []
     for path in sorted(folder.rglob(HULLS)):
@@ -80,8 +81,13 @@ def cooking_faults(folder: Path) -> list[CookingFault]:
     if not named:
         return []
     pieces = [vertices for _, _, vertices in named]
-    with ProcessPoolExecutor(1, get_context("spawn"), _enable_gpu) as pool:
-        ways = {"GPU": pool.submit(cook_hulls, pieces).result(), "CPU": cook_hulls(pieces)}
+
+    def died(task: object) -> NoReturn:
+        raise AssetError("the process that cooked its hulls died", where=folder, fix="Is memory short?")
+
+    with Pool(_as_a_gpu_does, 1, died=died, here=False) as pool:
+        (on_gpu,) = pool.do([pieces])
+    ways = {"GPU": on_gpu, "CPU": cook_hulls(pieces)}
     return [
         CookingFault(name, number, way, result)
         for way, results in ways.items()
@@ -106,5 +112,6 @@ def cook_hulls(hulls: Sequence[Array]) -> list[CookedHull]:
     return results
 
 
-def _enable_gpu() -> None:
+def _as_a_gpu_does() -> Calls[Sequence[Array], list[CookedHull]]:
     physx._enable_gpu()
+    return Calls(cook_hulls)

@@ -20,7 +20,9 @@ from __future__ import annotations
 from pathlib import PurePosixPath
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from robocas_ms3.strict import StrictModel
 
 SCHEMA_VERSION = 2
 
@@ -67,12 +69,6 @@ Moments = Annotated[
 Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
 FilePath = Annotated[str, Field(pattern=r"^[a-z0-9_./-]+$"), AfterValidator(_inside)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-
-
-class StrictModel(BaseModel):
-    """Unknown keys and numbers that aren't finite are errors; nothing changes after loading."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Surface(StrictModel):

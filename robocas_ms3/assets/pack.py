@@ -19,6 +19,7 @@ from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, FurnitureAsset, ObjectAsset, PackManifest
 from robocas_ms3.errors import AssetError
 from robocas_ms3.paths import builtin_packs_dir, data_dir
+from robocas_ms3.strict import mistakes, refusal
 
 VisualLevel = Literal["fast", "full"]
 
@@ -287,14 +288,11 @@ def required_files(asset: ObjectAsset | FurnitureAsset) -> list[str]:
 
 
 def _damaged(path: Path, error: ValidationError) -> AssetError:
-    for entry in error.errors():
-        if entry["loc"] == ("schema_version",):
-            return _other_format(path, repr(entry["input"])[:40])
-    first = error.errors()[0]
-    place = ".".join(map(str, first["loc"])) or "the top"
-    # keys and values of the file may hold line breaks
-    found, expected = (" ".join(text.split()) for text in (f"at {place}", first["msg"].removeprefix("Value error, ")))
-    return AssetError("the manifest is damaged", where=path, expected=expected, found=found, fix="Make the pack again.")
+    for mistake in mistakes(error, PackManifest):
+        if mistake.key == "schema_version":
+            return _other_format(path, repr(mistake.value)[:40])
+    fix = "Make the pack again."
+    return refusal(error, PackManifest, AssetError, where=path, about="the manifest is damaged", fix=fix)
 
 
 def _other_format(path: Path, found: str) -> AssetError:

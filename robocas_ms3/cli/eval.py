@@ -28,7 +28,8 @@ class Eval:
     """Tasks; or one of the words above, and what it is about."""
     policy: str = "scripted"
     """Of whom: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), random, still, replay:TRAJECTORY.h5,
-    module:Class of your own, or ws://HOST:PORT, a server's (`robocas serve-policy`)."""
+    module:Class of your own, one that an installed package brings (`robocas list`), or ws://HOST:PORT, a server's
+    (`robocas serve-policy`)."""
     protocol: str | None = None
     """Name of a shipped protocol, or a folder. Default: ms3-v1; of a result, the shipped one that it names."""
     out: Path | None = None
@@ -90,7 +91,6 @@ def run(cfg: Eval) -> int:
     """Play what a result lacks."""
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.cli.eval_results import write_pages
-    from robocas_ms3.config.load import nearest
     from robocas_ms3.datasets.statistics.described import count_of
     from robocas_ms3.demos.checks import check_number
     from robocas_ms3.errors import EvaluationError
@@ -99,6 +99,7 @@ def run(cfg: Eval) -> int:
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.run import Settings, evaluate
     from robocas_ms3.evaluation.tables import markdown
+    from robocas_ms3.strict import nearest
     from robocas_ms3.tasks.spec import TASKS
 
     for word in cfg.words:

@@ -27,15 +27,18 @@ def freeze(plan: Path, out: Path | None) -> int:
     from robocas_ms3.evaluation.freeze import Plan
     from robocas_ms3.evaluation.freeze import freeze as make
     from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.outputs import check_absent
+    from robocas_ms3.strict import parse
 
     if out is None:
         raise EvaluationError("where to?", where="--out", expected="a folder")
+    what = "no plan of a protocol"
     try:
-        read = Plan.model_validate(yaml.safe_load(plan.read_text(encoding="utf-8")))
+        data = yaml.safe_load(plan.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
-        raise EvaluationError("no plan of a protocol", where=plan, found=" ".join(str(error).split())) from error
-    if out.exists():
-        raise EvaluationError("there is something already", where=out, fix="Choose another --out.")
+        raise EvaluationError(what, where=plan, found=" ".join(str(error).split())) from error
+    read = parse(Plan, data, EvaluationError, where=plan, about=what)
+    check_absent(out, EvaluationError)
     with bar("episodes") as shown:
         for done, total in make(read, out):
             shown.at(done, total)

@@ -52,7 +52,7 @@ def main(cfg: ImportRobocas) -> int:
     from robocas_ms3.datasets.manage.output import check_apart
     from robocas_ms3.datasets.manage.survey import survey
     from robocas_ms3.datasets.statistics.described import count_of
-    from robocas_ms3.files import claim_output
+    from robocas_ms3.outputs import claim_output
 
     if cfg.out is not None:
         check_apart(cfg.out, [cfg.dataset])

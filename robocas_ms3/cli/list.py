@@ -1,4 +1,4 @@
-"""``robocas list``: tasks, shipped configurations, asset packs."""
+"""``robocas list``: tasks, shipped configurations, policies, asset packs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 @dataclass
 class List:
-    """List the tasks, the shipped task configurations and the asset packs."""
+    """List the tasks, the shipped task configurations, the policies and the asset packs."""
 
     json: bool = False
     """Print a machine-readable list."""
@@ -33,7 +33,8 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     """Gather what there is, verifying every pack.
 
     Returns:
-        ``tasks``, ``configs`` and ``packs``, mappings of plain values. A damaged pack has an ``error`` and no objects.
+        ``tasks``, ``configs``, ``policies`` and ``packs``, mappings of plain values. A damaged pack has an ``error``
+        and no objects; policies of other packages are not imported, so a broken one shows only when it is chosen.
 
     Raises:
         ConfigError: a shipped configuration is damaged.
@@ -41,6 +42,7 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     from robocas_ms3.assets.pack import load_pack, pack_folders
     from robocas_ms3.config import load_task_config, shipped_configs
     from robocas_ms3.errors import AssetError
+    from robocas_ms3.evaluation.policies import BUILTIN, installed_policies, package_of
     from robocas_ms3.tasks.spec import TASKS
 
     tasks = [
@@ -52,6 +54,9 @@ def collect() -> dict[str, list[dict[str, Any]]]:
         config = load_task_config(path)
         scene = f"{config.objects.count} objects, {config.layout.kind}, on the {config.support}"
         configs.append({"name": name, "task": config.task, "scene": scene, "description": config.description})
+    policies = [{"name": name, "package": "robocas_ms3", "of": "builtin"} for name in BUILTIN]
+    for entries in installed_policies().values():
+        policies += [{"name": entry.name, "package": package_of(entry), "of": entry.value} for entry in entries]
     packs = []
     for name, folder in pack_folders().items():
         row: dict[str, Any] = {"name": name, "folder": str(folder), "megabytes": round(_size(folder) / 1e6, 1)}
@@ -60,7 +65,7 @@ def collect() -> dict[str, list[dict[str, Any]]]:
             packs.append(row | {"objects": sorted(pack.objects), "furniture": sorted(pack.furniture), "error": ""})
         except AssetError as error:
             packs.append(row | {"objects": [], "furniture": [], "error": str(error)})
-    return {"tasks": tasks, "configs": configs, "packs": packs}
+    return {"tasks": tasks, "configs": configs, "policies": policies, "packs": packs}
 
 
 def _size(folder: Path) -> int:
@@ -76,6 +81,7 @@ def _print(found: dict[str, list[dict[str, Any]]]) -> None:
     tables = {
         "tasks": ("name", "env_id", "default_config", "summary"),
         "configs": ("name", "task", "scene", "description"),
+        "policies": ("name", "package", "of"),
         "packs": ("name", "objects", "furniture", "megabytes", "folder"),
     }
     console = table_console()

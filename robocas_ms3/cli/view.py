@@ -65,13 +65,11 @@ def _write(cfg: View, out: Path, source, console) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from robocas_ms3.errors import RobocasError
-    from robocas_ms3.files import claim_output
+    from robocas_ms3.outputs import check_overwrite, claim_output
     from robocas_ms3.viewer.export import export
 
-    ours = (out / "data" / "index.js").is_file()
-    if cfg.overwrite and out.is_dir() and any(out.iterdir()) and not ours:
-        raise RobocasError("this folder was not made by `robocas view`", where=out, fix="It stays; choose another.")
+    if cfg.overwrite:
+        check_overwrite(out, ("data/index.js",), "made by `robocas view`")
     claim_output(out, resume=cfg.overwrite or None)  # what is there stays until the new one is written
     with Progress(console=Console(stderr=True), transient=True) as progress:
         bar = progress.add_task("episodes", total=None)

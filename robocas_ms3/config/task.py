@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StrictInt, model_validator
+from pydantic import AfterValidator, Field, StrictInt, model_validator
 
 from robocas_ms3.config.relations import RELATIONS, Relation
+from robocas_ms3.strict import StrictModel
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
-
-
-class StrictModel(BaseModel):
-    """Unknown keys and wrong types are errors (no silent conversion of strings); nothing changes after loading."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class PoseConfig(StrictModel):

@@ -6,6 +6,7 @@ docs/extending.md.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -19,6 +20,7 @@ from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.errors import DatasetError
 
 GROUP = "robocas_ms3.formats"
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -101,20 +103,17 @@ _BUILTIN = (
 def formats() -> dict[str, Format]:
     """All formats by name; those of other packages come first, so that they see their own folders before others do.
 
-    Raises:
-        DatasetError: an entry point names something else.
+    What of another package can't be used is left out, with a warning.
     """
     found = {}
     for point in entry_points(group=GROUP):
-        where = f"{GROUP}, {point.value}"
         try:
-            found[point.name] = point.load()
-        except (ImportError, AttributeError) as error:
-            raise DatasetError(
-                "a dataset format can't be imported", where=f"{GROUP}, {point.value}", found=error
-            ) from error
-        if not isinstance(found[point.name], Format):
-            raise DatasetError("not a dataset format", where=where, expected="a Format")
+            loaded = point.load()
+            if not isinstance(loaded, Format):
+                raise TypeError(f"{type(loaded).__name__}, not a Format")
+            found[point.name] = loaded
+        except Exception as error:  # whatever a stranger's module raises
+            _log.warning("%s, %s: this dataset format can't be used: %s", GROUP, point.value, error)
     return {**found, **{one.name: one for one in _BUILTIN}}
 
 

@@ -13,16 +13,17 @@ import numpy as np
 
 from robocas_ms3.demos.checks import check_arguments, check_same_run
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
-from robocas_ms3.demos.ledger import Failure, Ledger, count_by_stage
+from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_stage
 from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
+from robocas_ms3.files import make_folder, write_json
+from robocas_ms3.outputs import check_overwrite, claim_output, locked_folder
 from robocas_ms3.planning.executor import Seconds
 from robocas_ms3.recordings.entries import read_json
 from robocas_ms3.recordings.reading import open_trajectory
 from robocas_ms3.recordings.writing import merge
 
-_BEGINNINGS = {"run.json", "failures.jsonl", "episodes"}  # of a run that has not finished a seed yet
+_BEGINNINGS = {"run.json", FAILURES_FILE, "episodes"}  # of a run that has not finished a seed yet
 
 
 @dataclass(frozen=True)
@@ -91,8 +92,8 @@ def generate(
             process writes there; far too many seeds fail.
     """
     check_arguments(settings, episodes=episodes, first_seed=first_seed, jobs=jobs)
-    if overwrite and out.is_dir() and any(out.iterdir()) and not (out / "run.json").is_file():
-        raise RobocasError("this folder was not made by `robocas generate`", where=out, fix="It stays; choose another.")
+    if overwrite:
+        check_overwrite(out, ("run.json",), "made by `robocas generate`")
     with locked_folder(out):
         if _only_begun(out):
             shutil.rmtree(out)
@@ -109,7 +110,7 @@ def _only_begun(out: Path) -> bool:
     """Whether a run was begun here, and ended before it was through with a seed."""
     if not (out / "run.json").is_file() or {path.name for path in out.iterdir()} - _BEGINNINGS:
         return False
-    return not _finished(out, out / "episodes", Ledger(out / "failures.jsonl"))
+    return not _finished(out, out / "episodes", Ledger(out / FAILURES_FILE))
 
 
 def _generate_in(
@@ -121,7 +122,7 @@ def _generate_in(
     fork: bool,
     on_result: Callable[[EpisodeResult], None],
 ) -> Summary:
-    shards, ledger = make_folder(out / "episodes"), Ledger(out / "failures.jsonl")
+    shards, ledger = make_folder(out / "episodes"), Ledger(out / FAILURES_FILE)
     earlier = _finished(out, shards, ledger)
     ledger.keep_only(set(earlier))
     missing = (seed for seed in count(first_seed) if seed not in earlier)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
-from robocas_ms3.files import replacing
+from robocas_ms3 import ledger
+
+FAILURES_FILE = "failures.jsonl"
 
 
 @dataclass(frozen=True)
@@ -35,34 +36,15 @@ class Failure:
         return self.attempt < 0
 
 
-class Ledger:
+class Ledger(ledger.Ledger[Failure]):
     """The file, appended to seed by seed."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def read(self) -> list[Failure]:
-        """All failures written so far; a last line cut short by a crash is dropped."""
-        if not self.path.is_file():
-            return []
-        failures = []
-        for line in self.path.read_text(encoding="utf-8").splitlines():
-            try:
-                failures.append(Failure(**json.loads(line)))
-            except (json.JSONDecodeError, TypeError):
-                continue
-        return failures
-
-    def append(self, failures: Iterable[Failure]) -> None:
-        """Add lines."""
-        with self.path.open("a", encoding="utf-8") as file:
-            file.writelines(json.dumps(asdict(failure)) + "\n" for failure in failures)
+        super().__init__(path, Failure)
 
     def keep_only(self, seeds: set[int]) -> None:
         """Drop the lines of seeds that will be run again."""
-        kept = [failure for failure in self.read() if failure.seed in seeds]
-        with replacing(self.path) as tmp:
-            tmp.write_text("".join(json.dumps(asdict(f)) + "\n" for f in kept), encoding="utf-8")
+        self.rewrite(failure for failure in self.read() if failure.seed in seeds)
 
 
 def count_by_stage(failures: Iterable[Failure]) -> dict[str, int]:

@@ -16,7 +16,8 @@ from mani_skill.trajectory.utils import dict_to_list_of_dicts
 from robocas_ms3.demos.checks import check_number
 from robocas_ms3.demos.convert_actions import CONVERTIBLE, ActionConverter
 from robocas_ms3.errors import DatasetError, RobocasError
-from robocas_ms3.files import claim_output, replacing_folder
+from robocas_ms3.files import replacing_folder
+from robocas_ms3.outputs import claim_output
 from robocas_ms3.recordings.entries import read_json, read_reset
 from robocas_ms3.recordings.environment import RecordedEnv, read_env
 from robocas_ms3.recordings.reading import open_trajectory

@@ -9,17 +9,17 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.config import TaskConfig, load_task_config
-from robocas_ms3.config.task import StrictModel
 from robocas_ms3.errors import EvaluationError, LayoutError
-from robocas_ms3.evaluation.protocol import CONFIGS, EPISODES, LAYOUTS, RULES, TRAIN, Episode, Protocol
+from robocas_ms3.evaluation.protocol import CONFIGS, EPISODES, LAYOUTS, NO_RULES, RULES, TRAIN, Episode, Protocol
 from robocas_ms3.files import make_folder, replacing, replacing_folder
 from robocas_ms3.scenes.frozen import write_frozen
 from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.strict import StrictModel, parse
 from robocas_ms3.tasks.spec import TASKS
 from robocas_ms3.tasks.transfer import TransferEnv
 
@@ -92,11 +92,8 @@ def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Ite
         EvaluationError: the rules are none of a protocol, or two parts are of one name and another configuration.
     """
     pack = load_pack(str(plan.rules.get("pack", "builtin")))
-    try:
-        rules = Protocol.model_validate({**plan.rules, "pack_hash": sha256(pack.root / MANIFEST)})
-    except ValidationError as error:
-        found = " ".join(str(error).split())
-        raise EvaluationError("no rules of a protocol", where="rules", found=found) from error
+    said = {**plan.rules, "pack_hash": sha256(pack.root / MANIFEST)}
+    rules = parse(Protocol, said, EvaluationError, where="rules", about=NO_RULES)
     configs, train = _configs(plan.parts), _configs(plan.train)
     total, episodes = sum(part.count for part in plan.parts), []
     with replacing_folder(folder) as tmp:

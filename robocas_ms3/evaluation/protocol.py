@@ -14,7 +14,6 @@ Its hash is that of all these files, so two results of one hash were measured by
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,16 +21,16 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from robocas_ms3.config.load import nearest
-from robocas_ms3.config.task import StrictModel
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.paths import protocols_dir
+from robocas_ms3.strict import StrictModel, nearest, parse, parse_json
 from robocas_ms3.tasks.spec import TASKS
 
+NO_RULES = "no rules of a protocol"
 DEFAULT_HZ = 20  # where neither protocol nor policy says
 RULES, EPISODES, CONFIGS, LAYOUTS, TRAIN = "protocol.yaml", "episodes.jsonl", "configs", "layouts", "train"
 
@@ -214,9 +213,9 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
 def _rules(path: Path) -> Protocol:
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return Protocol.model_validate_json(json.dumps(data), strict=True)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, TypeError, ValidationError) as error:
-        raise EvaluationError("no rules of a protocol", where=path, found=" ".join(str(error).split())) from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise EvaluationError(NO_RULES, where=path, found=" ".join(str(error).split())) from error
+    return parse(Protocol, data, EvaluationError, where=path, about=NO_RULES)
 
 
 def _episodes(path: Path) -> Iterator[Episode]:
@@ -225,11 +224,7 @@ def _episodes(path: Path) -> Iterator[Episode]:
     except (OSError, UnicodeDecodeError) as error:
         raise EvaluationError("can't read the episodes", where=path, found=error) from error
     for number, line in enumerate(lines):
-        try:
-            episode = Episode.model_validate_json(line, strict=True)
-        except ValidationError as error:
-            found = " ".join(str(error).split())
-            raise EvaluationError("no episode", where=f"{path}:{number + 1}", found=found) from error
+        episode = parse_json(Episode, line, EvaluationError, where=f"{path}:{number + 1}", about="no episode")
         if episode.episode != number:
             raise EvaluationError(
                 "episodes are not in order", where=f"{path}:{number + 1}", expected=number, found=episode.episode

@@ -11,9 +11,8 @@ Parts of a result, such as shards, are read as one (`read`) or written as one (`
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,9 @@ from typing import Any
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import Share, share
-from robocas_ms3.files import make_folder, replacing, replacing_folder, write_json
+from robocas_ms3.files import make_folder, replacing_folder, write_json
+from robocas_ms3.ledger import Ledger
+from robocas_ms3.outputs import check_absent
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
@@ -105,20 +106,16 @@ def begin(folder: Path, run: dict[str, Any], *, resume: bool, again: bool = Fals
         if _telling(key, before.get(key)) != _telling(key, value):
             expected, found = _differing(before.get(key), value)
             raise EvaluationError(f"can't go on with another {key}", where=folder, expected=expected, found=found)
-    outcomes = _mended(folder / OUTCOMES)
+    outcomes = _outcomes(folder)
     if again and any(one.error for one in outcomes.values()):
         outcomes = {number: one for number, one in outcomes.items() if not one.error}
-        with replacing(folder / OUTCOMES) as tmp:
-            tmp.write_text(_lines(outcomes.values()), encoding="utf-8")
+        _ledger(folder).rewrite(outcomes.values())
     return outcomes
 
 
 def append(folder: Path, outcome: Outcome) -> None:
     """Add an episode; on the disk when this returns."""
-    with (folder / OUTCOMES).open("a", encoding="utf-8") as file:
-        file.write(json.dumps(asdict(outcome)) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
+    _ledger(folder).append([outcome], sync=True)
 
 
 def read(*folders: Path) -> Result:
@@ -173,11 +170,10 @@ def merge(folders: Sequence[Path], out: Path) -> Result:
         EvaluationError: see `read`; or something is there already.
     """
     result = read(*folders)
-    if out.exists():
-        raise EvaluationError("there is something already", where=out, fix="Choose another --out.")
+    check_absent(out, EvaluationError)
     with replacing_folder(out) as folder:
         write_json(folder / RUN, result.run)
-        (folder / OUTCOMES).write_text(_lines(result.outcomes.values()), encoding="utf-8")
+        _ledger(folder).rewrite(result.outcomes.values())
     return read(out)
 
 
@@ -193,26 +189,14 @@ def _telling(key: str, value: Any) -> Any:
     return value
 
 
-def _lines(outcomes: Iterable[Outcome]) -> str:
-    return "".join(json.dumps(asdict(outcome)) + "\n" for outcome in outcomes)
-
-
-def _mended(path: Path) -> dict[int, Outcome]:
-    """The outcomes of a file that a kill may have cut in the middle of its last line, which goes."""
-    if not path.is_file():
-        return {}
-    content = path.read_bytes()
-    whole = content[: content.rfind(b"\n") + 1]
-    if whole != content:
-        with path.open("r+b") as file:
-            file.truncate(len(whole))
-    return _outcomes(path)
+def _ledger(folder: Path) -> Ledger[Outcome]:
+    return Ledger(folder / OUTCOMES, Outcome)
 
 
 def _read(folder: Path) -> Result:
     try:
         run = json.loads((folder / RUN).read_text(encoding="utf-8"))
-        outcomes = dict(sorted(_outcomes(folder / OUTCOMES).items()))
+        outcomes = dict(sorted(_outcomes(folder).items()))
     except (OSError, ValueError) as error:
         raise EvaluationError("no result of an evaluation", where=folder, found=error) from error
     run = {**_BEFORE, **run} if isinstance(run, dict) else {}
@@ -224,20 +208,14 @@ def _read(folder: Path) -> Result:
     return Result(folder, run, outcomes)
 
 
-def _outcomes(path: Path) -> dict[int, Outcome]:
-    if not path.is_file():
-        return {}
-    known = {one.name for one in fields(Outcome)}
-    found: dict[int, Outcome] = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(keepends=True), start=1):
-        if not line.endswith("\n"):
-            break  # of a run that is at it, or was killed
-        try:
-            data = json.loads(line)
-            outcome = Outcome(**{name: value for name, value in data.items() if name in known})
-        except (ValueError, TypeError, AttributeError) as error:
-            raise EvaluationError("no outcome of an episode", where=f"{path}:{number}", found=error) from error
-        _add(found, outcome, f"{path}:{number}")
+def _outcomes(folder: Path) -> dict[int, Outcome]:
+    """Those of a run that may be at it, or was killed."""
+    ledger, found = _ledger(folder), dict[int, Outcome]()
+    for line in ledger.lines():
+        if line.record is not None:
+            _add(found, line.record, f"{ledger.path}:{line.number}")
+        elif not line.cut_off:
+            raise ledger.refusal(line, EvaluationError, "no outcome of an episode") from line.problem
     return found
 
 

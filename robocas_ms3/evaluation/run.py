@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
-from robocas_ms3.config.load import nearest
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation import results
@@ -19,6 +18,7 @@ from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
 from robocas_ms3.evaluation.weld import refuse
+from robocas_ms3.strict import nearest
 from robocas_ms3.tasks.vector.backend import Backend, choose_backend
 
 

@@ -8,11 +8,11 @@ from string import Formatter
 from typing import Annotated, Literal, TypeVar
 
 import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from robocas_ms3.config.relations import Relation
-from robocas_ms3.config.task import StrictModel
 from robocas_ms3.errors import ConfigError
+from robocas_ms3.strict import StrictModel, parse
 
 Task = Literal["pick", "select", "search", "open_pick"]
 Split = Literal["upstream", "train", "held_out"]
@@ -107,12 +107,7 @@ def read_texts(path: Path, model: type[_Model]) -> _Model:
     Raises:
         ConfigError: unknown keys, wrong types, a template with wrong fields: the first mistake.
     """
-    try:
-        return model.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{key}: {first['msg']}".removeprefix(": "), where=path) from error
+    return parse(model, yaml.safe_load(path.read_text(encoding="utf-8")), ConfigError, where=path)
 
 
 def _check_fields(template: str, *, needed: set[str], allowed: set[str]) -> None:

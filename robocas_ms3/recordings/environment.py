@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 from robocas_ms3.assets.pack import pack_folders
 from robocas_ms3.config.load import shipped_configs
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.strict import StrictModel, mistakes
 
 _PREFIX = "robocas_ms3:"  # lets gymnasium import this package by itself: ManiSkill's own tools then work
 _DEEP = 3  # dicts in dicts that settings of simulation and cameras may have
@@ -27,10 +28,10 @@ _Name = Annotated[str, Field(pattern=f"^{_NAME.pattern}$")]
 _Settings = dict[str, Any]
 
 
-class _Kwargs(BaseModel):
+class _Kwargs(StrictModel):
     """Arguments of ``gym.make`` that a file may have; those that aren't the scene's are the reader's to choose."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
+    model_config = ConfigDict(strict=True)
 
     config: _Name | dict[str, Any] | None = None
     pack: _Name = "builtin"
@@ -154,20 +155,15 @@ def recorded_id(env_id: str) -> str:
 
 
 def _refusal(error: ValidationError, where: object) -> DatasetError:
-    first = error.errors(include_url=False)[0]
-    place = [str(part) for part in first["loc"] if part not in ("str", "dict[str,any]", "constrained-str")]
-    key, kind = ".".join(place), first["type"]
-    fix = ""
-    if kind == "string_pattern_mismatch" and place[-1] in ("pack", "furniture_pack"):
-        fix = "Pass the pack with --pack, if you trust it." if place[-1] == "pack" else "Install that pack by name."
-    expected = {
-        "string_pattern_mismatch": "a name, no path",
-        "extra_forbidden": f"one of {', '.join(_Kwargs.model_fields)}",
-        "missing": "this key",
-    }.get(kind, first["msg"].removeprefix("Input should be "))
-    found = "no such key" if kind == "missing" else str(first["input"])[:80]
+    first = mistakes(error, _Info)[0]
+    name, fix, expected = first.key.rpartition(".")[2], first.fix, first.expected
+    if first.kind == "string_pattern_mismatch":
+        expected = "a name, no path"
+        if name in ("pack", "furniture_pack"):
+            fix = "Pass the pack with --pack, if you trust it." if name == "pack" else "Install that pack by name."
     what = "the recorded environment can't be read"
-    return DatasetError(what, where=f"{where}, {key}" if key else where, expected=expected, found=found, fix=fix)
+    where = f"{where}, {first.key}" if first.key else where
+    return DatasetError(what, where=where, expected=expected, found=first.found, fix=fix)
 
 
 def _check_settings(settings: Any, where: str, deep: int) -> None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Generator, Iterable
+from functools import partial
 
 from robocas_ms3.errors import LayoutError
+from robocas_ms3.processes import Calls, Pool
 from robocas_ms3.scenes.bank import LayoutBank
 from robocas_ms3.scenes.table import Pair
 
@@ -40,47 +39,23 @@ def fill(bank: LayoutBank, pairs: Iterable[Pair], jobs: int = 1) -> Generator[tu
     missing = bank.missing(pairs)
     firsts = [pair for pair in missing if pair[0] == pair[1]]
     without: dict[int, str] = {}  # objects seeds without objects, and why
-    with _pool(bank, jobs, len(missing)) as made:
-        for pair, problem in made(firsts):
+    with Pool(partial(Calls, partial(_make, bank)), min(jobs, len(missing)), died=_died) as pool:
+        for pair, problem in pool.do(firsts):
             if problem:
                 without[pair[0]] = problem
             yield pair, problem
         others = [pair for pair in missing if pair[0] != pair[1]]
         yield from ((pair, without[pair[0]]) for pair in others if pair[0] in without)
-        yield from made([pair for pair in others if pair[0] not in without])
+        yield from pool.do([pair for pair in others if pair[0] not in without])
 
 
-@contextmanager
-def _pool(bank: LayoutBank, jobs: int, count: int) -> Generator[Callable[[list[Pair]], Iterator[tuple[Pair, str]]]]:
-    """Gives a function that makes layouts, each pair with why there is none."""
-    if jobs <= 1 or count < 2:
-        yield lambda pairs: ((pair, _make(bank, pair)) for pair in pairs)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, count), context, _start_worker, (bank,)) as pool:
-        try:
-            yield lambda pairs: (
-                done.result() for done in as_completed([pool.submit(_make_in_worker, pair) for pair in pairs])
-            )
-        except BaseException:  # an interruption too: only what is under way is waited for
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
-
-
-def _make(bank: LayoutBank, pair: Pair) -> str:
+def _make(bank: LayoutBank, pair: Pair) -> tuple[Pair, str]:
     try:
         bank.get(*pair)
     except LayoutError as error:
-        return str(error)
-    return ""
+        return pair, str(error)
+    return pair, ""
 
 
-_worker_bank: list[LayoutBank] = []
-
-
-def _start_worker(bank: LayoutBank) -> None:
-    _worker_bank.append(bank)
-
-
-def _make_in_worker(pair: Pair) -> tuple[Pair, str]:
-    return pair, _make(_worker_bank[0], pair)
+def _died(pair: Pair) -> tuple[Pair, str]:
+    return pair, "the process that made it died; is memory short?"

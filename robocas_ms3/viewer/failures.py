@@ -8,13 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-
 from robocas_ms3.datasets.sources.provenance import environment_of
-from robocas_ms3.demos.ledger import Failure
+from robocas_ms3.demos.ledger import FAILURES_FILE, Failure
+from robocas_ms3.ledger import Ledger
 from robocas_ms3.viewer.source import row
-
-FAILURES_FILE = "failures.jsonl"
 
 
 @dataclass(frozen=True)
@@ -35,9 +32,6 @@ class Told(Failure):
         return environment_of(env_info) in ("", self.environment)
 
 
-_LINE = TypeAdapter(Told)
-
-
 @dataclass(frozen=True)
 class Failures:
     """The file.
@@ -54,21 +48,14 @@ class Failures:
     def read(cls, folder: Path) -> Failures:
         """Read that of a folder; nothing where there is none."""
         try:
-            lines = (folder / FAILURES_FILE).read_text(encoding="utf-8", errors="replace").split("\n")
-        except FileNotFoundError:
-            return cls()
+            lines = Ledger[Told](folder / FAILURES_FILE, Told).lines()
         except OSError as error:
             return cls(note=f"`{FAILURES_FILE}` can't be read: {error.strerror}.")
         found: dict[int, list[Told]] = defaultdict(list)
-        damaged = []
-        for number, line in enumerate(lines, 1):
-            try:
-                if line.strip():
-                    failure = _LINE.validate_json(line, strict=True)
-                    found[failure.seed].append(failure)
-            except ValidationError:
-                damaged.append(str(number))
-        return cls(dict(found), _damaged(damaged))
+        for line in lines:
+            if line.record is not None:
+                found[line.record.seed].append(line.record)
+        return cls(dict(found), _damaged([str(line.number) for line in lines if line.record is None]))
 
     def of_seed(self, seed: int | None, env_info: Any = None) -> list[Told]:
         """Of one seed in an environment; none where the seed is not known."""

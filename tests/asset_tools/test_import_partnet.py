@@ -163,12 +163,14 @@ def test_missing_files_are_named(chest, tmp_path):
 def test_bad_annotations_are_named(tmp_path):
     path = tmp_path / "7.yaml"
     path.write_text("name: a\ncategory: b\norigin_lift: 0\nsurface: {}\n")
-    with pytest.raises(AssetError, match=r"7\.yaml: the annotation is wrong.*at surface"):
+    with pytest.raises(
+        AssetError, match=r"7\.yaml: the annotation is wrong: unknown key 'surface'.*Did you mean surfaces"
+    ):
         load_annotation(path)
     path.write_text(
         "name: a\ncategory: b\norigin_lift: 0\nsurfaces: {top: {min_xy: [0, 0], max_xy: [0, 0.1], z: 0.2}}\n"
     )
-    with pytest.raises(AssetError, match=r"the annotation is wrong.*min_xy.*at surfaces\.top"):
+    with pytest.raises(AssetError, match=r"the annotation is wrong: surfaces\.top: min_xy"):
         load_annotation(path)
     path.write_text("name: [a")
     with pytest.raises(AssetError, match=r"7\.yaml: the annotation can't be read"):

@@ -124,7 +124,7 @@ def test_a_damaged_manifest_says_where(box_pack):
     data = json.loads(path.read_text())
     data["assets"][0]["mass"] = -1
     path.write_text(json.dumps(data))
-    with pytest.raises(AssetError, match=r"manifest\.json: the manifest is damaged .*mass"):
+    with pytest.raises(AssetError, match=r"manifest\.json: the manifest is damaged.*mass"):
         load_pack(box_pack)
     path.write_text(path.read_text()[:100])
     with pytest.raises(AssetError, match="the manifest is damaged"):
@@ -146,18 +146,18 @@ def test_a_pack_of_another_format_says_so(box_pack, instead, found):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"mass": "0.1"}, r"valid number, found at assets\.0\.object\.mass"),
-        ({"mass": True}, r"valid number, found at assets\.0\.object\.mass"),
-        ({"friction": float("inf")}, r"finite number, found at .*friction"),
-        ({"center_of_mass": [0, 0, float("nan")]}, r"finite number, found at .*center_of_mass\.2"),
-        ({"grasp_count": 1.0}, r"valid integer, found at .*grasp_count"),
-        ({"extents": [0.1, -0.06, 0.04]}, r"greater than or equal to 0, found at .*extents\.1"),
+        ({"mass": "0.1"}, r"'assets\.0\.mass' .expected a number"),
+        ({"mass": True}, r"'assets\.0\.mass' .expected a number"),
+        ({"friction": float("inf")}, r"friction' .expected a finite number, found inf"),
+        ({"center_of_mass": [0, 0, float("nan")]}, r"center_of_mass\.2' .expected a finite number"),
+        ({"grasp_count": 1.0}, "grasp_count' .expected a whole number"),
+        ({"extents": [0.1, -0.06, 0.04]}, r"extents\.1' .expected greater than or equal to 0"),
         ({"inertia_wxyz": [1, 0.1, 0, 0]}, "no unit quaternion"),
         ({"inertia": [1e-5, 1e-5, 2.1e-5]}, "no body has the moments of inertia"),
-        ({"files": {"hulls.obj": "g" * 64}}, r"match pattern .*files\.hulls\.obj"),
-        ({"files": {"hulls.obj": "0" * 63}}, r"match pattern .*files\.hulls\.obj"),
-        ({"files": {"hulls.obj\n": "0" * 64}}, r"match pattern .*files\.hulls\.obj"),
-        ({"files": {"Hulls.obj": "0" * 64}}, r"match pattern .*files\.Hulls\.obj"),
+        ({"files": {"hulls.obj": "g" * 64}}, r"files\.hulls\.obj' .expected a string like"),
+        ({"files": {"hulls.obj": "0" * 63}}, r"files\.hulls\.obj' .expected a string like"),
+        ({"files": {"hulls.obj\n": "0" * 64}}, r"files\.hulls\.obj' .expected a string like"),
+        ({"files": {"Hulls.obj": "0" * 64}}, r"files\.Hulls\.obj' .expected a string like"),
         ({"files": {"../hulls.obj": "0" * 64}}, "no plain path inside the asset's folder"),
         ({"files": {"links/../hulls.obj": "0" * 64}}, "no plain path inside"),
         ({"files": {"/hulls.obj": "0" * 64}}, "no plain path inside"),
@@ -169,7 +169,7 @@ def test_manifests_that_make_no_sense(box_pack, changes, message):
     data = json.loads(path.read_text())
     data["assets"][0].update(changes)
     path.write_text(json.dumps(data))
-    with pytest.raises(AssetError, match=f"the manifest is damaged .*{message}") as caught:
+    with pytest.raises(AssetError, match=f"the manifest is damaged.*{message}") as caught:
         load_pack(box_pack)
     assert "\n" not in str(caught.value)
 

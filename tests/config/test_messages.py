@@ -7,7 +7,6 @@ import pytest
 import yaml
 
 from robocas_ms3.config import load_task_config, shipped_configs
-from robocas_ms3.config.load import nearest
 from robocas_ms3.errors import ConfigError
 
 SHIPPED = yaml.safe_load(shipped_configs()["pick_table_scattered"].read_text())
@@ -76,8 +75,6 @@ def test_a_mistyped_name_gets_the_nearest_ones():
     assert "select_table_rows" not in text
     with pytest.raises(ConfigError, match="select_table_rows"):  # unlike any: all are listed
         load_task_config("xyz")
-    assert nearest("shelv", ["table", "shelf"]) == "Did you mean shelf?"
-    assert nearest("sofa", ["table", "shelf"]) == ""
 
 
 def test_an_unknown_support_is_a_warning(tmp_path, caplog):

@@ -18,7 +18,7 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.files import locked_folder
+from robocas_ms3.outputs import locked_folder
 from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.reading import TrajectoryFile
 

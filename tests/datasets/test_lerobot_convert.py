@@ -26,7 +26,7 @@ from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.writing.dataset_player import open_player
 from robocas_ms3.datasets.writing.players import Request
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.files import locked_folder
+from robocas_ms3.outputs import locked_folder
 from robocas_ms3.recordings.reading import TrajectoryFile
 
 

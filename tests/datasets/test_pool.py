@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from robocas_ms3.datasets.writing.pool import do_all
+from robocas_ms3.errors import DatasetError
 
 
 class Looking:
@@ -40,6 +41,19 @@ def test_torch_has_one_thread_where_pictures_are_rendered():
     assert {task for task, *_ in others} == {1, 2, 3}
     assert os.getpid() not in {pid for _, pid, *_ in others}
     assert {(threads, rasteriser) for *_, threads, rasteriser in others} == {(1, "1")}
+
+
+class Deadly(Looking):
+    def do(self, task):
+        return os._exit(9) if task == 2 else task
+
+
+def test_a_process_that_dies_is_one_clear_line(monkeypatch):
+    monkeypatch.setenv("ROBOCAS_DEFER_REGISTRATION", "1")
+    results = do_all(Deadly, [1, 2, 3], 2, Path("out"), renders=False)
+    assert next(results) == 1
+    with pytest.raises(DatasetError, match="out: a worker process died.*--resume and fewer --jobs"):
+        list(results)
 
 
 def test_elsewhere_torch_is_left_alone():

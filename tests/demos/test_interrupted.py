@@ -2,19 +2,17 @@
 
 import json
 import shutil
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from types import SimpleNamespace
 
 import h5py
 import pytest
 
 from robocas_ms3.demos import generate as module
-from robocas_ms3.demos import workers
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.workers import generate_seeds, shard_name
+from robocas_ms3.processes import Pool
 from robocas_ms3.recordings.entries import read_json
 
 SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
@@ -122,39 +120,9 @@ def test_fewer_than_there_are(tmp_path, made):
     assert made == [0, 1, 2, 3, 4]
 
 
-class Pool:
-    """All that is under way fails as soon as a seed which crashes is; of another seed it was dead before."""
-
-    crashing, found_dead = 5, {7}  # noqa: RUF012
-
-    def __init__(self, *_, **__):
-        self.under_way = []
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
-    def shutdown(self, **_):
-        pass
-
-    def submit(self, _, seed, folder):
-        if seed in Pool.found_dead:
-            Pool.found_dead = set()
-            raise BrokenProcessPool
-        self.under_way.append(seed)
-        return SimpleNamespace(result=lambda: self.result(seed))
-
-    def result(self, seed):
-        if Pool.crashing in self.under_way:
-            raise BrokenProcessPool
-        return EpisodeResult(seed, success=True)
-
-
-def test_a_crash_costs_no_seed_but_its_own(monkeypatch):
-    monkeypatch.setattr(workers, "ProcessPoolExecutor", Pool)
-    results = generate_seeds(SETTINGS, iter(range(100)), Path(), 2)
-    first = [next(results) for _ in range(10)]
-    assert [result.seed for result in first] == list(range(10))
-    assert [result.seed for result in first if not result.success] == [5]
+def test_a_seed_that_takes_its_process_down_is_a_failure_of_its_own(monkeypatch):
+    """Whose fault it was is the pool's to find out: tests/test_processes.py."""
+    monkeypatch.setattr(Pool, "do", lambda pool, seeds, in_order: (pool._died(seed) for seed in seeds))
+    (result,) = generate_seeds(SETTINGS, iter([5]), Path(), 2)
+    assert (result.seed, result.success, result.attempts) == (5, False, 1)
+    assert [(one.stage, one.reason) for one in result.failures] == [("worker", "crashed")]

@@ -15,7 +15,7 @@ from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.errors import OutputExistsError, RobocasError
-from robocas_ms3.files import locked_folder
+from robocas_ms3.outputs import locked_folder
 from robocas_ms3.tasks.base import RoboCASEnv
 
 SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")

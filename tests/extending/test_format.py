@@ -14,7 +14,6 @@ from robocas_ms3.datasets import RoboCASDataset
 from robocas_ms3.datasets.formats import format_of, formats, open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.writing import convert as conversion
-from robocas_ms3.errors import DatasetError
 
 
 @pytest.fixture
@@ -95,11 +94,9 @@ def test_a_format_that_there_is_not(stranger, tmp_path, capsys):
     assert "--append: not for toy datasets" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("what", "said"), [("missing_module:FORMAT", "can't be imported"), ("json:dumps", "not a dataset format")]
-)
-def test_a_broken_entry_point_is_said(stranger, what, said):
+@pytest.mark.parametrize("what", ["missing_module:FORMAT", "json:dumps"])
+def test_a_broken_package_is_said_and_left_out(stranger, what, caplog):
     (stranger / "toy_format-1.0.dist-info" / "entry_points.txt").write_text(f"[robocas_ms3.formats]\ntoy = {what}\n")
     formats.cache_clear()
-    with pytest.raises(DatasetError, match=f"robocas_ms3.formats, {what}: .*{said}"):
-        formats()
+    assert set(formats()) == {"trajectory", "robocas", "lerobot"}
+    assert f"robocas_ms3.formats, {what}: this dataset format can't be used: " in caplog.text

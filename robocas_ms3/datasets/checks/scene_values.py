@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, 
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation
+from robocas_ms3.strict import Mistake, mistakes
 
 
 def one_seed(value: Any) -> int | None:
@@ -117,17 +118,13 @@ class Scene(_Part):
 
 
 _UNKNOWN = {**dict.fromkeys(schema.SCENE), "schema_version": schema.SCHEMA_VERSION, "rate_hz": 1.0, "source": {}}
-_EXPECTED = {
-    "missing": "this key",
+# JSON's
+_WORDS = {
     "int_type": "an integer",
-    "float_type": "a number",
-    "finite_number": "a finite number",
     "string_type": "text",
-    "bool_type": "true or false",
-    "list_type": "a list",
     "dict_type": "an object",
     "model_type": "an object",
-}
+}  # JSON's
 
 
 def check_values(scene: Mapping[str, Any], file: str = schema.SCENE_FILE) -> list[Violation]:
@@ -173,23 +170,19 @@ def _check(model: type[_Part], content: Mapping[str, Any], file: str) -> list[Vi
         model.model_validate(content)
     except ValidationError as error:
         found: dict[str, Violation] = {}  # by key; of a list's items the first one says it all
-        for details in error.errors(include_url=False):
-            words = [str(word) for word in details["loc"] if not isinstance(word, int)]
-            found.setdefault(".".join(words), _violation(file, details))
+        for mistake in mistakes(error, words=_WORDS):
+            key = ".".join(word for word in mistake.key.split(".") if not word.isdecimal())
+            found.setdefault(key, _violation(file, mistake))
         return list(found.values())
     return []
 
 
-def _violation(file: str, details: Mapping[str, Any]) -> Violation:
-    key = ".".join(map(str, details["loc"]))
-    kind, context = details["type"], details.get("ctx", {})
-    if kind == "missing":
-        return Violation(file, key, _EXPECTED[kind], "no such key")
-    if kind in ("too_short", "too_long"):
-        limit = context.get("min_length", context.get("max_length"))
-        return Violation(file, key, f"{limit} values", f"{context['actual_length']}")
-    expected = _EXPECTED.get(kind) or details["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-    return Violation(file, key, expected, _shown(details["input"]))
+def _violation(file: str, mistake: Mistake) -> Violation:
+    if mistake.kind in ("too_short", "too_long"):
+        limit = mistake.context.get("min_length", mistake.context.get("max_length"))
+        return Violation(file, mistake.key, f"{limit} values", f"{mistake.context['actual_length']}")
+    found = "no such key" if mistake.kind == "missing" else _shown(mistake.value)
+    return Violation(file, mistake.key, mistake.expected or mistake.what.removeprefix(f"{mistake.key}: "), found)
 
 
 def _shown(value: Any) -> str:

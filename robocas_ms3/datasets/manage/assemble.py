@@ -15,7 +15,8 @@ from robocas_ms3.datasets.manage.parts import Part
 from robocas_ms3.datasets.statistics.described import count_of
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import SETTINGS
-from robocas_ms3.files import claim_output, replacing_folder
+from robocas_ms3.files import replacing_folder
+from robocas_ms3.outputs import claim_output
 
 Side = Literal["train", "val"]
 OnStart = Callable[[int], None]

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.writing.output import check_overwrite, kept_if_begun, sweep
+from robocas_ms3.datasets.writing.output import check_overwrite
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
+from robocas_ms3.files import make_folder, write_json
+from robocas_ms3.outputs import claim_output, kept_if_begun, locked_folder, sweep
 
 _NO_LINKS = {errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS}
 

@@ -20,7 +20,8 @@ from robocas_ms3.datasets.manage.parts import Part, Sides, names_of
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.info import info_of
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import locked_folder, write_json
+from robocas_ms3.files import write_json
+from robocas_ms3.outputs import locked_folder
 
 By = Literal["seed", "target", "task"]
 KEEP_RULE = "every episode keeps the side it had in the dataset it is from"

@@ -20,7 +20,7 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.failures import add_failures
 from robocas_ms3.datasets.writing.frames import OpenSource, open_env
 from robocas_ms3.datasets.writing.info import write_info
-from robocas_ms3.datasets.writing.output import check_overwrite, kept_if_begun, sweep
+from robocas_ms3.datasets.writing.output import check_overwrite
 from robocas_ms3.datasets.writing.plan import (
     Plan,
     appended_plan,
@@ -33,7 +33,8 @@ from robocas_ms3.datasets.writing.players import Player, RecordingPlayer, Reques
 from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.datasets.writing.workers import Job, write_all
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
-from robocas_ms3.files import claim_output, locked_folder, make_folder, write_json
+from robocas_ms3.files import make_folder, write_json
+from robocas_ms3.outputs import claim_output, kept_if_begun, locked_folder, sweep
 
 _log = logging.getLogger(__name__)
 

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.datasets.sources.provenance import environment_of, task_of
-from robocas_ms3.files import replacing
-
-FAILURES_FILE = "failures.jsonl"
+from robocas_ms3.demos.ledger import FAILURES_FILE
+from robocas_ms3.ledger import Ledger
 
 
 def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
@@ -25,25 +24,15 @@ def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
         env_info: of the trajectory.
     """
     made_in = {"task": task_of(str(env_info.get("env_id"))), "environment": environment_of(env_info)}
-    known = _lines(out / FAILURES_FILE)
-    new = []
-    for line in _lines(run / FAILURES_FILE):
-        marked = _marked(line, made_in)
-        if marked and not {line, marked} & set(known):
-            new.append(marked)
-    if new:
-        with replacing(out / FAILURES_FILE) as tmp:
-            tmp.write_bytes(b"".join(line + b"\n" for line in known + new))
+    there = _lines_of(out)
+    known = {_key(line) for line in there.read()}
+    marked = ((line, {**line, **made_in}) for line in _lines_of(run).read())
+    there.append([line for before, line in marked if not {_key(before), _key(line)} & known])
 
 
-def _lines(path: Path) -> list[bytes]:
-    return path.read_bytes().splitlines() if path.is_file() else []
+def _lines_of(folder: Path) -> Ledger[dict[str, Any]]:
+    return Ledger(folder / FAILURES_FILE, dict[str, Any])
 
 
-def _marked(line: bytes, made_in: Mapping[str, Any]) -> bytes:
-    """The line with more keys; empty where it is no whole one."""
-    try:
-        content = json.loads(line)
-    except ValueError:
-        return b""
-    return json.dumps({**content, **made_in}).encode() if isinstance(content, dict) else b""
+def _key(line: Mapping[str, Any]) -> str:
+    return json.dumps(line, sort_keys=True)

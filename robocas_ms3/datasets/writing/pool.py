@@ -1,35 +1,19 @@
-"""Does tasks in this process or in several, each of which keeps open what the tasks need."""
+"""Does what writes datasets in this process or in several, which render beside each other."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import NoReturn, TypeVar
 
-from robocas_ms3.demos.parent import leave_with_parent
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.processes import Pool, Worker
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-Task_contra = TypeVar("Task_contra", contravariant=True)
-Result_co = TypeVar("Result_co", covariant=True)
-
-
-class Worker(Protocol[Task_contra, Result_co]):
-    """Does one task after the other."""
-
-    def do(self, task: Task_contra) -> Result_co:
-        """Do a task."""
-        ...
-
-    def close(self) -> None:
-        """Free what it holds."""
-        ...
 
 
 def do_all(
@@ -52,25 +36,16 @@ def do_all(
     Raises:
         DatasetError: a process died; else whatever a task raises.
     """
-    if processes <= 1 or len(tasks) < 2:
-        with one_torch_thread() if renders else nullcontext(), closing(open_worker()) as worker:
-            yield from map(worker.do, tasks)
-        return
-    pool = ProcessPoolExecutor(
-        min(processes, len(tasks)),
-        mp_context=multiprocessing.get_context("spawn"),  # a renderer does not survive a fork
-        initializer=_start_worker,
-        initargs=(open_worker, renders),
-    )
-    try:
-        for future in as_completed([pool.submit(_do, task) for task in tasks]):
-            yield future.result()
-    except BrokenProcessPool as error:
-        raise DatasetError(
-            "a worker process died", where=where, fix="Is memory short? Pass --resume and fewer --jobs."
-        ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
+
+    def died(task: Task) -> NoReturn:
+        fix = "Is memory short? Pass --resume and fewer --jobs."
+        raise DatasetError("a worker process died", where=where, fix=fix)
+
+    processes = min(processes, len(tasks))
+    here = one_torch_thread() if renders and processes <= 1 else nullcontext()
+    opened = partial(_open_renderer, open_worker) if renders and processes > 1 else open_worker
+    with here, Pool(opened, processes, died=died) as pool:
+        yield from pool.do(tasks)
 
 
 @contextmanager
@@ -86,21 +61,11 @@ def one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-_worker: Worker[Any, Any] | None = None
+def _open_renderer(open_worker: Callable[[], Worker[Task, Result]]) -> Worker[Task, Result]:
+    """In one of several processes."""
+    # One thread a process: several that render in software on all cores get in each other's way.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    import torch
 
-
-def _start_worker(open_worker: Callable[[], Worker[Any, Any]], renders: bool) -> None:
-    global _worker  # noqa: PLW0603  (state of a worker process)
-    leave_with_parent()
-    if renders:
-        # One thread a process: several that render in software on all cores get in each other's way.
-        os.environ.setdefault("LP_NUM_THREADS", "1")
-        import torch
-
-        torch.set_num_threads(1)
-    _worker = open_worker()
-
-
-def _do(task: Any) -> Any:
-    assert _worker is not None
-    return _worker.do(task)
+    torch.set_num_threads(1)
+    return open_worker()

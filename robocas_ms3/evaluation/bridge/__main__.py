@@ -12,7 +12,7 @@ import traceback
 from contextlib import suppress
 
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.evaluation.bridge.channel import Channel, leave_with
+from robocas_ms3.evaluation.bridge.channel import Channel, leave_with_starter
 
 
 def main(fd: int, starter: int) -> int:
@@ -24,7 +24,7 @@ def main(fd: int, starter: int) -> int:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the starter's, which closes its end
     end = socket.socket(fileno=fd)
-    leave_with(end, starter)
+    leave_with_starter(end, starter)
     channel, bridge = Channel(end), None
     try:
         from robocas_ms3.evaluation.bridge.server import open_bridge  # the simulator, which takes seconds

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import select
 import socket
-import threading
 from typing import Any
 
 from robocas_ms3.errors import WireError
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES, pack, unpack
+from robocas_ms3.processes import leave_with
 
 _LENGTH = 8  # bytes, most significant first
 _LOOK = 1.0  # s
@@ -55,22 +55,16 @@ class Channel:
         return bytes(parts)
 
 
-def leave_with(end: socket.socket, starter: int) -> None:
+def leave_with_starter(end: socket.socket, starter: int) -> None:
     """End this process as soon as the other end is closed, or its starter is no more, whatever it is at.
 
     Args:
         end: of the pair of sockets; forks of the starter may keep the other one open.
-        starter: its process id.
+        starter: its process id; a script between the two may be the parent.
     """
-    threading.Thread(target=_wait_and_leave, args=(end.fileno(), starter), daemon=True).start()
-
-
-def _wait_and_leave(end: int, starter: int) -> None:
-    parent, poll = os.getppid(), select.poll()  # a script between the two may be the parent
-    poll.register(end, 0)  # nothing but hang-ups
-    while not poll.poll(1000 * _LOOK) and os.getppid() == parent and _is_there(starter):
-        pass
-    os._exit(1)
+    poll = select.poll()
+    poll.register(end.fileno(), 0)  # nothing but hang-ups
+    leave_with(os.getppid(), lambda: poll.poll(1000 * _LOOK) or not _is_there(starter))
 
 
 def _is_there(pid: int) -> bool:

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError
 
 from robocas_ms3 import __version__
-from robocas_ms3.config.task import StrictModel
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.errors import EvaluationError, WireError
 from robocas_ms3.evaluation import results
@@ -22,6 +21,7 @@ from robocas_ms3.evaluation.protocol import Episode, load_protocol
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.run import Settings, about, chosen
 from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
+from robocas_ms3.strict import StrictModel, refusal
 from robocas_ms3.tasks.vector.backend import Backend, choose_backend
 
 VERSION = 1
@@ -187,5 +187,5 @@ def open_bridge(channel: Channel) -> Bridge:
     try:
         asked = Asked.model_validate(message)
     except ValidationError as error:
-        raise EvaluationError("can't play that", found=" ".join(str(error).split())) from error
+        raise refusal(error, Asked, EvaluationError, where="", about="can't play that") from error
     return Bridge(asked, channel)

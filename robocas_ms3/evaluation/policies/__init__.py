@@ -1,4 +1,7 @@
-"""Policies by name: builtin ones, ``replay:DATASET``, ``module:Class``, or ``ws://host:port`` of a server."""
+"""Policies by name: builtin ones, those of installed packages, ``replay:DATASET``, ``module:Class``, ``ws://host:port``.
+
+A package offers policies as entry points of the group `GROUP`: see docs/extending.md.
+"""
 
 from __future__ import annotations
 
@@ -9,33 +12,55 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from robocas_ms3.config.load import nearest
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policies.plain import RandomPolicy, StillPolicy
-from robocas_ms3.evaluation.policies.replay import ReplayPolicy
-from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
 from robocas_ms3.evaluation.policy import Policy, Wants
+from robocas_ms3.strict import nearest
+
+GROUP = "robocas_ms3.policies"
+
+
+def _scripted(speaks: Literal["joint_positions", "robocas"]) -> Policy:
+    from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
+
+    return ScriptedPolicy(speaks)
+
 
 BUILTIN: dict[str, Callable[[], Policy]] = {
-    "scripted": ScriptedPolicy,
-    "scripted-motions": partial(ScriptedPolicy, "robocas"),
+    "scripted": partial(_scripted, "joint_positions"),
+    "scripted-motions": partial(_scripted, "robocas"),
     "random": RandomPolicy,
     "still": StillPolicy,
 }
+
+
+def installed_policies() -> dict[str, list[EntryPoint]]:
+    """Policies of installed packages by name; none is imported. One that two packages have can't be chosen."""
+    found: dict[str, list[EntryPoint]] = {}
+    for entry in sorted(entry_points(group=GROUP), key=lambda entry: (entry.name, package_of(entry))):
+        if entry.name not in BUILTIN:  # what is installed can't hide a builtin one
+            found.setdefault(entry.name, []).append(entry)
+    return found
+
+
+def package_of(entry: EntryPoint) -> str:
+    """Name of the package that has an entry point."""
+    return entry.dist.name if entry.dist else entry.module.partition(".")[0]
 
 
 def make_policy(name: str) -> Policy:
     """Make a policy.
 
     Args:
-        name: of a builtin one; ``replay:TRAJECTORY.h5``; ``module:Class`` of your own, called without arguments;
-            or the address of a server (`remote.address.read_address`).
+        name: of a builtin one, or of one that a package brings; ``replay:TRAJECTORY.h5``; ``module:Class`` of your
+            own, called without arguments; or the address of a server (`remote.address.read_address`).
 
     Raises:
-        EvaluationError: there is no such policy.
+        EvaluationError: there is no such policy, or that of a package is broken.
         MissingExtraError: it is elsewhere, and the ``remote`` extra is not installed.
     """
     policy = _made(name)
@@ -59,11 +84,32 @@ def _made(name: str) -> Policy:
 
         return RemotePolicy(name)
     if kind == "replay" and rest:
+        from robocas_ms3.evaluation.policies.replay import ReplayPolicy
+
         return ReplayPolicy(Path(rest))
+    installed = installed_policies()
+    if name in installed:
+        return _installed(name, installed[name])
     if not re.fullmatch(r"\w+(\.\w+)*", kind) or not rest.isidentifier():
-        expected = f"{', '.join(BUILTIN)}, replay:TRAJECTORY.h5, module:Class or ws://host:port"
-        raise EvaluationError("no such policy", where=name, expected=expected, fix=nearest(name, BUILTIN))
+        known = [*BUILTIN, *installed]
+        expected = f"{', '.join(known)}, replay:TRAJECTORY.h5, module:Class or ws://host:port"
+        raise EvaluationError("no such policy", where=name, expected=expected, fix=nearest(name, known))
     return _own(name, kind, rest)
+
+
+def _installed(name: str, entries: list[EntryPoint]) -> Policy:
+    """A policy of an installed package."""
+    packages = ", ".join(map(package_of, entries))
+    if len(entries) > 1:
+        fix = "Uninstall one, or name it by module:Class."
+        raise EvaluationError("several packages have a policy of this name", where=name, found=packages, fix=fix)
+    try:
+        made: Any = entries[0].load()
+    except Exception as error:
+        found = " ".join(f"{type(error).__name__}: {error}".split())
+        what, fix = f"this policy of the package {packages} can't be imported", "Mend or uninstall that package."
+        raise EvaluationError(what, where=name, found=found, fix=fix) from error
+    return _call(name, made)
 
 
 def _own(name: str, module: str, of: str) -> Policy:
@@ -84,6 +130,10 @@ def _own(name: str, module: str, of: str) -> Policy:
     except Exception as error:
         what, found = "this policy's module can't be imported", f"{type(error).__name__}: {error}"
         raise EvaluationError(what, where=module, found=found) from error
+    return _call(name, made)
+
+
+def _call(name: str, made: Any) -> Policy:
     try:
         return made()
     except TypeError as error:

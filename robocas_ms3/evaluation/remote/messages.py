@@ -19,6 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 from robocas_ms3.errors import EvaluationError, WireError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.strict import refusal
 
 WANTS, POLICY = "robocas_wants", "robocas_policy"  # keys of the metadata
 ENV, RESET, START, PROMPT, ACTIONS = "env_id", "reset", "start", "prompt", "actions"
@@ -26,6 +27,7 @@ PREFIX = "observation/"
 ROBOT = {"qpos": 12, "tcp_in_base": 7, "gripper_width": 1}
 _LARGEST = 1e3  # m or rad: physics of what is beyond would be broken, and nobody means it
 _MAX_PIXELS = 4096  # a side
+_WANTS = TypeAdapter(Wants)
 
 
 def wants_message(wants: Wants) -> dict[str, Any]:
@@ -43,8 +45,10 @@ def wants_of(message: Any, where: object) -> Wants:
     if not isinstance(message, dict) or not set(message) <= set(known):
         raise EvaluationError("no wants of a policy", where=where, expected=f"some of {known}", found=_line(message))
     try:
-        wants = TypeAdapter(Wants).validate_json(json.dumps(message), strict=True)
-    except (TypeError, ValueError, ValidationError) as error:
+        wants = _WANTS.validate_json(json.dumps(message), strict=True)
+    except ValidationError as error:
+        raise refusal(error, _WANTS, EvaluationError, where=where, about="no wants of a policy") from error
+    except (TypeError, ValueError) as error:
         raise EvaluationError("no wants of a policy", where=where, found=_line(error)) from error
     sides = [side for size in wants.cameras.values() for side in size]
     if not all(1 <= side <= _MAX_PIXELS for side in sides) or not 0 < (wants.rate_hz or 1) < math.inf:

@@ -7,8 +7,6 @@ import importlib
 import logging
 import os
 import pickle
-import threading
-import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -22,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import LayoutError, VectorEnvError
+from robocas_ms3.processes import leave_with
 from robocas_ms3.tasks.vector.block import Block, Field, Path, leaves, space_fields
 from robocas_ms3.tasks.vector.handle import LEAVE, NUMBER, STEP, EnvFailed, name_envs
 
@@ -137,20 +136,13 @@ def main(connection: int, memory: int, parent: int) -> None:
         parent: that process.
     """
     faulthandler.enable()
-    threading.Thread(target=_leave_with, args=(parent,), daemon=True).start()
+    leave_with(parent)
     for descriptor in (connection, memory):
         os.set_inheritable(descriptor, False)
     torch.set_num_threads(1)
     with suppress(EOFError, OSError):  # nobody is there any more
         _Worker(Connection(connection), memory).serve()
     os._exit(0)  # environments are closed; what else would be torn down takes long, and may crash
-
-
-def _leave_with(parent: int) -> None:
-    # The end of the connection says so too, unless a fork of the parent keeps that open.
-    while os.getppid() == parent:
-        time.sleep(0.5)
-    os._exit(1)
 
 
 class _Worker:

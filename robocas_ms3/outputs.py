@@ -1,0 +1,166 @@
+"""Folders that runs write into: whose they may be, what becomes of what is there, and who else may write there.
+
+A run that writes one episode after the other takes these steps, all under `locked_folder`: `claim_output` refuses what
+is there unless the user said what to do with it; `check_overwrite` keeps what is none of ours from being deleted;
+`sweep` removes what a killed run left half written; `kept_if_begun` leaves no folder behind of which nothing came.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import glob
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from io import TextIOWrapper
+from pathlib import Path
+
+from robocas_ms3.errors import OutputExistsError, RobocasError
+from robocas_ms3.files import make_folder
+
+
+def is_taken(path: Path) -> bool:
+    """Whether there is something: a file, or a folder that is not empty."""
+    return path.exists() and not (path.is_dir() and not any(path.iterdir()))
+
+
+def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool | None = False) -> None:
+    """Refuse an output that exists, unless the user said what to do with it.
+
+    What is overwritten disappears at once: a run killed while it deletes leaves no half of it under this name.
+
+    Args:
+        path: of the output.
+        overwrite: whether to replace it.
+        resume: whether to go on with it; None where that can't be done.
+
+    Raises:
+        OutputExistsError: ``path`` exists and is not empty, and neither flag is set.
+        RobocasError: it can't be moved away.
+    """
+    path = Path(path)
+    taken = is_taken(path)
+    if taken and not (overwrite or resume):
+        ways = ("" if resume is None else "--resume to go on, ") + "--overwrite to replace it"
+        raise OutputExistsError("the output exists already", where=path, fix=f"Pass {ways}.")
+    for old in path.parent.glob(f".{glob.escape(path.name)}.*.old"):
+        if not (old / "old").exists():  # that of a folder being replaced, which may have to come back
+            shutil.rmtree(old, ignore_errors=True)
+    if taken and overwrite:
+        _remove(path)
+
+
+def _remove(path: Path) -> None:
+    """Delete a file or a folder, which is renamed first."""
+    if not path.is_dir():
+        path.unlink()
+        return
+    target = path.resolve()  # a link to a folder goes on leading to one
+    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=make_folder(target.parent)))
+    try:
+        os.replace(target, old)
+    except OSError as error:
+        old.rmdir()
+        what = "can't replace this folder"
+        raise RobocasError(what, where=path, found=error.strerror, fix="Choose another.") from error
+    if path.is_symlink():
+        target.mkdir()
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def check_absent(out: Path, error: type[RobocasError] = OutputExistsError) -> None:
+    """See that there is nothing yet, where what is there is neither gone on with nor replaced.
+
+    Raises:
+        RobocasError: ``error``: there is.
+    """
+    if out.exists():
+        raise error("there is something already", where=out, fix="Choose another --out.")
+
+
+def check_overwrite(out: Path, marks: Sequence[str], what: str, error: type[RobocasError] = OutputExistsError) -> None:
+    """See that what will be replaced is ours, whatever path was named by mistake.
+
+    Args:
+        out: the folder.
+        marks: files or folders, of which one of ours has one at least.
+        what: such a folder is.
+        error: to be raised.
+
+    Raises:
+        RobocasError: ``error``: there is something else.
+    """
+    if is_taken(out) and not any((out / mark).exists() for mark in marks):
+        raise error(
+            f"refusing to overwrite what is not {what}", where=out, expected=" or ".join(marks), fix="Choose another."
+        )
+
+
+@contextmanager
+def locked_folder(path: Path | str) -> Iterator[None]:
+    """Hold a lock on a folder that may not exist yet; it ends with the process, however that ends.
+
+    If the folder is not there in the end, the parents made for the lock go too.
+
+    Raises:
+        RobocasError: another process holds it, or nothing can be written there.
+    """
+    path = Path(path)
+    new = [folder for folder in path.parents if not folder.exists()]
+    lock = path.parent / f".{path.name}.lock"
+    try:
+        with _locked(lock, path):
+            try:
+                yield
+            finally:
+                lock.unlink(missing_ok=True)
+    finally:
+        if not path.exists():
+            with suppress(OSError):  # nothing came of it; another run may be in them
+                for folder in new:
+                    folder.rmdir()
+
+
+def _locked(lock: Path, path: Path) -> TextIOWrapper:
+    """Open and lock a file that whoever held it before may just have removed."""
+    while True:
+        make_folder(lock.parent)
+        try:
+            file = lock.open("w")
+        except OSError as error:  # it says that it is writable, as those of /proc do
+            what = "can't write into this folder"
+            raise RobocasError(what, where=lock.parent, found=error.strerror, fix="Choose another.") from error
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
+                    return file
+        except OSError as error:
+            file.close()
+            raise RobocasError("another process is writing here", where=path, fix="Wait until it is done.") from error
+        file.close()
+
+
+def sweep(folder: Path) -> None:
+    """Remove what a killed run left half written; nobody else may write here, so lock the folder before."""
+    for leftover in [*folder.glob(".*.tmp*"), *folder.glob(".*.old")]:
+        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+
+
+@contextmanager
+def kept_if_begun(out: Path, parts: Path | None = None, pattern: str = "episode_*") -> Iterator[None]:
+    """Delete ``out`` if what is done inside fails before there is a part; otherwise a resumed run goes on.
+
+    Args:
+        out: the folder.
+        parts: the folder that gets the parts; default: the same.
+        pattern: of their names.
+    """
+    try:
+        yield
+    except BaseException:
+        if not any((parts or out).glob(pattern)):
+            shutil.rmtree(out, ignore_errors=True)  # nothing came of it
+        raise

@@ -1,0 +1,110 @@
+"""Whose an output folder is: what is refused, overwritten, locked, swept, and left behind."""
+
+import fcntl
+import os
+
+import pytest
+
+from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.files import make_folder
+from robocas_ms3.outputs import check_overwrite, claim_output, kept_if_begun, locked_folder, sweep
+
+
+def test_existing_output_needs_a_flag(tmp_path):
+    (tmp_path / "out").mkdir()
+    claim_output(tmp_path / "out")  # empty: fine
+    (tmp_path / "out" / "file").write_text("")
+    with pytest.raises(OutputExistsError, match="--resume.*--overwrite"):
+        claim_output(tmp_path / "out")
+    with pytest.raises(OutputExistsError, match=r"exists already\. Pass --overwrite to replace it\.$"):
+        claim_output(tmp_path / "out", resume=None)  # it can't be gone on with
+    claim_output(tmp_path / "out", resume=True)
+    assert (tmp_path / "out" / "file").exists()
+    claim_output(tmp_path / "out", overwrite=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_overwritten_disappears_at_once(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "file").write_text("")
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.rmtree", lambda *_, **__: None)  # as if killed there
+        claim_output(out, overwrite=True)
+    assert not out.exists()
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".out.")
+    assert left.name.endswith(".old")
+    claim_output(out)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_link_to_a_folder_goes_on_leading_to_one(tmp_path):
+    (tmp_path / "disk" / "data").mkdir(parents=True)
+    (tmp_path / "disk" / "data" / "file").write_text("")
+    (tmp_path / "out").symlink_to(tmp_path / "disk" / "data")
+    claim_output(tmp_path / "out", overwrite=True)
+    assert (tmp_path / "out").is_symlink()
+    assert [*(tmp_path / "disk").iterdir(), *(tmp_path / "out").iterdir()] == [tmp_path / "disk" / "data"]
+
+
+def test_a_lock_leaves_no_parents_of_a_folder_that_never_was(tmp_path):
+    with pytest.raises(ZeroDivisionError), locked_folder(tmp_path / "a" / "b" / "out"):
+        _ = 1 / 0
+    assert list(tmp_path.iterdir()) == []
+    with locked_folder(tmp_path / "a" / "out"):
+        make_folder(tmp_path / "a" / "out")
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["out"]
+
+
+def test_a_lock_that_was_removed_meanwhile_is_none(tmp_path, monkeypatch):
+    """The one who held it removes it between another's opening and locking."""
+    lock, whole, calls = tmp_path / ".out.lock", fcntl.flock, []
+
+    def flock(*args):
+        calls.append(args)
+        if len(calls) == 1:
+            lock.unlink()
+        whole(*args)
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with locked_folder(tmp_path / "out"):
+        assert len(calls) == 2
+        with pytest.raises(RobocasError, match="another process"), locked_folder(tmp_path / "out"):
+            pass
+
+
+@pytest.mark.skipif(not os.access("/proc", os.W_OK), reason="here it says that it is not writable")
+def test_a_lock_in_a_folder_that_only_says_it_is_writable():
+    with pytest.raises(RobocasError, match="/proc: can't write into this folder") as error, locked_folder("/proc/out"):
+        pass
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("error", [OutputExistsError, DatasetError])
+def test_only_what_is_ours_is_overwritten(tmp_path, error):
+    check_overwrite(tmp_path / "none", ("run.json",), "a run", error)
+    check_overwrite(tmp_path, ("run.json",), "a run", error)  # empty
+    (tmp_path / "thesis").write_text("")
+    for path in (tmp_path, tmp_path / "thesis"):
+        with pytest.raises(error, match=r"refusing to overwrite what is not a run .expected run\.json or parts"):
+            check_overwrite(path, ("run.json", "parts"), "a run", error)
+    (tmp_path / "parts").mkdir()
+    check_overwrite(tmp_path, ("run.json", "parts"), "a run", error)
+
+
+def test_what_was_left_half_written_is_swept(tmp_path):
+    for name in (".a.1.tmp.png", ".b.tmp", "kept.tmp", ".c.old"):
+        (tmp_path / name).mkdir() if name == ".b.tmp" else (tmp_path / name).touch()
+    sweep(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["kept.tmp"]
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_folder_of_which_nothing_came_goes(tmp_path, begun):
+    parts = make_folder(tmp_path / "out" / "parts")
+    with pytest.raises(KeyboardInterrupt), kept_if_begun(tmp_path / "out", parts, "part_*"):
+        if begun:
+            (parts / "part_0").touch()
+        raise KeyboardInterrupt
+    assert (tmp_path / "out").exists() is begun

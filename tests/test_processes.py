@@ -1,0 +1,204 @@
+"""The pool as every room uses it: order, errors, deaths of a worker and of the parent, Ctrl-C."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from robocas_ms3.errors import AssetError, RobocasError
+from robocas_ms3.processes import Calls, Pool
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Processes that import this package without its environments, which take seconds."""
+    monkeypatch.setenv("ROBOCAS_DEFER_REGISTRATION", "1")
+
+
+class Slow:
+    """Says which process did a task and how many it had done; some tasks are slow, deadly or wrong."""
+
+    def __init__(self, opened=None, log=None):
+        self.done, self.log = 0, log
+        if opened is not None:
+            (opened / str(os.getpid())).touch()
+
+    def do(self, task):
+        if task == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if task == "fail":
+            raise AssetError("no such thing", where="it")
+        if isinstance(task, float):
+            time.sleep(task)
+        self.done += 1
+        if self.log is not None:
+            with self.log.open("a") as file:
+                file.write(f"{task}\n")
+        return task, os.getpid(), self.done
+
+    def close(self):
+        self.done = -1
+
+
+class Unopened(Slow):
+    def __init__(self):
+        raise AssetError("nothing to work with")
+
+
+def squared(number):
+    return number**2
+
+
+def tasks_of(results):
+    return [task for task, *_ in results]
+
+
+def test_one_process_is_this_one_and_opens_nothing_it_does_not_need():
+    with Pool(Slow, 1) as pool:
+        results = list(pool.do(["a", "b"]))
+        worker = pool._worker
+    assert results == [("a", os.getpid(), 1), ("b", os.getpid(), 2)]
+    assert worker is not None and worker.done == -1  # closed
+    with Pool(Unopened, 1) as pool:
+        assert list(pool.do([])) == []
+
+
+def test_each_process_opens_once_and_serves_all_that_is_asked_of_the_pool(tmp_path):
+    with Pool(partial(Slow, tmp_path), 2) as pool:
+        first, second = list(pool.do(list(map(str, range(9))))), list(pool.do(["x", "y"]))
+    pids = {pid for _, pid, _ in first + second}
+    assert sorted(tasks_of(first)) == list(map(str, range(9)))
+    assert sorted(tasks_of(second)) == ["x", "y"]
+    assert os.getpid() not in pids
+    assert {path.name for path in tmp_path.iterdir()} == {str(pid) for pid in pids}
+    assert len(pids) <= 2
+
+
+def test_results_come_in_order_or_as_they_are_there_and_tasks_may_have_no_end():
+    tasks = [0.6, 0.0, 0.01, 0.02]
+    with Pool(Slow, 2) as pool:
+        assert tasks_of(pool.do(tasks, in_order=True)) == tasks
+        assert next(pool.do(tasks))[0] != 0.6
+    with Pool(partial(Calls, squared), 2) as pool:
+        squares = pool.do(count(), in_order=True)
+        assert [next(squares) for _ in range(20)] == [number**2 for number in range(20)]
+
+
+@pytest.mark.parametrize(("worker", "message"), [(Slow, "it: no such thing"), (Unopened, "nothing to work with")])
+def test_an_error_of_a_task_or_of_opening_is_raised_as_it_is(worker, message):
+    with pytest.raises(AssetError, match=message), Pool(worker, 2) as pool:
+        list(pool.do(["fail", "fail", "fail"]))
+
+
+@pytest.mark.parametrize("in_order", [True, False])
+def test_a_death_costs_no_task_but_its_own(in_order):
+    tasks = ["a", "b", "die", "c", "die", "d", "e"]
+    with Pool(Slow, 2, died=lambda task: (f"{task}d", 0, 0)) as pool:
+        found = tasks_of(pool.do(tasks, in_order=in_order))
+    expected = ["a", "b", "died", "c", "died", "d", "e"]
+    assert found == expected if in_order else sorted(found) == sorted(expected)
+
+
+def test_what_was_done_before_a_death_is_not_done_again(tmp_path):
+    tasks = [0.5, "fast", "fast too", "die"]
+    with Pool(partial(Slow, log=tmp_path / "log"), 2, died=lambda task: (task, 0, 0)) as pool:
+        assert tasks_of(pool.do(tasks, in_order=True)) == tasks
+    done = (tmp_path / "log").read_text().split("\n")
+    assert [done.count(task) for task in ("fast", "fast too")] == [1, 1]
+
+
+def test_a_death_is_an_error_where_nothing_else_was_asked_for():
+    with pytest.raises(RobocasError, match="die: the process that was at this died"), Pool(Slow, 2) as pool:
+        list(pool.do(["die", "a"]))
+    with pytest.raises(RobocasError, match="die: the process"), Pool(Slow, 1, here=False) as pool:
+        list(pool.do(["die"]))  # not this one, though one is enough
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from robocas_ms3.processes import Calls, Pool
+from functools import partial
+import os, time
+def wait(task):
+    (Path(sys.argv[1]) / f"{task}-{os.getpid()}").touch()
+    time.sleep(60)
+if __name__ == "__main__":
+    try:
+        with Pool(partial(Calls, wait), 2) as pool:
+            list(pool.do(range(20)))
+    except KeyboardInterrupt:
+        sys.exit(130)
+"""
+
+
+def begin(folder):
+    """The program, in a session of its own."""
+    words = [sys.executable, str(folder / "program.py"), str(folder / "begun")]
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    return subprocess.Popen(words, env=env, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+@pytest.fixture
+def running(tmp_path):
+    """A program whose two workers wait for long, and the ids of these."""
+    (tmp_path / "begun").mkdir()
+    (tmp_path / "program.py").write_text(PROGRAM)
+    with begin(tmp_path) as program:
+        while len(begun := list((tmp_path / "begun").iterdir())) < 2:
+            time.sleep(0.02)
+            assert program.poll() is None
+        yield program, [int(path.name.partition("-")[2]) for path in begun]
+        program.kill()
+
+
+def gone(pid):
+    """Whether a process is no more, or dead and not buried yet."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+def all_gone(pids, seconds=10):
+    deadline = time.monotonic() + seconds
+    while not all(map(gone, pids)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return all(map(gone, pids))
+
+
+def test_workers_end_with_a_parent_that_is_killed(running):
+    program, workers = running
+    program.kill()
+    assert all_gone(workers)
+
+
+def test_ctrl_c_while_processes_start_begins_nothing_either(tmp_path):
+    (tmp_path / "begun").mkdir()
+    starting = (
+        "\nif __name__ != '__main__':\n    (Path(__file__).parent / str(os.getpid())).touch()\n    time.sleep(1.5)\n"
+    )
+    (tmp_path / "program.py").write_text(PROGRAM.replace("import os, time\n", "import os, time" + starting))
+    program = begin(tmp_path)
+    while not list(tmp_path.glob("[0-9]*")):
+        time.sleep(0.02)
+        assert program.poll() is None
+    os.killpg(program.pid, signal.SIGINT)
+    assert program.communicate(timeout=60)[1] == ""
+    assert program.returncode == 130
+    assert list((tmp_path / "begun").iterdir()) == []
+
+
+def test_ctrl_c_ends_what_is_under_way_begins_nothing_and_prints_nothing(running, tmp_path):
+    program, workers = running
+    os.killpg(program.pid, signal.SIGINT)  # as a terminal does: to all of them
+    assert program.wait(60) == 130
+    assert program.stderr.read() == ""
+    assert all_gone(workers)
+    assert len(list((tmp_path / "begun").iterdir())) == 2
