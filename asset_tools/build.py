@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from asset_tools.decompose import Decomposition, decompose, is_hollow, volume_iou
+from asset_tools.decompose import Decomposition, decompose, is_hollow
+from asset_tools.glb import write_glb
 from asset_tools.grasps import sample_grasps
 from asset_tools.inertia import moments_of, piece_inertia, principal_inertia, triple
 from asset_tools.quality.furniture import measure_furniture
+from asset_tools.quality.hulls import volume_iou
 from asset_tools.quality.measure import measure_object
 from asset_tools.resting import resting_poses
 from asset_tools.sources import FurnitureSource, ObjectSource
-from asset_tools.visual import to_display, write_glb
+from asset_tools.visual import to_display
 from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.hulls import read_hulls, write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, ObjectAsset

@@ -22,7 +22,7 @@ SAME = 1e-6  # of the diagonal
 
 
 @dataclass(frozen=True)
-class Cleaned:
+class CleanScan:
     """A scan without its dirt.
 
     Attributes:
@@ -34,7 +34,7 @@ class Cleaned:
     welded: trimesh.Trimesh
 
 
-def clean(scan: trimesh.Trimesh, repairs: list[str]) -> Cleaned:
+def clean(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
     """Drop faces that are no part of the outer surface, and turn all others outwards.
 
     Args:
@@ -63,7 +63,7 @@ def clean(scan: trimesh.Trimesh, repairs: list[str]) -> Cleaned:
         faces[turned] = faces[turned][:, ::-1]
         welded.faces = faces
     welded.remove_unreferenced_vertices()
-    return Cleaned(_shown(scan, kept, turned, repairs), welded)
+    return CleanScan(_shown(scan, kept, turned, repairs), welded)
 
 
 def _welded(scan: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from manifold3d import Manifold, OpType
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from asset_tools.quality.hulls import hull_quality, volume_iou
 from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.assets.hulls import center_of
 from robocas_ms3.errors import AssetError, MissingExtraError
@@ -77,24 +77,6 @@ def decompose(closed: trimesh.Trimesh) -> Decomposition:
     if best is None:
         raise AssetError("the convex decomposition found no hulls", fix="Check the mesh for slivers or zero volume.")
     return best
-
-
-def volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
-    """Volume of the intersection over that of the union, of a body and the union of convex hulls.
-
-    Args:
-        closed: watertight mesh.
-        hulls: (V, 3) vertices each, in its frame.
-
-    Raises:
-        AssetError: the mesh is no solid.
-    """
-    solid = to_solid(closed)
-    if solid is None:
-        raise AssetError("the mesh is no solid", expected="watertight", fix="Close it first.")
-    union = Manifold.batch_boolean([Manifold.hull_points(hull) for hull in hulls], OpType.Add)
-    shared = (solid ^ union).volume()
-    return float(shared / (solid.volume() + union.volume() - shared))
 
 
 def few_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
@@ -165,8 +147,6 @@ def is_hollow(closed: trimesh.Trimesh) -> bool:
 def _good_enough(closed: trimesh.Trimesh, found: Decomposition, hollow: bool, least: float = 0.0) -> bool:
     if not hollow:
         return found.volume_iou >= WANTED_OVERLAP
-    from asset_tools.quality.hulls import hull_quality
-
     return found.volume_iou >= least and hull_quality(closed, found.hulls).surface_p95 <= WANTED_DISTANCE
 
 

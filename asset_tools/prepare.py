@@ -17,7 +17,7 @@ NAMES = {"cm": "centimetres", "mm": "millimetres", "inch": "inches"}
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedScan:
     """A scan, ready for hulls and grasps.
 
     Attributes:
@@ -35,7 +35,7 @@ class Prepared:
     repairs: tuple[str, ...]
 
 
-def prepare(path: Path, *, up: Up | None = None, unit: Unit | None = None) -> Prepared:
+def prepare(path: Path, *, up: Up | None = None, unit: Unit | None = None) -> PreparedScan:
     """Read a scan and mend it: files, faces, holes, axis, unit, base.
 
     Args:
@@ -69,7 +69,7 @@ def prepare(path: Path, *, up: Up | None = None, unit: Unit | None = None) -> Pr
         repairs.append(f"scaled from {NAMES[unit]}")
     mesh, closed = (upright(part, up).apply_scale(METRES[unit]) for part in (solid.scan, solid.mesh))
     mesh, closed = level_base(mesh, closed, repairs)
-    return Prepared(mesh, closed, up, unit, tuple(repairs))
+    return PreparedScan(mesh, closed, up, unit, tuple(repairs))
 
 
 def _about_colours(mesh: trimesh.Trimesh) -> list[str]:

@@ -31,7 +31,7 @@ NEIGHBOURS = 6  # samples that tell on which side of the surface a point near it
 
 
 @dataclass(frozen=True)
-class Closed:
+class ClosedScan:
     """A solid made of a scan.
 
     Attributes:
@@ -45,7 +45,7 @@ class Closed:
     repairs: tuple[str, ...]
 
 
-def close(scan: trimesh.Trimesh) -> Closed:
+def close(scan: trimesh.Trimesh) -> ClosedScan:
     """Make a watertight solid of a scan: weld, drop dirt, turn faces outwards, fill holes; else mesh it anew.
 
     A shell inside of the outer surface (an empty can scanned through) is dropped: things are solid.
@@ -73,7 +73,7 @@ def close(scan: trimesh.Trimesh) -> Closed:
             found=f"{_open_edges(mesh)} open edges of {len(mesh.edges_unique)}",
             fix="Repair the scan, or leave it out.",
         )
-    return Closed(_light(solid, float(np.linalg.norm(shown.extents))), shown, tuple(repairs))
+    return ClosedScan(_light(solid, float(np.linalg.norm(shown.extents))), shown, tuple(repairs))
 
 
 def _filled(

@@ -52,7 +52,7 @@ class ScanFiles(Resolver):
         return self
 
     def write(self, name: str, data: Any) -> None:
-        """Refused."""
+        """Refuse to write: a scan is only read."""
         raise NotImplementedError
 
 

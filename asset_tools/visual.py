@@ -1,11 +1,7 @@
-"""Light copies of scanned meshes for rendering, and GLB files of them that are the same bytes every time."""
+"""Light copies of scanned meshes for rendering: few faces, one small texture."""
 
 from __future__ import annotations
 
-import io
-import json
-import struct
-from pathlib import Path
 from typing import Any
 
 import fast_simplification
@@ -15,17 +11,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
-from trimesh.visual.color import to_rgba
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from asset_tools.glb import rgba_of, roughness_of
 from robocas_ms3.errors import AssetError, MissingExtraError
-from robocas_ms3.files import replacing
 
 Array = NDArray[np.float64]
 
-DEFAULT_ROUGHNESS = 0.6
-JPEG_QUALITY = 88
 CREASE = np.cos(np.deg2rad(40))  # faces that meet more sharply get an edge, not a smooth normal
 SAMPLES = 150_000  # on the original surface, to find the face that a texel shows
 NORMAL_WEIGHT = 0.02  # of the diagonal; keeps the two sides of a thin shell apart, hardly moves anything else
@@ -86,75 +79,16 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
     return trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
 
 
-def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
-    """Write a mesh from `to_display` as GLB with its texture inside as JPEG; the same mesh gives the same bytes.
-
-    Raises:
-        AssetError: the mesh has no ``PBRMaterial``.
-    """
-    material = getattr(mesh.visual, "material", None)
-    if not isinstance(material, PBRMaterial):
-        raise AssetError("can't write this mesh", where=path, expected="a PBRMaterial", fix="Use to_display first.")
-    vertices = np.asarray(mesh.vertices, dtype="<f4")
-    normals = np.asarray(mesh.vertex_normals, dtype="<f4")
-    indices = np.asarray(mesh.faces, dtype="<u2" if len(vertices) < 65535 else "<u4").reshape(-1)
-    views: list[dict] = []
-    blob = bytearray()
-
-    def view(data: bytes, **more: int) -> int:
-        views.append({"buffer": 0, "byteOffset": len(blob), "byteLength": len(data), **more})
-        blob.extend(data + b"\0" * (-len(data) % 4))
-        return len(views) - 1
-
-    limits = {"min": vertices.min(axis=0).tolist(), "max": vertices.max(axis=0).tolist()}
-    float_view = {"componentType": 5126, "count": len(vertices)}
-    whole = {"componentType": 5123 if indices.itemsize == 2 else 5125, "count": len(indices), "type": "SCALAR"}
-    accessors = [
-        {"bufferView": view(vertices.tobytes(), target=34962), **float_view, "type": "VEC3", **limits},
-        {"bufferView": view(normals.tobytes(), target=34962), **float_view, "type": "VEC3"},
-        {"bufferView": view(indices.tobytes(), target=34963), **whole},
-    ]
-    shading: dict[str, Any] = {
-        "baseColorFactor": (_rgba(material.baseColorFactor) / 255).tolist(),
-        "metallicFactor": float(material.metallicFactor or 0),
-        "roughnessFactor": _roughness(material),
-    }
-    primitive = {"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": 2, "material": 0}
-    tree: dict = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
-    uv = getattr(mesh.visual, "uv", None)
-    if material.baseColorTexture is not None and uv is not None:
-        flipped = np.column_stack([uv[:, 0], 1 - uv[:, 1]]).astype("<f4")  # glTF counts v from the top
-        accessors.append({"bufferView": view(flipped.tobytes(), target=34962), **float_view, "type": "VEC2"})
-        primitive["attributes"]["TEXCOORD_0"] = 3
-        jpeg = io.BytesIO()
-        material.baseColorTexture.convert("RGB").save(jpeg, format="JPEG", quality=JPEG_QUALITY, optimize=True)
-        shading["baseColorTexture"] = {"index": 0}
-        tree["images"] = [{"bufferView": view(jpeg.getvalue()), "mimeType": "image/jpeg"}]
-        tree["textures"] = [{"source": 0}]
-    tree |= {
-        "meshes": [{"primitives": [primitive]}],
-        "materials": [{"pbrMetallicRoughness": shading}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(blob)}],
-    }
-    head = json.dumps(tree, separators=(",", ":")).encode()
-    head += b" " * (-len(head) % 4)
-    start = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(head) + len(blob), len(head), b"JSON")
-    with replacing(path) as tmp:
-        tmp.write_bytes(start + head + struct.pack("<I4s", len(blob), b"BIN\0") + blob)
-
-
 class _Source:
     """How the original looks: texture and UVs, or else (F, 3, 3) colours of the corners, 0 to 255."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         visual: Any = mesh.visual
         material: Any = getattr(visual, "material", None)
-        self.roughness, self.factor = _roughness(material), _rgba(None)
+        self.roughness, self.factor = roughness_of(material), rgba_of(None)
         uv, image = getattr(visual, "uv", None), None
         if isinstance(material, PBRMaterial):
-            image, self.factor = material.baseColorTexture, _rgba(material.baseColorFactor)
+            image, self.factor = material.baseColorTexture, rgba_of(material.baseColorFactor)
         elif material is not None:
             image = material.image  # a diffuse colour beside a texture is a mere default in most OBJ files
         self.image = None if image is None or uv is None else image.convert("RGB")
@@ -164,20 +98,11 @@ class _Source:
         elif visual.kind == "vertex":
             self.colors = np.asarray(visual.vertex_colors, dtype=float)[mesh.faces][:, :, :3]
         else:
-            color = _rgba(None if material is None else material.main_color)
+            color = rgba_of(None if material is None else material.main_color)
             self.colors = np.broadcast_to(color[:3], (len(mesh.faces), 3, 3))
         self.plain = self.image is None and bool((self.colors == self.colors[0, 0]).all())
         if self.plain:
             self.factor = self.colors[0, 0]
-
-
-def _roughness(material: Any) -> float:
-    value = getattr(material, "roughnessFactor", None)
-    return DEFAULT_ROUGHNESS if value is None else float(value)
-
-
-def _rgba(color: Any) -> Array:
-    return np.asarray((255,) * 4 if color is None else to_rgba(color), dtype=float)
 
 
 def _shrunk(image: Image.Image, size: int) -> Image.Image:

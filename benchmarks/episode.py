@@ -25,10 +25,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import torch
 import tyro
 
 from robocas_ms3.config import load_task_config
-from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.demos.episode import EpisodeSettings
+from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import Noise
 from robocas_ms3.recordings.motion import Motion, sample_states, sample_stride
 from robocas_ms3.recordings.reading import open_trajectory
@@ -92,6 +94,7 @@ def main(args: Args) -> None:
 
 
 def run(args: Args, config: str, seeds: list[int]) -> list[Seed]:
+    torch.set_num_threads(1)  # as `robocas generate` does
     settings = EpisodeSettings(load_task_config(config).task, config, args.pack)
     generator = EpisodeGenerator(settings, fork=args.fork)
     found = []
@@ -190,8 +193,6 @@ def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> N
 
 def bare_physx(generator: EpisodeGenerator, seed: int, actions: np.ndarray) -> float:
     """CPU seconds that PhysX takes for an episode's actions."""
-    import torch
-
     generator.env.reset(seed=seed)
     env: Any = generator.env.unwrapped
     substeps, spent = env._sim_steps_per_control, 0.0

@@ -26,7 +26,7 @@ AXES = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}  # two axes across, and 
 
 
 def ellipsoid(center: Point, radii: Point, turn: Point = (0, 0, 0)) -> Field:
-    """An ellipsoid."""
+    """Make an ellipsoid, turned about its centre."""
     scale = np.asarray(radii, np.float32)
 
     def field(points: np.ndarray) -> np.ndarray:

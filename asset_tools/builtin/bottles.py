@@ -230,5 +230,5 @@ def _neck(radius: float, z: float, cut: float = 0.0) -> Ring:
 
 
 def _ellipse_perimeter(a: float, b: float) -> float:
-    """Ramanujan's approximation."""
+    """Approximate the perimeter as Ramanujan did."""
     return np.pi * (3 * (a + b) - np.sqrt((3 * a + b) * (a + 3 * b)))

@@ -97,7 +97,7 @@ def terracotta(grid: Grid, rng: np.random.Generator) -> Array:
 
 
 def concrete(grid: Grid, rng: np.random.Generator) -> Array:
-    """Polished concrete."""
+    """Paint polished concrete."""
     cloud = grid.noise(rng, (0.6, 0.6), slope=1.9)
     fine = grid.noise(rng, (0.02, 0.02), slope=1.6)
     spots = np.clip(grid.noise(rng, (0.03, 0.03), slope=2.5) - 2.2, 0, 1)

@@ -36,20 +36,20 @@ def _leaf(pen: Pen, x: float, y: float, length: float, angle: float, fill: tuple
 
 
 def tomato(pen: Pen, x: float, y: float, r: float) -> None:
-    """A tomato."""
+    """Draw a tomato."""
     _disc(pen, x, y + 0.08 * r, 0.9 * r, (205, 38, 30), 1.08)
     _disc(pen, x - 0.35 * r, y - 0.2 * r, 0.2 * r, (232, 104, 84))
     pen.polygon(_ray_points(x, y - 0.62 * r, 0.13 * r, 0.5 * r, 6), fill=DARK_GREEN)
 
 
 def sun(pen: Pen, x: float, y: float, r: float) -> None:
-    """A sun."""
+    """Draw a sun."""
     pen.polygon(_ray_points(x, y, 0.62 * r, r, 14), fill=(250, 190, 40))
     _disc(pen, x, y, 0.56 * r, (255, 226, 96))
 
 
 def leaf(pen: Pen, x: float, y: float, r: float) -> None:
-    """Three leaves."""
+    """Draw three leaves."""
     for angle in (0.5, 1.57, 2.64):
         _leaf(pen, x, y + 0.7 * r, 1.6 * r if angle == 1.57 else 1.25 * r, angle, GREEN)
 
@@ -62,7 +62,7 @@ def drop(pen: Pen, x: float, y: float, r: float) -> None:
 
 
 def strawberry(pen: Pen, x: float, y: float, r: float) -> None:
-    """A strawberry."""
+    """Draw a strawberry."""
     red = (208, 28, 48)
     _disc(pen, x - 0.36 * r, y - 0.22 * r, 0.46 * r, red)
     _disc(pen, x + 0.36 * r, y - 0.22 * r, 0.46 * r, red)
@@ -81,7 +81,7 @@ def chips(pen: Pen, x: float, y: float, r: float) -> None:
 
 
 def flower(pen: Pen, x: float, y: float, r: float, petal: tuple[int, int, int] = (252, 222, 70)) -> None:
-    """A flower."""
+    """Draw a flower."""
     for angle in np.arange(8) * np.pi / 4:
         _disc(pen, x + 0.58 * r * np.cos(angle), y + 0.58 * r * np.sin(angle), 0.36 * r, petal)
     _disc(pen, x, y, 0.36 * r, (150, 90, 30))
@@ -131,7 +131,7 @@ def sparkle(pen: Pen, x: float, y: float, r: float) -> None:
 
 
 def bubbles(pen: Pen, x: float, y: float, r: float) -> None:
-    """Rising bubbles."""
+    """Draw rising bubbles."""
     for dx, dy, size in ((-0.35, 0.45, 0.46), (0.42, 0.2, 0.34), (-0.1, -0.35, 0.28), (0.38, -0.7, 0.2)):
         cx, cy, s = x + dx * r, y + dy * r, size * r
         pen.ellipse(
@@ -157,7 +157,7 @@ def lily(pen: Pen, x: float, y: float, r: float) -> None:
 
 
 def crown(pen: Pen, x: float, y: float, r: float) -> None:
-    """A crown."""
+    """Draw a crown."""
     gold, dark = (252, 224, 130), (84, 44, 20)
     spikes = [(-0.9, -0.45), (-0.45, 0.05), (0, -0.7), (0.45, 0.05), (0.9, -0.45), (0.7, 0.6), (-0.7, 0.6)]
     pen.polygon([(x + dx * r, y + dy * r) for dx, dy in spikes], fill=gold, outline=dark)
@@ -197,7 +197,7 @@ def shield(pen: Pen, x: float, y: float, r: float) -> None:
 
 
 def snowflake(pen: Pen, x: float, y: float, r: float) -> None:
-    """A snowflake."""
+    """Draw a snowflake."""
     width = max(1, round(0.11 * r))
     for angle in np.arange(6) * np.pi / 3 + np.pi / 6:
         cos, sin = float(np.cos(angle)), float(np.sin(angle))

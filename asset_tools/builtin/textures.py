@@ -247,3 +247,19 @@ def _extents(words: str, spread: float) -> tuple[float, float, float, float]:
     half = max(box[2] - min(box[0], 0) for box in boxes) / 200
     top, bottom = boxes[0][1] / 100, boxes[-1][3] / 100 + LINE_PITCH * (len(lines) - 1)
     return -half - spread, top - spread, half + spread, bottom + spread
+
+
+def lettering(words: str, x: np.ndarray, y: np.ndarray, height: float) -> np.ndarray:
+    """Where (x, y) lie on a line of letters that is centred on 0 and ``height`` tall."""
+    font = ImageFont.load_default(64)
+    left, top, right, bottom = (round(v) for v in font.getbbox(words, stroke_width=2))
+    image = Image.new("L", (right - left, bottom - top))
+    ImageDraw.Draw(image).text((-left, -top), words, 255, font, stroke_width=2)
+    pixels = np.asarray(image)
+    scale = pixels.shape[0] / height
+    column = np.rint(x * scale + pixels.shape[1] / 2).astype(int)
+    row = np.rint(pixels.shape[0] / 2 - y * scale).astype(int)
+    inside = (column >= 0) & (column < pixels.shape[1]) & (row >= 0) & (row < pixels.shape[0])
+    result = np.zeros(len(x), bool)
+    result[inside] = pixels[row[inside], column[inside]] > 127
+    return result

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from asset_tools.builtin.blends import (
     both_sides,
@@ -20,27 +19,11 @@ from asset_tools.builtin.blends import (
     turned,
 )
 from asset_tools.builtin.models import Model, Part, pair
-from asset_tools.builtin.textures import Colour
+from asset_tools.builtin.textures import Colour, lettering
 
 BLACK: Colour = (30, 30, 32)
 STEEL: Colour = (176, 180, 186)
 SILVER: Colour = (206, 208, 212)
-
-
-def lettering(words: str, x: np.ndarray, y: np.ndarray, height: float) -> np.ndarray:
-    """Where (x, y) lie on a line of letters that is centred on 0 and ``height`` tall."""
-    font = ImageFont.load_default(64)
-    left, top, right, bottom = (round(v) for v in font.getbbox(words, stroke_width=2))
-    image = Image.new("L", (right - left, bottom - top))
-    ImageDraw.Draw(image).text((-left, -top), words, 255, font, stroke_width=2)
-    pixels = np.asarray(image)
-    scale = pixels.shape[0] / height
-    column = np.rint(x * scale + pixels.shape[1] / 2).astype(int)
-    row = np.rint(pixels.shape[0] / 2 - y * scale).astype(int)
-    inside = (column >= 0) & (column < pixels.shape[1]) & (row >= 0) & (row < pixels.shape[0])
-    result = np.zeros(len(x), bool)
-    result[inside] = pixels[row[inside], column[inside]] > 127
-    return result
 
 
 def power_drill() -> Model:

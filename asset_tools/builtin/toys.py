@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from asset_tools.builtin.mesh import Patch, Shape, Size, fitted
 from asset_tools.builtin.models import paint_in_space, unwrapped
 from asset_tools.builtin.surfaces import FACES
-from asset_tools.builtin.textures import Colour, Painter
-from asset_tools.builtin.tools import lettering
+from asset_tools.builtin.textures import Colour, Painter, lettering
 from asset_tools.decompose import few_vertices
 
 STICKERS: dict[str, Colour] = {
@@ -92,7 +91,7 @@ def scrambled(turns: tuple[tuple[int, int, int], ...] = TURNS) -> dict[str, list
 
 
 def ball(size: Size, *, texture_size: int = 256) -> Shape:
-    """A sphere."""
+    """Make a sphere."""
     sphere = trimesh.creation.icosphere(subdivisions=3)
     points = sphere.vertices * np.asarray(size) / sphere.extents
     middle = (points.max(0) + points.min(0)) / 2

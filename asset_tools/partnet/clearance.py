@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from asset_tools.quality.overlap import Convex, convex, overlap
+from asset_tools.quality.overlap import ConvexBody, convex, overlap
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Joint
 
@@ -66,7 +66,7 @@ def overlaps(pieces: Sequence[Array], others: Sequence[Array], joint: Joint, sha
     return np.array(depths).reshape(len(pieces), len(rest))
 
 
-def _passed(other: Array, joint: Joint, span: tuple[float, float]) -> Convex:
+def _passed(other: Array, joint: Joint, span: tuple[float, float]) -> ConvexBody:
     """Where something that stays is while a joint moves, as its link sees it."""
     far = max(joint.limits, key=abs)
     places = []

@@ -16,8 +16,9 @@ from scipy.sparse.csgraph import connected_components
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from asset_tools.glb import DEFAULT_ROUGHNESS
 from asset_tools.partnet.obj import Faces
-from asset_tools.visual import DEFAULT_ROUGHNESS, _crease_normals
+from asset_tools.visual import _crease_normals
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray

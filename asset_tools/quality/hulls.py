@@ -10,8 +10,9 @@ from manifold3d import Manifold, OpType
 from scipy.spatial import KDTree
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from asset_tools.decompose import volume_iou
 from asset_tools.grasps import surface_samples
+from asset_tools.solids import to_solid
+from robocas_ms3.errors import AssetError
 
 Array = np.ndarray
 
@@ -55,7 +56,7 @@ def hull_quality(closed: trimesh.Trimesh, hulls: list[Array], *, hollow: bool = 
         AssetError: the mesh is no solid.
     """
     overlap = volume_iou(closed, hulls)
-    union = Manifold.batch_boolean([Manifold.hull_points(hull) for hull in hulls], OpType.Add).to_mesh()
+    union = _union(hulls).to_mesh()
     surface = trimesh.Trimesh(np.asarray(union.vert_properties)[:, :3], np.asarray(union.tri_verts), process=False)
     return HullQuality(
         compact=not hollow and mean_thickness(closed) >= THIN,
@@ -67,6 +68,28 @@ def hull_quality(closed: trimesh.Trimesh, hulls: list[Array], *, hollow: bool = 
             _distance_p95(_outside_of_slits(surface, _samples(surface, SAMPLES)), closed),
         ),
     )
+
+
+def volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
+    """Volume of the intersection over that of the union, of a body and the union of convex hulls.
+
+    Args:
+        closed: watertight mesh.
+        hulls: (V, 3) vertices each, in its frame.
+
+    Raises:
+        AssetError: the mesh is no solid.
+    """
+    solid = to_solid(closed)
+    if solid is None:
+        raise AssetError("the mesh is no solid", expected="watertight", fix="Close it first.")
+    union = _union(hulls)
+    shared = (solid ^ union).volume()
+    return float(shared / (solid.volume() + union.volume() - shared))
+
+
+def _union(hulls: list[Array]) -> Manifold:
+    return Manifold.batch_boolean([Manifold.hull_points(hull) for hull in hulls], OpType.Add)
 
 
 def mean_thickness(closed: trimesh.Trimesh) -> float:

@@ -14,7 +14,7 @@ Array = np.ndarray
 
 
 @dataclass(frozen=True)
-class Convex:
+class ConvexBody:
     """A convex body.
 
     Attributes:
@@ -35,18 +35,18 @@ class Convex:
         """Upper corner (3,) of its bounding box."""
         return self.points.max(axis=0)
 
-    def moved(self, pose: Array) -> Convex:
+    def moved(self, pose: Array) -> ConvexBody:
         """The same, moved by a rigid motion (4, 4)."""
-        return Convex(self.points @ pose[:3, :3].T + pose[:3, 3], self.normals @ pose[:3, :3].T)
+        return ConvexBody(self.points @ pose[:3, :3].T + pose[:3, 3], self.normals @ pose[:3, :3].T)
 
 
-def convex(points: Array) -> Convex:
+def convex(points: Array) -> ConvexBody:
     """The convex hull of points (V, 3)."""
     hull = ConvexHull(points)
-    return Convex(points[hull.vertices], np.unique(np.round(hull.equations[:, :3], 6), axis=0))
+    return ConvexBody(points[hull.vertices], np.unique(np.round(hull.equations[:, :3], 6), axis=0))
 
 
-def overlap(moving: Convex, other: Convex, gap: float = 0.0) -> tuple[float, Array | None]:
+def overlap(moving: ConvexBody, other: ConvexBody, gap: float = 0.0) -> tuple[float, Array | None]:
     """How much must come off a moving body for a gap to another, m, and the plane (4,) to cut it at; else 0 and none.
 
     Directions are those of the faces of both, so for other bodies than boxes the depth is an upper bound.
@@ -62,7 +62,7 @@ def overlap(moving: Convex, other: Convex, gap: float = 0.0) -> tuple[float, Arr
     return float(depths[best]), np.append(normals[best], -edges[best])
 
 
-def deepest(bodies: Sequence[Convex], others: Sequence[Convex]) -> float:
+def deepest(bodies: Sequence[ConvexBody], others: Sequence[ConvexBody]) -> float:
     """The greatest depth in m to which one of some bodies reaches into one of others; 0 where none touch."""
     return max((overlap(body, other)[0] for body in bodies for other in others), default=0.0)
 

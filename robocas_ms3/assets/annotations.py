@@ -61,7 +61,7 @@ class Annotations:
             raise AssetError("no such resting pose", where="display_pose", found=f"{self.display_pose} of {poses}")
 
     def save(self, path: Path) -> None:
-        """Write ``annotations.npz``."""
+        """Write them as an ``annotations.npz``."""
         np.savez_compressed(path, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
 
     @classmethod

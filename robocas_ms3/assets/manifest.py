@@ -238,7 +238,7 @@ Asset = Annotated[ObjectAsset | FurnitureAsset, Field(discriminator="kind")]
 
 
 class PackManifest(StrictModel):
-    """``manifest.json``."""
+    """What a pack's ``manifest.json`` says."""
 
     # the default is for writing; `load_pack` insists that the file says it
     schema_version: Annotated[Literal[2], BeforeValidator(_whole)] = SCHEMA_VERSION

@@ -1,4 +1,4 @@
-"""``robocas convert``."""
+"""``robocas convert``: write a dataset from recorded episodes."""
 
 from __future__ import annotations
 

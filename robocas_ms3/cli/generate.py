@@ -55,6 +55,7 @@ class Generate:
 
 def main(cfg: Generate) -> int:
     """Run the command."""
+    import torch
     from rich.console import Console
     from rich.progress import Progress
 
@@ -64,6 +65,7 @@ def main(cfg: Generate) -> int:
     from robocas_ms3.demos.generate import generate
     from robocas_ms3.tasks.spec import TASKS
 
+    torch.set_num_threads(1)  # threads of small operations wait for each other
     name = cfg.config or TASKS[cfg.task].default_config
     config = recordable_config(load_task_config(name), name if name in shipped_configs() else None)
     out = cfg.out or Path("demos") / f"{Path(name).stem}-{Path(cfg.pack).name}"

@@ -1,4 +1,4 @@
-"""``robocas import-robocas``."""
+"""``robocas import-robocas``: bring a dataset in upstream's format into this one's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``robocas merge``."""
+"""``robocas merge``: write one dataset of several."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``robocas split``."""
+"""``robocas split``: write several datasets of one."""
 
 from __future__ import annotations
 

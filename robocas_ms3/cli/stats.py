@@ -1,4 +1,4 @@
-"""``robocas stats``."""
+"""``robocas stats``: count what is in a dataset."""
 
 from __future__ import annotations
 

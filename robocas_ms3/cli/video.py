@@ -1,4 +1,4 @@
-"""``robocas video``."""
+"""``robocas video``: film a dataset."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``robocas view``."""
+"""``robocas view``: look at a dataset or a recording in a browser."""
 
 from __future__ import annotations
 

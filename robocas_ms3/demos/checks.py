@@ -17,13 +17,13 @@ SIM_FREQ = 100  # Hz, of the environments' physics
 GREATEST_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
 
 
-def check_number(name: str, value: int, least: int, greatest: int | None = None) -> None:
+def check_number(name: str, value: float, least: int, greatest: int | None = None) -> None:
     """Check the range of a number.
 
     Raises:
         RobocasError: it is outside.
     """
-    if value < least or (greatest is not None and value > greatest):
+    if not least <= value < math.inf or (greatest is not None and value > greatest):
         expected = f"at least {least}" if greatest is None else f"{least} to {greatest}"
         raise RobocasError("this number is out of range", where=name, expected=expected, found=value)
 
@@ -48,9 +48,8 @@ def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int
         )
     check_number("noisy_trials", settings.noisy_trials, 0)
     check_number("noisy_failures", settings.noisy_failures, 0)
-    for name, value in (("noise_mm", settings.noise_mm), ("noise_deg", settings.noise_deg)):
-        if not 0 <= value < math.inf:
-            raise RobocasError("this number is out of range", where=name, expected="at least 0", found=value)
+    check_number("noise_mm", settings.noise_mm, 0)
+    check_number("noise_deg", settings.noise_deg, 0)
     check_number("replay_rate", settings.replay_rate, 0, settings.control_freq)
     if settings.replay_rate and (settings.control_freq % settings.replay_rate or SIM_FREQ % settings.replay_rate):
         raise RobocasError(

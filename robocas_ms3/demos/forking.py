@@ -1,16 +1,20 @@
-"""Fork a process: whether that is safe here, a pipe to the child, and what the child has to set right first."""
+"""Fork a process: whether that is safe here, the child, a pipe between the two, and errors as they can be sent."""
 
 from __future__ import annotations
 
 import ctypes
+import gc
 import logging
 import os
+import pickle
 import signal
 import sys
+import traceback
+from dataclasses import dataclass
 from functools import cache
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from typing import cast
+from typing import Any, cast
 
 import torch
 
@@ -20,39 +24,117 @@ _PR_SET_PDEATHSIG = 1
 _log = logging.getLogger(__name__)
 
 
-def piped_fork() -> tuple[Connection, Connection, int]:
-    """Both ends of a pipe, the parent's first, and what ``os.fork`` gives.
+class ChildCrash(Exception):  # noqa: N818
+    """A child took too long, or is gone."""
+
+
+class ChildGone(ChildCrash):
+    """A child has ended without a word."""
+
+
+@dataclass(frozen=True)
+class Child:
+    """A forked process, as its parent has it: its process id, and the pipe to it."""
+
+    pid: int
+    pipe: Connection
+
+    def tell(self, message: Any) -> None:
+        """Send something.
+
+        Raises:
+            ChildGone: there is no child any more.
+        """
+        try:
+            self.pipe.send(message)
+        except OSError as error:
+            raise ChildGone("crashed") from error
+
+    def hear(self, limit: float) -> Any:
+        """What it says within so many seconds.
+
+        Raises:
+            ChildGone: there is no child any more.
+            ChildCrash: it says nothing.
+        """
+        try:
+            if not self.pipe.poll(limit):
+                raise ChildCrash("timed_out")
+            return self.pipe.recv()
+        except (EOFError, OSError) as error:  # it ended before it said anything, or in the middle of it
+            raise ChildGone("crashed") from error
+
+    def end(self) -> None:
+        """Kill it, if it is there still."""
+        self.pipe.close()
+        os.kill(self.pid, signal.SIGKILL)  # it is still ours, if only as a zombie
+        os.waitpid(self.pid, 0)
+
+
+def fork() -> Child | Connection:
+    """Fork this process, which then has the child, while the child has a pipe to this one.
 
     Raises:
         RobocasError: the system allows no more processes, memory or open files.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:  # as in a service
+            stream.flush()
     try:
         here, there = cast("tuple[Connection, Connection]", Pipe())
-        return here, there, os.fork()
+        pid = os.fork()
     except OSError as error:
         raise RobocasError(
             "can't start another process",
             found=error.strerror,
             fix="Use fewer --jobs, raise the limits (ulimit -u, -n), or --no-fork, which is slower.",
         ) from error
+    (there if pid else here).close()
+    return Child(pid, here) if pid else there
 
 
-def die_with(parent: int) -> None:
-    """Let the system kill this process when its parent ends."""
+def set_up_child(parent: int) -> None:
+    """Set right what a child has to before anything else; the system kills it when the process ``parent`` ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it ended before that
         os._exit(0)
-
-
-def streams_of_its_own() -> None:
-    """Open the standard streams anew: threads that are not here may hold the locks of the parent's.
-
-    A line is written as soon as it ends, since a child ends without ado. Where there is no stream, as in a service,
-    none is opened.
-    """
+    gc.freeze()  # a collection that walks all objects would copy all of the parent's memory
+    # Threads that are not here may hold the locks of the parent's streams. A line is written as soon as it ends, since
+    # a child ends without ado. Where there is no stream, as in a service, none is opened.
     sys.stdout, sys.stderr = (
         stream and os.fdopen(os.dup(fd), "w", buffering=1) for fd, stream in ((1, sys.stdout), (2, sys.stderr))
     )
+
+
+@dataclass(frozen=True)
+class SentError:
+    """An error of a child as it can be sent.
+
+    Attributes:
+        error: it, or what says the same where it can't be pickled.
+        traceback: of the process where it was raised first.
+    """
+
+    error: BaseException
+    traceback: str
+
+    @classmethod
+    def of(cls, error: BaseException) -> SentError:
+        """Make it ready to be sent."""
+        cause = error.__cause__
+        text = cause.args[0] if isinstance(cause, BranchTraceback) else "".join(traceback.format_exception(error))
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # noqa: BLE001  (its class decides what that raises)
+            return cls(RuntimeError(f"{type(error).__name__}: {error}"), text)
+        return cls(error, text)
+
+
+class BranchTraceback(Exception):  # noqa: N818  (shown as the cause of an error, as `concurrent.futures` does)
+    """Where in a child an error came from, as text: tracebacks can't be sent."""
+
+    def __str__(self) -> str:
+        return f"in a branch\n\n{self.args[0]}"
 
 
 def why_not_fork(*, renders: bool) -> str:

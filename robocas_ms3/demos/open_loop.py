@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
@@ -41,7 +40,7 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Played:
+class Playback:
     """What came of an episode's actions.
 
     Attributes:
@@ -77,7 +76,6 @@ class OpenLoop:
             raise DatasetError(
                 "actions can't be played at this rate", where="rate_hz", expected=expected, found=rate_hz
             )
-        torch.set_num_threads(1)
         self._env = env.make(
             obs_mode="none",
             reward_mode="none",
@@ -86,8 +84,7 @@ class OpenLoop:
             sim_config={**env.kwargs.get("sim_config", {}), "control_freq": int(rate_hz)},
         )
         self.rate_hz = int(rate_hz)
-        self.success, self.clipped = False, 0
-        self._gripper = 1.0
+        self.success, self.clipped, self._gripper = False, 0, 1.0
 
     @property
     def env(self) -> TransferEnv:
@@ -135,14 +132,14 @@ class OpenLoop:
         *_, info = self._env.step(action.astype(np.float32))
         self.success |= bool(info["success"][0])
 
-    def play(self, dataset_actions: NDArray[np.floating]) -> Played:
+    def play(self, dataset_actions: NDArray[np.floating]) -> Playback:
         """Play actions (S, 7) from the reset on; see `sampling.stored_actions`, whose last row is left out."""
         places = [self.tcp_in_base()]
         for action in np.asarray(dataset_actions, dtype=np.float64).reshape(-1, 7):
             self.step(action)
             places.append(self.tcp_in_base())
         self.settle()
-        return Played(self.success, np.stack(places).astype(np.float64), self.clipped)
+        return Playback(self.success, np.stack(places).astype(np.float64), self.clipped)
 
     def close(self) -> None:
         """Close the environment."""

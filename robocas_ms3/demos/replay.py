@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -14,9 +16,9 @@ from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES, parse_obs_mo
 from mani_skill.trajectory.utils import dict_to_list_of_dicts
 
 from robocas_ms3.demos.checks import check_number
-from robocas_ms3.demos.convert_actions import CONVERTIBLE, ActionConverter
+from robocas_ms3.demos.convert_actions import CONVERTIBLE, convert_action
 from robocas_ms3.errors import DatasetError, RobocasError
-from robocas_ms3.files import replacing_folder
+from robocas_ms3.files import make_folder
 from robocas_ms3.outputs import claim_output
 from robocas_ms3.recordings.entries import read_json, read_reset
 from robocas_ms3.recordings.environment import RecordedEnv, read_env
@@ -128,31 +130,24 @@ def _replay_all(
     save: Path | None,
     allow_failure: bool,
 ) -> Iterator[Replay]:
-    torch.set_num_threads(1)  # as where episodes are generated
-    env = recorded.make(**kwargs)
-    try:
-        if save is None:
-            for episode in episodes:
+    shards: list[Path] = []
+    folder = None if save is None else make_folder(save.parent)
+    with closing(recorded.make(**kwargs)) as env, tempfile.TemporaryDirectory(dir=folder) as parts:
+        for episode in episodes:
+            if save is None:
                 yield _replay_one(env, trajectory, episode, use_env_states)
-            return
-        with replacing_folder(save.with_suffix(".parts")) as parts:
-            shards = []
-            for episode in episodes:
-                recorder = EpisodeRecorder(env, parts, f"episode_{episode['episode_id']:09d}")
-                result = _replay_one(recorder, trajectory, episode, use_env_states)
-                if result.success or allow_failure:
-                    recorder.finish(episode.get("robocas", {}))
-                    shards.append(parts / f"episode_{episode['episode_id']:09d}.h5")
-                else:
-                    recorder.discard()
-                yield result
-            if shards:
-                merge(shards, save)
-            for path in parts.iterdir():
-                path.unlink()
-        save.with_suffix(".parts").rmdir()
-    finally:
-        env.close()
+                continue
+            shard = Path(parts, f"episode_{episode['episode_id']}.h5")
+            recorder = EpisodeRecorder(env, shard.parent, shard.stem)
+            result = _replay_one(recorder, trajectory, episode, use_env_states)
+            if result.success or allow_failure:
+                recorder.finish(episode.get("robocas", {}))
+                shards.append(shard)
+            else:
+                recorder.discard()
+            yield result
+        if save is not None and shards:
+            merge(shards, save)
 
 
 def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env_states: bool) -> Replay:
@@ -168,14 +163,14 @@ def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env
     if not np.isfinite(actions).all():
         raise DatasetError("NaN or infinity", where=f"{trajectory}, {name}, actions", fix="Record it again.")
     _, info = env.reset(seed=seed, options=options)
-    convert = ActionConverter(base_env) if base_env.control_mode != episode["control_mode"] else None
+    converted = base_env.control_mode != episode["control_mode"]
     if use_env_states:
         base_env.set_state_dict(states[0])
     for action, state in zip(actions, states[1:], strict=True):
-        *_, info = env.step(action if convert is None else convert(action))
+        *_, info = env.step(convert_action(action, base_env) if converted else action)
         if use_env_states:
             base_env.set_state_dict(state)
-    error = None if convert else state_distance(cast(Any, base_env.get_state_dict()), states[-1])
+    error = None if converted else state_distance(cast(Any, base_env.get_state_dict()), states[-1])
     return Replay(episode["episode_id"], seed, bool(info["success"][0]), error)
 
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.demos.episode import NOISY
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.errors import EpisodeLost
 from robocas_ms3.recordings.motion import Motion, sample_states
@@ -19,7 +20,6 @@ from robocas_ms3.robots.constants import ROBOT_UID
 # m by which the target may be off the recording at the end of a part. What else lies about may roll elsewhere: where
 # that matters, what comes next goes wrong, and shows it.
 PARTED = 0.02
-NOISY = "noisy_"
 
 States = dict[str, dict[str, NDArray[np.float32]]]
 
@@ -64,30 +64,25 @@ class Trials:
         new = samples[self._played :]
         actions = Motion.of(states["articulations"][ROBOT_UID], gripper, new).actions[:-1].astype(np.float64)
         for number, world in enumerate(self._worlds if noisy else self._worlds[:1]):
-            self._play(world, number, actions)
-            reason = self._what_is_wrong(world, states, int(new[-1]), finished)
+            for action in self._with_noise(actions, number) if number else actions:
+                world.step(action)
+            reason = _what_is_wrong(world, states, int(new[-1]), finished)
             if reason:
                 raise EpisodeLost("replay", f"{NOISY}{reason}" if number else reason)
         self._played += len(actions)
 
-    def _what_is_wrong(self, world: OpenLoop, states: States, sample: int, finished: bool) -> str:
-        if world.clipped:
-            return "clipped"
-        if finished:
-            return "" if world.settle() else "no_success"
-        return "parted" if _distance(world, states, sample) > PARTED else ""
-
-    def _play(self, world: OpenLoop, number: int, actions: NDArray[np.float64]) -> None:
-        if number:
-            # drawn from the first action on, so that an action's noise is the same however often it is played
-            rng = np.random.default_rng([self._seed, number])
-            actions = actions + self._noise.draw(rng, self._played + len(actions))[self._played :]
-        for action in actions:
-            world.step(action)
+    def _with_noise(self, actions: NDArray[np.float64], number: int) -> NDArray[np.float64]:
+        # drawn from the first action on, so that an action's noise is the same however often it is played
+        rng = np.random.default_rng([self._seed, number])
+        return actions + self._noise.draw(rng, self._played + len(actions))[self._played :]
 
 
-def _distance(world: OpenLoop, states: States, sample: int) -> float:
-    """How far the target is off the recording, m."""
+def _what_is_wrong(world: OpenLoop, states: States, sample: int, finished: bool) -> str:
+    if world.clipped:
+        return "clipped"
+    if finished:
+        return "" if world.settle() else "no_success"
     target = int(world.env.target_slot[0])
     recorded = states["actors"][world.env.objects[target].name][sample, :3]
-    return float(np.linalg.norm(world.env.object_poses[0, target, :3].numpy() - recorded))
+    off = np.linalg.norm(world.env.object_poses[0, target, :3].numpy() - recorded)
+    return "parted" if off > PARTED else ""

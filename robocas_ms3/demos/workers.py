@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeResult, EpisodeSettings
+import torch
+
+from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
+from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.processes import Pool
 
@@ -40,6 +44,8 @@ class _Generates:
 
 
 def _open(settings: EpisodeSettings, folder: Path, fork: bool) -> _Generates:
+    if multiprocessing.parent_process():  # one of ours; the user's own keeps its threads
+        torch.set_num_threads(1)  # threads of small operations wait for each other
     return _Generates(EpisodeGenerator(settings, fork=fork), folder)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from robocas_ms3.evaluation import retrieval
 from robocas_ms3.evaluation.protocol import Episode
-from robocas_ms3.evaluation.rollout import Played
+from robocas_ms3.evaluation.rollout import Rollout
 
 # evaluation_v0.md and the paper's table: reach, pick, recognise, clear
 STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
@@ -60,7 +60,7 @@ class Outcome:
     retrieval: dict[str, Any] | None = None
 
     @classmethod
-    def of(cls, played: Played, episode: Episode, objects: Sequence[str]) -> Outcome:
+    def of(cls, played: Rollout, episode: Episode, objects: Sequence[str]) -> Outcome:
         """What is kept of an episode that was played, with objects of these ids."""
         flags, held_at, order = played.flags, played.flags.get("target_grasped"), None
         if played.retrieval is not None:

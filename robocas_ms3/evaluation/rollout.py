@@ -20,7 +20,7 @@ _WELDS = "welds"  # of `weld`, where there is one
 
 
 @dataclass
-class Played:
+class Rollout:
     """What came of an episode.
 
     Attributes:
@@ -82,7 +82,7 @@ class Rollouts:
         self._env, self._policy, self._rules, self._dt, self._refill = env, policy, rules, control_dt, refill
         self._size = CONVENTIONS[policy.wants.convention].size
         self._count: int = env.num_envs
-        self._playing: dict[int, Played] = {}
+        self._playing: dict[int, Rollout] = {}
         self._chunks: dict[int, list[NDArray[np.floating]]] = {}
         self._obs: Any = None
         self._info: dict[str, Any] = {}
@@ -90,7 +90,7 @@ class Rollouts:
         self._held = np.zeros((0, self._count), dtype=bool)  # by flag and env, whether it has held in its episode
         self._embed = TextEmbedder() if policy.wants.language == "embedding" else None
 
-    def play(self, episodes: Sequence[Start]) -> Iterator[Played]:
+    def play(self, episodes: Sequence[Start]) -> Iterator[Rollout]:
         """Play episodes; each is given as it ends, in any order. Their ``env`` is set here."""
         waiting = list(reversed(episodes))
         while waiting or self._playing:
@@ -109,7 +109,7 @@ class Rollouts:
             self._obs, info = self._env.reset(seed=seeds + rest, options={"reconfigure": True})
         starts = [Start(**{**vars(start), "env": env}) for env, start in pairs]
         for start in starts:
-            self._playing[start.env], self._chunks[start.env] = Played(start), []
+            self._playing[start.env], self._chunks[start.env] = Rollout(start), []
         self._info = info
         if not self._flags:
             self._flags = [name for name, value in info.items() if _is_flag(value)]
@@ -118,7 +118,7 @@ class Rollouts:
         self._note()
         self._policy.reset(starts)
 
-    def _step(self) -> Iterator[Played]:
+    def _step(self) -> Iterator[Rollout]:
         self._ask()
         for env, played in list(self._playing.items()):
             if played.error:
@@ -135,7 +135,7 @@ class Rollouts:
         for env in [env for env, played in self._playing.items() if self._is_over(played)]:
             yield self._end(env)
 
-    def _end(self, env: int) -> Played:
+    def _end(self, env: int) -> Rollout:
         played, info = self._playing.pop(env), self._info
         played.seconds = self._seconds(env)
         for name in self._flags:
@@ -213,7 +213,7 @@ class Rollouts:
     def _seconds(self, env: int) -> float:
         return float(self._info["elapsed_steps"][env]) * self._dt
 
-    def _is_over(self, played: Played) -> bool:
+    def _is_over(self, played: Rollout) -> bool:
         rules, info, env = self._rules, self._info, played.start.env
         v0 = rules.max_v0_steps is not None and summed(info, "v0_steps")[env] >= rules.max_v0_steps
         return v0 or played.steps >= rules.max_steps or any(info[name][env] for name in rules.ends_on if name in info)

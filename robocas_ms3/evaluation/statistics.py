@@ -79,17 +79,17 @@ class Comparison:
 
     @property
     def n(self) -> int:
-        """Scenes."""
+        """How many scenes both runs saw."""
         return self.both + self.only_a + self.only_b + self.neither
 
     @property
     def successes_a(self) -> int:
-        """Of n."""
+        """In how many of them A succeeded."""
         return self.both + self.only_a
 
     @property
     def successes_b(self) -> int:
-        """Of n."""
+        """In how many of them B succeeded."""
         return self.both + self.only_b
 
     @property
@@ -259,7 +259,7 @@ def _check_order(what: str, *numbers: float) -> None:
 
 
 def _successes(values: ArrayLike, where: str) -> NDArray[np.bool_]:
-    """(n,) bool."""
+    """Successes as an array (n,), of bools only."""
     array = np.asarray(values)
     if array.dtype != bool or array.ndim != 1:
         raise EvaluationError("no successes", where=where, expected="(n,) bool", found=f"{array.shape} {array.dtype}")

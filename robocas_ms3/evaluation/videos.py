@@ -29,7 +29,7 @@ _SPEED = 4  # times as fast as the scene
 
 
 @dataclass(frozen=True)
-class Filmed:
+class FailureVideo:
     """A video that was written; ``same``: what came of the episode is what had come of it before."""
 
     path: Path
@@ -50,7 +50,7 @@ def _in_turn(lists: list[list[int]]) -> list[int]:
     return [number for row in zip_longest(*lists) for number in row if number is not None]
 
 
-def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]) -> Iterator[Filmed]:
+def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]) -> Iterator[FailureVideo]:
     """Play episodes again, in processes, and write a video of each into the result's ``videos``.
 
     Raises:
@@ -74,13 +74,13 @@ def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Seq
         yield from _film(result, protocol, policy, numbers)
 
 
-def _film(result: Result, protocol: LoadedProtocol, policy: Policy, numbers: list[int]) -> Iterator[Filmed]:
+def _film(result: Result, protocol: LoadedProtocol, policy: Policy, numbers: list[int]) -> Iterator[FailureVideo]:
     rules, first = protocol.rules, protocol.episodes[numbers[0]]
     rate = rate_of(protocol, policy.wants)
     size = {"width": SIZE[0], "height": SIZE[1]}
     watched = {"render_mode": "rgb_array", "human_render_camera_configs": size, "weld": result.run["weld"]}
     made = make_env(protocol, policy.wants, first, 1, backend="processes", **watched)
-    env = _Watched(made, max(1, round(rate / _FRAMES)))
+    env = _FilmedEnv(made, max(1, round(rate / _FRAMES)))
     try:
         for number in numbers:
             episode, before = protocol.episodes[number], result.outcomes[number]
@@ -91,13 +91,13 @@ def _film(result: Result, protocol: LoadedProtocol, policy: Policy, numbers: lis
                 env.writer = writer
                 (played,) = Rollouts(env, policy, ends, 1 / rate, refill=True).play([start_of(protocol, episode)])
             outcome = Outcome.of(played, episode, object_ids(protocol, episode))
-            yield Filmed(path, outcome, outcome.without_clock() == before.without_clock())
+            yield FailureVideo(path, outcome, outcome.without_clock() == before.without_clock())
     finally:
         env.close()
 
 
 @dataclass
-class _Watched:
+class _FilmedEnv:
     """An environment that adds pictures to a video.
 
     Attributes:

@@ -67,7 +67,7 @@ class RelationPhrases(Synonyms):
 
 
 class InstructionTexts(StrictModel):
-    """``instructions.yaml``."""
+    """What ``instructions.yaml`` says."""
 
     tasks: dict[Task, Templates]
     relations: dict[Relation, RelationPhrases]
@@ -82,7 +82,7 @@ class InstructionTexts(StrictModel):
 
 
 class SynonymTexts(StrictModel):
-    """``synonyms.yaml``."""
+    """What ``synonyms.yaml`` says."""
 
     plurals: Words
     objects: dict[str, Synonyms]

@@ -1,7 +1,7 @@
 """Decisions of a scripted policy: several ways to go on from one moment, of which the best is gone on from.
 
 A decision is a list of candidates, a function that plays one of them and scores what came of it, and whoever runs them:
-`demos.branches` undoes what was tried, `Straight` can't.
+`demos.branches` undoes what was tried, `StraightDecisions` can't.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Decisions(Protocol):
 
 
 @dataclass(frozen=True)
-class Straight:
+class StraightDecisions:
     """Takes the first candidate that can be played and never undoes anything.
 
     Attributes:

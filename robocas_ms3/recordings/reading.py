@@ -96,7 +96,7 @@ class TrajectoryFile:
             )
 
     def __enter__(self) -> TrajectoryFile:
-        """Itself."""
+        """Give itself: the file is open already."""
         return self
 
     def __exit__(self, *_: object) -> None:

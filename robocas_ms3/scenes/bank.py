@@ -91,7 +91,7 @@ class LayoutBank:
             return None
 
     def table_path(self, engine: Engine) -> Path:
-        """Its file."""
+        """Where an engine's table is kept."""
         return self.folder / f"table-{engine}.npy"
 
     def write_table(self, engine: Engine, pairs: Iterable[Pair]) -> LayoutTable | None:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.poses import planar
-from robocas_ms3.scenes.placement import Array, Placeable, Region
+from robocas_ms3.scenes.placement import Array, PlaceableObject, Region
 
 # Builtin products show their label to their own -y, and resting poses have no yaw of their own, so that in every one
 # the label looks to -y of the plane or up, text upright for someone who stands at -y.
@@ -16,7 +16,7 @@ _LABEL_YAW = -np.pi / 2
 
 def sample_orderly(
     rng: np.random.Generator,
-    placeables: list[Placeable],
+    placeables: list[PlaceableObject],
     columns: list[str],
     region: Region,
     *,
@@ -90,7 +90,7 @@ def sample_orderly(
     return poses, there
 
 
-def _ordered(rng: np.random.Generator, placeables: list[Placeable], columns: list[str]) -> list[list[int]]:
+def _ordered(rng: np.random.Generator, placeables: list[PlaceableObject], columns: list[str]) -> list[list[int]]:
     """The objects of each column, in the order of the columns along the edge: kinds are shuffled."""
     kinds: dict[str, dict[str, list[int]]] = {}
     for i, (placeable, column) in enumerate(zip(placeables, columns, strict=True)):
@@ -99,7 +99,7 @@ def _ordered(rng: np.random.Generator, placeables: list[Placeable], columns: lis
     return [column for k in rng.permutation(len(names)) for column in kinds[names[k]].values()]
 
 
-def _standing(placeable: Placeable) -> int:
+def _standing(placeable: PlaceableObject) -> int:
     if placeable.display_pose >= 0:
         return placeable.display_pose
     return int(np.argmax(placeable.probabilities))

@@ -18,7 +18,7 @@ _TRIES_AT_ONCE = 40  # positions of one object before the layout starts over
 
 
 @dataclass(frozen=True)
-class Placeable:
+class PlaceableObject:
     """What a layout has to know of one object.
 
     Attributes:
@@ -47,7 +47,7 @@ class Region:
 
 
 def sample_scattered(
-    rng: np.random.Generator, placeables: list[Placeable], region: Region, *, min_gap: float, max_tries: int
+    rng: np.random.Generator, placeables: list[PlaceableObject], region: Region, *, min_gap: float, max_tries: int
 ) -> Array:
     """Place objects apart from each other, each in one of its resting poses at a random yaw.
 
@@ -123,7 +123,7 @@ def _candidates(rng: np.random.Generator, footprint: Array, region: Region) -> t
     return yaws[fits], positions[fits], shapely.polygons((turned + positions[:, None])[fits])
 
 
-def _choose_pose(rng: np.random.Generator, placeable: Placeable, areas: Array, draws: int) -> int:
+def _choose_pose(rng: np.random.Generator, placeable: PlaceableObject, areas: Array, draws: int) -> int:
     weights = np.asarray(placeable.probabilities, dtype=float)
     drawn = rng.choice(len(weights), size=draws, p=weights / weights.sum())
     return int(drawn[np.argmin(areas[drawn])])

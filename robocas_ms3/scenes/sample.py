@@ -16,7 +16,7 @@ from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout, ObjectIds
 from robocas_ms3.scenes.lookup import resolve_ids
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.orderly import sample_orderly
-from robocas_ms3.scenes.placement import Array, Placeable, choose_objects, sample_scattered
+from robocas_ms3.scenes.placement import Array, PlaceableObject, choose_objects, sample_scattered
 from robocas_ms3.scenes.settle import settle
 from robocas_ms3.scenes.stacked import drop_heap
 from robocas_ms3.scenes.standing import place_basket, place_robot
@@ -210,14 +210,14 @@ def _tell_left_out(ids: tuple[str, ...]) -> None:
     )
 
 
-def placeable(asset: LoadedObject, headroom: float = np.inf) -> Placeable:
+def placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableObject:
     """What a layout has to know of an object: its resting poses that are lower than ``headroom``, m."""
     notes = asset.annotations
     low = np.arange(len(notes.resting_poses))
     if np.isfinite(headroom):
         points = np.concatenate(asset.hulls)
         low = low[[transform(pose, points)[:, 2].max() < headroom for pose in notes.resting_poses]]
-    return Placeable(
+    return PlaceableObject(
         asset.asset.id,
         notes.resting_poses[low],
         notes.resting_probabilities[low],

@@ -22,7 +22,7 @@ MAX_LINEAR, MAX_ANGULAR = 0.01, 0.1  # m/s, rad/s, of an object at rest
 
 
 @dataclass(frozen=True)
-class Settled:
+class SettleResult:
     """What became of objects that were put somewhere. K objects.
 
     Attributes:
@@ -52,7 +52,7 @@ class Settled:
 
 def settle(
     assets: Sequence[LoadedObject], poses: Array, model: SceneModel, basket_pose: Array, *, heap: bool = False
-) -> Settled:
+) -> SettleResult:
     """Simulate objects among furniture and basket: first so that they settle, then to see whether they stay.
 
     The second part begins in a new scene, as a reset does: an engine that knows no contacts yet may give a narrow
@@ -85,12 +85,12 @@ def settle(
     return found
 
 
-def _compare(poses: Array, settled: Array, after: Array, at_rest: np.ndarray, max_tilt: float) -> Settled:
+def _compare(poses: Array, settled: Array, after: Array, at_rest: np.ndarray, max_tilt: float) -> SettleResult:
     moved = np.linalg.norm(settled[:, :3, 3] - poses[:, :3, 3], axis=1)
     upright = np.einsum("ki,ki->k", poses[:, 2, :3], settled[:, 2, :3])
     tilted = np.arccos(np.clip(upright, -1, 1))
     cosine = (np.einsum("kij,kij->k", settled[:, :3, :3], after[:, :3, :3]) - 1) / 2
-    return Settled(
+    return SettleResult(
         poses=settled,
         moved=moved,
         tilted=tilted,

@@ -58,7 +58,7 @@ class Arrangement:
 
     @property
     def names(self) -> list[str]:
-        """K names."""
+        """What the K objects are called."""
         return [asset.asset.name for asset in self.assets]
 
     @cached_property

@@ -42,7 +42,7 @@ class PinholeCamera:
 
     @property
     def focal_length(self) -> float:
-        """Pixels."""
+        """How far the picture lies behind the pinhole, pixels."""
         return self.height / 2 / np.tan(self.fov_y / 2)
 
     def rays(self, box: PixelBox) -> Array:

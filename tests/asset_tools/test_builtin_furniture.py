@@ -14,10 +14,10 @@ from asset_tools.builtin.furniture import MAKERS
 from asset_tools.builtin.furniture.base import block
 from asset_tools.builtin.furniture.room import room
 from asset_tools.builtin.materials import Grid
+from asset_tools.glb import write_glb
 from asset_tools.inertia import piece_inertia
 from asset_tools.quality.furniture import examine_furniture
 from asset_tools.quality.surfaces import clearances
-from asset_tools.visual import write_glb
 from robocas_ms3.assets.gripper import GRIPPER_BOXES
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.kinematics import joint_frame

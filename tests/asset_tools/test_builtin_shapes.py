@@ -8,7 +8,8 @@ from asset_tools.builtin import bottles, fruits, shapes, surfaces
 from asset_tools.builtin.catalogue import products
 from asset_tools.builtin.mesh import Patch, build_shape, fitted, pack_regions
 from asset_tools.builtin.surfaces import rounded_box
-from asset_tools.decompose import GPU_LIMIT, flat_faces, volume_iou
+from asset_tools.decompose import GPU_LIMIT, flat_faces
+from asset_tools.quality.hulls import volume_iou
 from robocas_ms3.assets.cooking import cooking_faults
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.pack import HULLS

@@ -13,9 +13,10 @@ from asset_tools.builtin import blends
 from asset_tools.builtin.catalogue import products
 from asset_tools.builtin.models import Model, Part, paint_in_space, unwrapped
 from asset_tools.builtin.toys import STICKERS, scrambled
-from asset_tools.decompose import GPU_LIMIT, flat_faces, volume_iou
+from asset_tools.decompose import GPU_LIMIT, flat_faces
+from asset_tools.glb import write_glb
 from asset_tools.grasps import sample_grasps
-from asset_tools.visual import write_glb
+from asset_tools.quality.hulls import volume_iou
 from robocas_ms3.assets.cooking import cooking_faults
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.pack import HULLS

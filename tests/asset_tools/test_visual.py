@@ -18,7 +18,8 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from asset_tools.visual import to_display, write_glb
+from asset_tools.glb import write_glb
+from asset_tools.visual import to_display
 from robocas_ms3.errors import AssetError
 
 SHARED = Path(os.environ.get("ROBOCAS_SHARED", Path(__file__).resolve().parents[3] / "shared"))

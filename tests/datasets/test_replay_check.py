@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks import replay as replay_check
 from robocas_ms3.datasets.checks.replay import replay_dataset
-from robocas_ms3.demos.open_loop import Played
+from robocas_ms3.demos.open_loop import Playback
 from robocas_ms3.errors import AssetError
 
 
@@ -42,7 +42,7 @@ class Player:
             pose[:3, 3] += pose[:3, :3] @ action[:3]
             pose[:3, :3] = pose[:3, :3] @ Rotation.from_euler("xyz", action[3:6]).as_matrix()
             places.append(pose[:3, 3].copy())
-        return Played(self.seed != 5, np.array(places), 0)
+        return Playback(self.seed != 5, np.array(places), 0)
 
     def close(self):
         self.closed = True

@@ -16,8 +16,8 @@ import pytest
 from branch_notes import Notes
 
 from robocas_ms3.demos import branches
-from robocas_ms3.demos.branches import BranchTraceback, ForkedBranches
-from robocas_ms3.demos.forking import why_not_fork
+from robocas_ms3.demos.branches import ForkedBranches
+from robocas_ms3.demos.forking import BranchTraceback, why_not_fork
 from robocas_ms3.errors import PlanningFailed, RobocasError
 from robocas_ms3.planning.decisions import Effort
 
@@ -274,15 +274,15 @@ class TwoWords(Exception):
 
 
 def test_an_interrupt_in_a_new_child_ends_the_run_not_its_siblings(monkeypatch):
-    die_with, me = branches.die_with, os.getpid()
+    set_up_child, me = branches.set_up_child, os.getpid()
 
     def interrupted(parent):
-        die_with(parent)
+        set_up_child(parent)
         raise KeyboardInterrupt
 
     def candidates():
         yield "a"
-        monkeypatch.setattr(branches, "die_with", interrupted)
+        monkeypatch.setattr(branches, "set_up_child", interrupted)
         yield "b"
 
     def decide(runner):

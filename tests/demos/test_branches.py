@@ -8,7 +8,7 @@ from branch_notes import Notes
 from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.demos.resimulation import Resimulation
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort, Straight
+from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort, StraightDecisions
 
 RUNNERS = [ForkedBranches, Resimulation]
 
@@ -138,7 +138,7 @@ def test_without_undoing_the_first_that_can_be_played_stays():
             raise PlanningFailed("late", letter)
         return 0.0
 
-    straight = Straight(lambda: len(world.done))
+    straight = StraightDecisions(lambda: len(world.done))
     assert straight.choose("ab", play) == "b"
     with pytest.raises(PlanningFailed, match="late: c"):
         straight.choose("cb", play)

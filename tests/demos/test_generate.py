@@ -12,9 +12,10 @@ import torch
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.structs import Pose
 
-from robocas_ms3.demos import branches
-from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings, horizon
+from robocas_ms3.demos.episode import EpisodeSettings, horizon
+from robocas_ms3.demos.forking import Child
 from robocas_ms3.demos.generate import generate
+from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.trials import Trials
 from robocas_ms3.errors import DatasetError, EpisodeLost, OutputExistsError, PlanningFailed, RobocasError
@@ -217,6 +218,16 @@ def test_a_horizon_at_another_rate_is_the_environments_too():
     generator.close()
 
 
+def test_a_generator_leaves_the_processs_threads_alone():
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin")).close()
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_that_a_policy_is_done_is_no_success(tmp_path):
     generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin", max_attempts=2))
     generator.policy, begun = waiting([3, 3])
@@ -272,7 +283,7 @@ def test_the_way_back_to_a_decision_leaves_no_trace(tmp_path, monkeypatch, fork)
 
 def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, monkeypatch):
     """Even where a branch is killed from outside while it goes on."""
-    tell = branches._tell
+    tell = Child.tell
 
     def tell_and_kill_the_first(child, tally):
         tell(child, tally)
@@ -280,7 +291,7 @@ def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, mo
             (tmp_path / "killed").touch()
             os.kill(child.pid, signal.SIGKILL)
 
-    monkeypatch.setattr(branches, "_tell", tell_and_kill_the_first)
+    monkeypatch.setattr(Child, "tell", tell_and_kill_the_first)
     episodes = []
     for fork in (True, False):
         generator = EpisodeGenerator(EpisodeSettings("search", "search_table_small_heap", "builtin"), fork=fork)

@@ -5,7 +5,8 @@ import pytest
 
 from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.sources.arrays import episode_arrays
-from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.demos.episode import EpisodeSettings
+from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.motion import sample_states

@@ -9,9 +9,10 @@ import pytest
 import torch
 from mani_skill.utils.structs import Pose
 
-from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.demos.episode import EpisodeSettings
+from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.errors import EpisodeLost, PlanningFailed
-from robocas_ms3.planning.decisions import Straight
+from robocas_ms3.planning.decisions import StraightDecisions
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Obstacle, Shape
 from robocas_ms3.planning.pushes import push_direction
@@ -38,7 +39,7 @@ def begin(generator, seed):
     executor = Executor(generator.env, seed)
     executor.reset()
     executor.facts = {"pushes": 0, "removals": 0}
-    arm = Arm(generator.planner, generator.reachability, executor, Straight(lambda: len(executor.actions)))
+    arm = Arm(generator.planner, generator.reachability, executor, StraightDecisions(lambda: len(executor.actions)))
     target = int(arm.env.target_slot[0])
     slots = [s for s in np.flatnonzero(arm.env.present[0].numpy()).tolist() if s != target]
     return arm, target, sorted(slots, key=lambda slot: -surface(arm, slot)[:, 2].max())

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from robocas_ms3.errors import EpisodeLost, PlanningFailed
-from robocas_ms3.planning.decisions import Straight
+from robocas_ms3.planning.decisions import StraightDecisions
 from robocas_ms3.planning.solvers import search
 
 
@@ -17,7 +17,7 @@ def arm(monkeypatch):
     env = SimpleNamespace(target_slot=[0], target_asset=lambda: asset, task_config=SimpleNamespace(support="table"))
     done: list[str] = []
     executor = SimpleNamespace(actions=done, facts={}, label=lambda **words: None, rehearse=lambda: None)
-    decisions = Straight(lambda: len(done))
+    decisions = StraightDecisions(lambda: len(done))
     arm = SimpleNamespace(env=env, executor=executor, choose=decisions.choose, planning=nullcontext)
 
     class Heap:

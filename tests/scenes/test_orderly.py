@@ -7,17 +7,17 @@ from hypothesis import strategies as st
 
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.scenes.orderly import sample_orderly
-from robocas_ms3.scenes.placement import Placeable, Region
+from robocas_ms3.scenes.placement import PlaceableObject, Region
 
 REGION = Region((0.0, -0.4), (0.3, 0.4), 0.6)
 
 
-def box(width: float, depth: float, height: float = 0.1) -> Placeable:
+def box(width: float, depth: float, height: float = 0.1) -> PlaceableObject:
     """Its label is on the side at -y, ``width`` wide; the second pose is more probable, the first is upright."""
     outline = np.array([[-width, -depth], [width, -depth], [width, depth], [-width, depth]]) / 2
     pose = np.eye(4)
     pose[2, 3] = height / 2
-    return Placeable("box", np.stack([pose, pose]), np.array([0.1, 0.9]), [outline, outline], display_pose=0)
+    return PlaceableObject("box", np.stack([pose, pose]), np.array([0.1, 0.9]), [outline, outline], display_pose=0)
 
 
 def kept(things, columns, front=(-1.0, 0.0), seed=0, **options):

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.poses import planar
 from robocas_ms3.scenes import placement
-from robocas_ms3.scenes.placement import Placeable, Region, choose_objects, sample_scattered
+from robocas_ms3.scenes.placement import PlaceableObject, Region, choose_objects, sample_scattered
 
 
-def box(width: float, depth: float, height: float = 0.1) -> Placeable:
+def box(width: float, depth: float, height: float = 0.1) -> PlaceableObject:
     """A box that stands or lies on its side."""
     standing, lying = np.eye(4), np.eye(4)
     standing[2, 3], lying[2, 3] = height / 2, depth / 2
@@ -19,7 +19,7 @@ def box(width: float, depth: float, height: float = 0.1) -> Placeable:
     def outline(a, b):
         return np.array([[-a, -b], [a, -b], [a, b], [-a, b]]) / 2
 
-    return Placeable(
+    return PlaceableObject(
         "box", np.stack([standing, lying]), np.array([0.5, 0.5]), [outline(width, depth), outline(width, height)]
     )
 
@@ -77,7 +77,7 @@ def test_where_it_is_tight_objects_are_packed(monkeypatch):
     """Eleven discs of 9 cm, 1 cm apart, on 43 x 33 cm: in rows they fit (twelve would), strewn at random they don't."""
     angles = np.arange(24) * np.pi / 12
     disc = 0.045 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    things = [Placeable(f"disc_{i}", np.eye(4)[None], np.ones(1), [disc]) for i in range(11)]
+    things = [PlaceableObject(f"disc_{i}", np.eye(4)[None], np.ones(1), [disc]) for i in range(11)]
     region = Region((0.0, 0.0), (0.43, 0.33), 0.0)
 
     def layout():

@@ -10,7 +10,8 @@ import yaml
 import robocas_ms3  # noqa: F401
 from robocas_ms3.config import shipped_configs
 from robocas_ms3.datasets.sources.arrays import episode_arrays, planar_base
-from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.demos.episode import EpisodeSettings
+from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.language.templates import subgoal

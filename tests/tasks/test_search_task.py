@@ -10,7 +10,8 @@ import torch
 from mani_skill.utils.structs import Pose
 
 import robocas_ms3.tasks  # noqa: F401
-from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.demos.episode import EpisodeSettings
+from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.tasks import occlusion
 from robocas_ms3.tasks.search import LOOKS_PER_SECOND
 

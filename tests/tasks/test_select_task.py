@@ -14,7 +14,8 @@ from mani_skill.utils.structs import Pose
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.config import load_task_config
 from robocas_ms3.config.load import shipped_configs
-from robocas_ms3.demos.episode import EpisodeGenerator, EpisodeSettings
+from robocas_ms3.demos.episode import EpisodeSettings
+from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.errors import AssetError
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.skills.arm import Arm

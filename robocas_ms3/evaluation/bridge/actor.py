@@ -15,7 +15,7 @@ from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 
 
-class Watched:
+class ObservationKeeper:
     """A vector environment that keeps what it showed last."""
 
     def __init__(self, env: Any) -> None:
@@ -53,12 +53,12 @@ class Actor:
         self._channel, self._convention = channel, CONVENTIONS[wants.convention]
         self._shape = (num_envs, self._convention.size)
         self._feels = Proprioception()
-        self._watched: Watched
+        self._watched: ObservationKeeper
         self._starts: dict[int, Start] = {}
         self._grippers: dict[int, float | None] = {}  # of envs that play, what they were told
         self._begins = True
 
-    def begin(self, watched: Watched) -> None:
+    def begin(self, watched: ObservationKeeper) -> None:
         """Another batch, in an environment."""
         self._watched, self.ended, self._begins = watched, {}, True
 
@@ -73,13 +73,13 @@ class Actor:
         """Ask the other end; actions (E, A) of the envs that play.
 
         Raises:
-            Abandoned: it wants another batch.
+            AbandonedBatch: it wants another batch.
             WireError: it says what is no action.
         """
         self.report()
         message = self._channel.receive()
         if "play" in message:
-            raise Abandoned(message)
+            raise AbandonedBatch(message)
         actions = message.get("act")
         if not isinstance(actions, np.ndarray) or actions.dtype.kind != "f" or actions.shape != self._shape:
             raise WireError("no actions", expected=f"{self._shape} numbers", found=str(message)[:200])
@@ -113,7 +113,7 @@ class Actor:
         return self._convention.read(np.nan_to_num(actions.astype(np.float64))).open
 
 
-class Abandoned(Exception):
+class AbandonedBatch(Exception):
     """The other end wants another batch in the middle of one.
 
     Args:

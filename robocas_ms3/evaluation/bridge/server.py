@@ -12,7 +12,7 @@ from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.errors import EvaluationError, WireError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.bridge.actor import Abandoned, Actor, Watched
+from robocas_ms3.evaluation.bridge.actor import AbandonedBatch, Actor, ObservationKeeper
 from robocas_ms3.evaluation.bridge.channel import Channel
 from robocas_ms3.evaluation.bridge.proprioception import WIDTHS
 from robocas_ms3.evaluation.outcomes import Outcome
@@ -29,7 +29,7 @@ VERSION = 1
 _Pixels = Annotated[int, Field(ge=1, le=4096)]
 
 
-class Asked(StrictModel):
+class BridgeRequest(StrictModel):
     """The first message: what is to be played.
 
     Attributes:
@@ -72,7 +72,7 @@ class Bridge:
         DatasetError: there is no render device.
     """
 
-    def __init__(self, asked: Asked, channel: Channel) -> None:
+    def __init__(self, asked: BridgeRequest, channel: Channel) -> None:
         self._channel, self._count, self._backend = channel, asked.num_envs, asked.backend
         cameras = {name: (size[0], size[1]) for name, size in asked.cameras.items()}
         self.wants = Wants(asked.convention, asked.reference, asked.rate_hz, cameras)
@@ -101,7 +101,7 @@ class Bridge:
             if (self._results / results.OUTCOMES).exists():
                 raise EvaluationError("there is a result already", where=self._results, fix="Choose another folder.")
             results.begin(self._results, run, resume=False)
-        self._env: Watched | None = None
+        self._env: ObservationKeeper | None = None
         self._config = ""
 
     def ready(self) -> dict[str, Any]:
@@ -129,7 +129,7 @@ class Bridge:
             try:
                 self._play(self._asked_for(message))
                 message = self._channel.receive()
-            except Abandoned as abandoned:
+            except AbandonedBatch as abandoned:
                 message = abandoned.message
 
     def close(self) -> None:
@@ -160,11 +160,11 @@ class Bridge:
                 self._kept.add(one.episode)
         actor.report()
 
-    def _env_of(self, episode: Episode) -> Watched:
+    def _env_of(self, episode: Episode) -> ObservationKeeper:
         if self._env is None or self._config != episode.config:
             self.close()
             made = make_env(self._protocol, self.wants, episode, self._count, backend=self._backend)
-            self._env, self._config = Watched(made), episode.config
+            self._env, self._config = ObservationKeeper(made), episode.config
         return self._env
 
 
@@ -185,7 +185,7 @@ def open_bridge(channel: Channel) -> Bridge:
             fix="Install robocas-ms3 and lerobot_env_robocas of one release.",
         )
     try:
-        asked = Asked.model_validate(message)
+        asked = BridgeRequest.model_validate(message)
     except ValidationError as error:
-        raise refusal(error, Asked, EvaluationError, where="", about="can't play that") from error
+        raise refusal(error, BridgeRequest, EvaluationError, where="", about="can't play that") from error
     return Bridge(asked, channel)

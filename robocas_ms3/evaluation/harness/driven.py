@@ -40,7 +40,7 @@ class DrivenEpisodes:
             require_renderer()
         self.protocol, self.rate = protocol, rate_of(protocol, wants)
         self.outcome: Outcome | None = None
-        self._policy = _Handing(wants)
+        self._policy = _HarnessPolicy(wants)
         self.about: dict[str, Any] = about(protocol, self._policy, "", Settings(backend="processes"))
         self._env: Any = None
         self._config = ""
@@ -139,7 +139,7 @@ class DrivenEpisodes:
             env.close()
 
 
-class _Handing:
+class _HarnessPolicy:
     """A policy whose actions come from elsewhere."""
 
     def __init__(self, wants: Wants) -> None:

@@ -93,7 +93,7 @@ class RemotePolicy:
         raise PolicyFailed(reasons, actions)
 
     def close(self) -> None:
-        """Hang up."""
+        """Hang up all connections."""
         for link in [*self._spare, *self._links.values()]:
             link.close(wait_s=1)
         self._spare.clear()

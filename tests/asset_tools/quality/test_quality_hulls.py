@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.quality.hulls import hull_quality, mean_thickness
+from asset_tools.quality.hulls import hull_quality, mean_thickness, volume_iou
 from robocas_ms3.errors import AssetError
 
 
@@ -22,6 +22,13 @@ def test_a_box_is_its_own_hull():
     assert (found.compact, found.hull_count, found.hull_vertices) == (True, 1, 8)
     assert found.volume_iou == pytest.approx(1, abs=1e-5)
     assert found.surface_p95 < 1e-6
+
+
+def test_overlap_of_shifted_boxes_is_known():
+    box = trimesh.creation.box([2.0, 1.0, 1.0])
+    half_out = np.asarray(box.vertices) + [1.0, 0, 0]
+    assert volume_iou(box, [np.asarray(box.vertices)]) == pytest.approx(1.0, abs=1e-6)
+    assert volume_iou(box, [half_out]) == pytest.approx(1 / 3, abs=1e-6)
 
 
 def test_boxes_that_overlap_by_half():

@@ -1,0 +1,225 @@
+"""One seed to one recorded episode: attempts, undone or kept, until the task succeeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import robocas_ms3.tasks  # noqa: F401  (registers the environments)
+from robocas_ms3.config import load_task_config
+from robocas_ms3.demos.branches import ForkedBranches
+from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, horizon
+from robocas_ms3.demos.forking import say_once, why_not_fork
+from robocas_ms3.demos.open_loop import Noise, OpenLoop
+from robocas_ms3.demos.resimulation import Resimulation
+from robocas_ms3.demos.trials import Trials
+from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
+from robocas_ms3.planning.backends import DEFAULT, make_planner
+from robocas_ms3.planning.decisions import Decisions, StraightDecisions
+from robocas_ms3.planning.executor import Executor
+from robocas_ms3.planning.protocol import Planner
+from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.retreating import back_out
+from robocas_ms3.recordings.environment import RecordedEnv
+from robocas_ms3.recordings.motion import sample_stride
+from robocas_ms3.recordings.subgoals import SubGoal
+from robocas_ms3.recordings.writing import EpisodeRecorder
+from robocas_ms3.robots.urdf import robot_files
+from robocas_ms3.tasks.base import RoboCASEnv
+from robocas_ms3.tasks.spec import TASKS
+
+
+class EpisodeGenerator:
+    """Makes episodes of one task in one process: holds the environment, the planner and the policy.
+
+    A process that has others beside it does best with one thread of torch (``torch.set_num_threads``): on a busy
+    machine the threads of its small operations wait for each other, 25 times longer than they work.
+
+    Args:
+        settings: the same for all episodes.
+        fork: undo what fails by forking where that is safe; the episodes are the same without.
+    """
+
+    def __init__(self, settings: EpisodeSettings, *, fork: bool = True) -> None:
+        self.settings = settings
+        config = load_task_config(settings.config)
+        self.horizon = horizon(settings.task, settings.control_freq)
+        self.env = gym.make(
+            TASKS[settings.task].env_id,
+            max_episode_steps=self.horizon,
+            config=settings.config,
+            pack=settings.pack,
+            layouts=settings.layouts,
+            obs_mode="none",
+            reward_mode="none",
+            control_mode="pd_joint_pos_base" if config.base_motion else "pd_joint_pos",
+            render_backend="none",
+            sim_config={"control_freq": settings.control_freq},
+        )
+        base_env = self.env.unwrapped
+        assert isinstance(base_env, RoboCASEnv)
+        files = robot_files()
+        self.planner: Planner = make_planner(DEFAULT, files.arm_urdf, files.arm_srdf, dt=base_env.control_timestep)
+        self.reachability = Reachability(str(files.arm_urdf))
+        # a scripted policy tries once, from wherever the episode stands, and raises PlanningFailed
+        self.policy: Callable[[Arm], None] = import_module(TASKS[settings.task].solver).attempt
+        self.worlds: list[OpenLoop] = []
+        self.trials: Trials | None = None
+        if settings.replay_rate and not config.base_motion:
+            scene = {"config": settings.config, "layouts": settings.layouts}
+            env = RecordedEnv(TASKS[settings.task].env_id, None, scene).with_pack(settings.pack)
+            self.worlds = [OpenLoop(env, settings.replay_rate) for _ in range(1 + settings.noisy_trials)]
+            noise = Noise(settings.noise_mm / 1000, float(np.deg2rad(settings.noise_deg)))
+            stride = sample_stride(settings.control_freq, settings.replay_rate)
+            self.trials = Trials(self.worlds, noise, stride)
+        self._fork = fork and not settings.keep_recoveries
+        reason = why_not_fork(renders=base_env.scene.can_render())
+        if self._fork and reason:
+            say_once(reason)
+            self._fork = False
+
+    def generate(self, seed: int, folder: Path, name: str) -> EpisodeResult:
+        """Make the episode of a seed, as ``folder/name.h5`` and ``.json``; no files where every attempt failed.
+
+        The same seed and versions give the same episode, whatever was generated before.
+        """
+        recorder = EpisodeRecorder(self.env, folder, name)
+        executor = Executor(recorder, seed)
+        result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=self.settings.max_attempts)
+        attempts = _Attempts(self, recorder, executor, result)
+        executor.rehearse = attempts.rehearse
+        try:
+            if self.settings.keep_recoveries:
+                attempts.make_in_one_motion()
+            else:
+                attempts.make_from_resets(ForkedBranches(result) if self._fork else Resimulation(result))
+        except LayoutError as error:
+            result.failed(PlanningFailed("layout", error.what))
+        result.attempts = len(result.failures) + result.success
+        return result
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.env.close()
+        for world in self.worlds:
+            world.close()
+
+
+@dataclass
+class _Attempts:
+    """The attempts at one seed."""
+
+    generator: EpisodeGenerator
+    recorder: EpisodeRecorder
+    executor: Executor
+    result: EpisodeResult
+
+    def make_from_resets(self, decisions: ForkedBranches | Resimulation) -> None:
+        """Attempt after attempt, each from the reset; within them decisions are made otherwise."""
+        while not self.result.exhausted:
+            number = len(self.result.failures)
+
+            def attempt(number: int = number) -> None:
+                self._reset()
+                self.generator.policy(self._arm(decisions, number))
+                self._finish([])
+
+            if decisions.run(attempt):
+                return
+
+    def make_in_one_motion(self) -> None:
+        """Attempts one after the other in one motion, as far as what failed can be mended."""
+        executor, result = self.executor, self.result
+        decisions = StraightDecisions(lambda: len(executor.actions))
+        recoveries: list[dict[str, Any]] = []
+        self._reset()
+        while not result.exhausted:
+            first = len(executor.actions)
+            arm = self._arm(decisions, len(result.failures))
+            try:
+                self.generator.policy(arm)
+                self._finish(recoveries)
+                return
+            except PlanningFailed as error:
+                result.failed(error)
+                last = error
+            try:
+                if not first < len(executor.actions) < self.generator.horizon or isinstance(last, EpisodeLost):
+                    raise last
+                back_out(arm)
+                span = [first, len(executor.actions) - 1]
+                recoveries.append({"range": span, "stage": last.stage, "reason": last.reason})
+            except PlanningFailed:
+                recoveries = []
+                self._reset()
+
+    def _arm(self, decisions: Decisions, number: int) -> Arm:
+        return Arm(self.generator.planner, self.generator.reachability, self.executor, decisions, (number,))
+
+    def _reset(self) -> None:
+        self.executor.reset()
+        if self.generator.trials is not None:
+            with self.executor.seconds.spent_on("reset"):
+                self.generator.trials.reset(self.executor.seed)
+
+    @property
+    def _noisy(self) -> bool:
+        """Whether noise counts still."""
+        return self.result.noisy_failures < self.generator.settings.noisy_failures
+
+    def rehearse(self, *, finished: bool = False) -> None:
+        """Try what was done so far; see `trials`."""
+        if self.generator.trials is not None:
+            gripper = np.array([action[7] for action in self.executor.actions])
+            with self.executor.seconds.spent_on("trial"):
+                self.generator.trials.follow(self.recorder.states, gripper, finished=finished, noisy=self._noisy)
+
+    def _finish(self, recoveries: list[dict[str, Any]]) -> None:
+        """Write what a policy says it has done, if it is a demonstration.
+
+        Raises:
+            PlanningFailed: the task has not succeeded.
+            EpisodeLost: it took longer than an episode may, or its own actions do not do it again, or not within the
+                range of ``pd_ee_delta_pose``.
+        """
+        if len(self.executor.actions) > self.generator.horizon:
+            raise EpisodeLost("horizon", "too_long")
+        if not self.executor.flag("success"):
+            raise PlanningFailed("episode", "no_success")
+        self.rehearse(finished=True)
+        self.result.success, self.result.steps = True, len(self.executor.actions)
+        self.recorder.finish(self._describe(recoveries))
+
+    def _describe(self, recoveries: list[dict[str, Any]]) -> dict[str, Any]:
+        """What the record says of the episode, besides ManiSkill's own."""
+        executor, settings, tried = self.executor, self.generator.settings, self.generator.trials is not None
+        env = executor.base_env
+        target = env.target_asset().asset
+        bounds = [part.first for part in executor.segments] + [len(executor.actions)]
+        said, layout = env.instruction(), env.layout()
+        assert layout is not None  # there was a reset
+        return {
+            "instruction": said.text,
+            "instruction_template": said.template_id,
+            "relation": layout.relation,
+            "support": env.task_config.support,
+            "target": {"slot": int(env.target_slot[0]), "asset_id": target.id, "name": target.name},
+            "objects": [asset.asset.id for asset in env.object_assets[0]],
+            "subgoals": [
+                SubGoal(part.goal_type, part.goal_description, part.first, after - 1).as_json()
+                for part, after in zip(executor.segments, bounds[1:], strict=True)
+            ],
+            "replay_rate": settings.replay_rate if tried else None,
+            "facts": {"disturbed": int(executor.info["disturbed"][0]), **executor.facts},
+            "seconds": {part: round(value, 3) for part, value in asdict(executor.seconds).items()},
+            "attempts": len(self.result.failures) + 1,
+            "noisy_trials": None if not tried else settings.noisy_trials if self._noisy else 0,
+            "recoveries": recoveries,
+        }
