@@ -40,8 +40,7 @@ def third_party(path: Path) -> set[str]:
 EXTRAS = {  # files that may import what an extra brings
     "robocas_ms3/language/": "language",
     "robocas_ms3/datasets/lerobot/": "lerobot",
-    "robocas_ms3/viewer/lerobot.py": "lerobot",
-    "robocas_ms3/datasets/stats_plots.py": "plots",
+    "robocas_ms3/datasets/statistics/plots.py": "plots",
     "robocas_ms3/evaluation/remote/": "remote",
     "robocas_ms3/evaluation/report/columns.py": "lerobot",
     "asset_tools/": "assets",

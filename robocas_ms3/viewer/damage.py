@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 from robocas_ms3.datasets.checks.scene_values import check_rate, sound
 from robocas_ms3.datasets.sources.tolerant import DAMAGED
 from robocas_ms3.errors import DatasetError
 
+T = TypeVar("T")
 _WRONG = (*DAMAGED, ArithmeticError, AttributeError, AssertionError, LookupError, RecursionError, TypeError)
 """What comes of values of another kind than expected."""
 
@@ -31,6 +32,29 @@ def readable(where: object) -> Iterator[None]:
         raise DatasetError("damaged, can't be shown", where=where, found=found, fix=fix) from error
 
 
+def attempt(read: Callable[[], T], otherwise: T) -> tuple[T, str]:
+    """What can be read and nothing, else the other value and what is wrong."""
+    try:
+        with readable(""):
+            return read(), ""
+    except DatasetError as error:
+        return otherwise, reason(error)
+
+
+def reason(error: DatasetError) -> str:
+    """What an error says of what is wrong, without where."""
+    return f"{error.what}, {error.found}" if str(error.found) else error.what
+
+
+def together(*said: str) -> str:
+    """What is wrong, each thing once."""
+    kept: list[str] = []
+    for text in said:
+        if not any(text in other for other in kept):
+            kept.append(text)
+    return "; ".join(filter(None, kept))
+
+
 def table(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str]:
     """A JSON object of a dataset; empty where it is damaged, with the reason."""
     try:
@@ -41,13 +65,10 @@ def table(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str]:
     return (found, "") if isinstance(found, dict) else ({}, f"`{name}` is damaged: it holds no object.")
 
 
-def scene(read: Callable[[], Any], name: str = "scene.json") -> tuple[dict[str, Any], str]:
+def scene(read: Callable[[], Any], name: str) -> tuple[dict[str, Any], str]:
     """A ``scene.json``, or what else has some of its keys, without the values that are wrong, and those in words."""
-    try:
-        with readable(name):
-            return sound(read(), name)
-    except DatasetError as error:
-        return {}, f"{name}: {error.what}, {error.found}"
+    (found, wrong), failed = attempt(lambda: sound(read(), name), ({}, ""))
+    return found, f"{name}: {failed}" if failed else wrong
 
 
 def rate_of(settings: Mapping[str, Any], name: str, default: float) -> tuple[float, str]:
@@ -59,34 +80,10 @@ def rate_of(settings: Mapping[str, Any], name: str, default: float) -> tuple[flo
     return default, said if "rate_hz" in settings else ""
 
 
-def ledger_entry(entries: Any, number: int, name: str) -> tuple[dict[str, Any], str]:
-    """Seed, success and target as the settings of a dataset say them of an episode, in a table or a list."""
-    listed = isinstance(entries, list) and number < len(entries)
-    found = entries[number] if listed else entry_of(entries, number)
-    if not isinstance(found, Mapping):
-        return sound(found, name)
-    return sound({key: found[key] for key in ("seed", "success", "target") if key in found}, name)
-
-
-def entry_of(entries: Any, number: int) -> Any:
-    """What a table by number has of an episode, None where it has nothing."""
-    return entries.get(str(number)) if isinstance(entries, dict) else None
-
-
 def split_of(info: Mapping[str, Any]) -> dict[int, str]:
     """Side of each episode that a dataset lists, "train" or "val"; the others are on neither."""
     sides = {side: info.get(f"{side}_eps") for side in ("train", "val")}
     return {n: side for side, listed in sides.items() if isinstance(listed, list) for n in listed if type(n) is int}
-
-
-def integer(value: Any) -> int | None:
-    """A whole number that is one; None for others."""
-    return value if type(value) is int else None
-
-
-def text(value: Any) -> str:
-    """A text that is one; empty for others."""
-    return value if isinstance(value, str) else ""
 
 
 def without_nan(value: Any) -> Any:

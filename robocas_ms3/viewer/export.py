@@ -10,16 +10,17 @@ from typing import Any
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, replacing_folder
 from robocas_ms3.viewer import pictures
-from robocas_ms3.viewer.damage import readable
+from robocas_ms3.viewer.content import PageContent
+from robocas_ms3.viewer.damage import readable, reason, together
+from robocas_ms3.viewer.parts import Picture
 from robocas_ms3.viewer.routes import PAGE_FILES, make_thumbnail, page_file, script
-from robocas_ms3.viewer.source import Picture, Source, read_episode
 
 WIDTH = 480
 """Pixels of a written picture; a static page is for sharing, so it is kept small."""
 
 
 def export(
-    source: Source,
+    source: PageContent,
     out: Path,
     *,
     episodes: Sequence[int] = (),
@@ -63,39 +64,32 @@ def export(
             on_episode(done, len(chosen))
             wrong = _write_episode(source, index, number, folder, width)
             if wrong:
-                damaged[number] = "; ".join(filter(None, (damaged.get(number), wrong)))
+                damaged[number] = together(damaged.get(number, ""), wrong)
         index["episodes"] = [{**entry, "damage": damaged.get(entry["n"], "")} for entry in index["episodes"]]
         (folder / "data" / "index.js").write_bytes(script("index", index))
         on_episode(len(chosen), len(chosen))
     return len(chosen), damaged
 
 
-def _write_episode(source: Source, index: dict[str, Any], number: int, folder: Path, width: int) -> str:
+def _write_episode(source: PageContent, index: dict[str, Any], number: int, folder: Path, width: int) -> str:
     """Write one, and say what of it can't be read."""
     lost = ""
     if index["cameras"]:
         lost = _write(folder / "thumbnails" / f"{number}.jpg", lambda: make_thumbnail(source, index, number))
     try:
-        content = read_episode(source, number)
+        content = source.episode(number)
     except DatasetError as error:
-        return f"{error.what}, {error.found}"
+        return reason(error)
     (folder / "data" / f"episode_{number}.js").write_bytes(script(f"episode_{number}", content))
+    make = {"rgb": lambda *place: pictures.shrunk(source.rgb(number, *place), width)}
+    if index["depth"]:
+        make["depth"] = lambda *place: pictures.depth_picture(source.depth(number, *place), width)
     for camera in index["cameras"]:
-        place = folder / "pictures" / str(number) / camera
         for step in range(content["steps"]):
-            lost = _write(place / "rgb" / f"{step}.jpg", partial(_rgb, source, number, camera, step, width)) or lost
-            if index["depth"]:
-                depth = partial(_depth, source, number, camera, step, width)
-                lost = _write(place / "depth" / f"{step}.jpg", depth) or lost
+            for kind, picture in make.items():
+                path = folder / "pictures" / str(number) / camera / kind / f"{step}.jpg"
+                lost = _write(path, partial(picture, camera, step)) or lost
     return lost
-
-
-def _rgb(source: Source, number: int, camera: str, step: int, width: int) -> Picture:
-    return pictures.shrunk(source.rgb(number, camera, step), width)
-
-
-def _depth(source: Source, number: int, camera: str, step: int, width: int) -> Picture:
-    return pictures.depth_picture(source.depth(number, camera, step), width)
 
 
 def _write(path: Path, make: Callable[[], Picture]) -> str:

@@ -11,11 +11,11 @@ from typing import Any
 from robocas_ms3.datasets.sources.provenance import environment_of
 from robocas_ms3.demos.ledger import FAILURES_FILE, Failure
 from robocas_ms3.ledger import Ledger
-from robocas_ms3.viewer.source import row
+from robocas_ms3.viewer.parts import row
 
 
 @dataclass(frozen=True)
-class Told(Failure):
+class FailedAttempt(Failure):
     """A line of the file.
 
     Attributes:
@@ -41,23 +41,23 @@ class Failures:
         note: which lines are damaged, for people.
     """
 
-    by_seed: Mapping[int, list[Told]] = field(default_factory=dict)
+    by_seed: Mapping[int, list[FailedAttempt]] = field(default_factory=dict)
     note: str = ""
 
     @classmethod
     def read(cls, folder: Path) -> Failures:
         """Read that of a folder; nothing where there is none."""
         try:
-            lines = Ledger[Told](folder / FAILURES_FILE, Told).lines()
+            lines = Ledger[FailedAttempt](folder / FAILURES_FILE, FailedAttempt).lines()
         except OSError as error:
             return cls(note=f"`{FAILURES_FILE}` can't be read: {error.strerror}.")
-        found: dict[int, list[Told]] = defaultdict(list)
+        found: dict[int, list[FailedAttempt]] = defaultdict(list)
         for line in lines:
             if line.record is not None:
                 found[line.record.seed].append(line.record)
         return cls(dict(found), _damaged([str(line.number) for line in lines if line.record is None]))
 
-    def of_seed(self, seed: int | None, env_info: Any = None) -> list[Told]:
+    def of_seed(self, seed: int | None, env_info: Any = None) -> list[FailedAttempt]:
         """Of one seed in an environment; none where the seed is not known."""
         return [] if seed is None else [told for told in self.by_seed.get(seed, []) if told.is_of(env_info)]
 
@@ -76,7 +76,7 @@ class Failures:
         task = tasks.pop() if len(tasks) == 1 else ""  # where the file does not say
         lost = []
         for seed, of_seed in sorted(self.by_seed.items()):
-            runs: dict[str | None, list[Told]] = defaultdict(list)
+            runs: dict[str | None, list[FailedAttempt]] = defaultdict(list)
             for told in of_seed:
                 runs[told.environment].append(told)
             for of_run in runs.values():
@@ -87,7 +87,7 @@ class Failures:
         return lost
 
 
-def _lost(seed: int, task: str, tried: list[Told]) -> dict[str, Any]:
+def _lost(seed: int, task: str, tried: list[FailedAttempt]) -> dict[str, Any]:
     named = stages(tried, {}) or ["given up"]
     return row(None, task=task, seed=seed, success=False, stages=named, attempts=len(tried))
 

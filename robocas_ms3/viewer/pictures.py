@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets.pictures.video import colour_depth
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.viewer.source import Picture
+from robocas_ms3.viewer.parts import Picture
 
 THUMBNAIL = (96, 72)
 """Width and height: twice what the table shows, for dense screens."""
 _QUALITY = 85
+
+
+def inside(path: Path, root: Path) -> Path:
+    """The path of a picture, unless it is a link that leads out of the dataset.
+
+    Raises:
+        DatasetError: it is.
+    """
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise DatasetError("this link leads out of the dataset", where=path)
+    return path
 
 
 def depth_picture(depth: NDArray[np.uint16], width: int | None = None) -> Picture:

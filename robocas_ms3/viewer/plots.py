@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.viewer.source import plot
+from robocas_ms3.viewer.parts import plot
 
 XYZ = ("x", "y", "z")
 ROLL_PITCH_YAW = ("roll", "pitch", "yaw")

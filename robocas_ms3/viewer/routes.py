@@ -26,8 +26,9 @@ from typing import Any
 
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer import pictures
+from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import without_nan
-from robocas_ms3.viewer.source import CAMERA_NAME, Picture, Source, read_episode
+from robocas_ms3.viewer.parts import CAMERA_NAME, Picture
 
 PAGE_FILES = {
     "index.html": "text/html; charset=utf-8",
@@ -59,13 +60,13 @@ class Response:
 class Routes:
     """Answers of one source; may be asked from several threads."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: PageContent) -> None:
         self.source = source
         self.version = secrets.token_hex(4)
         self._index: dict[str, Any] | None = None
         self._script = b""
         self._making = threading.Lock()
-        self._thumbnail = lru_cache(maxsize=4096)(self._make_thumbnail)
+        self._thumbnail = lru_cache(maxsize=4096)(lambda number: make_thumbnail(source, self.index, number))
 
     @property
     def index(self) -> dict[str, Any]:
@@ -93,7 +94,7 @@ class Routes:
             return Response(200, _SCRIPT, self._script)
         if match := _EPISODE.fullmatch(path):
             number = int(match[1])
-            return Response(200, _SCRIPT, script(f"episode_{number}", read_episode(self.source, number)))
+            return Response(200, _SCRIPT, script(f"episode_{number}", self.source.episode(number)))
         if match := _THUMBNAIL.fullmatch(path):
             return _picture(self._thumbnail(int(match[1])))
         if match := _PICTURE.fullmatch(path):
@@ -105,11 +106,8 @@ class Routes:
             return _picture(pictures.depth_picture(self.source.depth(number, camera, step)))
         return None
 
-    def _make_thumbnail(self, number: int) -> Picture:
-        return make_thumbnail(self.source, self.index, number)
 
-
-def make_thumbnail(source: Source, index: dict[str, Any], number: int) -> Picture:
+def make_thumbnail(source: PageContent, index: dict[str, Any], number: int) -> Picture:
     """The first step as the camera sees it that shows most: the static one where there is one.
 
     Raises:

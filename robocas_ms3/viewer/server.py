@@ -11,8 +11,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from robocas_ms3.errors import RobocasError
+from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.routes import Response, Routes
-from robocas_ms3.viewer.source import Source
 
 HOST = "127.0.0.1"
 _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -26,7 +26,7 @@ class Viewer(ThreadingHTTPServer):
 
     daemon_threads = False
 
-    def __init__(self, source: Source, port: int = 0) -> None:
+    def __init__(self, source: PageContent, port: int = 0) -> None:
         """Take a port of 127.0.0.1.
 
         Args:

@@ -1,8 +1,9 @@
-"""A trajectory file of ``robocas generate`` as the page shows it: no pictures, but the objects' motion."""
+"""A trajectory file of ``robocas generate`` on the page: no pictures, but recorded actions and the objects' motion."""
 
 from __future__ import annotations
 
-import threading
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,24 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.checks.scene_values import sound
 from robocas_ms3.datasets.sources.arrays import planar_base
 from robocas_ms3.datasets.sources.provenance import succeeded, task_of
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.datasets.sources.trajectory import TrajectorySource
+from robocas_ms3.poses import inverse
+from robocas_ms3.recordings.motion import Motion
 from robocas_ms3.recordings.reading import Recording, TrajectoryFile
-from robocas_ms3.recordings.seeds import one_seed
+from robocas_ms3.recordings.subgoals import SubGoal
 from robocas_ms3.robots import constants as c
-from robocas_ms3.viewer.damage import integer, readable, text
-from robocas_ms3.viewer.failures import Failures, describe, stages
-from robocas_ms3.viewer.plots import ARM, ROLL_PITCH_YAW, XYZ, base_plot, gripper_plot, motion_plots
-from robocas_ms3.viewer.source import Picture, make_episode, make_index, make_trace, plot, row
+from robocas_ms3.viewer import damage
+from robocas_ms3.viewer.arrays import facts_of, show_motion
+from robocas_ms3.viewer.content import PageContent
+from robocas_ms3.viewer.damage import readable
+from robocas_ms3.viewer.parts import plot
+from robocas_ms3.viewer.plots import ARM, ROLL_PITCH_YAW, XYZ
 
 NOTE = "A trajectory file holds states, no pictures: `robocas convert {name} --to robocas --out DIR` renders them."
 _STILL = 0.002  # m: an object that moves less is drawn where it stands
 
 
-class TrajectorySource:
+class TrajectoryContent(PageContent):
     """``F.h5`` with ``F.json`` beside it; a step is a state, T = S + 1."""
+
+    scene_name = entry_name = "its entry of the JSON"
 
     def __init__(self, path: Path) -> None:
         """Open both.
@@ -35,91 +41,52 @@ class TrajectorySource:
         Raises:
             DatasetError: a file is missing, damaged, or they do not match.
         """
-        self.root = path
-        self.failures = Failures.read(path.parent)
         with readable(path):
-            self.file = TrajectoryFile(path)
-            self._position = {int(e["episode_id"]): i for i, e in enumerate(self.file.episodes)}
-            self._kwargs = dict(self.file.env_info["env_kwargs"])
-        self._reading = threading.Lock()  # HDF5 reads from one thread at a time
+            with TrajectoryFile(path) as file:
+                rate_hz, self._listed = file.control_freq, file.episodes
+                self._task = task_of(file.env_info["env_id"])
+            self.recordings = TrajectorySource(path, rate_hz=rate_hz, include_failed=True)
+        super().__init__(self.recordings, "trajectory file", notes=[NOTE.format(name=path.name)], split={})
 
-    def index(self) -> dict[str, Any]:
-        """From the JSON alone; seeds without an episode, from ``failures.jsonl``, come last."""
-        task, rows = task_of(str(self.file.env_info.get("env_id"))) or "", []
-        for episode in self.file.episodes:
-            recorded, wrong = _entry(episode)
-            seed = one_seed(episode.get("episode_seed"))
-            rows.append(
-                row(
-                    int(episode["episode_id"]),
-                    steps=(integer(episode.get("elapsed_steps")) or 0) + 1,
-                    instruction=recorded["instruction"],
-                    task=task,
-                    target=(recorded["target"] or {}).get("name", ""),
-                    seed=seed,
-                    success=succeeded(episode),
-                    stages=stages(self.failures.of_seed(seed), recorded),
-                    attempts=recorded.get("attempts"),
-                    damage=wrong,
-                )
-            )
-        rows += self.failures.given_up(rows, [self.file.env_info] * len(rows))
-        note = f"{NOTE.format(name=self.root.name)} {self.failures.note}".strip()
-        return make_index(self.root, "trajectory file", self.file.control_freq, (), False, rows, note)
+    def _entry(self, number: int) -> tuple[dict[str, Any], str]:
+        """What can be told of a damaged one, which has no scene."""
+        listed = self._listed[number]
+        said = listed.get("robocas")
+        target = said.get("target") if isinstance(said, dict) else None
+        seed, success = listed.get("episode_seed"), succeeded(listed)
+        entry = {"task": self._task, "seed": seed, "success": success, "target": target}
+        return damage.scene(lambda: entry, self.entry_name)
 
-    def episode(self, number: int) -> dict[str, Any]:
+    def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
         """States as plots, recorded actions, and the paths of TCP and objects."""
-        if number not in self._position:
-            raise DatasetError("no such episode", where=self.root, found=number)
-        position = self._position[number]
-        with self._reading:
-            recording = self.file.recording(position)
-        entry, _ = _entry(self.file.episodes[position])  # the table says what is wrong
-        config = self._kwargs.get("config")
-        steps = recording.control_steps + 1
-        motion = recording.motion(np.arange(steps))
-        to_base = np.linalg.inv(motion.arm_base_in_world)
-        tcp = to_base @ motion.tcp_in_world
-        xyzw = Rotation.from_matrix(tcp[:, :3, :3]).as_quat()
-        last = steps - 1
-        return make_episode(
-            number,
-            instruction=recording.instruction,
-            steps=steps,
-            rate_hz=self.file.control_freq,
-            subgoals=[
-                {
-                    "type": goal.goal_type,
-                    "text": goal.goal_description,
-                    "first": goal.first,
-                    "last": last if goal.last == last - 1 else goal.last,  # the last state is its last action's
-                }
-                for goal in recording.subgoals
-            ],
-            plots=[
-                *motion_plots(tcp[:, :3, 3], xyzw, motion.qpos[:, c.ARM_SLICE]),
-                gripper_plot(motion.qpos[:, c.FINGER_SLICE].sum(axis=1), None),
-                *_actions(recording),
-                *base_plot(planar_base(motion.root_in_world, motion.qpos)),
-            ],
-            trace=make_trace(motion.tcp_in_world, _objects(recording, entry, to_base[0]), moving=True),
-            facts={
-                "Configuration": config if isinstance(config, str) else None,  # a whole one is too long
-                "Object pack": self._kwargs.get("pack"),
-                "Recorded with": recording.control_mode,
-                "Relation": entry.get("relation"),
-                **{str(name).capitalize(): value for name, value in (entry.get("facts") or {}).items()},
-            },
-            failures=describe(self.failures.of_seed(recording.seed), entry),
-        )
+        recording = self.recordings.episode(number).recording()
+        motion = recording.motion(np.arange(recording.control_steps + 1))
+        objects = _objects(recording, scene, self.recordings.said(number).objects, motion.arm_base_in_world[0])
+        return {
+            **show_motion(_arrays(recording, motion), _goals(recording), _actions(recording), objects, moving=True),
+            "facts": facts_of({**scene, "source": None}),  # which is this file
+        }
 
-    def rgb(self, number: int, camera: str, step: int) -> Picture:
-        """There is none."""
-        raise DatasetError("a trajectory file holds no pictures", where=self.root, fix="Use robocas convert.")
 
-    def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
-        """There is none."""
-        raise DatasetError("a trajectory file holds no pictures", where=self.root, fix="Use robocas convert.")
+def _arrays(recording: Recording, motion: Motion) -> dict[str, NDArray]:
+    """Those of ``episode_info.npz`` that the page shows, at all states."""
+    tcp, base = motion.tcp_in_base, motion.arm_base_in_world
+    return {
+        "language_goal": np.array(recording.instruction),
+        "ee_pos": tcp[:, :3, 3],
+        "ee_orn": Rotation.from_matrix(tcp[:, :3, :3]).as_quat(),
+        "base_pos": base[:, :3, 3],
+        "base_orn": Rotation.from_matrix(base[:, :3, :3]).as_quat(),
+        "robot_joints": motion.qpos[:, c.ARM_SLICE],
+        "gripper_width": motion.qpos[:, c.FINGER_SLICE].sum(axis=1),
+        "agv_pose": planar_base(motion.root_in_world, motion.qpos),
+    }
+
+
+def _goals(recording: Recording) -> list[SubGoal]:
+    """Sub-goals over the states; the last state is its last action's."""
+    last = recording.control_steps
+    return [replace(goal, last=last) if goal.last == last - 1 else goal for goal in recording.subgoals]
 
 
 def _actions(recording: Recording) -> list[dict[str, Any]]:
@@ -138,12 +105,12 @@ def _actions(recording: Recording) -> list[dict[str, Any]]:
     return plots + ([plot("Action: mobile base", "", ("x", "y", "yaw"), base, steps=True)] if base.any() else [])
 
 
-def _objects(recording: Recording, entry: dict[str, Any], world_to_base: NDArray) -> list[dict[str, Any]]:
+def _objects(recording: Recording, scene: Mapping[str, Any], ids: Any, base_in_world: NDArray) -> list[dict[str, Any]]:
     """Paths of actors, thinned to one point where they stand still, without those parked far away."""
-    target = (entry["target"] or {}).get("slot")
-    named = {f"object_{slot}": str(name).replace("_", " ") for slot, name in enumerate(entry.get("objects") or ())}
-    if target is not None:
-        named[f"object_{target}"] = entry["target"]["name"]
+    target, world_to_base = scene.get("target") or {}, inverse(base_in_world)
+    chosen = f"object_{target['slot']}" if target else ""
+    named = {f"object_{slot}": str(name).replace("_", " ") for slot, name in enumerate(ids or ())}
+    named |= {chosen: target.get("name", "")}
     found = []
     for actor, states in recording.states.get("actors", {}).items():
         path = states[:, :3].astype(float)
@@ -152,14 +119,5 @@ def _objects(recording: Recording, entry: dict[str, Any], world_to_base: NDArray
             continue
         still = np.ptp(path, axis=0).max() < _STILL
         name = named.get(actor, actor.replace("_", " "))
-        found.append({"name": name, "target": actor == f"object_{target}", "path": path[:1] if still else path})
+        found.append({"name": name, "target": actor == chosen, "path": path[:1] if still else path})
     return found
-
-
-def _entry(episode: dict[str, Any]) -> tuple[dict[str, Any], str]:
-    """What the generator said of an episode, without values that are wrong, and those in words."""
-    said = episode.get("robocas")
-    known = said if isinstance(said, dict) else {}
-    entry, wrong = sound({"recorded": said, "target": known.get("target")}, "its entry of the JSON")
-    instruction = text(known.get("instruction"))
-    return {**(entry.get("recorded") or {}), "target": entry.get("target"), "instruction": instruction}, wrong

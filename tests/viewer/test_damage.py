@@ -11,7 +11,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.failures import Failures
 from robocas_ms3.viewer.routes import Routes, script
-from robocas_ms3.viewer.source import open_source, read_episode
+from robocas_ms3.viewer.source import open_source
 
 WRONG = ["x", 7, True, ["x"], {"x": 1}, None, float("nan"), [[]], {"poses": 3}, [{"slot": "x"}], 10**400]
 
@@ -65,7 +65,7 @@ def test_the_row_says_what_is_wrong(spoilt, new, damage):
     (_, row, _, _) = open_source(spoilt).index()["episodes"]
     assert row["damage"].startswith(damage)
     assert (row["object"], row["seed"], row["success"]) == ("cube 4", 4, False)  # of the ledger or the scene
-    assert read_episode(open_source(spoilt), 1)["n"] == 1
+    assert open_source(spoilt).episode(1)["n"] == 1
 
 
 @pytest.mark.parametrize("text", ["[1]", "null", "7", "{", "", '"x"', "\xff", "[" * 100_000], ids=lambda t: t[:5])
@@ -104,7 +104,7 @@ def test_arrays_that_contradict_each_other(spoilt):
         arrays = dict(content)
     np.savez(path, **{**arrays, "rel_pos": arrays["rel_pos"][:3]})
     with pytest.raises(DatasetError, match="different lengths"):
-        read_episode(open_source(spoilt), 1)
+        open_source(spoilt).episode(1)
     assert shown(open_source(spoilt))[1] == [200, 404, 200]
 
 
@@ -131,6 +131,11 @@ def test_a_damaged_trajectory(run_folder, tmp_path):
     (_, row, *_) = open_source(folder).index()["episodes"]
     assert row["damage"] == 'its entry of the JSON, target: expected an object, found "cube"'
     assert row["instruction"].startswith("grasp the cube 4")
+    metadata["episodes"][1]["robocas"] = {"instruction": 3, "target": whole["episodes"][1]["robocas"]["target"]}
+    path.write_text(json.dumps(metadata))
+    (_, row, *_) = open_source(folder).index()["episodes"]
+    assert row["damage"].startswith("its entry of the JSON: the JSON's entry is incomplete")
+    assert (row["object"], row["seed"], row["success"], row["stages"]) == ("cube 4", 4, False, ["grasp"])
     for spoilt in ({"episodes": 3}, {"episodes": ["x"]}, {"env_info": {"env_id": 3, "env_kwargs": 4}}, {"robocas": []}):
         path.write_text(json.dumps({**whole, **spoilt}))
         with pytest.raises(DatasetError):

@@ -9,8 +9,9 @@ import pytest
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.viewer.parts import make_index, plot, rounded
 from robocas_ms3.viewer.plots import base_plot, motion_plots
-from robocas_ms3.viewer.source import make_index, open_source, plot, rounded
+from robocas_ms3.viewer.source import open_source
 
 ROW = {"n", "steps", "instruction", "task", "object", "seed", "success", "split", "stages", "attempts", "damage"}
 EPISODE = {"n", "instruction", "steps", "times", "subgoals", "plots", "trace", "facts", "failures"}

@@ -85,6 +85,11 @@ class LeRobotDataset(EpisodeSource):
                 found += file.read(columns=names).to_pylist()
         return found
 
+    @cached_property
+    def row_of(self) -> dict[int, dict[str, Any]]:
+        """The same by number, whichever are there."""
+        return {row["episode_index"]: row for row in self.rows}
+
     @property
     def numbers(self) -> list[int]:
         """Numbers of the episodes."""
@@ -116,13 +121,20 @@ class LeRobotDataset(EpisodeSource):
         """Texts of sub-goals, by ``subtask_index``."""
         return read_texts(self.root / schema.SUBTASKS_FILE)
 
+    @cached_property
+    def described(self) -> dict[int, dict[str, str]]:
+        """Number -> ``scene`` and ``cameras``, JSON, by ``meta/robocas/episodes.parquet``; empty without."""
+        path = self.root / schema.SCENES_FILE
+        rows = pq.read_table(path).to_pylist() if path.is_file() else []
+        return {row.pop("episode_index"): row for row in rows}
+
     def episode(self, number: int) -> LeRobotEpisode:
         """Open an episode.
 
         Raises:
             DatasetError: there is none of this number.
         """
-        if not 0 <= number < len(self.rows):
+        if number not in self.row_of:
             raise DatasetError("no such episode", where=self.root, expected=f"0 to {len(self.rows) - 1}", found=number)
         return LeRobotEpisode(self, number)
 
@@ -142,12 +154,17 @@ class LeRobotEpisode(SourceEpisode):
     @property
     def row(self) -> dict[str, Any]:
         """What ``meta/episodes`` says of it."""
-        return self.dataset.rows[self.number]
+        return self.dataset.row_of[self.number]
 
     @property
     def steps(self) -> int:
         """T."""
         return int(self.row["length"])
+
+    @property
+    def instruction(self) -> str:
+        """The first of its tasks; empty where it has none."""
+        return str((self.row.get("tasks") or [""])[0])
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -194,11 +211,7 @@ class LeRobotEpisode(SourceEpisode):
 
     @cached_property
     def _ours(self) -> dict[str, Any]:
-        path = self.dataset.root / schema.SCENES_FILE
-        if not path.is_file():
-            return {}
-        found = pq.read_table(path, filters=[("episode_index", "=", self.number)]).to_pylist()
-        return {key: json.loads(value) for key, value in found[0].items() if key != "episode_index"} if found else {}
+        return {key: json.loads(value) for key, value in self.dataset.described.get(self.number, {}).items()}
 
     @property
     def scene(self) -> dict[str, Any]:

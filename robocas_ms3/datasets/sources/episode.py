@@ -108,10 +108,17 @@ class Episode(SourceEpisode):
         Raises:
             DatasetError: the arrays do not tell.
         """
-        if "episode_length" not in self.arrays:
-            where = self.folder / schema.EPISODE_FILE
-            raise DatasetError("this episode has no length", where=where, expected="episode_length or ee_pos")
-        return int(self.arrays["episode_length"])
+        return int(self.read(["episode_length"])["episode_length"])
+
+    @property
+    def instruction(self) -> str:
+        """What the robot was told: by ``data_info.json``, else by the arrays.
+
+        Raises:
+            DatasetError: neither tells.
+        """
+        said = self._said().get("language_goal")
+        return said if isinstance(said, str) else str(self.read(["language_goal"])["language_goal"])
 
     @cached_property
     def scene(self) -> dict[str, Any]:

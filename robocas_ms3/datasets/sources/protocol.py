@@ -43,6 +43,11 @@ class SourceEpisode(Protocol):
         return int(self.arrays["episode_length"])
 
     @property
+    def instruction(self) -> str:
+        """What the robot was told; read from an overview where there is one."""
+        return str(self.read(["language_goal"])["language_goal"])
+
+    @property
     def arrays(self) -> dict[str, NDArray]:
         """All arrays that are there."""
         ...

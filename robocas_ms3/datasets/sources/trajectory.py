@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,36 @@ from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side, SourceEpi
 from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry, succeeded
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.errors import DatasetError, RobocasError
+from robocas_ms3.recordings.entries import Entry
 from robocas_ms3.recordings.motion import sample_states, sample_stride
 from robocas_ms3.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.recordings.subgoals import SubGoal, sample_subgoals
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
+
+
+@dataclass(frozen=True)
+class SaidOfRecording:
+    """What the JSON says of an episode.
+
+    Attributes:
+        entry: what was recorded.
+        scene: how it was made.
+        objects: assets by slot, as written.
+    """
+
+    entry: Entry
+    scene: dict[str, Any]
+    objects: Any
+
+    @classmethod
+    def read(cls, file: TrajectoryFile, index: int) -> SaidOfRecording:
+        """Read it.
+
+        Raises:
+            DatasetError: it is damaged.
+        """
+        entry = file.entry(index)
+        return cls(entry, recorded_scene(file, index), file.episodes[index]["robocas"].get("objects"))
 
 
 class TrajectorySource(EpisodeSource):
@@ -43,21 +70,37 @@ class TrajectorySource(EpisodeSource):
         with TrajectoryFile(path) as file:
             self.stride = sample_stride(file.control_freq, self.rate_hz)
             self.index = [n for n, e in enumerate(file.episodes) if include_failed or succeeded(e)]
-            self.entries = [file.entry(index) for index in self.index]
-            self._scenes = [recorded_scene(file, index) for index in self.index]
-            self.objects = [list(file.episodes[i]["robocas"].get("objects") or ()) for i in self.index]
+            self._said = [_attempt(file, index) for index in self.index]
         self.numbers = list(range(len(self.index)))
-        train, val = split_by_seed({n: entry.seed for n, entry in enumerate(self.entries)})
-        self._split = {"train": train, "val": val, "all": self.numbers}
+
+    def said(self, number: int) -> SaidOfRecording:
+        """What the JSON says of an episode.
+
+        Raises:
+            DatasetError: it is damaged.
+        """
+        said = self._said[number]
+        if isinstance(said, DatasetError):
+            raise said
+        return said
+
+    def steps(self, number: int) -> int:
+        """T of an episode."""
+        return len(sample_states(self.said(number).entry.control_steps, self.stride))
+
+    @cached_property
+    def _sides(self) -> dict[Side, list[int]]:
+        train, val = split_by_seed({number: self.said(number).entry.seed for number in self.numbers})
+        return {"train": train, "val": val, "all": self.numbers}
 
     @cached_property
     def lengths(self) -> dict[int, int]:
         """Number -> T, by the JSON."""
-        return {n: len(sample_states(e.control_steps, self.stride)) for n, e in enumerate(self.entries)}
+        return {number: self.steps(number) for number in self.numbers}
 
     def split(self, side: Side) -> list[int]:
         """Numbers of the episodes of one side, by the rule of ``robocas convert``."""
-        return self._split[side]
+        return self._sides[side]
 
     def entry(self, number: int) -> Mapping[str, Any]:
         """Which recording it is."""
@@ -70,13 +113,13 @@ class TrajectorySource(EpisodeSource):
         Raises:
             DatasetError: there is none of this number.
         """
-        if number not in self.lengths:
+        if not 0 <= number < len(self.index):
             raise DatasetError("no such episode", where=self.root, expected=f"0 to {len(self.index) - 1}", found=number)
         return RecordedEpisode(self, number)
 
     def scene(self, number: int) -> dict[str, Any]:
         """What the JSON says of how an episode was made."""
-        scene = self._scenes[number]
+        scene = self.said(number).scene
         config = scene["env_info"]["env_kwargs"].get("config")
         return {**scene, "config": config if isinstance(config, Mapping) else _shipped(str(config))}
 
@@ -88,7 +131,10 @@ class RecordedEpisode(SourceEpisode):
 
     def __init__(self, source: TrajectorySource, number: int) -> None:
         self._source, self._number = source, number
-        self._entry = source.entries[number]
+
+    @property
+    def _entry(self) -> Entry:
+        return self._source.said(self._number).entry
 
     @property
     def where(self) -> str:
@@ -98,7 +144,12 @@ class RecordedEpisode(SourceEpisode):
     @property
     def steps(self) -> int:
         """T."""
-        return self._source.lengths[self._number]
+        return self._source.steps(self._number)
+
+    @property
+    def instruction(self) -> str:
+        """What the robot was told."""
+        return self._entry.instruction
 
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
@@ -107,7 +158,7 @@ class RecordedEpisode(SourceEpisode):
         Raises:
             DatasetError: it is damaged, or the states are those of another robot.
         """
-        recording = self._recording(bodies=False)
+        recording = self.recording(bodies=False)
         samples = sample_states(recording.control_steps, self._source.stride)
         return episode_arrays(recording.motion(samples), recording.instruction, self.goals)
 
@@ -125,14 +176,19 @@ class RecordedEpisode(SourceEpisode):
     @cached_property
     def layout(self) -> dict[str, Any]:
         """Objects at the first state; those that take no part wait below the floor."""
-        ids = self._source.objects[self._number]
-        actors = self._recording(bodies=True).states.get("actors", {})
+        ids = list(self._source.said(self._number).objects or ())
+        actors = self.recording().states.get("actors", {})
         poses = [actors[f"object_{slot}"][0, :7] if f"object_{slot}" in actors else None for slot in range(len(ids))]
         there = [pose is not None and bool(pose[2] > PARKING_HEIGHT / 2) for pose in poses]
         known = [[0.0] * 7 if pose is None else pose.tolist() for pose in poses]
         return {"object_ids": ids, "poses": known, "present": there}
 
-    def _recording(self, *, bodies: bool) -> Recording:
+    def recording(self, *, bodies: bool = True) -> Recording:
+        """All control steps of it, with the states of all bodies or of the robot alone.
+
+        Raises:
+            DatasetError: it is damaged.
+        """
         with TrajectoryFile(self._source.root) as file:
             return file.recording(self._source.index[self._number], bodies=bodies)
 
@@ -155,6 +211,14 @@ class RecordedEpisode(SourceEpisode):
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
         """Not here: raises."""
         raise self._no_pictures()
+
+
+def _attempt(file: TrajectoryFile, index: int) -> SaidOfRecording | DatasetError:
+    """What the JSON says, or what is wrong with it, which is an error of that episode alone."""
+    try:
+        return SaidOfRecording.read(file, index)
+    except DatasetError as error:
+        return error
 
 
 @cache
