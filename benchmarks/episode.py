@@ -34,7 +34,7 @@ from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import Noise
 from robocas_ms3.recordings.motion import Motion, sample_states, sample_stride
 from robocas_ms3.recordings.reading import open_trajectory
-from robocas_ms3.robots.constants import ROBOT_UID
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 FRESH = 1000  # first number of the noise drawn here; trials while generating have smaller ones
 
@@ -172,7 +172,7 @@ def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> N
     with open_trajectory(path) as file:
         group: Any = file["traj_0"]
         actions = np.array(group["actions"])
-        states = np.array(group["env_states"]["articulations"][ROBOT_UID])
+        states = np.array(group["env_states"]["articulations"][MOBILE_PANDA.uid])
     found.facts = json.loads(path.with_suffix(".json").read_text())["episodes"][0]["robocas"]["facts"]
     found.physx = round(bare_physx(generator, found.seed, actions), 3)
     if not generator.worlds:

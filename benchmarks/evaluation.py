@@ -22,12 +22,12 @@ import tyro
 from numpy.typing import NDArray
 
 import robocas_ms3
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.stage import make_env, start_of
-from robocas_ms3.robots.constants import ARM_SLICE
-from robocas_ms3.tasks.spec import TASKS
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 RATE = 20  # Hz
 REACH = 0.3  # rad that the joints go to and fro
@@ -66,7 +66,7 @@ class Waving:
     def targets(self, qpos: NDArray[np.floating]) -> NDArray[np.floating]:
         """The next targets, from what the joints are at the first step."""
         if self._step == 0:
-            self._from = np.array(qpos[:, ARM_SLICE])
+            self._from = np.array(qpos[:, MOBILE_PANDA.arm_slice])
         self._step += 1
         away = REACH * np.sin(self._step / RATE) * np.array([1, 0.5, 1, 0.5, 1, 1, 1])
         return np.concatenate([self._from + away, np.ones((len(self._from), 1))], axis=1).astype(np.float32)

@@ -20,7 +20,7 @@ from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.mplib_backend import MplibPlanner
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.reachability import Reachability
-from robocas_ms3.robots.constants import ARM_REST
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import robot_files
 
 SPACING = 0.005
@@ -108,7 +108,7 @@ def main() -> None:
         points.append(len(cloud))
         planner.seed(scene)
         watch.run("set_scene", planner.set_scene, cloud)
-        here = np.array(ARM_REST)
+        here = np.array(MOBILE_PANDA.arm_rest)
         for _ in range(options.plans):
             goal = top_down(rng)
             watch.run("ik", planner.ik, goal, here)
@@ -121,7 +121,7 @@ def main() -> None:
             lift[2, 3] += rng.choice((-0.05, 0.1))
             watch.run("plan_straight", planner.plan_straight, here, lift, stage="straight")
         poses = np.array([top_down(rng) for _ in range(256)])
-        watch.run("reachability_256", reachability.reachable, poses, np.array(ARM_REST))
+        watch.run("reachability_256", reachability.reachable, poses, np.array(MOBILE_PANDA.arm_rest))
     result = {
         "points": int(np.median(points)),
         "trajectory_seconds_median": round(float(np.median(seconds)), 2),

@@ -22,7 +22,7 @@ from mani_skill.envs.tasks import PickCubeEnv  # noqa: F401  (registers it)
 
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.recordings.writing import EpisodeRecorder
-from robocas_ms3.robots.constants import ARM_JOINTS, ARM_REST, FINGER_JOINTS, FINGER_TARGETS
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 CUBE_REST = (0.0, np.pi / 8, 0.0, -np.pi * 5 / 8, 0.0, np.pi * 3 / 4, np.pi / 4)
 AGAINST = {
@@ -45,7 +45,7 @@ class Args:
 def main(args: Args) -> None:
     torch.set_num_threads(1)
     sway = 0.15 * np.sin(np.arange(args.steps)[:, None] / 20 + np.arange(7))
-    joints = np.column_stack([ARM_REST + sway - sway[0], np.ones(args.steps)]).astype(np.float32)
+    joints = np.column_stack([MOBILE_PANDA.arm_rest + sway - sway[0], np.ones(args.steps)]).astype(np.float32)
     cube = np.column_stack([CUBE_REST + sway - sway[0], np.ones(args.steps)]).astype(np.float32)
     deltas = np.column_stack([0.1 * np.diff(sway[:, :6], axis=0, prepend=sway[:1, :6]), np.ones(args.steps)])
     with tempfile.TemporaryDirectory() as folder:
@@ -87,8 +87,8 @@ def bare_steps(env: gym.Env, actions: np.ndarray) -> None:
     """What PhysX does while ``pd_joint_pos`` actions are played, and nothing else."""
     base: Any = env.unwrapped
     system, joints = base.scene.px, base.agent.robot.joints_map
-    drives = [joints[name]._objs[0] for name in (*ARM_JOINTS, *FINGER_JOINTS)]
-    low, high = FINGER_TARGETS
+    drives = [joints[name]._objs[0] for name in (*MOBILE_PANDA.arm_joints, *MOBILE_PANDA.finger_joints)]
+    low, high = MOBILE_PANDA.finger_targets
     last = np.array([drive.drive_target[0] for drive in drives])
     for action in actions.astype(float):
         finger = low + (action[7] + 1) / 2 * (high - low)

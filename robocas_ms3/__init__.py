@@ -1,8 +1,13 @@
-"""RoboCAS for ManiSkill3: importing this package registers its environments and its robot."""
+"""RoboCAS for ManiSkill3: importing this package tells gymnasium of its environments, and loads nothing heavy.
 
-import os as _os
+Where gymnasium is not imported yet, it is told when it is. Making an environment imports ManiSkill and tells it of the
+robot, as ``import robocas_ms3.tasks`` does.
+"""
+
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING as _TYPE_CHECKING
+
+from robocas_ms3.after_import import after_import as _after_import
 
 if _TYPE_CHECKING:
     from robocas_ms3.tasks.rl import rl_kwargs as rl_kwargs
@@ -12,8 +17,14 @@ __version__ = "0.1.0"
 
 _MODULES = {"make_vec": "robocas_ms3.tasks.vector", "rl_kwargs": "robocas_ms3.tasks.rl"}
 
-if not _os.environ.get("ROBOCAS_DEFER_REGISTRATION"):
-    from robocas_ms3 import tasks as _tasks  # noqa: F401
+
+def _register() -> None:
+    from robocas_ms3.registration import register
+
+    register()
+
+
+_after_import("gymnasium", _register)
 
 
 def __getattr__(name: str) -> object:

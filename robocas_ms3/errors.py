@@ -31,6 +31,10 @@ class ConfigError(RobocasError):
     """A task configuration is wrong."""
 
 
+class ExtensionError(RobocasError):
+    """A task, planner or the like is not known, or another package's can't be loaded."""
+
+
 class AssetError(RobocasError):
     """An asset pack, or a mesh on its way into one, is missing, damaged or unusable."""
 

@@ -13,13 +13,26 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "robocas_ms3"
 # Lowest first; a module imports from its own layer and those before it.
 LAYERS = (
-    ("errors", "paths", "files", "outputs", "arrays", "poses", "processes", "strict", "ledger"),
+    (
+        "errors",
+        "paths",
+        "files",
+        "outputs",
+        "arrays",
+        "poses",
+        "processes",
+        "strict",
+        "ledger",
+        "extensions",
+        "after_import",
+    ),
+    ("benchmark",),
+    ("robots",),
     ("config",),
     ("assets",),
     ("scenes",),
-    ("robots",),
     ("language",),
-    ("tasks",),
+    ("tasks", "registration"),
     ("recordings",),
     ("planning",),
     ("demos",),
@@ -33,6 +46,8 @@ RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 SIMULATOR_FREE = (
     "arrays",
     "poses",
+    "extensions",
+    "benchmark",
     "config",
     *(
         f"scenes.{name}"

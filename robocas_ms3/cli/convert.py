@@ -97,20 +97,19 @@ def _format(cfg: Convert) -> Format:
     """What is written.
 
     Raises:
-        DatasetError: there is no such format, or a flag does not suit it.
+        ExtensionError: there is no such format.
+        DatasetError: a flag does not suit it.
     """
-    from robocas_ms3.datasets.formats import formats
+    from robocas_ms3.datasets.formats import FORMATS
     from robocas_ms3.errors import DatasetError
 
-    known = {name: one for name, one in formats().items() if one.writer}
-    if cfg.to not in known:
-        raise DatasetError("no such format", where="--to", expected=f"one of {', '.join(known)}", found=cfg.to)
+    chosen = FORMATS.find(cfg.to, where="--to")
     flags = {"append": cfg.append, "image_format": cfg.image_format != "png", "codec": cfg.codec != "h264"}
     for option, given in flags.items():
-        if given and option not in known[cfg.to].options:
+        if given and option not in chosen.options:
             flag = f"--{option.replace('_', '-')}"
-            raise DatasetError(f"not for {known[cfg.to].title}s", where=flag, fix="Leave it out.")
-    return known[cfg.to]
+            raise DatasetError(f"not for {chosen.title}s", where=flag, fix="Leave it out.")
+    return chosen
 
 
 def _convert(cfg: Convert) -> int:

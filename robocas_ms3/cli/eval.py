@@ -89,6 +89,7 @@ def main(cfg: Eval) -> int:
 
 def run(cfg: Eval) -> int:
     """Play what a result lacks."""
+    from robocas_ms3.benchmark import TASKS
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.cli.eval_results import write_pages
     from robocas_ms3.datasets.statistics.described import count_of
@@ -100,7 +101,6 @@ def run(cfg: Eval) -> int:
     from robocas_ms3.evaluation.run import Settings, evaluate
     from robocas_ms3.evaluation.tables import markdown
     from robocas_ms3.strict import nearest
-    from robocas_ms3.tasks.spec import TASKS
 
     for word in cfg.words:
         if word not in TASKS:

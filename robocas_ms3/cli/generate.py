@@ -4,9 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from robocas_ms3.benchmark import TASKS
+
+if TYPE_CHECKING:
+    TaskName = str
+else:
+    TaskName = tyro.extras.literal_type_from_choices(TASKS)
 
 
 @dataclass
@@ -16,7 +23,7 @@ class Generate:
     Rendering is not needed: states and actions are recorded, pictures are made by `robocas convert`.
     """
 
-    task: Annotated[Literal["pick", "select", "search", "open_pick"], tyro.conf.Positional]
+    task: Annotated[TaskName, tyro.conf.Positional]
     """Which task."""
     episodes: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 10
     """How many successful episodes to record, at least 1."""
@@ -43,6 +50,8 @@ class Generate:
     """That noise: standard deviations in mm and degrees, of each component of each action."""
     noisy_failures: int = 1
     """Attempts that may fail for noise alone; after so many an episode counts without, and its record says so."""
+    planner: str = "mplib"
+    """Motion planner: mplib, or another package's (see docs/extending.md)."""
     fork: bool = True
     """Undo what fails by forking the process, where that is safe. The episodes are the same without, only slower."""
     keep_recoveries: bool = False
@@ -63,7 +72,6 @@ def main(cfg: Generate) -> int:
     from robocas_ms3.config import load_task_config, shipped_configs
     from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, recordable_config
     from robocas_ms3.demos.generate import generate
-    from robocas_ms3.tasks.spec import TASKS
 
     torch.set_num_threads(1)  # threads of small operations wait for each other
     name = cfg.config or TASKS[cfg.task].default_config
@@ -83,6 +91,7 @@ def main(cfg: Generate) -> int:
         cfg.noisy_trials,
         cfg.noisy_failures,
         *cfg.noise,
+        planner=cfg.planner,
     )
     progress = Progress(*columns(), console=Console(stderr=True))  # shown once there is something to do
 

@@ -40,10 +40,10 @@ def collect() -> dict[str, list[dict[str, Any]]]:
         ConfigError: a shipped configuration is damaged.
     """
     from robocas_ms3.assets.pack import load_pack, pack_folders
+    from robocas_ms3.benchmark import TASKS
     from robocas_ms3.config import load_task_config, shipped_configs
     from robocas_ms3.errors import AssetError
     from robocas_ms3.evaluation.policies import BUILTIN, installed_policies, package_of
-    from robocas_ms3.tasks.spec import TASKS
 
     tasks = [
         {"name": task.name, "env_id": task.env_id, "default_config": task.default_config, "summary": task.summary}

@@ -31,11 +31,11 @@ def main(cfg: Show) -> int:
     from rich.console import Console
 
     import robocas_ms3.tasks  # noqa: F401  (registers the environments)
+    from robocas_ms3.benchmark import TASKS
     from robocas_ms3.config import load_task_config
     from robocas_ms3.demos.checks import GREATEST_SEED, check_number
     from robocas_ms3.errors import RobocasError
     from robocas_ms3.files import make_folder, replacing
-    from robocas_ms3.tasks.spec import TASKS
     from robocas_ms3.tasks.transfer import TransferEnv
 
     check_number("seed", cfg.seed, 0, GREATEST_SEED)

@@ -8,6 +8,7 @@ from typing import Any
 
 import yaml
 
+from robocas_ms3.benchmark import TaskSpec
 from robocas_ms3.config.supports import SUPPORTS
 from robocas_ms3.config.task import TaskConfig
 from robocas_ms3.errors import ConfigError
@@ -36,6 +37,27 @@ class _UniqueKeyLoader(yaml.SafeLoader):
 def shipped_configs() -> dict[str, Path]:
     """Name -> file of the configurations that travel with the package."""
     return {path.stem: path for path in sorted(task_configs_dir().glob("*.yaml"))}
+
+
+def load_config_of(spec: TaskSpec, config: str | Path | dict | TaskConfig | None = None) -> TaskConfig:
+    """Read a configuration of a task.
+
+    Args:
+        spec: of the task.
+        config: see `load_task_config`; None: the task's default.
+
+    Raises:
+        ConfigError: it is wrong, or another task's.
+    """
+    loaded = load_task_config(spec.default_config if config is None else config)
+    if loaded.task != spec.name:
+        name = f" {config}" if isinstance(config, str) else ""
+        raise ConfigError(
+            f"{spec.env_id} can't run the configuration{name}",
+            expected=f"task: {spec.name}",
+            found=f"task: {loaded.task}",
+        )
+    return loaded
 
 
 def load_task_config(config: str | Path | dict | TaskConfig) -> TaskConfig:

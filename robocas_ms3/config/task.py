@@ -6,7 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StrictInt, model_validator
 
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config.relations import RELATIONS, Relation
+from robocas_ms3.errors import ConfigError, ExtensionError
+from robocas_ms3.extensions import load
 from robocas_ms3.strict import StrictModel
 
 Vec2 = tuple[float, float]
@@ -269,13 +272,15 @@ class RandomisationConfig(StrictModel):
 class TaskConfig(StrictModel):
     """One task configuration: a file of ``task_configs/``."""
 
-    task: Literal["pick", "select", "search", "open_pick"] = Field(description="which task; see tasks.md")
+    task: str = Field(description="which task; see tasks.md", json_schema_extra={"enum": list(TASKS.builtin)})
     description: str = Field(default="", description="one line for `robocas list`")
     support: str = Field(description="what the instruction calls the place the objects are on: 'table'")
     room: RoomConfig
     lights: LightConfig = LightConfig()
     furniture: dict[str, FurnitureConfig]
-    basket: BasketConfig
+    basket: BasketConfig | None = Field(
+        default=None, description="the container that objects go into; the benchmark's own tasks need it"
+    )
     robot: PoseConfig = Field(description="pose of the mobile base's frame on the floor")
     robot_start: Literal["rest", "evaluation"] = Field(
         default="rest",
@@ -301,10 +306,18 @@ class TaskConfig(StrictModel):
                 raise ValueError(
                     f"{name}.furniture: expected one of {sorted(self.furniture)}, found {part.furniture!r}"
                 )
-        if (self.opening is not None) != (self.task == "open_pick"):
-            raise ValueError("`opening` goes with task open_pick, and only with it")
-        if self.task == "select" and not (isinstance(self.layout, OrderlyLayout) and self.layout.copies > 1):
-            raise ValueError("task select needs layout.kind orderly with layout.copies > 1")
+        try:
+            spec = TASKS.find(self.task)
+        except ExtensionError as error:
+            told = ConfigError("wrong value for 'task'", expected=error.expected, found=error.found, fix=error.fix)
+            raise ValueError(str(told)) from error
+        if (self.opening is not None) != ("part" in spec.slots):
+            those = ", ".join(name for name, other in TASKS.items() if "part" in other.slots)
+            raise ValueError(f"`opening` goes with task {those}, and only with it")
+        if self.randomisation.basket is not None and self.basket is None:
+            raise ValueError("randomisation.basket: there is no `basket` to move")
+        for check in spec.checks:
+            load(check)(self)
         undrawn = sorted(set(self.randomisation.finishes) - set(self.randomisation.room or ()))
         if undrawn:
             raise ValueError(f"randomisation.finishes: {undrawn} must be among randomisation.room")

@@ -6,21 +6,18 @@ docs/extending.md.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.extensions import Table
 
 GROUP = "robocas_ms3.formats"
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -99,27 +96,13 @@ _BUILTIN = (
 )
 
 
-@cache
-def formats() -> dict[str, Format]:
-    """All formats by name; those of other packages come first, so that they see their own folders before others do.
-
-    What of another package can't be used is left out, with a warning.
-    """
-    found = {}
-    for point in entry_points(group=GROUP):
-        try:
-            loaded = point.load()
-            if not isinstance(loaded, Format):
-                raise TypeError(f"{type(loaded).__name__}, not a Format")
-            found[point.name] = loaded
-        except Exception as error:  # whatever a stranger's module raises
-            _log.warning("%s, %s: this dataset format can't be used: %s", GROUP, point.value, error)
-    return {**found, **{one.name: one for one in _BUILTIN}}
+FORMATS: Table[Format] = Table("dataset format", GROUP, Format, {one.name: one for one in _BUILTIN})
+"""All of them by name."""
 
 
 def format_of(path: Path) -> Format | None:
-    """Which format lies there; None: none."""
-    return next((one for one in formats().values() if one.holds(path)), None)
+    """Which format lies there; None: none. Those of other packages see their own folders before others do."""
+    return next((FORMATS[name] for name in reversed(list(FORMATS)) if FORMATS[name].holds(path)), None)
 
 
 def open_source(path: Path | str, *, rate_hz: float | None = None, include_failed: bool = False) -> EpisodeSource:
@@ -134,5 +117,5 @@ def open_source(path: Path | str, *, rate_hz: float | None = None, include_faile
         DatasetError: it can't be read, or the dataset is of another rate.
     """
     path = Path(path)
-    found = format_of(path) or formats()["robocas"]  # which says what is wrong, and what may have been meant
+    found = format_of(path) or FORMATS["robocas"]  # which says what is wrong, and what may have been meant
     return found.part("reader")(path, rate_hz=rate_hz, include_failed=include_failed)

@@ -8,12 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.benchmark import TASKS
+from robocas_ms3.config import load_config_of
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.errors import RobocasError
+from robocas_ms3.planning.backends import BACKENDS
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.tasks.spec import TASKS
 
-SIM_FREQ = 100  # Hz, of the environments' physics
+SIM_FREQ = MOBILE_PANDA.sim_freq
 GREATEST_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
 
 
@@ -58,7 +61,8 @@ def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int
             expected=f"a divisor of {settings.control_freq}, or 0 for no trial",
             found=settings.replay_rate,
         )
-    config = TASKS[settings.task].load_config(settings.config)
+    BACKENDS.find(settings.planner, where="planner")
+    config = load_config_of(TASKS[settings.task], settings.config)
     SceneModel.load(config, load_pack(settings.pack), load_pack("builtin"))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.poses import from_wxyz, inverse
-from robocas_ms3.robots.constants import ARM_BASE_LINK, ARM_SLICE, TCP_LINK
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.ee_controller import RoboCASEEPoseController
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.robots.forward import chain
@@ -37,9 +37,9 @@ def convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
     if env.control_mode == "pd_joint_pos":
         return action
     if env.control_mode == "pd_joint_delta_pos":
-        now = env.agent.robot.get_qpos()[0, ARM_SLICE].cpu().numpy()
+        now = env.agent.robot.get_qpos()[0, MOBILE_PANDA.arm_slice].cpu().numpy()
         return np.append(np.clip((arm - now) / _JOINT_DELTA_SCALE, -1, 1), gripper).astype(np.float32)
-    tcp_in_base = chain(robot_files().urdf, ARM_BASE_LINK, TCP_LINK, arm[None])[0]
+    tcp_in_base = chain(robot_files().urdf, MOBILE_PANDA.arm_base_link, MOBILE_PANDA.tcp_link, arm[None])[0]
     if env.control_mode == "pd_ee_pose":
         euler = Rotation.from_matrix(tcp_in_base[:3, :3]).as_euler("XYZ")
         return np.concatenate([tcp_in_base[:3, 3], euler, gripper]).astype(np.float32)

@@ -6,13 +6,13 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
+from robocas_ms3.benchmark.spec import STANDARD_FREQ
 from robocas_ms3.config import TaskConfig
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.backends import DEFAULT
 from robocas_ms3.planning.executor import Seconds
-from robocas_ms3.tasks.spec import TASKS
 
-STANDARD_FREQ = 20  # Hz, at which the tasks' horizons are given
 NOISY = "noisy_"  # begins the reasons of attempts that failed for noise alone
 
 
@@ -35,6 +35,7 @@ class EpisodeSettings:
         noise_mm: its standard deviation, of each component of each action's translation, mm.
         noise_deg: the same of its Euler angles.
         layouts: where layouts come from, see ``RoboCASEnv``.
+        planner: name of the motion planner.
     """
 
     task: str
@@ -49,6 +50,7 @@ class EpisodeSettings:
     noise_mm: float = 0.5
     noise_deg: float = 0.2
     layouts: str = "auto"
+    planner: str = DEFAULT
 
 
 @dataclass
@@ -97,14 +99,6 @@ class EpisodeResult:
         """Become what another process sent."""
         vars(self.seconds).update(vars(other.seconds))  # the executor counts on in these
         vars(self).update({key: value for key, value in vars(other).items() if key != "seconds"})
-
-
-def horizon(task: str, control_freq: int) -> int:
-    """Control steps a demonstration may have: as many seconds as the task allows at the standard rate.
-
-    ``gym.make`` alone allows ``TaskSpec.max_episode_steps`` at any rate.
-    """
-    return TASKS[task].max_episode_steps * control_freq // STANDARD_FREQ
 
 
 def recordable_config(config: TaskConfig, name: str | None) -> str | dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +11,17 @@ import gymnasium as gym
 import numpy as np
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config import load_task_config
 from robocas_ms3.demos.branches import ForkedBranches
-from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, horizon
+from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.forking import say_once, why_not_fork
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.demos.resimulation import Resimulation
 from robocas_ms3.demos.trials import Trials
 from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
-from robocas_ms3.planning.backends import DEFAULT, make_planner
+from robocas_ms3.extensions import load
+from robocas_ms3.planning.backends import make_planner
 from robocas_ms3.planning.decisions import Decisions, StraightDecisions
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Planner
@@ -33,7 +34,6 @@ from robocas_ms3.recordings.subgoals import SubGoal
 from robocas_ms3.recordings.writing import EpisodeRecorder
 from robocas_ms3.robots.urdf import robot_files
 from robocas_ms3.tasks.base import RoboCASEnv
-from robocas_ms3.tasks.spec import TASKS
 
 
 class EpisodeGenerator:
@@ -50,7 +50,7 @@ class EpisodeGenerator:
     def __init__(self, settings: EpisodeSettings, *, fork: bool = True) -> None:
         self.settings = settings
         config = load_task_config(settings.config)
-        self.horizon = horizon(settings.task, settings.control_freq)
+        self.horizon = TASKS[settings.task].steps(settings.control_freq)
         self.env = gym.make(
             TASKS[settings.task].env_id,
             max_episode_steps=self.horizon,
@@ -66,10 +66,12 @@ class EpisodeGenerator:
         base_env = self.env.unwrapped
         assert isinstance(base_env, RoboCASEnv)
         files = robot_files()
-        self.planner: Planner = make_planner(DEFAULT, files.arm_urdf, files.arm_srdf, dt=base_env.control_timestep)
+        self.planner: Planner = make_planner(
+            settings.planner, files.arm_urdf, files.arm_srdf, dt=base_env.control_timestep
+        )
         self.reachability = Reachability(str(files.arm_urdf))
         # a scripted policy tries once, from wherever the episode stands, and raises PlanningFailed
-        self.policy: Callable[[Arm], None] = import_module(TASKS[settings.task].solver).attempt
+        self.policy: Callable[[Arm], None] = load(TASKS[settings.task].solver)
         self.worlds: list[OpenLoop] = []
         self.trials: Trials | None = None
         if settings.replay_rate and not config.base_motion:

@@ -15,7 +15,7 @@ from robocas_ms3.demos.episode import NOISY
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.errors import EpisodeLost
 from robocas_ms3.recordings.motion import Motion, sample_states
-from robocas_ms3.robots.constants import ROBOT_UID
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 # m by which the target may be off the recording at the end of a part. What else lies about may roll elsewhere: where
 # that matters, what comes next goes wrong, and shows it.
@@ -62,7 +62,7 @@ class Trials:
         if not finished:
             samples = samples[samples % self._stride == 0]
         new = samples[self._played :]
-        actions = Motion.of(states["articulations"][ROBOT_UID], gripper, new).actions[:-1].astype(np.float64)
+        actions = Motion.of(states["articulations"][MOBILE_PANDA.uid], gripper, new).actions[:-1].astype(np.float64)
         for number, world in enumerate(self._worlds if noisy else self._worlds[:1]):
             for action in self._with_noise(actions, number) if number else actions:
                 world.step(action)

@@ -68,12 +68,12 @@ def planner() -> str:
     import numpy as np
 
     from robocas_ms3.planning.mplib_backend import MplibPlanner
-    from robocas_ms3.robots.constants import ARM_REST
+    from robocas_ms3.robots.description import MOBILE_PANDA
     from robocas_ms3.robots.urdf import robot_files
 
     files = robot_files()
     planner = MplibPlanner(files.arm_urdf, files.arm_srdf, dt=0.05)
-    start = np.asarray(ARM_REST, dtype=np.float64)
+    start = np.asarray(MOBILE_PANDA.arm_rest, dtype=np.float64)
     path = planner.plan_to_qpos(start, [start + 0.2], stage="doctor")
     return f"works, planned {len(path.qpos)} steps"
 
@@ -105,7 +105,6 @@ def _main() -> int:
     # that it also answers in a checkout that is not installed.
     sys.path.pop(0)
     sys.path.append(str(Path(__file__).resolve().parents[2]))
-    os.environ["ROBOCAS_DEFER_REGISTRATION"] = "1"
     # What libraries print goes to stderr; stdout is for the answer.
     answer = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)

@@ -13,6 +13,7 @@ from pydantic import Field
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config import TaskConfig, load_task_config
 from robocas_ms3.errors import EvaluationError, LayoutError
 from robocas_ms3.evaluation.protocol import CONFIGS, EPISODES, LAYOUTS, NO_RULES, RULES, TRAIN, Episode, Protocol
@@ -20,7 +21,6 @@ from robocas_ms3.files import make_folder, replacing, replacing_folder
 from robocas_ms3.scenes.frozen import write_frozen
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.strict import StrictModel, parse
-from robocas_ms3.tasks.spec import TASKS
 from robocas_ms3.tasks.transfer import TransferEnv
 
 _WRONG = 300  # stream of the object that a wrong instruction names

@@ -23,12 +23,12 @@ from typing import Annotated, Literal
 import yaml
 from pydantic import Field, model_validator
 
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.paths import protocols_dir
 from robocas_ms3.strict import StrictModel, nearest, parse, parse_json
-from robocas_ms3.tasks.spec import TASKS
 
 NO_RULES = "no rules of a protocol"
 DEFAULT_HZ = 20  # where neither protocol nor policy says

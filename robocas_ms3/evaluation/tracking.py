@@ -68,7 +68,8 @@ class Tracker:
             sums[:, _DISTURBED] = greater(sums[:, _DISTURBED], as_float(moment.disturbed.sum(1)))
             sums[:, _FALLEN] = greater(sums[:, _FALLEN], as_float(env.fallen().sum(1)))
             target = terms.of_target(moment.objects[..., :2], native(env.target_slot))
-            self._near = length(target - moment.basket[:, :2]) <= V0_RADIUS
+            if moment.basket is not None:  # else that rule never holds
+                self._near = length(target - moment.basket[:, :2]) <= V0_RADIUS
             if self._retrieval is not None:
                 self._retrieval.look(moment)
         told = torch.as_tensor(opened, device=env.device) if isinstance(tcp, torch.Tensor) else opened

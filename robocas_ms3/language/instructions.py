@@ -8,11 +8,11 @@ from typing import TypeVar, get_args
 
 import numpy as np
 
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config.relations import Relation
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.language.texts import Split, Task, instruction_texts, synonym_texts
+from robocas_ms3.language.texts import Split, Templates, instruction_texts, synonym_texts
 
-TASKS: tuple[Task, ...] = get_args(Task)
 SPLITS: tuple[Split, ...] = get_args(Split)
 
 _T = TypeVar("_T")
@@ -40,7 +40,7 @@ class Instruction:
 
 
 def instruction(
-    task: Task,
+    task: str,
     *,
     object: str,
     support: str,
@@ -51,11 +51,12 @@ def instruction(
     """Tell the robot what to do, in plain names.
 
     Args:
-        task: pick, select, search or open_pick.
+        task: its name, pick.
         object: the target's name, 'sugar box'.
         support: what the objects are on or in, 'table'.
-        relation: select only: which one of several identical objects; none: the nearest, which upstream does not say.
-        part: open_pick only: what has to be opened, 'left door'; see ``part_name``.
+        relation: where the task has that slot: which one of several identical objects; none: the nearest, which
+            upstream does not say.
+        part: where the task has that slot: what has to be opened, 'left door'; see ``part_name``.
         template_id: of the template; none: upstream's.
 
     Raises:
@@ -64,7 +65,7 @@ def instruction(
     template_id = template_id or f"{task}/upstream/00"
     for split in SPLITS:
         if template_id in (ids := template_ids(task, split)):
-            template = instruction_texts().tasks[task].of(split)[ids.index(template_id)]
+            template = _templates(task, split)[ids.index(template_id)]
             phrase = instruction_texts().relations[relation].plain if relation else ""
             return _render(task, split, template_id, template, object, support, _on(support), phrase, part)
     raise RobocasError(
@@ -76,7 +77,7 @@ def instruction(
 
 def choose_instruction(
     rng: np.random.Generator,
-    task: Task,
+    task: str,
     split: Split,
     *,
     object: str,
@@ -103,11 +104,13 @@ def choose_instruction(
         synonyms: False: the plain names and plain relations in every template.
 
     Raises:
-        RobocasError: part missing, or relation or part out of place.
+        RobocasError: part missing, or relation or part out of place; or the task has no templates of the split.
     """
     draws = rng.random(4)
     texts, words = instruction_texts(), synonym_texts()
-    templates = texts.tasks[task].of(split)
+    templates = _templates(task, split)
+    if not templates:
+        raise RobocasError("this task has no templates of this split", where=task, found=split)
     index = _pick(range(len(templates)), draws[0])
     others = [name for name in others if name != object]
     object_words, support_words, phrases = [object], [support], [texts.relations[relation].plain] if relation else [""]
@@ -129,9 +132,13 @@ def choose_instruction(
     )
 
 
-def template_ids(task: Task, split: Split) -> list[str]:
+def template_ids(task: str, split: Split) -> list[str]:
     """Ids of the templates of a split, in order."""
-    return [_template_id(task, split, index) for index in range(len(instruction_texts().tasks[task].of(split)))]
+    return [_template_id(task, split, index) for index in range(len(_templates(task, split)))]
+
+
+def _templates(task: str, split: Split) -> Sequence[str]:
+    return Templates.for_task(TASKS.find(task)).of(split)
 
 
 def part_name(link: str) -> str:
@@ -155,7 +162,7 @@ def is_plural(word: str) -> bool:
 
 
 def _render(
-    task: Task,
+    task: str,
     split: Split,
     template_id: str,
     template: str,
@@ -165,11 +172,13 @@ def _render(
     phrase: str,
     part: str,
 ) -> Instruction:
-    if phrase and task != "select":
-        raise RobocasError("the task select, and no other, may have a relation", where=task, found=repr(phrase))
-    if bool(part) != (task == "open_pick"):
+    slots = TASKS[task].slots
+    if phrase and "relation" not in slots:
+        what = f"the task {_with('relation')}, and no other, may have a relation"
+        raise RobocasError(what, where=task, found=repr(phrase))
+    if bool(part) != ("part" in slots):
         found = repr(part) if part else "none"
-        raise RobocasError("the task open_pick, and no other, needs a part", where=task, found=found)
+        raise RobocasError(f"the task {_with('part')}, and no other, needs a part", where=task, found=found)
     text = template.format(
         object=phrase.format(object=object_word) if phrase else object_word,
         support=support_word,
@@ -180,12 +189,16 @@ def _render(
     return Instruction(text, template_id, split, object_word, support_word, phrase)
 
 
+def _with(slot: str) -> str:
+    return ", ".join(name for name, spec in TASKS.items() if slot in spec.slots)
+
+
 def _on(support: str) -> str:
     known = synonym_texts().supports.get(support)
     return "in" if known and known.inside else "on"
 
 
-def _template_id(task: Task, split: Split, index: int) -> str:
+def _template_id(task: str, split: Split, index: int) -> str:
     return f"{task}/{split}/{index:02d}"
 
 

@@ -10,11 +10,11 @@ from typing import Annotated, Literal, TypeVar
 import yaml
 from pydantic import Field, model_validator
 
+from robocas_ms3.benchmark import TASKS, TaskSpec
 from robocas_ms3.config.relations import Relation
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.strict import StrictModel, parse
 
-Task = Literal["pick", "select", "search", "open_pick"]
 Split = Literal["upstream", "train", "held_out"]
 
 INSTRUCTIONS_FILE = Path(__file__).with_name("instructions.yaml")
@@ -31,6 +31,34 @@ class Templates(StrictModel):
     upstream: Annotated[Words, Field(min_length=1)]
     train: Words
     held_out: Words
+
+    @classmethod
+    def for_task(cls, spec: TaskSpec) -> Templates:
+        """The templates of a task: those of its row, or of ``instructions.yaml``.
+
+        Raises:
+            ConfigError: they are not what templates have to be.
+        """
+        if not spec.instructions:
+            return instruction_texts().tasks[spec.name]
+        try:
+            templates = cls.model_validate({"train": (), "held_out": (), **spec.instructions})
+            templates.check(spec)
+        except ValueError as error:  # pydantic's as well
+            raise ConfigError(
+                "wrong instructions", where=f"task {spec.name}", found=" ".join(str(error).split())
+            ) from error
+        return templates
+
+    def check(self, spec: TaskSpec) -> None:
+        """See that each has the fields that the task's templates have to have.
+
+        Raises:
+            ValueError: one hasn't.
+        """
+        needed = {"object", *({"part"} & set(spec.slots))}
+        for template in (*self.upstream, *self.train, *self.held_out):
+            _check_fields(template, needed=needed, allowed=needed | {"support"} | _REPEATABLE)
 
     def of(self, split: Split) -> Words:
         """Templates of one split."""
@@ -69,15 +97,15 @@ class RelationPhrases(Synonyms):
 class InstructionTexts(StrictModel):
     """What ``instructions.yaml`` says."""
 
-    tasks: dict[Task, Templates]
+    tasks: dict[str, Templates]
     relations: dict[Relation, RelationPhrases]
 
     @model_validator(mode="after")
     def _fields(self) -> InstructionTexts:
         for task, templates in self.tasks.items():
-            needed = {"object", "part"} if task == "open_pick" else {"object"}
-            for template in (*templates.upstream, *templates.train, *templates.held_out):
-                _check_fields(template, needed=needed, allowed=needed | {"support"} | _REPEATABLE)
+            if task not in TASKS.builtin:
+                raise ValueError(f"no such task: {task}")
+            templates.check(TASKS.builtin[task])
         return self
 
 

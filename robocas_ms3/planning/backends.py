@@ -1,16 +1,16 @@
-"""Motion planners by name."""
+"""Motion planners by name, and those of other packages (entry points ``robocas_ms3.planners``)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.extensions import Table
 from robocas_ms3.planning.mplib_backend import MplibPlanner
 from robocas_ms3.planning.protocol import Planner
 
-BACKENDS: dict[str, Callable[..., Planner]] = {"mplib": MplibPlanner}
 DEFAULT = "mplib"
+BACKENDS: Table[Callable[..., Planner]] = Table("planner", "robocas_ms3.planners", Callable, {DEFAULT: MplibPlanner})
 
 
 def make_planner(name: str, arm_urdf: Path | str, arm_srdf: Path | str, *, dt: float) -> Planner:
@@ -23,8 +23,7 @@ def make_planner(name: str, arm_urdf: Path | str, arm_srdf: Path | str, *, dt: f
         dt: seconds between rows of a trajectory.
 
     Raises:
-        RobocasError: there is no such planner, or it can't load the description.
+        ExtensionError: there is no such planner, or another package's can't be loaded.
+        RobocasError: it can't load the description.
     """
-    if name not in BACKENDS:
-        raise RobocasError("no such planner", where="planner", expected=", ".join(BACKENDS), found=name)
-    return BACKENDS[name](arm_urdf, arm_srdf, dt=dt)
+    return BACKENDS.find(name, where="planner")(arm_urdf, arm_srdf, dt=dt)

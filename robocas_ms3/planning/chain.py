@@ -14,11 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.planning.protocol import Array
+from robocas_ms3.robots.description import MOBILE_PANDA
 
-ARM_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
-TCP_LINK = "panda_hand_tcp"
-BASE_LINK = "panda_link0"
-HAND_LINK = "panda_hand"
 LIMIT_MARGIN = 0.02  # rad kept from every joint limit
 
 
@@ -44,15 +41,21 @@ class ArmChain:
         root = ElementTree.parse(arm_urdf).getroot()
         joints = {child.attrib["link"]: joint for joint in root.iterfind("joint") for child in joint.findall("child")}
         chain: list[ElementTree.Element] = []
-        link = TCP_LINK
-        while link in joints and link != BASE_LINK:
+        link = MOBILE_PANDA.tcp_link
+        while link in joints and link != MOBILE_PANDA.arm_base_link:
             chain.insert(0, joints[link])
             link = next(parent.attrib["link"] for parent in joints[link].findall("parent"))
         turning = [joint for joint in chain if joint.attrib["type"] == "revolute"]
         names = tuple(joint.attrib["name"] for joint in turning)
         axes = [axis.attrib["xyz"].split() for joint in turning for axis in joint.findall("axis")]
-        if link != BASE_LINK or names != ARM_JOINTS or any([float(v) for v in axis] != [0, 0, 1] for axis in axes):
-            raise RobocasError("not a Panda", where=arm_urdf, expected=", ".join(ARM_JOINTS), found=", ".join(names))
+        if (
+            link != MOBILE_PANDA.arm_base_link
+            or names != MOBILE_PANDA.arm_joints
+            or any([float(v) for v in axis] != [0, 0, 1] for axis in axes)
+        ):
+            raise RobocasError(
+                "not a Panda", where=arm_urdf, expected=", ".join(MOBILE_PANDA.arm_joints), found=", ".join(names)
+            )
         self.links, self.hand_in_tcp = [], np.eye(4)
         pending, after_hand = np.eye(4), False
         for joint in chain:
@@ -62,7 +65,7 @@ class ArmChain:
             if joint in turning:
                 self.links.append(pending)
                 pending = np.eye(4)
-            after_hand |= any(child.attrib["link"] == HAND_LINK for child in joint.findall("child"))
+            after_hand |= any(child.attrib["link"] == MOBILE_PANDA.hand_link for child in joint.findall("child"))
         self.links.append(pending)
         self.hand_in_tcp = np.linalg.inv(self.hand_in_tcp)
         limits = np.array(

@@ -20,15 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.planning.chain import ARM_JOINTS, BASE_LINK, TCP_LINK, ArmChain
+from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle
 from robocas_ms3.planning.shapes import CollisionShapes, Pieces, bounds, matrix_to_pose
+from robocas_ms3.robots.description import MOBILE_PANDA
 
-FINGER_JOINTS = ("panda_finger_joint1", "panda_finger_joint2")
-WIDEST = 0.08  # m, the gripper's opening
-STATIC_LINKS = (BASE_LINK, "base_link")  # the second one, what carries the arm, may be missing
+STATIC_LINKS = (MOBILE_PANDA.arm_base_link, MOBILE_PANDA.base_link)  # what carries the arm may be missing
 CLOUD, ATTACHED = "cloud", "attached"
-HITTABLE = (*STATIC_LINKS, *(f"panda_link{i}" for i in range(1, 7)))  # by a held object
+HITTABLE = (*STATIC_LINKS, *MOBILE_PANDA.arm_links[:-1])  # by a held object
 REACH = 1.5  # m; obstacle points further from the arm's base never matter
 BASE_MARGIN = 0.015  # m around the parts that never move within which points of the cloud are cut out
 SPARSE = 12  # every so manieth configuration of a path is checked before all others
@@ -105,14 +104,16 @@ class ArmWorld:
         self.chain = ArmChain(urdf)
         self.kinematics = self._robot.get_pinocchio_model()
         links, joints = self.kinematics.get_link_names(), self.kinematics.get_joint_names()
-        self._robot.set_move_group(TCP_LINK)
-        self.tcp_index = links.index(TCP_LINK)
-        self.arm_indices = np.array([joints.index(name) for name in ARM_JOINTS])
-        self._fingers = np.array([joints.index(name) for name in FINGER_JOINTS if name in joints], dtype=int)
+        self._robot.set_move_group(MOBILE_PANDA.tcp_link)
+        self.tcp_index = links.index(MOBILE_PANDA.tcp_link)
+        self.arm_indices = np.array([joints.index(name) for name in MOBILE_PANDA.arm_joints])
+        self._fingers = np.array(
+            [joints.index(name) for name in MOBILE_PANDA.finger_joints if name in joints], dtype=int
+        )
         self.state_size = len(joints)
         self.limits = np.concatenate(self.kinematics.get_joint_limits())[self.arm_indices]
         self.checks = 0  # configurations checked so far
-        self.finger_width = WIDEST
+        self.finger_width = MOBILE_PANDA.open_width
         self._request = fcl.CollisionRequest()
         self._object_in_tcp = np.eye(4)
         self._body: Any = None
@@ -125,12 +126,12 @@ class ArmWorld:
         self._names: list[str] = [*model.get_collision_link_names(), ATTACHED]
         self._parts: list[Any] = [*model.get_collision_objects(), None]
         body = len(self._parts) - 1
-        carriers = {BASE_LINK: -1, "base_link": -1, **{f"panda_link{i + 1}": i for i in range(7)}}
+        carriers = dict.fromkeys(STATIC_LINKS, -1) | {link: i for i, link in enumerate(MOBILE_PANDA.arm_links)}
         self._carrier = np.array([carriers.get(name, 7) for name in self._names])  # 7: what is rigid with the TCP
         rotations, positions = self.chain.frames(np.zeros((1, 7)))
         frames = [*zip(rotations[:, 0], positions[:, 0], strict=True), (np.eye(3), np.zeros(3))]
         boxes = []
-        for width in (0.0, WIDEST):
+        for width in (0.0, MOBILE_PANDA.open_width):
             self._robot.set_qpos(self._full(np.zeros(7), width), True)
             boxes.append([bounds(part, *frames[c]) for part, c in zip(self._parts[:-1], self._carrier, strict=False)])
             boxes[-1].append(np.zeros((2, 3)))
@@ -268,7 +269,7 @@ class ArmWorld:
 
     def _overlapping(self, rotations: Array, positions: Array, width: float, obstacles: bool) -> _Pairs:
         """The broad phase: links 1 to 7 and the TCP at rotations (8, M, 3, 3) and positions (8, M, 3)."""
-        box = self._box + (self._box_opened - self._box) * (width / WIDEST)
+        box = self._box + (self._box_opened - self._box) * (width / MOBILE_PANDA.open_width)
         moving = self._moving if self._body is not None else self._moving[:-1]
         carrier, count = self._carrier[moving], rotations.shape[1]
         turned = rotations[carrier]  # (P, M, 3, 3)

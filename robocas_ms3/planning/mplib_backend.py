@@ -19,6 +19,7 @@ from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle, Traject
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.rrt import PathSearch
 from robocas_ms3.planning.timing import JointPath, blended, rounded, stopping, thinned, through, timed
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 CHECKS_PER_SECOND = 10_000  # turns a planning time into a budget of collision checks, which load can't change
 SPACING = 0.03  # rad between checks while searching
@@ -57,8 +58,8 @@ class MplibPlanner:
         srdf: Path | str,
         *,
         dt: float,
-        velocity_limit: float = 0.5,
-        acceleration_limit: float = 0.5,
+        velocity_limit: float = MOBILE_PANDA.arm_velocity_limit,
+        acceleration_limit: float = MOBILE_PANDA.arm_acceleration_limit,
         rrt_range: float = 0.25,
         planning_time: float = 2.0,
         voxel: float = 0.005,
@@ -83,7 +84,7 @@ class MplibPlanner:
 
     @finger_width.setter
     def finger_width(self, width: float) -> None:
-        self._world.finger_width = float(np.clip(width, 0.0, 0.08))
+        self._world.finger_width = float(np.clip(width, 0.0, MOBILE_PANDA.open_width))
 
     @property
     def collision_checks(self) -> int:
@@ -109,11 +110,11 @@ class MplibPlanner:
         """Give the TCP's pose in the base frame (4x4) at joints (7,)."""
         return self._world.tcp(qpos)
 
-    def collisions(self, qpos: Array, finger_width: float = 0.08) -> list[str]:
+    def collisions(self, qpos: Array, finger_width: float = MOBILE_PANDA.open_width) -> list[str]:
         """Name what touches at a configuration (7,): links, 'cloud', 'attached'."""
         return self._world.contacts(np.asarray(qpos, dtype=np.float64), finger_width)
 
-    def free(self, qpos: Array, finger_width: float = 0.08) -> NDArray[np.bool_]:
+    def free(self, qpos: Array, finger_width: float = MOBILE_PANDA.open_width) -> NDArray[np.bool_]:
         """Say which configurations (M, 7) touch nothing: (M,)."""
         return self._world.free(np.asarray(qpos, dtype=np.float64).reshape(-1, 7), finger_width=finger_width)
 

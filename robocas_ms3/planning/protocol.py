@@ -14,6 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.robots.description import MOBILE_PANDA
+
 Array = NDArray[np.float64]
 
 
@@ -83,7 +85,7 @@ class Planner(Protocol):
 
     @property
     def finger_width(self) -> float:
-        """Distance between the pads in all collision checks, m; 0.08 is fully open."""
+        """Distance between the pads in all collision checks, m."""
         ...
 
     @finger_width.setter
@@ -110,11 +112,11 @@ class Planner(Protocol):
         """Forward kinematics: (7,) -> 4x4 TCP in the arm's base frame."""
         ...
 
-    def collisions(self, qpos: Array, finger_width: float = 0.08) -> list[str]:
+    def collisions(self, qpos: Array, finger_width: float = MOBILE_PANDA.open_width) -> list[str]:
         """Name what touches at a configuration: links, obstacles ('cloud': of points), 'attached'. Empty: free."""
         ...
 
-    def free(self, qpos: Array, finger_width: float = 0.08) -> NDArray[np.bool_]:
+    def free(self, qpos: Array, finger_width: float = MOBILE_PANDA.open_width) -> NDArray[np.bool_]:
         """Say which configurations (M, 7) touch nothing: (M,). Far cheaper than one at a time."""
         ...
 

@@ -13,6 +13,7 @@ from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.pack import Part
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape
 from robocas_ms3.poses import from_wxyz, inverse, transform
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.tasks.transfer import TransferEnv
 
 # Upstream's: samples of the meshes at 5 mm, none farther than 1.5 m from the robot
@@ -64,7 +65,8 @@ class PlanningScene:
             for link, pose in link_poses(asset.asset.links, self.joint_positions(name)).items():
                 if (name, link) != without_link:
                     yield f"{name}/{link}", asset.links[link], FURNITURE_SPACING, frame @ pose
-        yield BASKET, self.env.model.basket, SPACING, from_wxyz(self.env.basket_pose[0])
+        if self.env.model.basket is not None:
+            yield BASKET, self.env.model.basket, SPACING, from_wxyz(self.env.basket_pose[0])
         present, poses = self.env.present[0].tolist(), self.env.object_states[0, :, :7]
         for slot, asset in enumerate(self.env.object_assets[0]):
             if present[slot] and slot not in left_out:
@@ -95,7 +97,7 @@ class PlanningScene:
     @property
     def arm_qpos(self) -> Array:
         """(7,) rad, where the arm is."""
-        return self.env.agent.robot.get_qpos()[0, 3:10].cpu().numpy().astype(float)
+        return self.env.agent.robot.get_qpos()[0, MOBILE_PANDA.arm_slice].cpu().numpy().astype(float)
 
     def object_in_base(self, slot: int) -> Array:
         """4x4 of an object in the arm's base frame."""

@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_wxyz, inverse
-from robocas_ms3.robots.constants import FINGER_SLICE, FINGER_TARGETS, JOINTS
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.forward import link_poses
 
 Array = NDArray[np.float64]
 
 _POSE = 13  # of a state: position 3, quaternion wxyz 4, linear and angular velocity 6
-OPEN_WIDTH = 0.04
+OPEN_WIDTH = MOBILE_PANDA.open_width / 2
 """A gripper commanded wider than this counts as open, m."""
 
 
@@ -67,7 +67,7 @@ def gripper_open(
     Returns:
         (T,) bool.
     """
-    low, high = FINGER_TARGETS
+    low, high = MOBILE_PANDA.finger_targets
     finger_targets = low + (np.clip(commands, -1, 1) + 1) / 2 * (high - low)
     widths = np.concatenate([[initial_width], 2 * finger_targets])
     return widths[samples] > OPEN_WIDTH + 1e-6
@@ -137,7 +137,7 @@ class Motion:
             samples: (T,) indices of states, from `sample_states`, or some of them in a row.
         """
         root_in_world, qpos, qvel = split_states(robot_states[samples])
-        width = float(split_states(robot_states[:1])[1][0, FINGER_SLICE].sum())
+        width = float(split_states(robot_states[:1])[1][0, MOBILE_PANDA.finger_slice].sum())
         return cls.of_joints(root_in_world, qpos, qvel, gripper_open(gripper, samples, initial_width=width))
 
     @classmethod
@@ -164,4 +164,8 @@ def gripper_commands(actions: NDArray[np.floating], control_mode: str) -> NDArra
 def split_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:
     """The robot's root in the world (T, 4, 4), qpos (T, 12) and qvel (T, 12) of its states (T, 37), ManiSkill's."""
     states = np.asarray(states, dtype=np.float64)
-    return from_wxyz(states[:, :7]), states[:, _POSE : _POSE + len(JOINTS)], states[:, _POSE + len(JOINTS) :]
+    return (
+        from_wxyz(states[:, :7]),
+        states[:, _POSE : _POSE + len(MOBILE_PANDA.joints)],
+        states[:, _POSE + len(MOBILE_PANDA.joints) :],
+    )

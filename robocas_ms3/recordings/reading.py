@@ -14,9 +14,9 @@ from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.entries import Entry, read_entry, read_json, reason
 from robocas_ms3.recordings.environment import read_env
 from robocas_ms3.recordings.motion import Motion, gripper_commands
-from robocas_ms3.robots.constants import JOINTS, ROBOT_UID
+from robocas_ms3.robots.description import MOBILE_PANDA
 
-_STATE_DIM = 13 + 2 * len(JOINTS)
+_STATE_DIM = 13 + 2 * len(MOBILE_PANDA.joints)
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Recording(Entry):
     def motion(self, samples: NDArray[np.int64]) -> Motion:
         """What the robot did, at some of the states, in order."""
         commands = gripper_commands(self.actions, self.control_mode)
-        return Motion.of(self.states["articulations"][ROBOT_UID], commands, samples)
+        return Motion.of(self.states["articulations"][MOBILE_PANDA.uid], commands, samples)
 
     def state(self, index: int) -> dict[str, dict[str, NDArray[np.float32]]]:
         """One state as ``set_state_dict`` takes it, each array (1, D)."""
@@ -136,7 +136,7 @@ class TrajectoryFile:
                 kind: {
                     key: np.asarray(data, dtype=np.float32)
                     for key, data in group["env_states"][kind].items()
-                    if bodies or key == ROBOT_UID
+                    if bodies or key == MOBILE_PANDA.uid
                 }
                 for kind in ("actors", "articulations")
                 if kind in group["env_states"]
@@ -156,13 +156,13 @@ class TrajectoryFile:
                 expected=f"{entry.control_steps} actions, one state more",
                 found=f"{len(actions)} actions, {sorted(lengths)} states",
             )
-        robot = states.get("articulations", {}).get(ROBOT_UID)
+        robot = states.get("articulations", {}).get(MOBILE_PANDA.uid)
         width = _STATE_DIM
         if robot is None or robot.shape[1] != width:
             raise DatasetError(
                 "states of another robot",
                 where=where,
-                expected=f"{ROBOT_UID} of {width} numbers",
+                expected=f"{MOBILE_PANDA.uid} of {width} numbers",
                 found=sorted(states.get("articulations", {})) if robot is None else robot.shape[1],
             )
         recording = Recording(**vars(entry), actions=actions, states=states)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.robots.constants import ARM_BASE_LINK, ARM_SLICE, BASE_SLICE, TCP_LINK
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import robot_files
 
 Array = NDArray[np.float64]
@@ -27,8 +27,8 @@ def link_poses(root_in_world: Array, qpos: Array) -> tuple[Array, Array]:
         qpos: (T, 12) m, rad.
     """
     urdf = robot_files().urdf
-    base = root_in_world @ chain(urdf, "root", ARM_BASE_LINK, qpos[:, BASE_SLICE])
-    return base @ chain(urdf, ARM_BASE_LINK, TCP_LINK, qpos[:, ARM_SLICE]), base
+    base = root_in_world @ chain(urdf, "root", MOBILE_PANDA.arm_base_link, qpos[:, MOBILE_PANDA.base_slice])
+    return base @ chain(urdf, MOBILE_PANDA.arm_base_link, MOBILE_PANDA.tcp_link, qpos[:, MOBILE_PANDA.arm_slice]), base
 
 
 def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:

@@ -17,8 +17,8 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import common
 from mani_skill.utils.structs import Actor, Link, Pose
 
-from robocas_ms3.robots import constants as c
 from robocas_ms3.robots.combined import RobotController, State
+from robocas_ms3.robots.description import MOBILE_PANDA as c
 from robocas_ms3.robots.drives import EvenDrives
 from robocas_ms3.robots.ee_controller import (
     BODY_FRAME,
@@ -56,7 +56,7 @@ def _camera(
 
 
 def _keyframe(arm: tuple[float, ...]) -> Keyframe:
-    qpos = np.array([0.0, 0.0, 0.0, *arm, c.OPEN_FINGER, c.OPEN_FINGER])
+    qpos = np.array([0.0, 0.0, 0.0, *arm, c.open_finger, c.open_finger])
     return Keyframe(pose=sapien.Pose(), qpos=qpos)
 
 
@@ -70,21 +70,21 @@ class RoboCASMobilePanda(BaseAgent):
     Every control mode holds the base, except those ending in ``_base``, which take 3 numbers more for x, y, yaw.
     """
 
-    uid = c.ROBOT_UID
-    finger_extension = c.FINGER_EXTENSION
+    uid = c.uid
+    finger_extension = c.finger_extension
     urdf_path: Any = _GeneratedUrdf()
     urdf_config = dict(
         _materials=dict(
-            gripper=dict(static_friction=c.FINGER_FRICTION, dynamic_friction=c.FINGER_FRICTION, restitution=0.0)
+            gripper=dict(static_friction=c.finger_friction, dynamic_friction=c.finger_friction, restitution=0.0)
         ),
-        link={name: _FINGER for name in c.FINGER_LINKS},
+        link={name: _FINGER for name in c.finger_links},
     )
-    keyframes = dict(rest=_keyframe(c.ARM_REST), evaluation=_keyframe(c.ARM_EVALUATION_START))
+    keyframes = dict(rest=_keyframe(c.arm_rest), evaluation=_keyframe(c.arm_evaluation_start))
 
-    ee_link_name = c.TCP_LINK
-    arm_joint_names = list(c.ARM_JOINTS)
-    gripper_joint_names = list(c.FINGER_JOINTS)
-    base_joint_names = list(c.BASE_JOINTS)
+    ee_link_name = c.tcp_link
+    arm_joint_names = list(c.arm_joints)
+    gripper_joint_names = list(c.finger_joints)
+    base_joint_names = list(c.base_joints)
 
     # Arm: twice as stiff as ManiSkill's Panda, damped so that no direction overshoots. Damping / stiffness is the lag.
     # Stiffer gains would track no better (targets are smooth) and press harder on what is touched.
@@ -108,7 +108,7 @@ class RoboCASMobilePanda(BaseAgent):
             joint_names=self.arm_joint_names,
             ee_link=self.ee_link_name,
             urdf_path=str(robot_files(self.finger_extension).arm_urdf),
-            root_link_name=c.ARM_BASE_LINK,
+            root_link_name=c.arm_base_link,
             **arm,
         )
         arms = dict(
@@ -132,8 +132,8 @@ class RoboCASMobilePanda(BaseAgent):
         mimic: dict[str, Any] = {self.gripper_joint_names[1]: {"joint": self.gripper_joint_names[0]}}
         gripper = FingersControllerConfig(
             self.gripper_joint_names,
-            lower=c.FINGER_TARGETS[0],
-            upper=c.FINGER_TARGETS[1],
+            lower=c.finger_targets[0],
+            upper=c.finger_targets[1],
             stiffness=self.gripper_stiffness,
             damping=self.gripper_damping,
             force_limit=self.gripper_force_limit,
@@ -163,17 +163,17 @@ class RoboCASMobilePanda(BaseAgent):
         if self.static_camera_pose is not None:
             static.pose = Pose.create(self.static_camera_pose)
         return [
-            _camera("base_camera", (0, -0.3, 1.2), (0, 0.43633, 0), near=0.005, far=5, link=c.BASE_LINK),
-            _camera("gripper_camera", (0.05, 0, 0.05), (np.pi, -np.pi / 2, 0), near=0.001, far=5, link=c.HAND_LINK),
+            _camera("base_camera", (0, -0.3, 1.2), (0, 0.43633, 0), near=0.005, far=5, link=c.base_link),
+            _camera("gripper_camera", (0.05, 0, 0.05), (np.pi, -np.pi / 2, 0), near=0.001, far=5, link=c.hand_link),
             static,
         ]
 
     def _after_init(self) -> None:
         links: dict[str, Link] = self.robot.links_map
-        self.finger1_link, self.finger2_link = (links[name] for name in c.FINGER_LINKS)
+        self.finger1_link, self.finger2_link = (links[name] for name in c.finger_links)
         self.tcp: Link = links[self.ee_link_name]
-        self.arm_base_link: Link = links[c.ARM_BASE_LINK]
-        self.base_link: Link = links[c.BASE_LINK]
+        self.arm_base_link: Link = links[c.arm_base_link]
+        self.base_link: Link = links[c.base_link]
 
     def reset(self, init_qpos: Any = None) -> None:
         """Stop the robot and, given a configuration, put it there, drive targets included.
@@ -278,7 +278,7 @@ class RoboCASMobilePanda(BaseAgent):
     @property
     def gripper_width(self) -> torch.Tensor:
         """(N,) m, distance between the pads: the sum of both finger joints."""
-        return self.robot.get_qpos()[:, c.FINGER_SLICE].sum(dim=1)
+        return self.robot.get_qpos()[:, c.finger_slice].sum(dim=1)
 
     def is_grasping(self, object: Actor, min_force: float = 0.5, max_angle: float = 85) -> torch.Tensor:
         """Say whether both fingers press on an object.
@@ -303,7 +303,7 @@ class RoboCASMobilePanda(BaseAgent):
 
     def is_static(self, threshold: float = 0.2) -> torch.Tensor:
         """(N,) bool: no joint but the fingers moves faster than ``threshold`` (m/s, rad/s)."""
-        qvel = self.robot.get_qvel()[:, : c.FINGER_SLICE.start]
+        qvel = self.robot.get_qvel()[:, : c.finger_slice.start]
         return qvel.abs().max(dim=1).values <= threshold
 
 
@@ -311,5 +311,5 @@ class RoboCASMobilePanda(BaseAgent):
 class RoboCASMobilePandaStockFingers(RoboCASMobilePanda):
     """The same robot with ManiSkill's own fingers, for comparison."""
 
-    uid = f"{c.ROBOT_UID}_stock_fingers"
+    uid = f"{c.uid}_stock_fingers"
     finger_extension = 0.0

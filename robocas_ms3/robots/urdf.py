@@ -19,15 +19,15 @@ from xml.etree.ElementTree import Element, SubElement
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import make_folder
 from robocas_ms3.paths import cache_dir
-from robocas_ms3.robots import constants as c
+from robocas_ms3.robots.description import MOBILE_PANDA as c
 from robocas_ms3.robots.meshes import decimate_glb, write_boxes_glb
 
 LINK_TRIANGLES = 1000
 
 # The AGV: a body on the floor (1 cm of air below, so that it never rubs), a deck that carries the pedestal.
-_BODY = ((0.5, 0.4, 0.24), (0.0, 0.0, 0.13 - c.BASE_LINK_HEIGHT), (0.16, 0.17, 0.19))
-_DECK = ((0.36, 0.3, 0.04), (0.0, 0.0, 0.27 - c.BASE_LINK_HEIGHT), (0.85, 0.86, 0.88))
-_PEDESTAL = (c.PEDESTAL_SIZE, (0.0, 0.0, c.PEDESTAL_ABOVE_BASE_LINK), (0.85, 0.86, 0.88))
+_BODY = ((0.5, 0.4, 0.24), (0.0, 0.0, 0.13 - c.base_link_height), (0.16, 0.17, 0.19))
+_DECK = ((0.36, 0.3, 0.04), (0.0, 0.0, 0.27 - c.base_link_height), (0.85, 0.86, 0.88))
+_PEDESTAL = (c.pedestal_size, (0.0, 0.0, c.pedestal_above_base_link), (0.85, 0.86, 0.88))
 _BASE_MASS = 60.0  # kg
 
 # Tip pads in the finger's frame; y is the closing direction. Upstream's 55 mm pad starts 28 mm up the finger, over the
@@ -56,7 +56,7 @@ class RobotFiles:
     folder: Path
 
 
-def robot_files(finger_extension: float = c.FINGER_EXTENSION) -> RobotFiles:
+def robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
     """Return the robot's files, generating them where they are missing.
 
     The folder's name is a hash of all they are made from, this generator's code included. Two processes may do this at
@@ -73,7 +73,7 @@ def robot_files(finger_extension: float = c.FINGER_EXTENSION) -> RobotFiles:
     source = _panda_folder()
     folder = cache_dir() / "robots" / _fingerprint(source, finger_extension)
     files = RobotFiles(
-        urdf=folder / f"{c.ROBOT_UID}.urdf",
+        urdf=folder / f"{c.uid}.urdf",
         arm_urdf=folder / "panda_arm.urdf",
         arm_srdf=folder / "panda_arm.srdf",
         folder=folder,
@@ -128,7 +128,7 @@ def _fingerprint(source: Path, finger_extension: float) -> str:
     version = importlib.metadata.version("mani_skill")
     digest.update(f"{version} {finger_extension:.6f}".encode())
     meshes = source / "franka_description" / "meshes"
-    generator = [Path(__file__).with_name(name) for name in ("constants.py", "meshes.py", "urdf.py")]
+    generator = [Path(__file__).with_name(name) for name in ("description.py", "meshes.py", "urdf.py")]
     for path in [*generator, *sorted(source.glob("panda_v2.*rdf")), *sorted(meshes.glob("*/*"))]:
         digest.update(path.name.encode())
         digest.update(path.read_bytes())
@@ -158,7 +158,7 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
         for element in link.findall("visual"):
             link.remove(element)
     arm.append(_base_link())
-    _joint(arm, "arm_base_joint", "fixed", c.ARM_BASE_LINK, c.BASE_LINK, -c.ARM_BASE_ABOVE_BASE_LINK)
+    _joint(arm, "arm_base_joint", "fixed", c.arm_base_link, c.base_link, -c.arm_base_above_base_link)
     _write(arm, folder / "panda_arm.urdf")
 
     for link, (size, centre) in tips.items():
@@ -166,16 +166,16 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
         shown = (centre[0], centre[1] * 0.95, centre[2])  # 0.1 mm inwards, before the rubber in the same plane
         write_boxes_glb(folder / name, [(size, shown, _TIP_COLOUR)])
         _find(panda, "link", link).insert(1, _visual(name))
-    _write(_with_base(panda), folder / f"{c.ROBOT_UID}.urdf")
+    _write(_with_base(panda), folder / f"{c.uid}.urdf")
 
     srdf = _parse(source / "panda_v2.srdf")
     for pair in srdf.findall("disable_collisions"):
         if {pair.attrib["link1"], pair.attrib["link2"]} == {"panda_link2", "panda_link6"}:
             srdf.remove(pair)  # listed as "Never", but they meet in 0.1 % of all configurations
-    for link, reason in ((c.ARM_BASE_LINK, "Adjacent"), ("panda_link1", "Never")):
-        SubElement(srdf, "disable_collisions", link1=c.BASE_LINK, link2=link, reason=reason)
+    for link, reason in ((c.arm_base_link, "Adjacent"), ("panda_link1", "Never")):
+        SubElement(srdf, "disable_collisions", link1=c.base_link, link2=link, reason=reason)
     _write(srdf, folder / "panda_arm.srdf")
-    _write(srdf, folder / f"{c.ROBOT_UID}.srdf")
+    _write(srdf, folder / f"{c.uid}.srdf")
 
     names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
     (folder / "files.json").write_text(json.dumps(names, indent=1), encoding="utf-8")
@@ -183,12 +183,12 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
 
 def _adapt_fingers(panda: Element, extension: float) -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
     """Move the TCP and add the tips' collision boxes; return size and centre of each finger's tip box."""
-    _origin(panda, "panda_hand_tcp_joint").set("xyz", f"0 0 {c.STOCK_TCP_IN_HAND + extension:g}")
+    _origin(panda, "panda_hand_tcp_joint").set("xyz", f"0 0 {c.stock_tcp_in_hand + extension:g}")
     tips = {}
     if extension == 0:
         return tips
     end = _TIP_STOCK_END + extension
-    for link, side in zip(c.FINGER_LINKS, (1, -1), strict=True):
+    for link, side in zip(c.finger_links, (1, -1), strict=True):
         _origin(panda, f"{link}_pad_joint").set("xyz", f"0 0 {0.0455 + extension:g}")
         size = (_TIP_WIDTH, _TIP_THICKNESS, end - _TIP_START)
         centre = (0.0, side * _TIP_THICKNESS / 2, (end + _TIP_START) / 2)
@@ -201,29 +201,29 @@ def _adapt_fingers(panda: Element, extension: float) -> dict[str, tuple[tuple[fl
 
 def _with_base(panda: Element) -> Element:
     """Put the arm on the mobile base: root, three virtual joints, base link, fixed arm base."""
-    robot = Element("robot", name=c.ROBOT_UID)
+    robot = Element("robot", name=c.uid)
     # Small but not tiny: reduced-coordinate solvers dislike mass ratios beyond a few hundred along a chain.
     for link in ("root", "base_x_link", "base_y_link"):
         SubElement(robot, "link", name=link).append(_inertial(1.0, (0.01, 0.01, 0.01), (0, 0, 0)))
     base = _base_link()
     base.append(_visual("visual/base.glb"))
     robot.append(base)
-    chain = ("root", "base_x_link", "base_y_link", c.BASE_LINK)
+    chain = ("root", "base_x_link", "base_y_link", c.base_link)
     for i, (name, axis, limits) in enumerate(
-        zip(c.BASE_JOINTS, ("1 0 0", "0 1 0", "0 0 1"), c.BASE_LIMITS, strict=True)
+        zip(c.base_joints, ("1 0 0", "0 1 0", "0 0 1"), c.base_limits, strict=True)
     ):
-        height = c.BASE_LINK_HEIGHT if chain[i + 1] == c.BASE_LINK else 0.0
+        height = c.base_link_height if chain[i + 1] == c.base_link else 0.0
         joint = _joint(robot, name, "revolute" if i == 2 else "prismatic", chain[i], chain[i + 1], height)
         SubElement(joint, "axis", xyz=axis)
         lower, upper = (f"{limit:.10g}" for limit in limits)
         SubElement(joint, "limit", effort="1000", lower=lower, upper=upper, velocity="1")
-    _joint(robot, "arm_base_joint", "fixed", c.BASE_LINK, c.ARM_BASE_LINK, c.ARM_BASE_ABOVE_BASE_LINK)
+    _joint(robot, "arm_base_joint", "fixed", c.base_link, c.arm_base_link, c.arm_base_above_base_link)
     robot.extend(list(panda))
     return robot
 
 
 def _base_link() -> Element:
-    base = Element("link", name=c.BASE_LINK)
+    base = Element("link", name=c.base_link)
     for size, centre, _ in (_BODY, _DECK, _PEDESTAL):
         base.append(_box_collision(size, centre))
     x, y, z = _BODY[0]

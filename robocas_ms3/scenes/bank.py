@@ -173,7 +173,7 @@ def about(model: SceneModel) -> dict[str, Any]:
         k: v for k, v in config["randomisation"].items() if k not in {"room", "finishes", "lights", "cameras"}
     }
     config.pop("room")
-    parts: dict[str, LoadedFurniture] = {**model.furniture, "basket": model.basket}
+    parts: dict[str, LoadedFurniture] = {**model.furniture, **({"basket": model.basket} if model.basket else {})}
     return {
         "layout_format": LAYOUT_FORMAT,
         "config": config,
@@ -186,7 +186,8 @@ def about(model: SceneModel) -> dict[str, Any]:
 def write_layout(layout: Layout, path: Path) -> None:
     """Write a layout as ``.npz``."""
     with replacing(path) as tmp, tmp.open("wb") as file:
-        np.savez(file, **{f.name: np.asarray(getattr(layout, f.name)) for f in fields(Layout)})
+        values = {f.name: getattr(layout, f.name) for f in fields(Layout)}
+        np.savez(file, **{name: np.zeros(0) if value is None else np.asarray(value) for name, value in values.items()})
 
 
 def read_layout(path: Path) -> Layout:
@@ -200,6 +201,7 @@ def read_layout(path: Path) -> Layout:
     return Layout(
         **{
             **values,
+            "basket_pose": values["basket_pose"] if values["basket_pose"].size else None,
             "object_ids": tuple(values["object_ids"].tolist()),
             "target": int(values["target"]),
             "relation": str(values["relation"]),

@@ -25,7 +25,7 @@ class Fixtures:
 
     room: Actor
     furniture: dict[str, Actor | Articulation]
-    basket: Actor
+    basket: Actor | None
 
 
 def build_fixtures(
@@ -43,11 +43,10 @@ def build_fixtures(
     for name, asset in model.furniture.items():
         build_one = spawn_articulation if asset.links else spawn
         furniture[name] = build_one(scene, asset, name=name, pose=sapien.Pose(model.furniture_poses[name]), level=level)
-    return Fixtures(
-        room=_build_room(scene, model, level, seeds),
-        furniture=furniture,
-        basket=spawn(scene, model.basket, name="basket", pose=sapien.Pose(model.basket_pose), level=level),
-    )
+    room, basket = _build_room(scene, model, level, seeds), None
+    if model.basket is not None and model.basket_pose is not None:
+        basket = spawn(scene, model.basket, name="basket", pose=sapien.Pose(model.basket_pose), level=level)
+    return Fixtures(room=room, furniture=furniture, basket=basket)
 
 
 def _build_room(scene: ManiSkillScene, model: SceneModel, level: VisualLevel, seeds: Sequence[int]) -> Actor:

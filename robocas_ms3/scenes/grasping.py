@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from robocas_ms3.assets.gripper import GRIPPER_BOXES
 from robocas_ms3.assets.pack import LoadedObject
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 Array = NDArray[np.float64]
 
 Approach = Literal["top", "front"]  # from above; level, as into a shelf
 
-MAX_WIDTH = 0.08  # m, the gripper's opening
+MAX_WIDTH = MOBILE_PANDA.open_width  # m
 MAX_CLOSING_TILT_DEG = 60.0  # of the closing axis from the horizontal
 MAX_SIDEWAYS_DEG = 45.0  # of the approach's horizontal direction from that of base -> object
 FRONT_ELEVATION_DEG = (-60.0, 10.0)  # of a front approach above the horizontal

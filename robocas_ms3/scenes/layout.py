@@ -23,7 +23,7 @@ class Layout:
         object_ids: K ids of the object pack, one a slot.
         object_poses: (K, 4, 4) objects in the world, at rest; of those that aren't present, where they wait.
         robot_pose: (4, 4) the robot's root on the floor, in the world.
-        basket_pose: (4, 4) the basket's frame in the world.
+        basket_pose: (4, 4) the basket's frame in the world; None where there is no basket.
         target: slot of the target.
         relation: how the instruction tells the target from its likes, e.g. ``nearest``; empty where its name does.
         present: (K,) which slots take part; default: all. Slots are as many for every seed, their use may vary.
@@ -33,7 +33,7 @@ class Layout:
     object_ids: ObjectIds
     object_poses: Array
     robot_pose: Array
-    basket_pose: Array
+    basket_pose: Array | None
     target: int
     relation: str = ""
     present: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))

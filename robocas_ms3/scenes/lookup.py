@@ -8,6 +8,7 @@ import numpy as np
 
 from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, Pack, load_pack
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config.relations import NEED_THREE, RELATIONS
 from robocas_ms3.config.task import OrderlyLayout, PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.errors import ConfigError
@@ -109,7 +110,8 @@ def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
         ConfigError: it can't.
     """
     asked, layout, random = config.target.relations, config.layout, config.randomisation
-    if config.task != "select" or not isinstance(layout, OrderlyLayout) or set(asked) == set(RELATIONS):
+    named = "relation" in TASKS[config.task].slots
+    if not named or not isinstance(layout, OrderlyLayout) or set(asked) == set(RELATIONS):
         return
     wrong = [relation for relation in asked if relation in NEED_THREE]
     sets = [resolve_ids(pack, names, key="randomisation.object_sets") for names in random.object_sets or ()] or [ids]

@@ -37,7 +37,7 @@ class SceneModel:
         room: the room.
         furniture: by the configuration's names.
         furniture_poses: of the furniture's frames.
-        basket: the container.
+        basket: the container; None: there is none.
         basket_pose: of its frame.
         robot_pose: of the robot's root, on the floor.
         region: rectangle for objects, in the frame of the furniture it belongs to.
@@ -49,8 +49,8 @@ class SceneModel:
     room: LoadedFurniture
     furniture: dict[str, LoadedFurniture]
     furniture_poses: dict[str, Array]
-    basket: LoadedFurniture
-    basket_pose: Array
+    basket: LoadedFurniture | None
+    basket_pose: Array | None
     robot_pose: Array
     region: Region
 
@@ -65,7 +65,7 @@ class SceneModel:
             name: find_furniture(furniture_pack, item.asset, key=f"furniture.{name}.asset")
             for name, item in config.furniture.items()
         }
-        basket = find_container(furniture_pack, config.basket)
+        basket = find_container(furniture_pack, config.basket) if config.basket else None
         model = cls(
             config=config,
             object_pack=object_pack,
@@ -74,7 +74,7 @@ class SceneModel:
             furniture=furniture,
             furniture_poses={name: furniture_pose(config.furniture[name], asset) for name, asset in furniture.items()},
             basket=basket,
-            basket_pose=furniture_pose(config.basket, basket),
+            basket_pose=furniture_pose(config.basket, basket) if config.basket and basket else None,
             robot_pose=fixture_pose(config.robot),
             region=find_region(config.surface, furniture[config.surface.furniture]),
         )
@@ -127,14 +127,16 @@ class SceneModel:
         positions = self.joint_positions(name, opened=opened)
         return link_poses(self.furniture[name].asset.links, positions)[self.support_link]
 
-    def fixture_points(self, basket_pose: Array, *, opened: bool = False) -> Array:
+    def fixture_points(self, basket_pose: Array | None, *, opened: bool = False) -> Array:
         """Samples (P, 3) of the collision surfaces of furniture and basket, world, m.
 
         Args:
-            basket_pose: 4x4.
+            basket_pose: 4x4; None where there is no basket.
             opened: with what the task wants opened as it should be.
         """
         furniture = self._opened_points if opened else self._closed_points
+        if self.basket is None or basket_pose is None:
+            return furniture
         return np.concatenate([furniture, transform(basket_pose, self.basket.surface_points())])
 
     @property

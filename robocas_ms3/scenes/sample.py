@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config.task import OrderlyLayout, ScatteredLayout, StackedLayout
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.poses import planar, transform
@@ -20,7 +21,7 @@ from robocas_ms3.scenes.placement import Array, PlaceableObject, choose_objects,
 from robocas_ms3.scenes.settle import settle
 from robocas_ms3.scenes.stacked import drop_heap
 from robocas_ms3.scenes.standing import place_basket, place_robot
-from robocas_ms3.scenes.targets import Arrangement, choose_target
+from robocas_ms3.scenes.targets import Arrangement, choose_target, target_rule
 
 # Every random decision of a scene has a stream of its own, so that a new one never shifts the others.
 _OBJECTS, _LAYOUT, _TARGET, _ROBOT, _BASKET, _COUNT = range(6)
@@ -129,15 +130,19 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
     raise _failure(model, unarranged, unsettled, untargeted)
 
 
-def meets_basket(assets: list[LoadedObject], poses: Array, basket: LoadedFurniture, basket_pose: Array) -> bool:
+def meets_basket(
+    assets: list[LoadedObject], poses: Array, basket: LoadedFurniture | None, basket_pose: Array | None
+) -> bool:
     """Whether an object is in the basket, or where its walls are, judged by boxes around them.
 
     Args:
         assets: K objects.
         poses: (K, 4, 4) in the world.
-        basket: what may have been moved among them.
+        basket: what may have been moved among them; None: there is none to meet.
         basket_pose: 4x4 in the world.
     """
+    if basket is None or basket_pose is None:
+        return False
     walls = np.concatenate(basket.hulls)
     low, high = walls.min(axis=0), walls.max(axis=0)
     for asset, pose in zip(assets, poses, strict=True):
@@ -158,9 +163,9 @@ def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, u
     if untargeted < _SEVERAL:
         fix = "Lower objects.count, enlarge the surface, use objects that stand firmly, or move the basket less."
         return LayoutError("the objects don't come to rest", where="layout", found=found, fix=fix)
-    lower = "min_grasps, min_uncovered_grasps" if model.config.task == "search" else "min_grasps"
+    lower = ", ".join(target_rule(model.config.task).keys)
     fix = f"Raise target.max_distance, lower target.{lower} or min_free_grasps, or use other objects."
-    if model.config.task == "select":
+    if "relation" in TASKS[model.config.task].slots:
         names = ", ".join(model.config.target.relations)
         fix = (f"Give other target.relations than {names}, or more layout.copies. " if names else "") + fix
     return LayoutError("no object qualifies as the target", where="target", found=found, fix=fix)

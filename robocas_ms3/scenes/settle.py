@@ -51,7 +51,7 @@ class SettleResult:
 
 
 def settle(
-    assets: Sequence[LoadedObject], poses: Array, model: SceneModel, basket_pose: Array, *, heap: bool = False
+    assets: Sequence[LoadedObject], poses: Array, model: SceneModel, basket_pose: Array | None, *, heap: bool = False
 ) -> SettleResult:
     """Simulate objects among furniture and basket: first so that they settle, then to see whether they stay.
 
@@ -66,7 +66,7 @@ def settle(
         assets: K objects.
         poses: (K, 4, 4) in the world.
         model: where the furniture stands; doors and drawers stay as at first.
-        basket_pose: 4x4 in the world.
+        basket_pose: 4x4 in the world; None where there is no basket.
         heap: whether objects lie on each other; then they may tip over meanwhile.
     """
     with engine_settings():
@@ -105,7 +105,7 @@ def _simulate(
     assets: Sequence[LoadedObject],
     poses: Array,
     model: SceneModel,
-    basket_pose: Array,
+    basket_pose: Array | None,
     seconds: float,
     *,
     backwards: bool = False,
@@ -117,7 +117,8 @@ def _simulate(
     """
     scene = new_scene()
     add_furniture(scene, model)
-    add_fixed(scene, model.basket.hulls, basket_pose, model.basket.asset.friction)
+    if model.basket is not None and basket_pose is not None:
+        add_fixed(scene, model.basket.hulls, basket_pose, model.basket.asset.friction)
     order = -1 if backwards else 1
     placed = list(zip(assets, poses, strict=True))[::order]
     bodies = [add_body(scene, solid_of(asset), pose) for asset, pose in placed][::order]

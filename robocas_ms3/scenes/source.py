@@ -101,7 +101,7 @@ class OtherProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,  # an interrupt from the keyboard is not its to deal with
-            env={**os.environ, "PYTHONPATH": path, "ROBOCAS_DEFER_REGISTRATION": "1"},
+            env={**os.environ, "PYTHONPATH": path},
         )
         weakref.finalize(self, _stop, self._process)
         with suppress(BrokenPipeError):  # it died at once, as the first layout will tell

@@ -35,12 +35,16 @@ def place_robot(model: SceneModel, rng: np.random.Generator) -> Array:
     return _place("robot", model.robot_pose, by, rng, lambda pose: body_is_free(pose, points))
 
 
-def place_basket(model: SceneModel, robot_pose: Array, rng: np.random.Generator) -> Array:
+def place_basket(model: SceneModel, robot_pose: Array, rng: np.random.Generator) -> Array | None:
     """4x4 of the basket's frame, drawn until it stands, clear of the robot; as configured where nothing moves it.
+
+    None where there is no basket.
 
     Raises:
         LayoutError: it never does.
     """
+    if model.basket is None or model.basket_pose is None:
+        return None
     points = model.basket.surface_points()
 
     def good(pose: Array) -> bool:
@@ -96,6 +100,7 @@ def basket_stands(model: SceneModel, basket_pose: Array) -> bool:
         model: where room and furniture stand; doors and drawers stay as at first.
         basket_pose: 4x4 in the world.
     """
+    assert model.basket is not None  # there is a pose of it
     facts = model.basket.asset
     assert facts.inner is not None  # the model saw to it
     assert facts.mass is not None

@@ -1,4 +1,4 @@
-"""Which object of an arrangement is the target: one rule a task. No simulator."""
+"""Which object of an arrangement is the target: rules, of which each task names one. No simulator."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.assets.gripper import GRIPPER_RADIUS
 from robocas_ms3.assets.pack import LoadedObject
+from robocas_ms3.benchmark import TASKS
+from robocas_ms3.extensions import load
 from robocas_ms3.poses import transform
 from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, has_free_grasps
 from robocas_ms3.scenes.model import SceneModel
@@ -45,7 +47,7 @@ class Arrangement:
         present: (K,) which slots take part.
         candidate: (K,) which may be the target: present, and no distractor.
         robot_pose: of the robot's root.
-        basket_pose: of the basket's frame.
+        basket_pose: of the basket's frame, if there is one.
     """
 
     model: SceneModel
@@ -54,7 +56,7 @@ class Arrangement:
     present: NDArray[np.bool_]
     candidate: NDArray[np.bool_]
     robot_pose: Array
-    basket_pose: Array
+    basket_pose: Array | None
 
     @property
     def names(self) -> list[str]:
@@ -119,9 +121,27 @@ class Arrangement:
         return bool(np.linalg.norm(centers[1] - centers[0]) <= radius + reach)
 
 
+@dataclass(frozen=True)
+class TargetRule:
+    """How a target is chosen.
+
+    Attributes:
+        choose: from a generator and an arrangement; None where no object qualifies.
+        keys: of ``target`` in a configuration, numbers that let fewer objects qualify the higher they are.
+    """
+
+    choose: Callable[[np.random.Generator, Arrangement], Choice | None]
+    keys: tuple[str, ...] = ("min_grasps",)
+
+
+def target_rule(task: str) -> TargetRule:
+    """The rule of a task."""
+    return load(TASKS[task].target)
+
+
 def choose_target(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
     """Choose the target by the task's rule; None where no object qualifies."""
-    return _RULES[scene.model.config.task](rng, scene)
+    return target_rule(scene.model.config.task).choose(rng, scene)
 
 
 def _by_name(rng: np.random.Generator, scene: Arrangement) -> Choice | None:
@@ -189,9 +209,6 @@ def _by_visibility(rng: np.random.Generator, scene: Arrangement) -> Choice | Non
     return None
 
 
-_RULES: dict[str, Callable[[np.random.Generator, Arrangement], Choice | None]] = {
-    "pick": _by_name,
-    "open_pick": _by_name,
-    "select": _by_relation,
-    "search": _by_visibility,
-}
+BY_NAME = TargetRule(_by_name)
+BY_RELATION = TargetRule(_by_relation)
+BY_VISIBILITY = TargetRule(_by_visibility, ("min_grasps", "min_uncovered_grasps"))

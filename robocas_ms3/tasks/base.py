@@ -74,16 +74,31 @@ class RoboCASEnv(SceneEnv):
 
     @property
     def basket_pose(self) -> torch.Tensor:
-        """(N, 7) pose of the basket in the world; don't write to it."""
+        """(N, 7) pose of the basket in the world, where the scene has one; don't write to it."""
         return self._basket_in(self.bodies.read())
 
     def _objects_in(self, state: torch.Tensor) -> torch.Tensor:
         return self.bodies.of_actors(state)[:, self._object_rows]
 
     def _basket_in(self, state: torch.Tensor) -> torch.Tensor:
+        assert self._basket_row is not None, "there is no basket in this scene"
         return self.bodies.of_actors(state)[:, self._basket_row, :7]
 
-    def _tcp(self) -> Any:
+    def _native_basket(self, state: torch.Tensor) -> Any:
+        """(N, 7) pose of the basket, native (`arrays`), from the state of all bodies; None where there is none."""
+        return None if self._basket_row is None else native(self._basket_in(state))
+
+    def centers(self, objects: Any) -> Any:
+        """(N, K, 3) m, centres of mass of the objects in the world, from states (N, K, 13); native (`arrays`)."""
+        return objects[..., :3] + terms.rotate(objects[..., 3:7], native(self._centers_of_mass))
+
+    def target_center(self, objects: Any) -> Any:
+        """(N, 3) m, the target's centre of mass in the world, from states (N, K, 13); native (`arrays`)."""
+        slot = native(self.target_slot)
+        target, center = terms.of_target(objects, slot), terms.of_target(native(self._centers_of_mass), slot)
+        return target[:, :3] + terms.rotate(target[:, 3:7], center)
+
+    def tcp_in_world(self) -> Any:
         """(N, 7) pose of the TCP in the world, native (`arrays`)."""
         return native(link_poses(self.scene, [self.agent.tcp]))[:, 0]
 
@@ -112,12 +127,13 @@ class RoboCASEnv(SceneEnv):
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         """``tcp_pose`` (N, 7) in the world; before it, in state modes, what only a simulator knows."""
         told = self.obs_mode_struct.state or self.obs_mode_struct.state_dict
-        return {**(self._privileged() if told else {}), "tcp_pose": as_tensor(self._tcp())}
+        return {**(self._privileged() if told else {}), "tcp_pose": as_tensor(self.tcp_in_world())}
 
     def _privileged(self) -> dict[str, torch.Tensor]:
         """What only a simulator knows, (N, D) each; see docs/rl.md."""
+        basket = {} if self._basket_row is None else {"basket_pose": self.basket_pose}
         return {
             "object_poses": torch.where(self.present[..., None], self.object_states[..., :7], 0.0).flatten(1),
             "target": self._is_target.float(),
-            "basket_pose": self.basket_pose,
+            **basket,
         }

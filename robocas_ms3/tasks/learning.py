@@ -8,16 +8,14 @@ import torch
 
 from robocas_ms3.arrays import as_tensor, choose, join, native
 from robocas_ms3.tasks import rewards, terms
+from robocas_ms3.tasks.goals import DenseGoal
 from robocas_ms3.tasks.transfer import TransferEnv
 
-_DROP_HEIGHT, _LOWERING = 0.1, 0.25  # m above the basket's rim: where a carry leads; from where on lowering counts
-_FAR = 0.2  # m from there at which half of the carry is done
 DENSE = ("normalized_dense", "dense", "progress")  # reward modes whose terms are worked out
-_LIFT = 0.03  # m, that of `terms.lifted`
 
 
 class LearningEnv(TransferEnv):
-    """Moves the target to the basket, and says how far that has come.
+    """Moves the target to its goal, a `DenseGoal`, and says how far that has come.
 
     The reward of ``normalized_dense`` lies in [0, 1]: 1 on success and then only, 0 on ``fail``, else what `rewards`
     makes of the table ``REWARDS``. ``dense`` is the same times the table's total. ``progress`` is how much the first
@@ -34,8 +32,8 @@ class LearningEnv(TransferEnv):
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
-        low, high = self._basket_low, self._basket_high
-        self._drop = torch.cat([(low + high)[:2] / 2, high[2:] + _DROP_HEIGHT])  # in the basket's frame
+        assert isinstance(self.goal, DenseGoal), "the task's goal does not say how near it is"
+        self._nearness = self.goal
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
@@ -83,36 +81,9 @@ class LearningEnv(TransferEnv):
 
     def _progress(self) -> tuple[Any, dict[str, Any]]:
         """Stages (N,) and the terms that count in them by name, (N,) each; all native (`arrays`), of `evaluate`."""
-        now, table = self._moment, self.REWARDS
+        now = self._moment
         assert now is not None
-        slot = native(self.target_slot)
-        target, center = terms.of_target(now.objects, slot), self._target_center(now.objects)
-        basket, turned = now.basket[:, :3], now.basket[:, 3:]
-        drop, (low, high) = native(self._drop), (native(self._basket_low), native(self._basket_high))
-        inside = terms.rotate_inverse(turned, center - basket)  # the target in the basket's frame
-        over = ((inside[:, :2] >= low[:2]) & (inside[:, :2] <= high[:2])).all(-1) & (inside[:, 2] >= low[2])
-        brought = native(self._stages["target_lifted"])
-        delivered = brought & now.in_basket
-        stage = rewards.furthest(
-            0 * slot + table.index("grasp"),
-            [
-                (now.held, table.index("lift")),
-                # a basket may stand lower than where the target stood
-                (now.held & brought, table.index("carry")),
-                (brought & over, table.index("place")),
-                (delivered, table.index("release")),
-                (delivered & ~now.touched, table.index("rest")),
-            ],
-        )
-        start = terms.of_target(native(self.start_poses)[..., 2], slot)
-        return stage, {
-            "reach": rewards.closeness(self._tcp()[:, :3], center),
-            "lift": rewards.rise(target[:, 2], start, _LIFT),
-            "carry": rewards.closeness(center, basket + terms.rotate(turned, drop), half=_FAR),
-            "place": 1 - rewards.rise(inside[:, 2], high[2], _LOWERING),
-            "released": rewards.let_go(now.held, now.touched),
-            "at_rest": rewards.calm(target[:, 7:10], target[:, 10:]),
-        }
+        return self._nearness.progress(now, native(self._stages["target_lifted"]), self.REWARDS)
 
     def _penalties(self, action: Any) -> dict[str, Any]:
         """The table's penalties by name, (N,) in [0, 1] each, native (`arrays`)."""
@@ -120,7 +91,7 @@ class LearningEnv(TransferEnv):
         assert now is not None
         found = {
             "disturbed": rewards.count_share(now.disturbed.sum(1)),
-            "basket_shift": rewards.shift(now.basket[:, :3], native(self.basket_at_start)[:, :3]),
+            **self._nearness.penalties(now),
             "action_rate": self._action_rate(action),
         }
         return {name: found[name] for name in self.REWARDS.penalties}
@@ -132,23 +103,17 @@ class LearningEnv(TransferEnv):
         action = torch.as_tensor(action, device=self.device).reshape(self.num_envs, -1)
         return rewards.action_rate(native(action), native(torch.where(before.isnan(), action, before)))
 
-    def _target_center(self, objects: Any) -> Any:
-        """(N, 3) the target's centre of mass in the world, from states (N, K, 13); native (`arrays`)."""
-        slot = native(self.target_slot)
-        target, center = terms.of_target(objects, slot), terms.of_target(native(self._centers_of_mass), slot)
-        return target[:, :3] + terms.rotate(target[:, 3:7], center)
-
     # ------------------------------------------------------------------ observations
 
     def _privileged(self) -> dict[str, torch.Tensor]:
-        state, tcp = self.bodies.read(), self._tcp()
-        center, basket = self._target_center(native(self._objects_in(state))), native(self._basket_in(state))
-        drop = basket[:, :3] + terms.rotate(basket[:, 3:], native(self._drop))
-        seen = seen_from(tcp, join([center - tcp[:, :3], drop - center]).reshape(-1, 2, 3))
+        state, tcp = self.bodies.read(), self.tcp_in_world()
+        center = self.target_center(native(self._objects_in(state)))
+        point = self._nearness.point(self._native_basket(state))
+        seen = seen_from(tcp, join([center - tcp[:, :3], point - center]).reshape(-1, 2, 3))
         return {
             **super()._privileged(),
             "tcp_to_target": seen[:, 0],
-            "target_to_drop": seen[:, 1],
+            self._nearness.TOWARDS: seen[:, 1],
             "target_extents": self._target_extents,
         }
 

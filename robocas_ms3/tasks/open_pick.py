@@ -6,18 +6,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Articulation
 
 from robocas_ms3.arrays import as_tensor, native, none
+from robocas_ms3.benchmark.tasks import OPEN_PICK
 from robocas_ms3.tasks import rewards, terms
 from robocas_ms3.tasks.bodies import link_poses
 from robocas_ms3.tasks.learning import LearningEnv, seen_from
-from robocas_ms3.tasks.spec import OPEN_PICK
 from robocas_ms3.tasks.transfer import STAGES
 
 
-@register_env(OPEN_PICK.env_id, max_episode_steps=OPEN_PICK.max_episode_steps)
 class RoboCASOpenPickEnv(LearningEnv):
     """Open and pick. The stages begin with ``furniture_opened``: the joint was past ``opening.opened_at`` of its range.
 
@@ -32,6 +30,7 @@ class RoboCASOpenPickEnv(LearningEnv):
         """From above the basket's side, where an opening door does not hide the gripper."""
         model, opening = self.model, self.task_config.opening
         assert opening is not None  # the configuration saw to it
+        assert model.basket_pose is not None
         handle = model.furniture[opening.furniture].asset.handles[opening.handle]
         held = model.furniture_poses[opening.furniture] @ np.append(handle.position, 1.0)
         out = model.robot_pose[:2, 3] - held[:2]
@@ -71,7 +70,7 @@ class RoboCASOpenPickEnv(LearningEnv):
         shut = (stage == self.REWARDS.index("grasp")) & ~native(self._stages["furniture_opened"])
         if none(shut):
             return stage, found
-        found["handle"] = rewards.closeness(self._tcp()[:, :3], self._handle_in_world())
+        found["handle"] = rewards.closeness(self.tcp_in_world()[:, :3], self._handle_in_world())
         found["open"] = rewards.rise(native(self.opening_position()), 0.0, self.model.opened_position)
         return rewards.furthest(stage, [(shut, self.REWARDS.index("open"))]), found
 
@@ -83,7 +82,7 @@ class RoboCASOpenPickEnv(LearningEnv):
 
     def _privileged(self) -> dict[str, torch.Tensor]:
         """As of `LearningEnv`, and how far it is open (N, 1), 1 where that is enough, and the handle from the TCP."""
-        tcp = self._tcp()
+        tcp = self.tcp_in_world()
         opened = rewards.rise(native(self.opening_position()), 0.0, self.model.opened_position)
         return {
             **super()._privileged(),

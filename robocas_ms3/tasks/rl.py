@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.config import TaskConfig
+from robocas_ms3.benchmark import TASKS, TaskSpec
+from robocas_ms3.config import TaskConfig, load_config_of
 from robocas_ms3.errors import ConfigError
-from robocas_ms3.tasks.spec import TASKS, TaskSpec
 
 CONTROL_FREQ = 5  # Hz: `pd_ee_delta_pose` was made for it
-DRIVING_STEPS = 150  # more where the base drives
+DRIVING_SECONDS = 30  # more where the base drives
 
 
 def rl_kwargs(task: str, config: str | Path | dict | TaskConfig | None = None) -> dict[str, Any]:
@@ -28,14 +28,14 @@ def rl_kwargs(task: str, config: str | Path | dict | TaskConfig | None = None) -
         ConfigError: there is no such task or configuration, or the task can't run it.
     """
     spec = _find(task)
-    drives = spec.load_config(config).base_motion
+    drives = load_config_of(spec, config).base_motion
     return {
         **({} if config is None else {"config": config}),
         "obs_mode": "state",
         "reward_mode": "normalized_dense",
         "control_mode": "pd_ee_delta_pose_base" if drives else "pd_ee_delta_pose",
         "sim_config": {"control_freq": CONTROL_FREQ},
-        "max_episode_steps": spec.training_steps + drives * DRIVING_STEPS,
+        "max_episode_steps": (spec.training_seconds + drives * DRIVING_SECONDS) * CONTROL_FREQ,
         "render_backend": "none",
     }
 

@@ -16,9 +16,10 @@ from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
 from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
-from robocas_ms3.config import TaskConfig
+from robocas_ms3.benchmark import TaskSpec
+from robocas_ms3.config import TaskConfig, load_config_of
 from robocas_ms3.errors import ConfigError
-from robocas_ms3.robots.constants import HAND_LINK
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.mobile_panda import RoboCASMobilePanda
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.bank import layout_bank
@@ -30,7 +31,6 @@ from robocas_ms3.tasks.contacts import Contacts
 from robocas_ms3.tasks.engine_errors import EngineErrors
 from robocas_ms3.tasks.gpu_memory import gpu_memory
 from robocas_ms3.tasks.seeds import SeededEnv
-from robocas_ms3.tasks.spec import TaskSpec
 from robocas_ms3.tasks.vector.backend import check_one_process
 
 # with a renderer what is left of a scene holds 8 MB until it is collected, without one 0.5 MB
@@ -84,7 +84,7 @@ class SceneEnv(SeededEnv):
         **kwargs: Any,
     ) -> None:
         check_one_process(num_envs, kwargs.get("sim_backend", "auto"))
-        self.task_config = self.SPEC.load_config(config)
+        self.task_config = load_config_of(self.SPEC, config)
         if visual_level not in VISUALS:
             raise ConfigError("no such visual_level", expected=f"one of {list(VISUALS)}", found=visual_level)
         sees_nothing = kwargs.get("obs_mode") in {None, "none", "state", "state_dict"}
@@ -114,7 +114,13 @@ class SceneEnv(SeededEnv):
         contacts, random = SceneConfig(contact_offset=CONTACT_OFFSET), self.task_config.randomisation
         objects = self.task_config.objects.count + (random.distractors.count[1] if random.distractors else 0)
         memory = gpu_memory(self.num_envs, objects)
-        return SimConfig(sim_freq=100, control_freq=20, spacing=10, scene_config=contacts, gpu_memory_config=memory)
+        return SimConfig(
+            sim_freq=MOBILE_PANDA.sim_freq,
+            control_freq=MOBILE_PANDA.control_freq,
+            spacing=10,
+            scene_config=contacts,
+            gpu_memory_config=memory,
+        )
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
@@ -195,10 +201,6 @@ class SceneEnv(SeededEnv):
         self.target_slot = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
         self.basket_at_start = torch.zeros(self.num_envs, 7, device=self.device)
         self._sideways = torch.tensor([[0.0, 1.0, 0.0]], device=self.device)
-        inner = self.model.basket.asset.inner
-        assert inner is not None  # the model saw to it
-        self._basket_low = torch.tensor(inner.min, device=self.device)
-        self._basket_high = torch.tensor(inner.max, device=self.device)
 
     def _after_reconfigure(self, options: dict) -> None:
         super()._after_reconfigure(options)
@@ -208,8 +210,9 @@ class SceneEnv(SeededEnv):
         rows = [self.bodies.actors.index(actor.name) for actor in self.objects]
         assert rows == list(range(rows[0], rows[0] + len(rows))), "the objects are built one after the other"
         self._object_rows = slice(rows[0], rows[-1] + 1)
-        self._basket_row = self.bodies.actors.index(self.fixtures.basket.name)
-        gripper = [self.agent.finger1_link, self.agent.finger2_link, self.agent.robot.links_map[HAND_LINK]]
+        basket = self.fixtures.basket
+        self._basket_row = None if basket is None else self.bodies.actors.index(basket.name)
+        gripper = [self.agent.finger1_link, self.agent.finger2_link, self.agent.robot.links_map[MOBILE_PANDA.hand_link]]
         self._gripper_contacts = Contacts(self.scene, gripper, self.objects)
 
     def _load_lighting(self, options: dict) -> None:
@@ -238,9 +241,10 @@ class SceneEnv(SeededEnv):
                     qpos = torch.tensor([positions.get(joint.name, 0.0) for joint in furniture.active_joints])
                     furniture.set_qpos(qpos.repeat(count, 1))
                     furniture.set_qvel(torch.zeros(count, furniture.max_dof))
-            basket = Pose.create(starts.basket_poses)
-            self.fixtures.basket.set_pose(basket)
-            self.basket_at_start[env_idx] = basket.raw_pose
+            if self.fixtures.basket is not None:
+                basket = Pose.create(starts.basket_poses)
+                self.fixtures.basket.set_pose(basket)
+                self.basket_at_start[env_idx] = basket.raw_pose
             if self.gpu_sim_enabled:
                 self.bodies.put_actors(env_idx, self._object_rows, starts.object_poses)
             else:

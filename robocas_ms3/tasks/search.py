@@ -6,13 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from mani_skill.utils.registration import register_env
 
 from robocas_ms3.arrays import as_tensor, native, none
+from robocas_ms3.benchmark.tasks import SEARCH
 from robocas_ms3.scenes.targets import selection_camera
 from robocas_ms3.tasks import occlusion, rewards, terms
 from robocas_ms3.tasks.learning import DENSE, LearningEnv
-from robocas_ms3.tasks.spec import SEARCH
 from robocas_ms3.tasks.transfer import STAGES
 
 # of each object's surface; hidden shares are then off ray casting by 0.03 on average, 0.08 at the 95th percentile
@@ -21,7 +20,6 @@ LOOKS_PER_SECOND = 5  # at what is cleared
 ENVS_AT_ONCE = 512  # whose clutter is measured: a quarter of a GB with 15 objects each
 
 
-@register_env(SEARCH.env_id, max_episode_steps=SEARCH.max_episode_steps)
 class RoboCASSearchEnv(LearningEnv):
     """Search: the target is hidden in part (p_vis from above below ``target.max_visible_share``, where one is given).
 
@@ -149,7 +147,7 @@ class RoboCASSearchEnv(LearningEnv):
         covered = (stage == self.REWARDS.index("grasp")) & ~settled
         if none(covered):
             return stage, found
-        found["push_point"] = rewards.closeness(self._tcp()[:, :3], native(self._push_point))
+        found["push_point"] = rewards.closeness(self.tcp_in_world()[:, :3], native(self._push_point))
         found["clear"] = rewards.uncovered(native(self.hidden_share), native(self._obstacles.sum(dim=1)))
         return rewards.furthest(stage, [(covered, self.REWARDS.index("clear"))]), found
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from mani_skill.utils.registration import register_env
 
 from robocas_ms3.arrays import native
+from robocas_ms3.benchmark.tasks import SELECT
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.learning import LearningEnv
-from robocas_ms3.tasks.spec import SELECT
 
 
-@register_env(SELECT.env_id, max_episode_steps=SELECT.max_episode_steps)
 class RoboCASSelectEnv(LearningEnv):
     """Select: "the nearest soap", "the second soda can from the left", seen from the robot. The others are wrong.
 
@@ -30,6 +28,6 @@ class RoboCASSelectEnv(LearningEnv):
 
     def _target_measures(self, touched: Any, objects: Any, basket: Any) -> dict[str, Any]:
         """As of `TransferEnv`, and ``others_out``: no other object of the target's name is in the basket."""
-        inside = self._in_basket(objects[..., :7], native(self._centers_of_mass), basket)
+        inside = self.goal.holds(self.centers(objects), basket)
         others_in = terms.another_of_its_kind(inside, native(self._kinds), native(self.target_slot))
         return {**super()._target_measures(touched, objects, basket), "others_out": ~others_in}

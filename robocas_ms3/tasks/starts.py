@@ -21,7 +21,7 @@ class Starts:
     Attributes:
         object_poses: (E, K, 7) float32.
         robot_poses: (E, 7) of the robot's root.
-        basket_poses: (E, 7).
+        basket_poses: (E, 7); NaN where there is no basket.
         targets: (E,) int64, slots.
         present: (E, K) bool.
     """
@@ -39,10 +39,11 @@ class Starts:
         def poses(matrices: list[NDArray[np.float64]]) -> torch.Tensor:
             return torch.from_numpy(to_wxyz(np.stack(matrices)).astype(np.float32)).to(device)
 
+        baskets = [layout.basket_pose for layout in layouts if layout.basket_pose is not None]
         return cls(
             poses([layout.object_poses for layout in layouts]),
             poses([layout.robot_pose for layout in layouts]),
-            poses([layout.basket_pose for layout in layouts]),
+            poses(baskets) if baskets else torch.full((len(layouts), 7), torch.nan, device=device),
             torch.tensor([layout.target for layout in layouts], device=device),
             torch.from_numpy(np.stack([layout.present for layout in layouts])).to(device),
         )

@@ -1,72 +1,52 @@
-"""What the benchmark's tasks have in common: the target has to end up in the basket. Stages, success, instruction."""
+"""What the tasks have in common: the target has to end up somewhere. Stages, success, instruction."""
 
 from __future__ import annotations
 
 from functools import reduce
 from operator import and_
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
 from mani_skill.utils.structs import Articulation
 
-from robocas_ms3.arrays import as_tensor, count_up, every, native, none
+from robocas_ms3.arrays import as_tensor, count_up, native, none
 from robocas_ms3.assets.manifest import BODY
 from robocas_ms3.config.relations import Relation
 from robocas_ms3.language.instructions import Instruction, choose_instruction, part_name
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses
+from robocas_ms3.tasks.goals import Goal, InBasket, Moment
 
 _LANGUAGE = 100  # stream of an episode's seed; those of layouts are in scenes/sample.py
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
-_RIM = 0.05  # m around the basket's inside that still count as over it for a target that falls
-
-
-class Moment(NamedTuple):
-    """What `TransferEnv.evaluate` found last, all native (`arrays`).
-
-    Attributes:
-        objects: (N, K, 13) their states.
-        basket: (N, 7) its pose in the world.
-        held: (N,) bool, whether the target is held; so are the next ones.
-        touched: the gripper touches it.
-        in_basket: it is in the basket.
-        disturbed: (N, K) bool, which objects other than the target no longer stand as they stood.
-        forces: (N, 3, K, 3) N, of objects on left finger, right finger and hand, world frame.
-    """
-
-    objects: Any
-    basket: Any
-    held: Any
-    touched: Any
-    in_basket: Any
-    disturbed: Any
-    forces: Any
 
 
 class TransferEnv(RoboCASEnv):
-    """Move the target to the basket.
+    """Move the target to the ``GOAL``, which is the basket unless a task says otherwise.
 
     ``evaluate()`` gives (N,) bools. The stages are sticky over an episode: ``reached_any`` (the gripper touched any
     object), ``picked_any`` (both fingers held any object >= 3 cm above where it stood), ``reached_target``,
-    ``target_grasped``, ``target_lifted`` (as ``picked_any``, of the target), ``target_in_basket``. ``success`` is not:
-    the target was lifted, now lies in the basket's inner volume at rest, untouched by the gripper, and the basket
-    stands (moved <= 0.1 m, tilted <= 20 deg). Nor is ``fail``: the target lies or falls more than 5 cm below what it
-    stood on, out of basket and gripper, or the basket has fallen (10 cm lower, or tilted by 60 deg). ``disturbed`` (N,)
-    int counts the objects other than the target that are more than 3 cm from where they stood, or have fallen over (30
-    deg), relative to the door or drawer they are on.
+    ``target_grasped``, ``target_lifted`` (as ``picked_any``, of the target), and of the goal, ``target_in_basket``.
+    ``success`` is not: the target was lifted, now lies in the basket's inner volume at rest, untouched by the gripper,
+    and the basket stands (moved <= 0.1 m, tilted <= 20 deg). Nor is ``fail``: the target lies or falls more than 5 cm
+    below what it stood on, out of basket and gripper, or the basket has fallen (10 cm lower, or tilted by 60 deg).
+    Other goals may do without the lift, and have measures of their own. ``disturbed`` (N,) int counts the objects other
+    than the target that are more than 3 cm from where they stood, or have fallen over (30 deg), relative to the door or
+    drawer they are on.
     """
 
     STAGES: ClassVar[tuple[str, ...]] = STAGES
+    GOAL: ClassVar[type[Goal]] = InBasket
+    goal: Goal
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
         shut = self.model.support_motion(opened=False)
         self._support_shut = torch.as_tensor(shut, dtype=torch.float32, device=self.device)
         self._surface = float(self.model.support_pose[2, 3]) + self.model.region.z
-        aside = torch.tensor([_RIM, _RIM, torch.inf], device=self.device)
-        self._above_basket = self._basket_low - aside, self._basket_high + aside
+        self.goal = self.GOAL(self)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
@@ -129,7 +109,7 @@ class TransferEnv(RoboCASEnv):
             return dict(self._last[1])
         # right after a reset the engine still tells the contacts of before
         forces = forces * native(self.elapsed_steps > 0)[:, None, None, None]
-        found = self._evaluated(forces, native(self._objects_in(state)), native(self._basket_in(state)))
+        found = self._evaluated(forces, native(self._objects_in(state)), self._native_basket(state))
         self._last = self._known_by(forces), found
         return dict(found)
 
@@ -139,7 +119,7 @@ class TransferEnv(RoboCASEnv):
         return None if others is None or forces.any() else (others, native(self._reached).tobytes())
 
     def _evaluated(self, forces: Any, objects: Any, basket: Any) -> dict[str, torch.Tensor]:
-        """`evaluate` from forces (N, 3, K, 3), states (N, K, 13) and the basket's pose (N, 7), all native."""
+        """`evaluate` from forces (N, 3, K, 3), states (N, K, 13) and the basket's pose (N, 7) or None, all native."""
         slot = native(self.target_slot)
         grasped, touched = self._grasped_by(forces), terms.touched(forces)
         lifted = terms.lifted(objects[..., 2], native(self.start_poses)[..., 2], grasped)
@@ -151,18 +131,20 @@ class TransferEnv(RoboCASEnv):
             "reached_target": terms.of_target(touched, slot),
             "target_grasped": held,
             "target_lifted": terms.of_target(lifted, slot),
-            "target_in_basket": measures["in_basket"],
+            f"target_{self.goal.NAME}": measures[self.goal.NAME],
             **self._task_stages(objects, held),
         }
         reached = native(self._reached)
         for row, stage in enumerate(self.STAGES):
             if stage in now:
                 reached[row] |= now[stage]
-        success = native(self._stages["target_lifted"]) & reduce(and_, measures.values())
+        success = reduce(and_, measures.values())
+        if self.goal.LIFTS:
+            success = native(self._stages["target_lifted"]) & success
         fail = self._has_failed(measures, objects, basket)
         stages = dict(zip(self.STAGES, self._reached.clone(), strict=True))
         disturbed, touched = self._disturbed(objects[..., :7]), now["reached_target"]
-        self._moment = Moment(objects, basket, held, touched, measures["in_basket"], disturbed, forces)
+        self._moment = Moment(objects, basket, held, touched, measures[self.goal.NAME], disturbed, forces)
         flags = {"success": as_tensor(success), "fail": as_tensor(fail)}
         return {**stages, **flags, "disturbed": as_tensor(disturbed.sum(1))}
 
@@ -172,17 +154,15 @@ class TransferEnv(RoboCASEnv):
         return self._moment
 
     def _has_failed(self, measures: dict[str, Any], objects: Any, basket: Any) -> Any:
-        """(N,) bool of ``fail``, native, from `_target_measures`, states (N, K, 13) and the basket's pose (N, 7)."""
-        slot, start = native(self.target_slot), native(self.basket_at_start)
+        """(N,) bool of ``fail``, native, from `_target_measures`, states (N, K, 13) and the basket's pose."""
+        slot = native(self.target_slot)
         height = terms.of_target(objects[..., 2], slot)
-        low = height < self._surface - terms.FALLEN
-        if every(measures["basket_stands"]) and none(low):  # as nearly always
+        low, lost = height < self._surface - terms.FALLEN, self.goal.lost(basket, measures)
+        if lost is None and none(low):  # as nearly always
             return low
-        first, last = map(native, self._above_basket)
-        above = terms.inside_box(terms.of_target(objects[..., :3], slot), basket[:, :3], basket[:, 3:], first, last)
-        fell = terms.fell_off(height, self._surface, above, ~measures["untouched"])
-        over = terms.fell_over(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:])
-        return fell | (over & ~measures["basket_stands"])
+        caught = self.goal.catches(terms.of_target(objects[..., :3], slot), basket)
+        fell = terms.fell_off(height, self._surface, low & False if caught is None else caught, ~measures["untouched"])
+        return fell if lost is None else fell | lost
 
     def compute_sparse_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """(N,) float32: 1 where the task has succeeded at this moment, else 0."""
@@ -201,7 +181,8 @@ class TransferEnv(RoboCASEnv):
     def target_measures(self) -> dict[str, torch.Tensor]:
         """What has to hold at the same moment for success, besides the target having been lifted: (N,) bool each."""
         touched = terms.touched(self._gripper_contacts.forces())
-        found = self._target_measures(touched, native(self.object_states), native(self.basket_pose))
+        basket = self._native_basket(self.bodies.read())
+        found = self._target_measures(touched, native(self.object_states), basket)
         return {name: as_tensor(measure) for name, measure in found.items()}
 
     def _target_measures(self, touched: Any, objects: Any, basket: Any) -> dict[str, Any]:
@@ -210,19 +191,19 @@ class TransferEnv(RoboCASEnv):
         Args:
             touched: (N, K) bool, which objects the gripper touches.
             objects: (N, K, 13) their states.
-            basket: (N, 7) its pose in the world.
+            basket: (N, 7) its pose in the world; None where there is none.
         """
-        start, slot = native(self.basket_at_start), native(self.target_slot)
-        target, center = terms.of_target(objects, slot), terms.of_target(native(self._centers_of_mass), slot)
+        slot = native(self.target_slot)
+        target = terms.of_target(objects, slot)
         return {
-            "in_basket": self._in_basket(target[:, :7], center, basket),
+            self.goal.NAME: self.goal.holds(self.target_center(objects), basket),
             "untouched": ~terms.of_target(touched, slot),
             "at_rest": terms.at_rest(target[:, 7:10], target[:, 10:]),
-            "basket_stands": terms.stands(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:]),
+            **self.goal.measures(basket),
         }
 
     def fallen(self) -> Any:
-        """(N, K) bool, native: which other objects lay 5 cm below what they stood on in `moment`, not in the basket.
+        """(N, K) bool, native: which other objects lay 5 cm below what they stood on in `moment`, not at the goal.
 
         The target is carried there, and if it falls, that is ``fail``.
         """
@@ -230,19 +211,7 @@ class TransferEnv(RoboCASEnv):
         low = (objects[..., 2] < self._surface - terms.FALLEN) & native(self.present & ~self._is_target)
         if none(low):  # as nearly always
             return low
-        return low & ~self._in_basket(objects[..., :7], native(self._centers_of_mass), self._moment.basket)
-
-    def _in_basket(self, poses: Any, centers_of_mass: Any, basket: Any) -> Any:
-        """(N,) or (N, K) bool: whose centre of mass is in the basket's inner volume; all native (`arrays`).
-
-        Args:
-            poses: (N, 7) or (N, K, 7) of objects in the world.
-            centers_of_mass: (N, 3) or (N, K, 3) in their frames.
-            basket: (N, 7) pose in the world.
-        """
-        centers = poses[..., :3] + terms.rotate(poses[..., 3:], centers_of_mass)
-        low, high = native(self._basket_low), native(self._basket_high)
-        return terms.inside_box(centers, basket[:, :3], basket[:, 3:], low, high)
+        return low & ~self.goal.holds(self.centers(objects), self._moment.basket)
 
     def _disturbed(self, poses: Any) -> Any:
         """(N, K) bool: which objects other than the target no longer stand as they stood, from poses (N, K, 7)."""

@@ -203,7 +203,7 @@ def workers_of(script):
 def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
     script = tmp_path / "run.py"
     script.write_text(SCRIPT.format(tests=os.path.dirname(__file__), root=str(tmp_path)))
-    quick = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1", "ROBOCAS_TEST_RUN": str(script)}
+    quick = {**os.environ, "ROBOCAS_TEST_RUN": str(script)}
     run = subprocess.Popen([sys.executable, script], start_new_session=True, env=quick)
     while len(list((tmp_path / "kept").glob("asset_*/asset.json"))) < 3:
         time.sleep(0.02)

@@ -49,7 +49,6 @@ def test_help_lists_every_command_and_imports_nothing_heavy():
         [sys.executable, "-c", code],
         capture_output=True,
         text=True,
-        env=os.environ | {"ROBOCAS_DEFER_REGISTRATION": "1"},
         check=True,
     )
     assert all(f"• {name}" in done.stdout for name in cli.COMMANDS)

@@ -37,6 +37,11 @@ def message(**changes) -> str:
             "'min_gapp'). Did you mean min_gap?",
         ),
         (
+            {"task": "serch"},
+            "config: wrong value for 'task' (expected one of ['pick', 'select', 'search', 'open_pick'], found "
+            "'serch'). Did you mean search?",
+        ),
+        (
             {"objects": {"ids": "apple"}},
             "config: wrong value for 'objects.ids' (expected a list or 'all', found 'apple')",
         ),

@@ -1,7 +1,6 @@
 """What tests of managed datasets share."""
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -81,6 +80,5 @@ def make(folder, name, seeds, **kwargs):
 def die(moment, *words):
     """Run `robocas` in a process of its own, which is killed at a moment."""
     command = [sys.executable, str(Path(__file__).parents[1] / "support" / "dying_manage.py"), moment, *map(str, words)]
-    environment = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}
-    done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr

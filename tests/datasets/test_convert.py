@@ -116,8 +116,7 @@ def test_without_embeddings_and_at_another_rate(trajectory, tmp_path):
         assert len(arrays["rel_pos"]) == STEPS // 2 + 1
 
 
-def test_processes_write_the_same(trajectory, tmp_path, monkeypatch):
-    monkeypatch.setenv("ROBOCAS_DEFER_REGISTRATION", "1")  # the workers need no ManiSkill here
+def test_processes_write_the_same(trajectory, tmp_path):
     out = tmp_path / "out"
     run(trajectory, out, jobs=2)
     run(trajectory, tmp_path / "one", jobs=1)
@@ -311,8 +310,7 @@ def test_killed_and_resumed_is_as_if_never_killed(trajectory, tmp_path, moment):
         str(trajectory),
         str(out),
     ]
-    environment = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}  # there is no simulator in this, only its import
-    done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr
     run(trajectory, out, resume=True)
     assert files_of(out) == files_of(tmp_path / "whole")

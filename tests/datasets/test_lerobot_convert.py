@@ -1,5 +1,4 @@
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -266,8 +265,7 @@ def test_failed_episodes_of_a_folder_stay_out(made, tmp_path):
     assert check_lerobot(tmp_path / "out") == []
 
 
-def test_processes_write_the_same(trajectory, lerobot, tmp_path, monkeypatch):
-    monkeypatch.setenv("ROBOCAS_DEFER_REGISTRATION", "1")  # the workers need no ManiSkill here
+def test_processes_write_the_same(trajectory, lerobot, tmp_path):
     run(trajectory, tmp_path / "out", jobs=2)
     assert files_of(tmp_path / "out") == files_of(lerobot)
 
@@ -313,8 +311,7 @@ def test_killed_and_resumed_is_as_if_never_killed(trajectory, lerobot, tmp_path,
         str(trajectory),
         str(out),
     ]
-    environment = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}  # there is no simulator in this, only its import
-    done = subprocess.run(command, check=False, capture_output=True, text=True, env=environment)
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr
     if (out / schema.INFO_FILE).exists():
         assert check_lerobot(out) == []

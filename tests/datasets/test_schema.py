@@ -52,7 +52,7 @@ def test_other_versions_are_refused(found, fix):
 
 
 def test_a_task_is_known_by_its_environment():
-    from robocas_ms3.tasks.spec import TASKS
+    from robocas_ms3.benchmark import TASKS
 
     assert [task_of(f"robocas_ms3:{spec.env_id}") for spec in TASKS.values()] == list(TASKS)
     assert task_of("PushCube-v1") is None

@@ -25,7 +25,7 @@ from robocas_ms3.datasets.training.sampling import SampleIndex, balancing_weight
 from robocas_ms3.datasets.training.windows import Window
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.motion import Motion
-from robocas_ms3.robots.constants import ARM_EVALUATION_START
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 CAMERAS = ("base_camera", "gripper_camera")
 SMALL = (32, 24)  # half of the synthetic pictures
@@ -249,8 +249,7 @@ def test_workers_see_what_one_process_sees(made):
 
 
 @pytest.mark.slow
-def test_spawned_workers(trajectory, monkeypatch):
-    monkeypatch.setenv("ROBOCAS_DEFER_REGISTRATION", "1")
+def test_spawned_workers(trajectory):
     data = RoboCASDataset(trajectory, split="all", cameras=())
     loader = DataLoader(data, batch_size=4, num_workers=1, multiprocessing_context="spawn")
     assert torch.equal(torch.cat([batch["action"] for batch in loader]), torch.stack([item["action"] for item in data]))
@@ -313,7 +312,7 @@ def test_forward_kinematics_by_hand():
     # below it, looking down. The base moved by (0.1, 0.2) and turned by 90 deg, on a root at (1, 0).
     qpos = np.zeros((2, 12))
     qpos[0, :3] = 0.1, 0.2, math.pi / 2
-    qpos[1, 3:10] = ARM_EVALUATION_START
+    qpos[1, 3:10] = MOBILE_PANDA.arm_evaluation_start
     root = np.tile(np.eye(4), (2, 1, 1))
     root[:, 0, 3] = 1
     frames = Motion.of_joints(root, qpos, qpos, np.ones(2, bool))
@@ -445,5 +444,4 @@ def test_the_documentations_code_runs(made, tmp_path, monkeypatch):
 
 def test_the_package_alone_brings_no_torch():
     code = "import sys, robocas_ms3.datasets; sys.exit('torch' in sys.modules)"
-    environment = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1"}
-    assert subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

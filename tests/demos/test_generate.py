@@ -12,7 +12,8 @@ import torch
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.structs import Pose
 
-from robocas_ms3.demos.episode import EpisodeSettings, horizon
+from robocas_ms3.benchmark import TASKS
+from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.forking import Child
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.generator import EpisodeGenerator
@@ -24,7 +25,7 @@ from robocas_ms3.planning.protocol import Trajectory
 from robocas_ms3.recordings.entries import read_json
 from robocas_ms3.recordings.reading import open_trajectory
 from robocas_ms3.recordings.writing import merge
-from robocas_ms3.robots.constants import ARM_SLICE
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 pytestmark = pytest.mark.slow
 SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
@@ -85,7 +86,7 @@ def test_motion_is_a_robots(run):
         arm = episode["actions"][:, :7]
         speed = np.abs(np.diff(arm, axis=0)) * 20
         assert speed.max() <= 0.5 + 1e-3
-        qpos = episode["states"]["articulations/robocas_mobile_panda"][:, 13:25][:, ARM_SLICE]
+        qpos = episode["states"]["articulations/robocas_mobile_panda"][:, 13:25][:, MOBILE_PANDA.arm_slice]
         assert np.abs(np.diff(qpos, axis=0)).max() * 20 <= 1.0  # no jump of the arm itself
         still = (np.abs(np.diff(arm, axis=0)) < 1e-5).all(axis=1)
         longest = max((len(run) for run in "".join("s" if s else " " for s in still).split()), default=0)
@@ -209,7 +210,7 @@ def test_what_takes_longer_than_an_episode_may_is_undone(tmp_path, monkeypatch, 
 
 @pytest.mark.parametrize(("freq", "steps"), [(20, 800), (5, 200), (100, 4000)])
 def test_the_horizon_is_as_many_seconds_at_any_rate(freq, steps):
-    assert horizon("pick", freq) == steps
+    assert TASKS["pick"].steps(freq) == steps
 
 
 def test_a_horizon_at_another_rate_is_the_environments_too():

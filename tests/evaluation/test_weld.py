@@ -24,7 +24,7 @@ from robocas_ms3.evaluation.tracking import summed
 from robocas_ms3.evaluation.verify import problems
 from robocas_ms3.evaluation.videos import film
 from robocas_ms3.evaluation.weld import Weld, refuse
-from robocas_ms3.robots.constants import HAND_LINK
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 OPEN, CLOSE = 1.0, 0.0
 
@@ -86,7 +86,7 @@ def open_fingers(env: PolicyStepping) -> None:
 
 def in_hand(env: PolicyStepping) -> sapien.Pose:
     base: Any = env.unwrapped
-    return base.agent.robot.links_map[HAND_LINK]._bodies[0].entity_pose.inv() * target(env).entity_pose
+    return base.agent.robot.links_map[MOBILE_PANDA.hand_link]._bodies[0].entity_pose.inv() * target(env).entity_pose
 
 
 def test_what_is_welded_keeps_its_pose_in_the_hand_whatever_arm_and_fingers_do():

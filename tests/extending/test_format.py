@@ -10,10 +10,11 @@ from strangers import install
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets import RoboCASDataset
-from robocas_ms3.datasets.formats import format_of, formats, open_source
+from robocas_ms3.datasets import RoboCASDataset, formats
+from robocas_ms3.datasets.formats import format_of, open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.writing import convert as conversion
+from robocas_ms3.extensions import Table
 
 
 @pytest.fixture
@@ -22,9 +23,9 @@ def stranger(tmp_path, monkeypatch):
     folder = install("A dataset format", tmp_path / "site")
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setattr("robocas_ms3.datasets.writing.render.EnvFrames", RayCaster)
-    formats.cache_clear()
+    table = Table("dataset format", formats.GROUP, formats.Format, formats.FORMATS.builtin)
+    monkeypatch.setattr(formats, "FORMATS", table)  # as if the process had begun now
     yield folder
-    formats.cache_clear()
     sys.modules.pop("toy_format", None)
 
 
@@ -89,7 +90,10 @@ def test_what_is_wrong_with_it_is_said(both, capsys):
 def test_a_format_that_there_is_not(stranger, tmp_path, capsys):
     file = write_trajectory(tmp_path / "F.h5")
     assert run(["convert", str(file), "--to", "rlds", "--out", str(tmp_path / "out")]) == 1
-    assert "--to: no such format (expected one of toy, lerobot, robocas, found rlds)" in capsys.readouterr().err
+    assert (
+        "--to: no such dataset format (expected one of ['trajectory', 'lerobot', 'robocas', 'toy']"
+        in capsys.readouterr().err
+    )
     assert run(["convert", str(file), "--to", "toy", "--append", "--out", str(tmp_path / "out")]) == 1
     assert "--append: not for toy datasets" in capsys.readouterr().err
 
@@ -97,6 +101,5 @@ def test_a_format_that_there_is_not(stranger, tmp_path, capsys):
 @pytest.mark.parametrize("what", ["missing_module:FORMAT", "json:dumps"])
 def test_a_broken_package_is_said_and_left_out(stranger, what, caplog):
     (stranger / "toy_format-1.0.dist-info" / "entry_points.txt").write_text(f"[robocas_ms3.formats]\ntoy = {what}\n")
-    formats.cache_clear()
-    assert set(formats()) == {"trajectory", "robocas", "lerobot"}
-    assert f"robocas_ms3.formats, {what}: this dataset format can't be used: " in caplog.text
+    assert set(formats.FORMATS) == {"trajectory", "robocas", "lerobot"}
+    assert f"toy = {what}: " in caplog.text

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config import load_task_config
 from robocas_ms3.config.load import shipped_configs
 from robocas_ms3.errors import AssetError, RobocasError
 from robocas_ms3.language.instructions import (
     SPLITS,
-    TASKS,
     Instruction,
     choose_instruction,
     could_mean,
@@ -18,7 +18,7 @@ from robocas_ms3.language.instructions import (
     part_name,
     template_ids,
 )
-from robocas_ms3.language.texts import Split, Task, instruction_texts, synonym_texts
+from robocas_ms3.language.texts import Split, instruction_texts, synonym_texts
 from robocas_ms3.scenes.model import SceneModel
 
 EXTRA = {"pick": {}, "search": {}, "select": {"relation": "nearest"}, "open_pick": {"part": "left door"}}
@@ -26,7 +26,7 @@ EXTRA = {"pick": {}, "search": {}, "select": {"relation": "nearest"}, "open_pick
 
 def choose(
     seed: int,
-    task: Task = "pick",
+    task: str = "pick",
     split: Split = "train",
     object: str = "apple",
     support: str = "table",

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import yaml
 
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config.relations import RELATIONS
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.language.instructions import (
     SPLITS,
-    TASKS,
     choose_instruction,
     could_mean,
     instruction,

@@ -3,13 +3,13 @@ from xml.etree import ElementTree
 import numpy as np
 
 from robocas_ms3.assets.gripper import GRIPPER_BOXES
-from robocas_ms3.robots.constants import FINGER_EXTENSION, OPEN_FINGER, STOCK_TCP_IN_HAND
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 
 def test_boxes_hold_the_real_fingers_and_hand(panda_files, checker):
     """Every collision shape of the open left finger and of the hand lies in the boxes, to 1.5 mm."""
-    tcp_in_hand = STOCK_TCP_IN_HAND + FINGER_EXTENSION
-    finger = np.concatenate(checker.surfaces["panda_leftfinger"]) + [0, OPEN_FINGER, 0.0584 - tcp_in_hand]
+    tcp_in_hand = MOBILE_PANDA.stock_tcp_in_hand + MOBILE_PANDA.finger_extension
+    finger = np.concatenate(checker.surfaces["panda_leftfinger"]) + [0, MOBILE_PANDA.open_finger, 0.0584 - tcp_in_hand]
     hand = np.concatenate(checker.surfaces["panda_hand"]) - [0, 0, tcp_in_hand]
     points = np.concatenate([finger, hand]) * [1, 1, 1]
     points[:, 1] = np.abs(points[:, 1])

@@ -11,7 +11,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.recordings.writing import EpisodeRecorder
-from robocas_ms3.robots.constants import ARM_REST
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 pytestmark = pytest.mark.slow
 
@@ -41,7 +41,9 @@ def assert_same(ours: dict, theirs: dict) -> None:
 
 def play(env: gym.Env, mode: str) -> None:
     env.reset(seed=3)
-    action = np.array([*ARM_REST, -1] if mode == "pd_joint_pos" else [0.3, 0, -0.2, 0, 0.1, 0, -1], np.float32)
+    action = np.array(
+        [*MOBILE_PANDA.arm_rest, -1] if mode == "pd_joint_pos" else [0.3, 0, -0.2, 0, 0.1, 0, -1], np.float32
+    )
     for _ in range(STEPS):
         env.step(action)
 
@@ -116,7 +118,7 @@ def test_a_forked_process_goes_on_recording_and_writes_its_own_file(tmp_path):
         try:
             env_of_child = EpisodeRecorder(env, tmp_path, "child")
             env_of_child._steps = recorder._steps
-            env_of_child.step(np.array([*ARM_REST, -1], np.float32))
+            env_of_child.step(np.array([*MOBILE_PANDA.arm_rest, -1], np.float32))
             env_of_child.finish({})
             code = 0
         finally:

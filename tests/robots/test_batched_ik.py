@@ -8,7 +8,7 @@ import torch
 from mani_skill.utils.geometry.rotation_conversions import matrix_to_quaternion
 from mani_skill.utils.structs import Pose
 
-from robocas_ms3.robots import constants as c
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.ee_controller import batched_ik
 from robocas_ms3.robots.ee_deltas import ee_delta_target
 
@@ -46,7 +46,7 @@ def test_batched_inverse_kinematics_goes_far_too(make_env):
     kinematics._setup_gpu()
     rng = np.random.default_rng(2)
     start = agent.robot.qpos[:, 3:10].repeat(64, 1)
-    middle = torch.tensor(np.array(c.ARM_EVALUATION_START), dtype=torch.float32)
+    middle = torch.tensor(np.array(MOBILE_PANDA.arm_evaluation_start), dtype=torch.float32)
     goal = (middle + torch.tensor(rng.uniform(-0.6, 0.6, (64, 7))).float()).clamp(limits[:, 0], limits[:, 1])
     matrices = kinematics.pk_chain.forward_kinematics(goal).get_matrix()
     target = Pose.create_from_pq(matrices[:, :3, 3], matrix_to_quaternion(matrices[:, :3, :3]))

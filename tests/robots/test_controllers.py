@@ -8,7 +8,7 @@ from mani_skill.agents.controllers import PDJointPosController
 from motions import matrix, moved
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.robots import constants as c
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 MODES = {"pd_joint_pos": 8, "pd_joint_delta_pos": 8, "pd_ee_delta_pose": 7, "pd_ee_pose": 7}
 ALL_MODES = {**MODES, **{f"{mode}_base": size + 3 for mode, size in MODES.items()}}
@@ -23,7 +23,7 @@ def test_action_dimensions_and_the_base(make_env, mode):
     assert {"arm", "gripper"} <= set(agent.controller.controllers)
     action = np.zeros(ALL_MODES[mode], np.float32)
     if "delta" not in mode:
-        arm = c.ARM_EVALUATION_START
+        arm = MOBILE_PANDA.arm_evaluation_start
         if "ee" in mode:
             tcp = matrix(agent.tcp_in_arm_base)
             arm = [*tcp[:3, 3], *Rotation.from_matrix(tcp[:3, :3]).as_euler("XYZ")]
@@ -39,14 +39,14 @@ def test_action_dimensions_and_the_base(make_env, mode):
         env.step(action)
     qpos = agent.robot.qpos[0].numpy()
     assert qpos[:3] == pytest.approx(base, abs=1e-3)
-    assert qpos[3:10] == pytest.approx(c.ARM_EVALUATION_START, abs=3e-3)
+    assert qpos[3:10] == pytest.approx(MOBILE_PANDA.arm_evaluation_start, abs=3e-3)
 
 
 def test_joint_delta_moves_by_a_tenth_of_a_radian(make_env):
     env, agent = make_env("pd_joint_delta_pos", control_freq=5)
     assert type(agent.controller.controllers["arm"]) is PDJointPosController  # ManiSkill's replay asks for the type
     env.step(np.array([0, 0, 0, 0, 1, 0, -0.5, 1], np.float32))
-    change = agent.robot.qpos[0, 3:10].numpy() - c.ARM_EVALUATION_START
+    change = agent.robot.qpos[0, 3:10].numpy() - MOBILE_PANDA.arm_evaluation_start
     assert change[[4, 6]] == pytest.approx([0.1, -0.05], rel=0.15)
 
 
@@ -70,12 +70,12 @@ def test_unreachable_pose_leaves_the_arm_where_it_is(make_env):
     env, agent = make_env("pd_ee_pose")
     for _ in range(5):
         env.step(np.array([1.9, 0, 0, 0, 0, 0, 1], np.float32))
-    assert agent.robot.qpos[0, 3:10].numpy() == pytest.approx(c.ARM_EVALUATION_START, abs=1e-3)
+    assert agent.robot.qpos[0, 3:10].numpy() == pytest.approx(MOBILE_PANDA.arm_evaluation_start, abs=1e-3)
 
 
 def test_gripper_plus_one_opens_minus_one_closes(make_env):
     env, agent = make_env()
-    arm = c.ARM_EVALUATION_START
+    arm = MOBILE_PANDA.arm_evaluation_start
     for command, width in ((-1.0, 0.0), (1.0, 0.08), (0.2, 0.04)):  # -0.01 + 1.2 * 0.025 = 0.02 each
         for _ in range(15):
             env.step(np.array([*arm, command], np.float32))
@@ -99,7 +99,7 @@ def velocity_profile(distance: float, dt: float) -> np.ndarray:
 @pytest.mark.parametrize("control_freq", [20, 5])
 def test_planned_motion_is_tracked_smoothly_and_the_base_is_held(make_env, control_freq):
     env, agent = make_env(control_freq=control_freq)
-    start = np.array(c.ARM_EVALUATION_START)
+    start = np.array(MOBILE_PANDA.arm_evaluation_start)
     direction = np.array([1.0, -0.6, 0.8, 0.5, -0.8, -0.9, 1.0])
     qvel, base = [], []
 
@@ -125,7 +125,7 @@ def test_planned_motion_is_tracked_smoothly_and_the_base_is_held(make_env, contr
 
 def test_base_drives_to_an_absolute_target_at_its_speed_limit(make_env):
     env, agent = make_env("pd_joint_pos_base")
-    action = np.array([*c.ARM_EVALUATION_START, 1, 0.3, -0.2, -0.4], np.float32)
+    action = np.array([*MOBILE_PANDA.arm_evaluation_start, 1, 0.3, -0.2, -0.4], np.float32)
     speeds = []
     for _ in range(30):
         env.step(action)
@@ -146,7 +146,7 @@ def test_reset_sets_the_drive_targets_too(make_env):
 
 def test_held_base_stays_where_a_state_put_it(make_env):
     env, agent = make_env()
-    action = np.array([*c.ARM_EVALUATION_START, 1], np.float32)
+    action = np.array([*MOBILE_PANDA.arm_evaluation_start, 1], np.float32)
     env.step(action)
     qpos = agent.robot.qpos.clone()
     qpos[0, 0] = 0.1

@@ -7,22 +7,22 @@ import sapien
 from robot_checks import link_poses
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.robots import constants as c
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.mobile_panda import RoboCASMobilePanda, RoboCASMobilePandaStockFingers
 from robocas_ms3.robots.urdf import robot_files
 
-EVALUATION = dict(zip(c.ARM_JOINTS, c.ARM_EVALUATION_START, strict=True))
+EVALUATION = dict(zip(MOBILE_PANDA.arm_joints, MOBILE_PANDA.arm_evaluation_start, strict=True))
 
 
 def test_simulated_robot_agrees_with_the_urdf(make_env):
     _, agent = make_env()
-    assert tuple(joint.name for joint in agent.robot.active_joints) == c.JOINTS
-    limits = np.array(c.BASE_LIMITS + c.ARM_LIMITS + c.FINGER_LIMITS)
+    assert tuple(joint.name for joint in agent.robot.active_joints) == MOBILE_PANDA.joints
+    limits = np.array(MOBILE_PANDA.base_limits + MOBILE_PANDA.arm_limits + MOBILE_PANDA.finger_limits)
     assert agent.robot.get_qlimits()[0].numpy() == pytest.approx(limits, abs=1e-5)
     root = np.eye(4)
     root[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     root[:3, 3] = [0.7, 0.15, 0]
-    fingers = dict.fromkeys(c.FINGER_JOINTS, 0.04)
+    fingers = dict.fromkeys(MOBILE_PANDA.finger_joints, 0.04)
     for link, pose in link_poses(robot_files().urdf, EVALUATION | fingers).items():
         simulated = agent.robot.links_map[link].pose.sp.to_transformation_matrix()
         assert simulated == pytest.approx(root @ pose, abs=1e-5), link
@@ -88,7 +88,7 @@ def test_cameras_see_what_they_should():
     try:
         env = gym.make(
             "Empty-v1",
-            robot_uids=c.ROBOT_UID,
+            robot_uids=MOBILE_PANDA.uid,
             obs_mode="segmentation",
             sensor_configs=dict(width=160, height=120),
             sim_config=dict(sim_freq=100, control_freq=20),
@@ -105,7 +105,7 @@ def test_cameras_see_what_they_should():
         assert list(pictures) == list(CAMERAS)
         # The gripper's picture: both fingers, mirrored, in the lower half; the TCP between them.
         labels = pictures["gripper_camera"]["segmentation"][0, ..., 0].numpy()
-        ids = {name: agent.robot.links_map[name].per_scene_id[0].item() for name in c.FINGER_LINKS}
+        ids = {name: agent.robot.links_map[name].per_scene_id[0].item() for name in MOBILE_PANDA.finger_links}
         columns = {name: np.nonzero(labels == number)[1] for name, number in ids.items()}
         assert all(len(found) > 200 for found in columns.values())
         left, right = sorted(columns.values(), key=np.mean)
@@ -136,7 +136,7 @@ def test_gripper_holds_a_box(make_env):
     """A free 0.3 kg box, 5 cm wide, held against gravity, swung about, and let go."""
     env, agent = make_env()
     scene = env.unwrapped.scene
-    arm = c.ARM_EVALUATION_START
+    arm = MOBILE_PANDA.arm_evaluation_start
     builder = env.unwrapped.scene.create_actor_builder()
     material = sapien.physx.PhysxMaterial(0.99, 0.99, 0.0)
     builder.add_box_collision(half_size=[0.04, 0.025, 0.03], material=material, density=0.3 / (0.08 * 0.05 * 0.06))
@@ -160,7 +160,7 @@ def test_gripper_holds_a_box(make_env):
     assert slip < 1e-3
     assert agent.is_static().item()
     for _ in range(10):
-        env.step(np.array([*c.ARM_EVALUATION_START, 1], np.float32))
+        env.step(np.array([*MOBILE_PANDA.arm_evaluation_start, 1], np.float32))
     assert not agent.is_grasping(box).item()
     assert box.pose.p[0, 2] < 0.5  # it fell
 

@@ -12,15 +12,15 @@ from robot_checks import link_poses, numbers
 
 import robocas_ms3.robots
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.robots import constants as c
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import robot_files
 
-REST = dict(zip(c.ARM_JOINTS, c.ARM_REST, strict=True))
-EVALUATION = dict(zip(c.ARM_JOINTS, c.ARM_EVALUATION_START, strict=True))
+REST = dict(zip(MOBILE_PANDA.arm_joints, MOBILE_PANDA.arm_rest, strict=True))
+EVALUATION = dict(zip(MOBILE_PANDA.arm_joints, MOBILE_PANDA.arm_evaluation_start, strict=True))
 
 
 def python(code: str, **env: str) -> subprocess.Popen:
-    env = {**os.environ, "ROBOCAS_DEFER_REGISTRATION": "1", **env}
+    env = {**os.environ, **env}
     return subprocess.Popen(
         [sys.executable, "-c", code], env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -35,12 +35,12 @@ def output(process: subprocess.Popen) -> str:
 def test_active_joints_have_the_reference_order_and_limits():
     joints = [j for j in ET.parse(robot_files().urdf).getroot().iterfind("joint") if j.get("type") != "fixed"]
     limits = {j.get("name"): (float(j.find("limit").get("lower")), float(j.find("limit").get("upper"))) for j in joints}
-    assert set(limits) == set(c.JOINTS)
-    assert [j.get("name") for j in joints][:3] == list(c.BASE_JOINTS)
-    expected = c.BASE_LIMITS + c.ARM_LIMITS + c.FINGER_LIMITS
-    for name, limit in zip(c.JOINTS, expected, strict=True):
+    assert set(limits) == set(MOBILE_PANDA.joints)
+    assert [j.get("name") for j in joints][:3] == list(MOBILE_PANDA.base_joints)
+    expected = MOBILE_PANDA.base_limits + MOBILE_PANDA.arm_limits + MOBILE_PANDA.finger_limits
+    for name, limit in zip(MOBILE_PANDA.joints, expected, strict=True):
         assert limits[name] == pytest.approx(limit, abs=1e-9), name
-    assert c.BASE_LIMITS[2] == pytest.approx((-3.14159265, 1.57079633))
+    assert MOBILE_PANDA.base_limits[2] == pytest.approx((-3.14159265, 1.57079633))
     assert {j.get("name"): j.get("type") for j in joints}["base_yaw_joint"] == "revolute"
 
 
@@ -79,7 +79,7 @@ def collision_boxes(urdf: Path, link: str) -> list[tuple[np.ndarray, np.ndarray]
 def test_finger_tips_meet_in_the_middle_and_reach_8_mm_beyond_the_tcp():
     urdf = robot_files().urdf
     poses = link_poses(urdf, {})
-    tips = {link: collision_boxes(urdf, link)[-1] for link in c.FINGER_LINKS}
+    tips = {link: collision_boxes(urdf, link)[-1] for link in MOBILE_PANDA.finger_links}
     for (size, centre), side in zip(tips.values(), (1, -1), strict=True):
         assert size == pytest.approx([0.018, 0.004, 0.055])
         assert side * centre[1] - size[1] / 2 == pytest.approx(0)  # inner face at the finger's y = 0
@@ -112,14 +112,14 @@ SELF_COLLISIONS = """
 import sys
 import numpy as np
 from mplib.pymp import ArticulatedModel, PlanningWorld
-from robocas_ms3.robots import constants as c
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import robot_files
 files = robot_files()
 arm = ArticulatedModel(str(files.arm_urdf), str(files.arm_srdf), [0, 0, -9.81], [], [], convex=True, verbose=False)
 world = PlanningWorld([arm], ["robot"], [], [])
 arm.set_move_group("panda_hand_tcp")
 reaching, into_base, folded = (0, 0.6, 0, -1.5, 0, 2.1, 0.78), (0, 1.7, 0, -1.6, 0, 1.5, 0), (0, -1, 0, -3.05, 0, 0, 0)
-for qpos in (c.ARM_REST, c.ARM_EVALUATION_START, reaching, into_base, folded):
+for qpos in (MOBILE_PANDA.arm_rest, MOBILE_PANDA.arm_evaluation_start, reaching, into_base, folded):
     pairs = set()
     for finger in (0.0, 0.04):
         arm.set_qpos(np.array([*qpos, finger, finger]), True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame
-from robocas_ms3.robots.constants import ARM_EVALUATION_START
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one
 SIZE = (64, 48)
@@ -111,7 +111,9 @@ def make_states(seed, steps=STEPS):
     rng = np.random.default_rng(seed)
     t = np.linspace(0, 1, steps + 1)[:, None]
     qpos = np.zeros((steps + 1, 12))
-    qpos[:, 3:10] = np.array(ARM_EVALUATION_START) + rng.uniform(-0.1, 0.1, 7) + t * rng.uniform(-0.15, 0.15, 7)
+    qpos[:, 3:10] = (
+        np.array(MOBILE_PANDA.arm_evaluation_start) + rng.uniform(-0.1, 0.1, 7) + t * rng.uniform(-0.15, 0.15, 7)
+    )
     qpos[:, 10:] = np.where(t < 0.4, 0.04, 0.02)
     robot = np.zeros((steps + 1, 37), np.float32)
     robot[:, :3] = 0.7, 0.15, 0.0

@@ -12,7 +12,7 @@ import torch
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3 import tasks
-from robocas_ms3.tasks import TASKS, base, learning, open_pick, search, transfer
+from robocas_ms3.tasks import TASKS, base, goals, learning, open_pick, search, transfer
 
 ENVS = 3
 PER_ENV = (
@@ -40,7 +40,7 @@ def several(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     env.bodies = SimpleNamespace(others=None, read=lambda: state, of_actors=bodies.of_actors)
     forces = torch.from_numpy(env._gripper_contacts.forces())
     env._gripper_contacts = SimpleNamespace(forces=lambda still=None: repeated(forces))
-    for module in (base, transfer, learning, search, open_pick, tasks.select):
+    for module in (base, goals, transfer, learning, search, open_pick, tasks.select):
         if hasattr(module, "native"):
             monkeypatch.setattr(module, "native", lambda tensor: tensor)
         if hasattr(module, "link_poses"):

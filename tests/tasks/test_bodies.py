@@ -11,7 +11,7 @@ from mani_skill.utils.structs import Articulation, Pose
 
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.robots.constants import ARM_REST
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.tasks.bodies import Bodies, link_poses
 
 pytestmark = pytest.mark.slow
@@ -66,7 +66,7 @@ def test_a_read_is_never_out_of_date(env):
     assert torch.equal(base.bodies.read(), maniskills(base))
     rng = np.random.default_rng(0)
     for _ in range(5):
-        env.step(np.array([*(ARM_REST + rng.normal(0, 0.2, 7)), -1], np.float32))
+        env.step(np.array([*(MOBILE_PANDA.arm_rest + rng.normal(0, 0.2, 7)), -1], np.float32))
         assert torch.equal(base.bodies.read(), maniskills(base))
     env.reset(seed=1)
     assert torch.equal(base.bodies.read(), maniskills(base))

@@ -122,7 +122,7 @@ def test_visual_modes_hold_nothing_only_a_simulator_knows(monkeypatch):
 
     env = RoboCASPickEnv.__new__(RoboCASPickEnv)
     env.obs_mode_struct, env._obs_mode = parse_obs_mode_to_struct("rgb+depth"), "rgb+depth"
-    monkeypatch.setattr(RoboCASPickEnv, "_tcp", lambda env: np.zeros((1, 7), np.float32))
+    monkeypatch.setattr(RoboCASPickEnv, "tcp_in_world", lambda env: np.zeros((1, 7), np.float32))
     assert list(env._get_obs_extra({})) == ["tcp_pose"]
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.robots.constants import ARM_REST
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 MODES = ("pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose", "pd_joint_pos_base")
 FREE_FALL = 1e-5  # m, rad: contacts are found anew, and nothing else is
@@ -34,7 +34,7 @@ def actions(env, count: int, seed: int) -> list[np.ndarray]:
         return list(rng.uniform(-0.3, 0.3, (count, size)).astype(np.float32))
     drift = np.cumsum(rng.uniform(-0.02, 0.02, (count, size)), axis=0)
     rest = np.zeros(size)
-    rest[:7] = ARM_REST
+    rest[:7] = MOBILE_PANDA.arm_rest
     return list((rest + drift).astype(np.float32))
 
 

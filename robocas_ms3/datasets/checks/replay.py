@@ -156,7 +156,7 @@ def _other_scene(scene: dict[str, Any], open_loop: OpenLoop) -> str:
         ("robot_pose", "the robot", built.robot_pose),
         ("basket_pose", "the basket", built.basket_pose),
     ):
-        if recorded.get(key):
+        if recorded.get(key) and poses is not None:
             places = np.reshape([pose[:3] for pose in np.atleast_2d(recorded[key])], (-1, 3)).astype(np.float64)
             apart = np.linalg.norm(places - np.reshape(poses, (-1, 4, 4))[:, :3, 3], axis=1).max()
             if apart > SAME_PLACE:

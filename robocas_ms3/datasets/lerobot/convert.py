@@ -17,9 +17,9 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.writing.convert import Conversion
 from robocas_ms3.datasets.writing.dataset_player import open_player
-from robocas_ms3.datasets.writing.frames import OpenSource, open_env
+from robocas_ms3.datasets.writing.frames import OpenSource
 from robocas_ms3.datasets.writing.output import check_overwrite
-from robocas_ms3.datasets.writing.players import Player, Request
+from robocas_ms3.datasets.writing.players import Player, Request, open_env
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, write_json

@@ -18,7 +18,7 @@ from robocas_ms3.datasets.pictures.preview import FEW, finish_previews, on_sheet
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.failures import add_failures
-from robocas_ms3.datasets.writing.frames import OpenSource, open_env
+from robocas_ms3.datasets.writing.frames import OpenSource
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.output import check_overwrite
 from robocas_ms3.datasets.writing.plan import (
@@ -29,7 +29,7 @@ from robocas_ms3.datasets.writing.plan import (
     resumed_plan,
     still_missing,
 )
-from robocas_ms3.datasets.writing.players import Player, RecordingPlayer, Request
+from robocas_ms3.datasets.writing.players import Player, RecordingPlayer, Request, open_env
 from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.datasets.writing.workers import Job, write_all
 from robocas_ms3.datasets.writing.writer import WrittenEpisode

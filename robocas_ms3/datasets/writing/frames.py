@@ -66,10 +66,3 @@ class FrameSource(Protocol):
 
 OpenSource = Callable[[RecordedEnv, str, Pictures], FrameSource]
 """Makes a frame source from what was recorded in, control mode and what is to be rendered."""
-
-
-def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> FrameSource:
-    """Show states through the environment that recorded them."""
-    from robocas_ms3.datasets.writing.render import EnvFrames
-
-    return EnvFrames(env, control_mode, pictures)

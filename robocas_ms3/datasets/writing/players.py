@@ -16,14 +16,22 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.datasets.sources.episode import DEFAULT_RATE
 from robocas_ms3.datasets.sources.provenance import recording_entry, scene_record, succeeded
-from robocas_ms3.datasets.writing.frames import CameraModel, Frame, FrameSource, OpenSource, open_env
+from robocas_ms3.datasets.writing.frames import CameraModel, Frame, FrameSource, OpenSource
 from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.recordings.environment import RecordedEnv
 from robocas_ms3.recordings.motion import sample_states, sample_stride
 from robocas_ms3.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.recordings.subgoals import sample_subgoals
 
 _log = logging.getLogger(__name__)
+
+
+def open_env(env: RecordedEnv, control_mode: str, pictures: Pictures) -> FrameSource:
+    """Show states through the environment that recorded them."""
+    from robocas_ms3.datasets.writing.render import EnvFrames
+
+    return EnvFrames(env, control_mode, pictures)
 
 
 @dataclass(frozen=True)

@@ -149,7 +149,7 @@ def describe_scene(env: Any) -> dict[str, Any]:
             "poses": [_numbers(pose) for pose in layout.object_poses],
             "present": layout.present.tolist(),
             "robot_pose": _numbers(layout.robot_pose),
-            "basket_pose": _numbers(layout.basket_pose),
+            "basket_pose": None if layout.basket_pose is None else _numbers(layout.basket_pose),
             "relation": layout.relation,
         },
         "objects": [

@@ -12,7 +12,7 @@ from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.poses import from_wxyz, inverse
 from robocas_ms3.recordings.motion import Motion, gripper_open
-from robocas_ms3.robots.constants import ARM_BASE_LINK, BASE_SLICE, FINGER_SLICE
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.forward import chain
 from robocas_ms3.robots.urdf import robot_files
 
@@ -57,9 +57,9 @@ class Proprioception:
             obs: the first one.
         """
         qpos, tcp_in_base, tcp_in_world = _row(obs, env)
-        base_in_root = chain(robot_files().urdf, "root", ARM_BASE_LINK, qpos[:, BASE_SLICE])
+        base_in_root = chain(robot_files().urdf, "root", MOBILE_PANDA.arm_base_link, qpos[:, MOBILE_PANDA.base_slice])
         root = from_wxyz(tcp_in_world) @ inverse(from_wxyz(tcp_in_base)) @ inverse(base_in_root)
-        self._robots[env] = _Robot(root, float(qpos[0, FINGER_SLICE].sum()))
+        self._robots[env] = _Robot(root, float(qpos[0, MOBILE_PANDA.finger_slice].sum()))
 
     def read(self, env: int, obs: dict[str, Any], gripper: float | None) -> dict[str, NDArray[np.float32]]:
         """The numbers (D,) of `KEYS`.

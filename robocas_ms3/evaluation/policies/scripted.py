@@ -15,7 +15,7 @@ from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack, PoseTrack, Track
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.recordings.motion import sample_stride
-from robocas_ms3.robots.constants import ROBOT_UID
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 _FREQ = 20  # Hz, at which it plans
 
@@ -62,7 +62,7 @@ class ScriptedPolicy:
                 with h5py.File(Path(folder) / "episode.h5") as file:
                     group: Any = file["traj_0"]
                     actions = np.array(group["actions"])[:, :8]
-                    states = np.array(group["env_states"]["articulations"][ROBOT_UID])
+                    states = np.array(group["env_states"]["articulations"][MOBILE_PANDA.uid])
         if self.wants.convention == "joint_positions":
             return JointTrack(actions)
         if not len(actions):

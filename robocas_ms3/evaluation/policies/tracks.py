@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.evaluation.policy import Observations
 from robocas_ms3.recordings.motion import Motion, sample_states
-from robocas_ms3.robots.constants import ARM_SLICE
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 Array = NDArray[np.floating]
 
@@ -39,7 +39,7 @@ class JointTrack:
     def next(self, observations: Observations, row: int) -> Array:
         """(8,) joint targets; see `Track`."""
         if not len(self.actions):
-            self.actions = np.append(observations.qpos[row, ARM_SLICE], 1.0)[None]
+            self.actions = np.append(observations.qpos[row, MOBILE_PANDA.arm_slice], 1.0)[None]
         action = self.actions[min(self.played, len(self.actions) - 1)]
         self.played += 1
         return action

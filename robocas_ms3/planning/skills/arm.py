@@ -14,7 +14,7 @@ from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.scene import PlanningScene
-from robocas_ms3.robots.constants import ARM_REST
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.grasping import MAX_WIDTH
 from robocas_ms3.tasks.transfer import TransferEnv
 
@@ -136,7 +136,7 @@ class Arm:
 
     def plan_home(self, start: Array) -> Trajectory:
         """Plan to the rest configuration."""
-        return self.planner.plan_to_qpos(start, [np.array(ARM_REST)], stage="home")
+        return self.planner.plan_to_qpos(start, [np.array(MOBILE_PANDA.arm_rest)], stage="home")
 
     def rise_clear(self, *, without: int | Collection[int] = ()) -> None:
         """Rise in small steps, through whatever is touched, until arm and held object touch nothing.

@@ -16,7 +16,7 @@ from robocas_ms3.planning.scene import seen_from
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.timing import stopping
 from robocas_ms3.poses import from_wxyz, planar, transform
-from robocas_ms3.robots.constants import ARM_BASE_ABOVE_BASE_LINK, BASE_LIMITS, BASE_LINK_HEIGHT
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes import standing
 
 SPEED, ACCELERATION = 0.25, 0.4  # m/s and rad/s; m/s^2 and rad/s^2
@@ -60,7 +60,7 @@ def base_at(arm: Arm) -> Array:
 def arm_base_in_world(arm: Arm, base: Array) -> Array:
     """4x4 of the arm's base with the base joints at a pose."""
     root = from_wxyz(arm.env.agent.robot.pose.raw_pose[0])
-    height = BASE_LINK_HEIGHT + ARM_BASE_ABOVE_BASE_LINK
+    height = MOBILE_PANDA.base_link_height + MOBILE_PANDA.arm_base_above_base_link
     return root @ planar(float(base[0]), float(base[1]), height, float(base[2]))
 
 
@@ -83,7 +83,7 @@ def drive(arm: Arm, *goals: Array) -> None:
 
 def places_before(arm: Arm, center: Array) -> Array:
     """Base poses (N, 3) in front of a point (3,) in the world, the most promising first."""
-    low, high = np.array(BASE_LIMITS).T + np.array([[LIMIT_MARGIN], [-LIMIT_MARGIN]])
+    low, high = np.array(MOBILE_PANDA.base_limits).T + np.array([[LIMIT_MARGIN], [-LIMIT_MARGIN]])
     high[2], low[2] = MAX_YAW, -MAX_YAW
     goals = arm.rng.uniform(low, high, (SAMPLES, 3))
     frames = np.array([arm_base_in_world(arm, goal) for goal in goals])
@@ -149,7 +149,7 @@ def _routes(start: Array, goal: Array, leaving: bool) -> Iterator[list[Array]]:
     narrow = start if leaving else goal
     for distance in DETOURS:
         via = narrow - distance * np.array([np.cos(narrow[2]), np.sin(narrow[2]), 0])
-        if all(a <= v <= b for v, (a, b) in zip(via, BASE_LIMITS, strict=True)):
+        if all(a <= v <= b for v, (a, b) in zip(via, MOBILE_PANDA.base_limits, strict=True)):
             yield [via, goal]
 
 
@@ -169,5 +169,5 @@ def _leg_is_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> b
 def body_is_free(arm_base_in_world: Array, cloud: Array) -> bool:
     """Whether none of the points (P, 3), world, is where the body on the floor would be."""
     root = arm_base_in_world.copy()
-    root[2, 3] -= BASE_LINK_HEIGHT + ARM_BASE_ABOVE_BASE_LINK  # on the floor
+    root[2, 3] -= MOBILE_PANDA.base_link_height + MOBILE_PANDA.arm_base_above_base_link  # on the floor
     return standing.body_is_free(root, cloud)

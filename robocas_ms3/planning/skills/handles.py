@@ -18,7 +18,7 @@ from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.planning.timing import through, timed
 from robocas_ms3.poses import inverse, transform
-from robocas_ms3.robots.constants import ARM_ACCELERATION_LIMIT, ARM_VELOCITY_LIMIT
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.grasping import HALF_TURN, MAX_WIDTH
 
 PULLS = 3  # with a new hold each, where one doesn't open far enough
@@ -253,7 +253,10 @@ def _retreatable(arm: Arm, path: Array, least: int) -> int:
 
 def _timed(path: Array, dt: float) -> Trajectory:
     motion = timed(
-        through(path), velocity=SPEED * ARM_VELOCITY_LIMIT, acceleration=SPEED * ARM_ACCELERATION_LIMIT, dt=dt
+        through(path),
+        velocity=SPEED * MOBILE_PANDA.arm_velocity_limit,
+        acceleration=SPEED * MOBILE_PANDA.arm_acceleration_limit,
+        dt=dt,
     )
     if motion is None:
         raise PlanningFailed("pull", "timing_failed")

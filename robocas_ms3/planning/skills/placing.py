@@ -146,10 +146,12 @@ def drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
     """
     object_in_tcp, vertices = held_object(arm, slot)
     low, high = _inner_box(arm)
+    basket = arm.env.fixtures.basket
+    assert basket is not None  # the task has one
     return sample_drops(
         arm.rng,
         count=DROPS_SAMPLED,
-        container_in_base=inverse(arm_base_in_world) @ from_wxyz(arm.env.fixtures.basket.pose.raw_pose[0]),
+        container_in_base=inverse(arm_base_in_world) @ from_wxyz(basket.pose.raw_pose[0]),
         inner_low=low,
         inner_high=high,
         vertices_in_tcp=transform(object_in_tcp, vertices),
@@ -159,8 +161,10 @@ def drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
 
 def _inner_box(arm: Arm) -> tuple[Array, Array]:
     """Least and greatest corner (3,) of the room inside the basket, in its frame, m."""
-    inner = arm.env.model.basket.asset.inner
-    assert inner is not None  # the environment saw to it
+    basket = arm.env.model.basket
+    assert basket is not None  # the task has one
+    inner = basket.asset.inner
+    assert inner is not None  # the model saw to it
     return np.array(inner.min), np.array(inner.max)
 
 

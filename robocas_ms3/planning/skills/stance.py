@@ -175,7 +175,9 @@ def drive_to_basket(arm: Arm, slot: int) -> None:
         if route is None and share(here) >= ABOVE_BASKET:
             return
         if route is None:
-            center = arm.env.fixtures.basket.pose.p[0].cpu().numpy()
+            basket = arm.env.fixtures.basket
+            assert basket is not None  # the task has one
+            center = basket.pose.p[0].cpu().numpy()
             route = best_route(arm, places_before(arm, center), around, share, enough=ABOVE_BASKET)
     drive(arm, *route)
     if not arm.holds(slot):

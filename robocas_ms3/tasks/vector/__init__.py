@@ -10,6 +10,7 @@ import gymnasium as gym
 from gymnasium.vector import VectorEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.errors import VectorEnvError
 from robocas_ms3.tasks.vector.backend import Backend, choose_backend
 from robocas_ms3.tasks.vector.environment import NumpyVectorEnv, RoboCASVectorEnv
@@ -85,12 +86,16 @@ def _check_count(name: str, value: Any) -> None:
 
 def _check_id(env_id: str) -> None:
     try:
-        known = gym.spec(env_id).id in REGISTERED_ENVS
+        known = gym.spec(env_id).id in {*_ours(), *REGISTERED_ENVS}
     except (gym.error.Error, ModuleNotFoundError) as error:
-        raise VectorEnvError("no such environment", where=env_id, expected=_ours(), found=error) from error
+        raise VectorEnvError("no such environment", where=env_id, expected=_one(), found=error) from error
     if not known:
-        raise VectorEnvError("no environment of ManiSkill's kind", where=env_id, expected=_ours())
+        raise VectorEnvError("no environment of ManiSkill's kind", where=env_id, expected=_one())
 
 
-def _ours() -> str:
-    return f"one such as {', '.join(sorted(name for name in REGISTERED_ENVS if name.startswith('RoboCAS')))}"
+def _one() -> str:
+    return f"one such as {', '.join(sorted(_ours()))}"
+
+
+def _ours() -> set[str]:
+    return {task.env_id for task in TASKS.values()}

@@ -62,7 +62,8 @@ class ProcessEnv(gym.Env):
         self._must_reset: set[int] = set()  # envs that an interrupted or failed call left in who knows what state
         cuts = [num_envs * worker // workers for worker in range(workers + 1)]
         shares = [range(*cut) for cut in zip(cuts, cuts[1:], strict=False)]
-        module = REGISTERED_ENVS[self.spec.id].cls.__module__
+        theirs = REGISTERED_ENVS.get(self.spec.id)  # ours are there once they are loaded
+        module = theirs.cls.__module__ if theirs else "robocas_ms3"
         if module == "__main__":
             fix = f'Put it into a module, and pass "the_module:{self.spec.id}".'
             raise VectorEnvError("registered in the program itself, which processes don't know", where=env_id, fix=fix)

@@ -12,7 +12,7 @@ from learning_envs import STATE_ONLY, held_still, put, reward_now, target_of
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.arrays import as_tensor
-from robocas_ms3.tasks import TASKS, learning, open_pick, search
+from robocas_ms3.tasks import TASKS, goals, learning, open_pick, search
 from robocas_ms3.tasks import base as tasks_base
 from robocas_ms3.tasks.transfer import Moment
 
@@ -80,7 +80,7 @@ def test_tensors_as_on_a_gpu_give_what_arrays_give(task, monkeypatch):
     action = action + 0.1
     info = base.get_info()
     expected, seen = base.compute_dense_reward({}, action, info), base._privileged()
-    for module in (tasks_base, learning, search, open_pick):
+    for module in (tasks_base, goals, learning, search, open_pick):
         monkeypatch.setattr(module, "native", lambda tensor: tensor)
     base._moment = Moment(*map(as_tensor, base._moment))
     again = {name: value for name, value in info.items() if name != "reward_terms"}

@@ -1,0 +1,51 @@
+"""What a task is: one frozen row, which everything that differs from task to task is read from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+STANDARD_FREQ = 20  # Hz, of control; gymnasium's horizon is for it
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """A task. What it is made of is named by import path, ``package.module:name``, and loaded where it is used.
+
+    Attributes:
+        name: short name, as in ``robocas generate pick``.
+        env_id: gymnasium id.
+        env: its class, a `tasks.scene.SceneEnv` whose ``SPEC`` is this.
+        default_config: task configuration used when none is given: name of a shipped one, or path of a YAML file.
+        target: how its target is chosen, a `scenes.targets.TargetRule`.
+        solver: its scripted policy, a function of an `Arm` that tries once.
+        seconds: horizon; upstream allows 200 steps of 5 Hz.
+        training_seconds: horizon to train with where the base stands still (`rl_kwargs`).
+        summary: one line for people.
+        slots: what its instructions have besides object and support: ``relation``, which may be left out, ``part``.
+        checks: what its configurations have to be besides well-formed: functions that raise ValueError.
+        instructions: its templates by split, ``upstream``, ``train`` and ``held_out``; default: those of
+            ``language/instructions.yaml``.
+    """
+
+    name: str
+    env_id: str
+    env: str
+    default_config: str
+    target: str
+    solver: str
+    seconds: int
+    training_seconds: int
+    summary: str
+    slots: tuple[str, ...] = ()
+    checks: tuple[str, ...] = ()
+    instructions: Mapping[str, Sequence[str]] = field(default_factory=dict, hash=False)
+
+    def steps(self, control_freq: int) -> int:
+        """The horizon in control steps at a rate, Hz."""
+        return self.seconds * control_freq
+
+    @property
+    def max_episode_steps(self) -> int:
+        """The horizon at the standard rate, which gymnasium is told, whatever the rate."""
+        return self.steps(STANDARD_FREQ)

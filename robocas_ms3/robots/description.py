@@ -1,0 +1,135 @@
+"""What a robot is to planners, controllers, recordings and datasets: names, limits and numbers.
+
+Metres, radians, seconds. Another arm is another description, beside its URDF and its agent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+
+from robocas_ms3.benchmark.spec import STANDARD_FREQ
+
+Limits = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class RobotDescription:
+    """A mobile base with an arm and a gripper of two fingers. ``qpos`` is base, arm, fingers.
+
+    Attributes:
+        uid: ManiSkill's name of the agent.
+        base_joints, arm_joints, finger_joints: active joints in the order of ``qpos``.
+        base_limits, arm_limits, finger_limits: least and greatest position of each.
+        base_link: what the base's joints move; upright, no arm joint moves it.
+        arm_base_link: root of the arm; planners plan in its frame.
+        arm_links: those after the arm's joints.
+        hand_link, tcp_link, finger_links: of the gripper. TCP: z approach, y closing direction.
+        open_finger: joint position of a finger of the open gripper, m.
+        finger_targets: target of a finger at the gripper actions -1 and +1, m.
+        arm_rest, arm_evaluation_start: configurations of the arm.
+        arm_velocity_limit, arm_acceleration_limit: of every arm joint, for planned motion, rad/s and rad/s^2.
+        base_link_height: of the base link above the floor, m.
+        arm_base_above_base_link: height of the arm's base above it, m.
+        pedestal_size, pedestal_above_base_link: of the box that carries the arm, and of its centre, m.
+        stock_tcp_in_hand: z of the TCP in the hand with the maker's fingers, m.
+        finger_extension: how much longer the fingers are, m.
+        finger_friction: of the finger tips.
+        control_freq, sim_freq: standard rates of control and physics, Hz.
+    """
+
+    uid: str
+    base_joints: tuple[str, ...]
+    arm_joints: tuple[str, ...]
+    finger_joints: tuple[str, ...]
+    base_limits: Limits
+    arm_limits: Limits
+    finger_limits: Limits
+    base_link: str
+    arm_base_link: str
+    arm_links: tuple[str, ...]
+    hand_link: str
+    tcp_link: str
+    finger_links: tuple[str, ...]
+    open_finger: float
+    finger_targets: tuple[float, float]
+    arm_rest: tuple[float, ...]
+    arm_evaluation_start: tuple[float, ...]
+    arm_velocity_limit: float
+    arm_acceleration_limit: float
+    base_link_height: float
+    arm_base_above_base_link: float
+    pedestal_size: tuple[float, float, float]
+    pedestal_above_base_link: float
+    stock_tcp_in_hand: float
+    finger_extension: float
+    finger_friction: float
+    control_freq: int = STANDARD_FREQ
+    sim_freq: int = 100
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Active joints in the order of ``qpos``."""
+        return self.base_joints + self.arm_joints + self.finger_joints
+
+    @property
+    def base_slice(self) -> slice:
+        """Where the base's joints are in ``qpos``."""
+        return slice(0, len(self.base_joints))
+
+    @property
+    def arm_slice(self) -> slice:
+        """Where the arm's are."""
+        first = len(self.base_joints)
+        return slice(first, first + len(self.arm_joints))
+
+    @property
+    def finger_slice(self) -> slice:
+        """Where the fingers' are."""
+        return slice(self.arm_slice.stop, len(self.joints))
+
+    @property
+    def open_width(self) -> float:
+        """Distance between the pads of the open gripper, m."""
+        return 2 * self.open_finger
+
+
+MOBILE_PANDA = RobotDescription(
+    uid="robocas_mobile_panda",
+    base_joints=("base_x_joint", "base_y_joint", "base_yaw_joint"),
+    arm_joints=tuple(f"panda_joint{i}" for i in range(1, 8)),
+    finger_joints=("panda_finger_joint1", "panda_finger_joint2"),
+    base_limits=((-0.2, 0.8), (-0.8, 0.8), (-pi, pi / 2)),
+    arm_limits=(
+        (-2.8973, 2.8973),
+        (-1.7628, 1.7628),
+        (-2.8973, 2.8973),
+        (-3.0718, -0.0698),
+        (-2.8973, 2.8973),
+        (-0.0175, 3.7525),
+        (-2.8973, 2.8973),
+    ),
+    finger_limits=((0.0, 0.04), (0.0, 0.04)),
+    base_link="base_link",
+    arm_base_link="panda_link0",
+    arm_links=tuple(f"panda_link{i}" for i in range(1, 8)),
+    hand_link="panda_hand",
+    tcp_link="panda_hand_tcp",
+    finger_links=("panda_leftfinger", "panda_rightfinger"),
+    open_finger=0.04,
+    finger_targets=(-0.01, 0.04),  # beyond closed, so that thin objects are pressed too
+    arm_rest=(0.0, -1.02, 0.0, -2.51, 0.0, 1.35, 0.78),
+    arm_evaluation_start=(-0.0276, 0.1581, 0.0, -1.8899, -0.0688, 2.7705, 0.7514),
+    arm_velocity_limit=0.5,
+    arm_acceleration_limit=0.5,
+    # The base body hangs 0.26 m below the base link: read as "the body stands on the floor", so the base link is 0.26 m
+    # above it and the arm's base 0.49 m. (At 0.23 m the evaluation start would put the TCP 3 cm above the 0.61 m table,
+    # among the objects; at 0.49 m it is 0.29 m above it.)
+    base_link_height=0.26,
+    arm_base_above_base_link=0.23,
+    pedestal_size=(0.25, 0.2, 0.2),
+    pedestal_above_base_link=0.13,
+    stock_tcp_in_hand=0.1034,
+    finger_extension=0.03,  # moves the TCP to 0.1334 m from the hand
+    finger_friction=0.99,
+)

@@ -1,0 +1,183 @@
+"""Where targets have to end up: terms of which a task picks one (`TransferEnv.GOAL`); the basket is the benchmark's.
+
+N envs, K objects; all arrays native (`arrays`). ``basket`` is the pose (N, 7) of the scene's basket in the world; None
+where it has none.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+
+from robocas_ms3.arrays import every, native
+from robocas_ms3.tasks import rewards, terms
+from robocas_ms3.tasks.base import RoboCASEnv
+
+_RIM = 0.05  # m around the basket's inside that still count as over it for a target that falls
+_DROP_HEIGHT, _LOWERING = 0.1, 0.25  # m above the basket's rim: where a carry leads; from where on lowering counts
+_FAR = 0.2  # m from there at which half of the carry is done
+_LIFT = 0.03  # m, that of `terms.lifted`
+
+
+class Moment(NamedTuple):
+    """What `TransferEnv.evaluate` found last.
+
+    Attributes:
+        objects: (N, K, 13) their states.
+        basket: (N, 7) its pose in the world; None where there is none.
+        held: (N,) bool, whether the target is held; so are the next ones.
+        touched: the gripper touches it.
+        at_goal: it is where it has to end up.
+        disturbed: (N, K) bool, which objects other than the target no longer stand as they stood.
+        forces: (N, 3, K, 3) N, of objects on left finger, right finger and hand, world frame.
+    """
+
+    objects: Any
+    basket: Any
+    held: Any
+    touched: Any
+    at_goal: Any
+    disturbed: Any
+    forces: Any
+
+
+class Goal(ABC):
+    """A goal of one environment, made when its scene is.
+
+    Args:
+        env: the environment.
+    """
+
+    NAME: ClassVar[str]
+    """Of its measure, ``in_basket``; the stage is ``target_in_basket``."""
+    LIFTS: ClassVar[bool] = True
+    """Whether the target must have been lifted for success."""
+
+    def __init__(self, env: RoboCASEnv) -> None:
+        self.env = env
+
+    @abstractmethod
+    def holds(self, centers: Any, basket: Any) -> Any:
+        """(N,) or (N, K) bool: which objects are there, from their centres of mass (N, 3) or (N, K, 3) in the world."""
+
+    def measures(self, basket: Any) -> dict[str, Any]:
+        """What else has to hold at the moment of success: (N,) bool each."""
+        return {}
+
+    def lost(self, basket: Any, measures: dict[str, Any]) -> Any:
+        """(N,) bool, in which envs the goal itself can't be reached any more; None: in none."""
+        return None
+
+    def catches(self, positions: Any, basket: Any) -> Any:
+        """(N,) bool: which targets at (N, 3) m may lie or fall lower than where they stood; None: none may."""
+        return None
+
+
+class DenseGoal(Goal):
+    """A goal that also says how near it is, as `learning.LearningEnv` needs it."""
+
+    TOWARDS: ClassVar[str] = "target_to_goal"
+    """Name of the observation of the way from the target's centre of mass to `point`."""
+
+    @abstractmethod
+    def point(self, basket: Any) -> Any:
+        """(N, 3) m, where the target's centre of mass is to be brought, in the world."""
+
+    @abstractmethod
+    def progress(self, now: Moment, brought: Any, table: rewards.RewardTable) -> tuple[Any, dict[str, Any]]:
+        """How far dense rewards have come.
+
+        Args:
+            now: what `TransferEnv.evaluate` found.
+            brought: (N,) bool, whether the target has been lifted.
+            table: the task's.
+
+        Returns:
+            Stages (N,) of the table, and the terms that count in them by name, (N,) in [0, 1] each.
+        """
+
+    def penalties(self, now: Moment) -> dict[str, Any]:
+        """Penalties of dense rewards by name, (N,) in [0, 1] each."""
+        return {}
+
+
+class InBasket(DenseGoal):
+    """The target's centre of mass is in the basket's inner volume, and the basket stands.
+
+    Lost where the basket has fallen: 10 cm lower, or tilted by 60 deg.
+    """
+
+    NAME = "in_basket"
+    TOWARDS = "target_to_drop"
+
+    def __init__(self, env: RoboCASEnv) -> None:
+        super().__init__(env)
+        assert env.model.basket is not None, "the scene has no basket"
+        inner = env.model.basket.asset.inner
+        assert inner is not None  # the model saw to it
+        low, high = (torch.tensor(corner, device=env.device) for corner in (inner.min, inner.max))
+        aside = torch.tensor([_RIM, _RIM, torch.inf], device=env.device)
+        self._inside, self._above = (low, high), (low - aside, high + aside)
+        self._drop = torch.cat([(low + high)[:2] / 2, high[2:] + _DROP_HEIGHT])  # in the basket's frame
+
+    def holds(self, centers: Any, basket: Any) -> Any:
+        """See `Goal`."""
+        return terms.inside_box(centers, basket[:, :3], basket[:, 3:], *map(native, self._inside))
+
+    def point(self, basket: Any) -> Any:
+        """See `Goal`: over the middle of the basket's rim."""
+        return basket[:, :3] + terms.rotate(basket[:, 3:], native(self._drop))
+
+    def measures(self, basket: Any) -> dict[str, Any]:
+        """``basket_stands``."""
+        start = native(self.env.basket_at_start)
+        return {"basket_stands": terms.stands(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:])}
+
+    def lost(self, basket: Any, measures: dict[str, Any]) -> Any:
+        """See `Goal`."""
+        if every(measures["basket_stands"]):  # as nearly always
+            return None
+        start = native(self.env.basket_at_start)
+        over = terms.fell_over(basket[:, :3], basket[:, 3:], start[:, :3], start[:, 3:])
+        return over & ~measures["basket_stands"]
+
+    def catches(self, positions: Any, basket: Any) -> Any:
+        """See `Goal`: those above the basket."""
+        return terms.inside_box(positions, basket[:, :3], basket[:, 3:], *map(native, self._above))
+
+    def progress(self, now: Moment, brought: Any, table: rewards.RewardTable) -> tuple[Any, dict[str, Any]]:
+        """See `Goal`: grasp, lift, carry, place, release, rest."""
+        env = self.env
+        slot = native(env.target_slot)
+        target, center = terms.of_target(now.objects, slot), env.target_center(now.objects)
+        basket, turned = now.basket[:, :3], now.basket[:, 3:]
+        inside = terms.rotate_inverse(turned, center - basket)  # the target in the basket's frame
+        low, high = map(native, self._inside)
+        over = ((inside[:, :2] >= low[:2]) & (inside[:, :2] <= high[:2])).all(-1) & (inside[:, 2] >= low[2])
+        delivered = brought & now.at_goal
+        stage = rewards.furthest(
+            0 * slot + table.index("grasp"),
+            [
+                (now.held, table.index("lift")),
+                # a basket may stand lower than where the target stood
+                (now.held & brought, table.index("carry")),
+                (brought & over, table.index("place")),
+                (delivered, table.index("release")),
+                (delivered & ~now.touched, table.index("rest")),
+            ],
+        )
+        start = terms.of_target(native(env.start_poses)[..., 2], slot)
+        return stage, {
+            "reach": rewards.closeness(env.tcp_in_world()[:, :3], center),
+            "lift": rewards.rise(target[:, 2], start, _LIFT),
+            "carry": rewards.closeness(center, self.point(now.basket), half=_FAR),
+            "place": 1 - rewards.rise(inside[:, 2], high[2], _LOWERING),
+            "released": rewards.let_go(now.held, now.touched),
+            "at_rest": rewards.calm(target[:, 7:10], target[:, 10:]),
+        }
+
+    def penalties(self, now: Moment) -> dict[str, Any]:
+        """``basket_shift``."""
+        return {"basket_shift": rewards.shift(now.basket[:, :3], native(self.env.basket_at_start)[:, :3])}

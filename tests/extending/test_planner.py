@@ -1,0 +1,56 @@
+"""The planner of a stranger's package, as docs/extending.md has it, used from outside."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from strangers import PAGE, install, python, robocas
+
+from robocas_ms3.planning.protocol import Planner
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    install("A planner backend", folder)
+    return install("A task", folder)
+
+
+def test_it_is_a_planner_by_name(site):
+    members = [name for name in vars(Planner) if not name.startswith("_")]
+    said = python(
+        site,
+        "-c",
+        f"""
+import numpy as np
+from robocas_ms3.planning.backends import BACKENDS, make_planner
+from robocas_ms3.robots.urdf import robot_files
+files = robot_files()
+planner = make_planner("straight", files.arm_urdf, files.arm_srdf, dt=0.05)
+print(list(BACKENDS), all(hasattr(planner, name) for name in {members!r}))
+start = np.array([0, -1.02, 0, -2.51, 0, 1.35, 0.78])
+goal = planner.tcp(start)
+goal[:3, 3] += [0.1, 0.1, 0.05]
+motion = planner.plan_straight(start, goal, stage="x")
+points = np.array([planner.tcp(qpos)[:3, 3] for qpos in motion.qpos])
+away = np.cross(points - goal[:3, 3], (goal - planner.tcp(start))[:3, 3] / 0.15)
+print(motion.dt, np.abs(points[-1] - goal[:3, 3]).max() < 1e-4, np.linalg.norm(away, axis=1).max() < 2e-3)
+""",
+    )
+    assert said.splitlines() == ["['mplib', 'straight'] True", "0.05 True True"]
+
+
+@pytest.mark.slow
+def test_demonstrations_are_recorded_with_it(site, tmp_path):
+    robocas(site, "generate", "push_zone", "-n", 1, "--planner", "straight", "--out", tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["settings"]["planner"] == "straight"
+    (episode,) = json.loads((tmp_path / "out" / "trajectory.json").read_text())["episodes"]
+    assert episode["success"]
+
+
+def test_without_its_package_it_is_unknown(tmp_path):
+    with pytest.raises(AssertionError, match=r"error: planner: no such planner .*'mplib'.*'straight'"):
+        robocas(tmp_path, "generate", "pick", "--planner", "straight", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert "--planner straight" in PAGE

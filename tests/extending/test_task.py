@@ -1,0 +1,140 @@
+"""The task of a stranger's package, as docs/extending.md has it, used from outside."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from strangers import install, python, robocas
+
+MAKE = """
+import gymnasium as gym, robocas_ms3, numpy as np, torch
+kwargs = dict(obs_mode="state_dict", reward_mode="normalized_dense", control_mode="pd_joint_pos", render_backend="none")
+env = gym.make("RoboCASPushZone-v1", **kwargs)
+base = env.unwrapped
+obs, info = env.reset(seed=0)
+hold = np.append(base.agent.robot.get_qpos()[0, 3:10].numpy(), 1.0).astype(np.float32)
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    return install("A task", tmp_path_factory.mktemp("site"))
+
+
+def test_it_is_listed(site):
+    tasks = {row["name"]: row for row in json.loads(robocas(site, "list", "--json"))["tasks"]}
+    assert list(tasks) == ["pick", "select", "search", "open_pick", "push_zone"]
+    assert tasks["push_zone"]["env_id"] == "RoboCASPushZone-v1"
+    assert "push_zone" in robocas(site, "generate", "--help")
+
+
+def test_its_environment_is_made_without_a_basket(site):
+    said = python(
+        site,
+        "-c",
+        MAKE
+        + """
+obs, reward, terminated, truncated, info = env.step(hold)
+print(base.get_language_instruction())
+print(sorted(obs["extra"]), sorted(base.STAGES), gym.spec("RoboCASPushZone-v1").max_episode_steps)
+print(0 < float(reward) < 0.3, list(info["reward_terms"]), sorted(base.target_measures()))
+""",
+    )
+    assert said.splitlines() == [
+        "['push the soap box on the table into the zone on the left']",
+        "['object_poses', 'target', 'target_extents', 'target_to_goal', 'tcp_pose', 'tcp_to_target'] "
+        "['picked_any', 'reached_any', 'reached_target', 'target_grasped', 'target_in_zone', 'target_lifted'] 400",
+        "True ['reach', 'push', 'released', 'success', 'disturbed', 'action_rate'] ['at_rest', 'in_zone', 'untouched']",
+    ]
+
+
+def test_its_goal_decides_success_and_fail(site):
+    said = python(
+        site,
+        "-c",
+        MAKE
+        + """
+from mani_skill.utils.structs import Pose
+actor = base.objects[0]
+for place in (base.goal.middle[0], base.goal.middle[0] + [0.0, 0.2, 0.0], [0.9, 0.3, 0.1]):
+    pose = actor.pose.raw_pose.clone()
+    pose[:, :2] = torch.tensor(place[:2])
+    pose[:, 2] += 0.002 if place[2] > 0.5 else -0.5
+    actor.set_pose(Pose.create(pose))
+    actor.set_linear_velocity(torch.zeros(3))
+    actor.set_angular_velocity(torch.zeros(3))
+    for _ in range(10):
+        *_, info = env.step(hold)
+    print(*(bool(info[name]) for name in ("success", "fail", "target_in_zone")))
+""",
+    )
+    assert said.splitlines() == ["True False True", "False False True", "False True True"]
+
+
+def test_several_at_once_and_to_train_with(site):
+    said = python(
+        site,
+        "-c",
+        """
+import robocas_ms3
+kwargs = robocas_ms3.rl_kwargs("push_zone")
+env = robocas_ms3.make_vec("RoboCASPushZone-v1", 2, backend="processes", workers=1, **kwargs)
+obs, info = env.reset(seed=[0, 1])
+obs, reward, *_ = env.step(env.action_space.sample())
+print(tuple(obs.shape)[0], tuple(reward.shape), kwargs["max_episode_steps"])
+env.close()
+""",
+    )
+    assert said.split("\n")[0] == "2 (2,) 100"
+
+
+@pytest.mark.slow
+def test_demonstrations_are_recorded(site, tmp_path):
+    robocas(site, "generate", "push_zone", "-n", 1, "--out", tmp_path / "out")
+    data = json.loads((tmp_path / "out" / "trajectory.json").read_text())
+    (episode,) = data["episodes"]
+    assert data["env_info"]["env_id"] == "robocas_ms3:RoboCASPushZone-v1"
+    assert episode["success"]
+    assert episode["robocas"]["instruction"] == "push the soap box on the table into the zone on the left"
+    assert episode["robocas"]["subgoals"][0]["goal_description"] == "push the soap box into the zone"
+    replayed = robocas(site, "replay", tmp_path / "out" / "trajectory.h5")
+    assert "1" in replayed
+
+
+def test_a_configuration_with_a_mistyped_task_is_told_its_name(site):
+    said = python(
+        site,
+        "-c",
+        """
+from robocas_ms3.benchmark import TASKS
+from robocas_ms3.config import load_config_of
+from robocas_ms3.errors import ConfigError
+config = load_config_of(TASKS["push_zone"]).model_dump(mode="json")
+try:
+    load_config_of(TASKS["push_zone"], config | {"task": "push_zones"})
+except ConfigError as error:
+    print(error)
+""",
+    )
+    assert "wrong value for 'task'" in said
+    assert said.strip().endswith("Did you mean push_zone?")
+
+
+def test_an_evaluation_measures_it_where_upstreams_rule_has_no_basket(site):
+    said = python(
+        site,
+        "-c",
+        MAKE
+        + """
+from robocas_ms3.evaluation.tracking import Tracker
+tracker = Tracker(base)
+for _ in range(3):
+    env.step(hold)
+    tracker.look(np.array([True]))
+    tracker.end_step()
+read = tracker.read()
+print(tuple(read["sums"].shape), bool(read["sums"][0, 4]), read["success_v0"].tolist())
+""",
+    )
+    assert said.strip() == "(1, 5) False [False]"
