@@ -155,7 +155,7 @@ def test_a_wrong_pack_leaves_nothing_behind(tmp_path):
 
 def test_overwrite_deletes_only_what_generate_made(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(RobocasError, match="was not made by `robocas generate`"):
+    with pytest.raises(RobocasError, match="refusing to overwrite what is not made by `robocas generate`"):
         generate(SETTINGS, tmp_path, episodes=1, overwrite=True)
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 

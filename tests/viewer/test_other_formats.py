@@ -51,7 +51,7 @@ def page(folder, monkeypatch):
 
         toy = formats.Format("toy", "toy dataset", lambda path: path == folder, "toys:read")
         monkeypatch.setattr(formats.Format, "part", lambda self, name: read)
-        monkeypatch.setattr(formats, "formats", lambda: {"toy": toy})
+        monkeypatch.setattr(formats, "FORMATS", {"toy": toy})
         return open_source(folder)
 
     yield opened
