@@ -248,6 +248,28 @@ def test_workers_see_what_one_process_sees(made):
     assert len(pickle.dumps(data)) < 20_000  # the cache stays behind
 
 
+def test_a_lerobot_folder_gives_the_same_samples(made, tmp_path):
+    pytest.importorskip("av")
+    from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+
+    convert_lerobot(made, tmp_path / "lerobot")
+    state = ("ee_pos", "robot_joints")
+    ours, theirs = (
+        RoboCASDataset(root, split="all", size=None, depth=True, subgoals=True, state=state)
+        for root in (made, tmp_path / "lerobot")
+    )
+    assert len(ours) == len(theirs) > 0
+    for index in (0, len(ours) // 2, len(ours) - 1):
+        one, other = ours[index], theirs[index]
+        assert one.keys() == other.keys()
+        for key in ("action", "state"):
+            torch.testing.assert_close(one[key], other[key], atol=1e-6, rtol=0)
+        for key in ("depth", "observation_mask", "action_mask", "subgoal_type"):
+            assert torch.equal(one[key], other[key])
+        assert (one["instruction"], one["subgoal"]) == (other["instruction"], other["subgoal"])
+        assert (one["rgb"].float() - other["rgb"].float()).abs().mean() < 12  # videos lose some
+
+
 @pytest.mark.slow
 def test_spawned_workers(trajectory):
     data = RoboCASDataset(trajectory, split="all", cameras=())

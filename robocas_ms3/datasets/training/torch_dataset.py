@@ -34,7 +34,7 @@ STATE_KEYS = tuple(
 
 
 class RoboCASDataset(torch.utils.data.Dataset):
-    """Samples of a RoboCAS folder, or of a trajectory file (state and action only).
+    """Samples of a dataset, or of a trajectory file (state and action only).
 
     Only the overview is read at the beginning; arrays and pictures are read sample by sample, and no file stays open,
     so that workers may be forked or spawned. A sample is a dict; H = ``observation_horizon``, A = ``action_horizon``:
@@ -57,7 +57,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
     Keys that were not asked for are absent.
 
     Args:
-        path: a RoboCAS folder, or ``trajectory.h5`` of ``robocas generate``.
+        path: a RoboCAS folder, a LeRobot folder of ours, one of another format, or ``trajectory.h5``.
         split: ``train`` or ``val`` by ``data_info.json``, or ``all``.
         observation_horizon: steps looked back on, the present one included; upstream's RT-1: 6, RoboFlamingo: 11.
         action_horizon: actions from the present step on; upstream: 1.
