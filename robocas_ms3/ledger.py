@@ -108,6 +108,11 @@ class Ledger(Generic[Record]):
 
     def _end(self, file: Any) -> None:
         """See that the last line has an end: one that was cut off goes."""
+        if not file.seek(0, os.SEEK_END):
+            return
+        file.seek(-1, os.SEEK_END)
+        if file.read(1) == b"\n":
+            return
         file.seek(0)
         content = file.read()
         rest = content[content.rfind(b"\n") + 1 :]

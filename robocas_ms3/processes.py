@@ -160,7 +160,7 @@ class Pool(Generic[Task, Result]):
 def leave_with(parent: int, look: Callable[[], object] = lambda: time.sleep(_LOOK)) -> None:
     """End this process as soon as its parent is no more, whatever it is at.
 
-    Not for a forked process, in which a thread may find locks held: see `demos.forking.die_with`.
+    Not for a forked process, in which a thread may find locks held: see `demos.forking.set_up_child`.
 
     Args:
         parent: process id.

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 from functools import partial
 from typing import Any
 
 from robocas_ms3.benchmark import TASKS, TaskSpec
+
+_log = logging.getLogger(__name__)
 
 
 def register() -> None:
@@ -16,8 +19,12 @@ def register() -> None:
     from gymnasium.envs.registration import registry  # not above: importing it calls this
 
     for task in TASKS.values():
-        if task.env_id not in registry:
+        if task.env_id in registry:
+            continue
+        try:
             registry[task.env_id] = _spec(task)
+        except Exception as error:  # an id or numbers that gymnasium does not take; the others are there all the same
+            _log.warning("the task %s can't be registered: %s", task.name, error)
 
 
 def _spec(task: TaskSpec) -> Any:

@@ -6,6 +6,7 @@ docs/extending.md.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -18,6 +19,7 @@ from robocas_ms3.errors import DatasetError
 from robocas_ms3.extensions import Table
 
 GROUP = "robocas_ms3.formats"
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,15 @@ FORMATS: Table[Format] = Table("dataset format", GROUP, Format, {one.name: one f
 
 def format_of(path: Path) -> Format | None:
     """Which format lies there; None: none. Those of other packages see their own folders before others do."""
-    return next((FORMATS[name] for name in reversed(list(FORMATS)) if FORMATS[name].holds(path)), None)
+    return next((FORMATS[name] for name in reversed(list(FORMATS)) if _holds(FORMATS[name], path)), None)
+
+
+def _holds(one: Format, path: Path) -> bool:
+    try:
+        return one.holds(path)
+    except Exception as error:  # another package's, of a path that it did not think of
+        _log.debug("%s: whether it holds %s can't be told: %s", one.name, path, error)
+        return False
 
 
 def open_source(path: Path | str, *, rate_hz: float | None = None, include_failed: bool = False) -> EpisodeSource:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,9 @@ def check_same_run(path: Path, run: dict[str, Any]) -> None:
     if not path.is_file():
         return
     before = json.loads(path.read_text(encoding="utf-8"))
+    if isinstance(before.get("settings"), dict):  # a setting that is newer than the output had its default then
+        defaults = {one.name: one.default for one in fields(EpisodeSettings) if one.default is not MISSING}
+        before["settings"] = {**defaults, **before["settings"]}
     for key, value in json.loads(json.dumps(run)).items():
         if before.get(key) != value:
             raise RobocasError(

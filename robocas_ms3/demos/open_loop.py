@@ -113,7 +113,7 @@ class OpenLoop:
         return self.env.agent.tcp_in_arm_base.p[0].numpy().copy()
 
     def step(self, action: NDArray[np.floating]) -> None:
-        """Play one action (7,), see `sampling.stored_actions`."""
+        """Play one action (7,), see `motion.stored_actions`."""
         wanted = np.asarray(action, dtype=np.float64)
         motion = to_ee_delta_action(wanted[:3], wanted[3:6], euler="xyz")
         self.clipped += bool(np.abs(motion[:3]).max() > 1 or np.linalg.norm(motion[3:]) > 1)
@@ -133,7 +133,7 @@ class OpenLoop:
         self.success |= bool(info["success"][0])
 
     def play(self, dataset_actions: NDArray[np.floating]) -> Playback:
-        """Play actions (S, 7) from the reset on; see `sampling.stored_actions`, whose last row is left out."""
+        """Play actions (S, 7) from the reset on; see `motion.stored_actions`, whose last row is left out."""
         places = [self.tcp_in_base()]
         for action in np.asarray(dataset_actions, dtype=np.float64).reshape(-1, 7):
             self.step(action)

@@ -1,6 +1,7 @@
 """A wrong argument is one line, before anything is written or a bar is shown."""
 
 import json
+from dataclasses import asdict
 
 import h5py
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from robocas_ms3.cli.main import run
 from robocas_ms3.config import load_task_config
 from robocas_ms3.demos import generate as module
-from robocas_ms3.demos.checks import SIM_FREQ
+from robocas_ms3.demos.checks import SIM_FREQ, check_same_run
 from robocas_ms3.demos.convert_actions import CONVERTIBLE
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.generate import generate
@@ -155,3 +156,12 @@ def test_a_replay_never_replaces_what_it_replays(recording):
 def test_converting_a_folder_names_the_file_in_it(recording, tmp_path, capsys):
     assert run(["convert", str(recording.parent), "--out", str(tmp_path / "out"), "--no-embeddings"]) == 1
     assert f"Did you mean {recording}?" in capsys.readouterr().err
+
+
+def test_a_setting_that_is_newer_than_the_output_had_its_default(tmp_path):
+    settings = asdict(EpisodeSettings("pick", "pick_table_scattered", "builtin"))
+    older = {key: value for key, value in settings.items() if key != "planner"}
+    (tmp_path / "run.json").write_text(json.dumps({"settings": older}))
+    check_same_run(tmp_path / "run.json", {"settings": settings})
+    with pytest.raises(RobocasError, match="settings differ"):
+        check_same_run(tmp_path / "run.json", {"settings": {**settings, "planner": "straight"}})

@@ -90,12 +90,12 @@ class LeRobotDataset(EpisodeSource):
         """The same by number, whichever are there."""
         return {row["episode_index"]: row for row in self.rows}
 
-    @property
+    @cached_property
     def numbers(self) -> list[int]:
         """Numbers of the episodes."""
         return [row["episode_index"] for row in self.rows]
 
-    @property
+    @cached_property
     def lengths(self) -> dict[int, int]:
         """Number -> T."""
         return {row["episode_index"]: int(row["length"]) for row in self.rows}

@@ -67,8 +67,7 @@ def stage_all(job: StageJob, processes: int) -> Generator[WrittenEpisode, None, 
     Raises:
         DatasetError: an episode can't be written, or a process died.
     """
-    renders = job.request.path.is_file()  # else a dataset's pictures are read
-    return do_all(partial(_Stager, job), job.tasks, processes, job.parts, renders=renders)
+    return do_all(partial(_Stager, job), job.tasks, processes, job.parts, renders=job.request.is_trajectory)
 
 
 class _Stager:

@@ -7,6 +7,7 @@ be pickled and forked.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -116,7 +117,7 @@ class EpisodeSource(Protocol):
     has_depth: bool
     has_embeddings: bool = False
 
-    @property
+    @cached_property
     def lengths(self) -> Mapping[int, int]:
         """Number -> T."""
         return {number: self.episode(number).steps for number in self.numbers}

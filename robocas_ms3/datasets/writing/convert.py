@@ -113,11 +113,11 @@ def convert(
     out = Path(out)
     request = Request(Path(trajectory), rate_hz, pictures or Pictures(), include_failed, open_source, pack)
     with closing(RecordingPlayer(request)) as player:
-        entries = player.entries()
         settings = dataset_settings(player.rate_hz, player.pictures, embeddings)
         with locked_folder(out):  # from the plan on: it numbers after what is there
             # Everything that may fail comes before the output is touched.
             claim_output(out, resume=resume or append or overwrite)
+            entries = player.entries()
             if append:
                 plan = appended_plan(out, entries, settings)
             elif resume:
@@ -165,6 +165,8 @@ def _write(
                 written.append(episode)
                 if on_episode:
                     on_episode(episode)
+        for folder in (job.out, job.out / schema.PREVIEW_FOLDER):
+            sweep(folder)  # what processes that died left; others did it again
         add_failures(job.request.path.parent, job.out, env_info)
         write_info(job.out, before)
     if job.sheet is not None:

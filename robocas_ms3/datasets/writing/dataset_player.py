@@ -174,6 +174,4 @@ def open_player(request: Request) -> Player:
     Raises:
         DatasetError: it is neither, can't be read, or the options don't suit it.
     """
-    if not request.path.is_dir():
-        return RecordingPlayer(request)
-    return DatasetPlayer(open_source(request.path), request)
+    return RecordingPlayer(request) if request.is_trajectory else DatasetPlayer(open_source(request.path), request)

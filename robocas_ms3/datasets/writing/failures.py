@@ -27,7 +27,9 @@ def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
     there = _lines_of(out)
     known = {_key(line) for line in there.read()}
     marked = ((line, {**line, **made_in}) for line in _lines_of(run).read())
-    there.append([line for before, line in marked if not {_key(before), _key(line)} & known])
+    new = [line for before, line in marked if not {_key(before), _key(line)} & known]
+    if new:  # anew: files of a dataset may be linked from another one
+        there.rewrite([*there.read(), *new])
 
 
 def _lines_of(folder: Path) -> Ledger[dict[str, Any]]:

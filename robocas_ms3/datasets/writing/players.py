@@ -12,6 +12,7 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.formats import format_of
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.datasets.sources.episode import DEFAULT_RATE
@@ -55,9 +56,15 @@ class Request:
     pack: str | Path | None = None
 
     @property
+    def is_trajectory(self) -> bool:
+        """Whether its pictures have to be rendered."""
+        found = format_of(self.path)
+        return found.name == "trajectory" if found else not self.path.is_dir()
+
+    @property
     def renders(self) -> bool:
         """Whether a renderer is needed."""
-        return self.open_source is open_env and not self.path.is_dir()
+        return self.open_source is open_env and self.is_trajectory
 
 
 class Played(Protocol):
