@@ -15,12 +15,6 @@ from robocas_ms3.errors import AssetError, RobocasError
 from robocas_ms3.processes import Calls, Pool
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    """Processes that import this package without its environments, which take seconds."""
-    monkeypatch.setenv("ROBOCAS_DEFER_REGISTRATION", "1")
-
-
 class Slow:
     """Says which process did a task and how many it had done; some tasks are slow, deadly or wrong."""
 

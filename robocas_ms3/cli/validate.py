@@ -55,7 +55,7 @@ def main(cfg: Validate) -> int:
     if found and found.name != "robocas" and cfg.replay:
         raise DatasetError("only RoboCAS folders can be replayed", where=cfg.dataset)
     with bar("checking", transient=True) as shown:
-        check = found.part("checker") if found and cfg.dataset.is_dir() else validate
+        check = found.part("checker") if found and found.checker else validate
         report: Report = check(cfg.dataset, on_episode=shown.at)
     console = Console(soft_wrap=True, highlight=False, markup=False)
     if not cfg.json:

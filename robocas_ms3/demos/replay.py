@@ -131,8 +131,8 @@ def _replay_all(
     allow_failure: bool,
 ) -> Iterator[Replay]:
     shards: list[Path] = []
-    folder = None if save is None else make_folder(save.parent)
-    with closing(recorded.make(**kwargs)) as env, tempfile.TemporaryDirectory(dir=folder) as parts:
+    place = {} if save is None else {"dir": make_folder(save.parent), "prefix": f".{save.stem}.", "suffix": ".tmp"}
+    with closing(recorded.make(**kwargs)) as env, tempfile.TemporaryDirectory(**place) as parts:
         for episode in episodes:
             if save is None:
                 yield _replay_one(env, trajectory, episode, use_env_states)

@@ -48,8 +48,7 @@ class Deadly(Looking):
         return os._exit(9) if task == 2 else task
 
 
-def test_a_process_that_dies_is_one_clear_line(monkeypatch):
-    monkeypatch.setenv("ROBOCAS_DEFER_REGISTRATION", "1")
+def test_a_process_that_dies_is_one_clear_line():
     results = do_all(Deadly, [1, 2, 3], 2, Path("out"), renders=False)
     assert next(results) == 1
     with pytest.raises(DatasetError, match="out: a worker process died.*--resume and fewer --jobs"):

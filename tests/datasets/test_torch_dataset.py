@@ -268,6 +268,11 @@ def test_a_lerobot_folder_gives_the_same_samples(made, tmp_path):
             assert torch.equal(one[key], other[key])
         assert (one["instruction"], one["subgoal"]) == (other["instruction"], other["subgoal"])
         assert (one["rgb"].float() - other["rgb"].float()).abs().mean() < 12  # videos lose some
+    assert (ours.stages == theirs.stages).all()
+    (table,) = (tmp_path / "lerobot" / "data").rglob("*.parquet")
+    table.write_bytes(table.read_bytes()[:100])
+    with pytest.raises(DatasetError, match="file-000.parquet: this table can't be read"):
+        RoboCASDataset(tmp_path / "lerobot", split="all", cameras=())
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,8 +20,9 @@ from robocas_ms3.datasets.lerobot.tables import numbers, read_texts
 from robocas_ms3.datasets.lerobot.video import read_frames
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side, SourceEpisode
 from robocas_ms3.datasets.sources.reader import check_rate
+from robocas_ms3.datasets.sources.tolerant import first_line
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.subgoals import SubGoal
+from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
 
 
 class LeRobotDataset(EpisodeSource):
@@ -122,6 +124,22 @@ class LeRobotDataset(EpisodeSource):
         return read_texts(self.root / schema.SUBTASKS_FILE)
 
     @cached_property
+    def goals(self) -> dict[int, list[SubGoal]]:
+        """Number -> sub-goals over the steps, in one pass over the tables; empty where they are not ours.
+
+        Raises:
+            DatasetError: one is damaged.
+        """
+        steps: dict[int, list[tuple[str, str]]] = {}
+        keys = ["episode_index", schema.SUBGOAL_TYPE.key, schema.SUBTASK_INDEX.key]
+        for path in sorted((self.root / "data").glob("*/*.parquet")) if self.is_ours else ():
+            with _readable(path):
+                columns = pq.read_table(path, columns=keys)
+                for number, kind, text in zip(*(columns.column(key).to_pylist() for key in keys), strict=True):
+                    steps.setdefault(number, []).append((kind, self.subtasks[text]))
+        return {number: subgoal_runs(*zip(*found, strict=True)) for number, found in steps.items()}
+
+    @cached_property
     def described(self) -> dict[int, dict[str, str]]:
         """Number -> ``scene`` and ``cameras``, JSON, by ``meta/robocas/episodes.parquet``; empty without."""
         path = self.root / schema.SCENES_FILE
@@ -183,7 +201,8 @@ class LeRobotEpisode(SourceEpisode):
         path = schema.data_file(
             self.dataset.root, schema.DATA_PATH, row["data/chunk_index"], row["data/file_index"]
         )  # fmt: skip
-        return pq.read_table(path, filters=[("episode_index", "=", self.number)])
+        with _readable(path):
+            return pq.read_table(path, filters=[("episode_index", "=", self.number)])
 
     @cached_property
     def columns(self) -> dict[str, NDArray]:
@@ -207,7 +226,7 @@ class LeRobotEpisode(SourceEpisode):
     @property
     def goals(self) -> list[SubGoal]:
         """Sub-goals over the steps; none where the dataset is not one of ours."""
-        return super().goals if self.dataset.is_ours else []
+        return self.dataset.goals.get(self.number, [])
 
     @cached_property
     def _ours(self) -> dict[str, Any]:
@@ -250,6 +269,15 @@ class LeRobotEpisode(SourceEpisode):
     def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
         """(H, W) mm, 0 = nothing."""
         return next(iter(list(self.frames(camera, "depth", step, 1))))
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, pa.ArrowException, LookupError) as error:
+        fix = "robocas validate says what is wrong."
+        raise DatasetError("this table can't be read", where=path, found=first_line(error), fix=fix) from error
 
 
 def open_lerobot(root: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> LeRobotDataset:
