@@ -12,10 +12,11 @@ import glob
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
 from pathlib import Path
+from typing import Any
 
 from robocas_ms3.errors import OutputExistsError, RobocasError
 from robocas_ms3.files import make_folder
@@ -96,6 +97,28 @@ def check_overwrite(out: Path, marks: Sequence[str], what: str, error: type[Robo
         raise error(
             f"refusing to overwrite what is not {what}", where=out, expected=" or ".join(marks), fix="Choose another."
         )
+
+
+def check_same(
+    before: Mapping[str, Any], now: Mapping[str, Any], what: str, *, where: Path, fix: str, error: type[RobocasError]
+) -> None:
+    """See that an output goes on as it was begun.
+
+    Args:
+        before: the settings it was begun with; may hold more.
+        now: those it would go on with.
+        what: is wrong where they differ.
+        where: they are written down.
+        fix: for who reads the error.
+        error: to be raised.
+
+    Raises:
+        RobocasError: ``error``: some differ.
+    """
+    different = [key for key in now if before.get(key) != now[key]]
+    if different:
+        expected = ", ".join(f"{key} {before.get(key)}" for key in different)
+        raise error(what, where=where, expected=expected, found=", ".join(f"{k} {now[k]}" for k in different), fix=fix)
 
 
 @contextmanager

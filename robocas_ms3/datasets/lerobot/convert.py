@@ -23,7 +23,7 @@ from robocas_ms3.datasets.writing.players import Player, Request, open_env
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import claim_output, kept_if_begun, locked_folder, sweep
+from robocas_ms3.outputs import check_same, claim_output, kept_if_begun, locked_folder, sweep
 
 Codec = Literal["h264", "av1"]
 
@@ -197,16 +197,14 @@ def _check_resume(out: Path, plan: dict[str, Any]) -> None:
             return  # killed before it wrote what it was to do
         what = "can't resume: no conversion to LeRobot was begun here"
         raise DatasetError(what, where=path, fix="Pass --overwrite.") from error
-    old, new = before.get("settings", {}), plan["settings"]
-    different = [key for key in new if old.get(key) != new[key]]
-    if different:
-        raise DatasetError(
-            "can't resume with other settings",
-            where=path,
-            expected=", ".join(f"{key} {old.get(key)}" for key in different),
-            found=", ".join(f"{key} {new[key]}" for key in different),
-            fix="Pass --overwrite, or the settings of before.",
-        )
+    check_same(
+        before.get("settings", {}),
+        plan["settings"],
+        "can't resume with other settings",
+        where=path,
+        fix="Pass --overwrite, or the settings of before.",
+        error=DatasetError,
+    )
     if before.get("episodes") != plan["episodes"]:
         raise DatasetError(
             "can't resume: these episodes are not what was begun here",

@@ -16,6 +16,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.split import SPLIT_RULE
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.outputs import check_same
 
 Entries = Sequence[dict[str, Any]]
 """What is to be converted, see `players.Player.entries`."""
@@ -63,7 +64,7 @@ def resumed_plan(out: Path, entries: Entries, settings: dict[str, Any]) -> Plan:
     if not out.is_dir() or not any(out.iterdir()):
         return new_plan(entries, settings)
     before = _read(out, missing="can't resume: no conversion was begun here", fix="Pass --overwrite.")
-    check_settings(out, before, settings, "can't resume with other settings", "--overwrite, or the settings of before")
+    _check_settings(out, before, settings, "resume", "Pass --overwrite, or the settings of before.")
     known, new = _divided(before, entries)
     if new:
         raise DatasetError(
@@ -82,7 +83,7 @@ def appended_plan(out: Path, entries: Entries, settings: dict[str, Any]) -> Plan
         DatasetError: there is no dataset of ours, or of other settings.
     """
     before = _read(out, missing="no dataset to append to", fix="Convert without --append first.")
-    check_settings(out, before, settings, "can't append with other settings", "the settings of before")
+    _check_settings(out, before, settings, "append", "Pass the settings of before.")
     known, new = _divided(before, entries)
     first = max((int(number) for number in before["episodes"]), default=-1) + 1
     plan = _extended(before, before["episodes"], new, first)
@@ -116,21 +117,10 @@ def _spans(numbers: list[int]) -> str:
     return ", ".join(f"{first}-{last}" if first < last else str(first) for first, last in spans)
 
 
-def check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any], what: str, fix: str) -> None:
-    """Compare the settings of two conversions.
-
-    Raises:
-        DatasetError: they differ.
-    """
-    different = [key for key in SETTINGS if before.get(key) != now[key]]
-    if different:
-        raise DatasetError(
-            what,
-            where=out / schema.CONVERSION_FILE,
-            expected=", ".join(f"{key} {before.get(key)}" for key in different),
-            found=", ".join(f"{key} {now[key]}" for key in different),
-            fix=f"Pass {fix}.",
-        )
+def _check_settings(out: Path, before: Mapping[str, Any], settings: Mapping[str, Any], verb: str, fix: str) -> None:
+    now = {key: settings[key] for key in SETTINGS}
+    what, where = f"can't {verb} with other settings", out / schema.CONVERSION_FILE
+    check_same(before, now, what, where=where, fix=fix, error=DatasetError)
 
 
 def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[str, Any]:
