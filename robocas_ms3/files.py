@@ -40,17 +40,42 @@ def replacing(path: Path | str) -> Iterator[Path]:
 
 @contextmanager
 def replacing_folder(path: Path | str) -> Iterator[Path]:
-    """Yield a fresh folder beside ``path``; on success it becomes ``path`` (an older one goes), else it is removed."""
+    """Yield a fresh folder beside ``path``; on success it becomes ``path`` (an older one goes), else it is removed.
+
+    A folder that has to stay where it is, see `is_fixed`, gets the new one's content, one entry after the other.
+    """
     path = Path(path)
-    make_folder(path.parent)
+    fixed = is_fixed(path)
+    home = make_folder(path if fixed else path.parent)
     _sweep(path)
-    tmp = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
+    tmp = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=home))
     tmp.chmod(0o755)
     try:
         yield tmp
-        _move_in(tmp, path)
+        if fixed:
+            empty_folder(path, but=tmp)
+            for entry in list(tmp.iterdir()):
+                os.replace(entry, path / entry.name)
+        else:
+            _move_in(tmp, path)
     finally:
         shutil.rmtree(tmp, ignore_errors=True)
+
+
+def is_fixed(folder: Path) -> bool:
+    """Whether a folder can be written into and not renamed: a mount point, or one in a folder that is read-only."""
+    return folder.is_dir() and (os.path.ismount(folder) or not os.access(folder.resolve().parent, os.W_OK | os.X_OK))
+
+
+def empty_folder(folder: Path, but: Path | None = None) -> None:
+    """Delete what is in a folder, ``but`` one entry."""
+    for entry in folder.iterdir():
+        if entry == but:
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()
 
 
 def _move_in(tmp: Path, path: Path, tries: int = 5) -> None:

@@ -19,12 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.errors import OutputExistsError, RobocasError
-from robocas_ms3.files import make_folder
+from robocas_ms3.files import empty_folder, is_fixed, make_folder
+
+_INSIDE = ".lock"  # of a folder that can't have it beside it
 
 
 def is_taken(path: Path) -> bool:
-    """Whether there is something: a file, or a folder that is not empty."""
-    return path.exists() and not (path.is_dir() and not any(path.iterdir()))
+    """Whether there is something: a file, or a folder that holds more than its lock."""
+    return path.exists() and not (path.is_dir() and all(entry.name == _INSIDE for entry in path.iterdir()))
 
 
 def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool | None = False) -> None:
@@ -54,9 +56,12 @@ def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool | No
 
 
 def _remove(path: Path) -> None:
-    """Delete a file or a folder, which is renamed first."""
+    """Delete a file or a folder, which is renamed first where it can be."""
     if not path.is_dir():
         path.unlink()
+        return
+    if is_fixed(path):
+        empty_folder(path, but=path / _INSIDE)
         return
     target = path.resolve()  # a link to a folder goes on leading to one
     old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=make_folder(target.parent)))
@@ -132,7 +137,7 @@ def locked_folder(path: Path | str) -> Iterator[None]:
     """
     path = Path(path)
     new = [folder for folder in path.parents if not folder.exists()]
-    lock = path.parent / f".{path.name}.lock"
+    lock = _lock_of(path)
     try:
         with _locked(lock, path):
             try:
@@ -144,6 +149,14 @@ def locked_folder(path: Path | str) -> Iterator[None]:
             with suppress(OSError):  # nothing came of it; another run may be in them
                 for folder in new:
                     folder.rmdir()
+
+
+def _lock_of(path: Path) -> Path:
+    """One file whatever links lead to the folder; beside it, since it may be replaced, or else inside."""
+    if is_fixed(path):
+        return path / _INSIDE
+    path = path.resolve()
+    return path.parent / f".{path.name}.lock"
 
 
 def _locked(lock: Path, path: Path) -> TextIOWrapper:

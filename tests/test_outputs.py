@@ -1,12 +1,14 @@
 """Whose an output folder is: what is refused, overwritten, locked, swept, and left behind."""
 
+import errno
 import fcntl
 import os
+from pathlib import Path
 
 import pytest
 
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.files import make_folder
+from robocas_ms3.files import make_folder, replacing_folder
 from robocas_ms3.outputs import check_overwrite, claim_output, kept_if_begun, locked_folder, sweep
 
 
@@ -108,3 +110,55 @@ def test_a_folder_of_which_nothing_came_goes(tmp_path, begun):
             (parts / "part_0").touch()
         raise KeyboardInterrupt
     assert (tmp_path / "out").exists() is begun
+
+
+def test_one_lock_whatever_links_lead_to_a_folder(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "disk")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "above").symlink_to(tmp_path)
+    for other in (tmp_path / "link", tmp_path / "other" / "above" / "disk"):
+        refused = pytest.raises(RobocasError, match="another process is writing here")
+        with locked_folder(tmp_path / "disk"), refused, locked_folder(other):
+            pass
+
+
+@pytest.fixture
+def fixed(tmp_path, monkeypatch):
+    """A folder that can be written into but neither renamed nor have anything beside it, as a container mounts it."""
+    out = tmp_path / "out"
+    out.mkdir()
+    whole, access = os.replace, os.access
+
+    def replace(source, target):
+        if out in (Path(source), Path(target)) or tmp_path in (Path(source).parent, Path(target).parent):
+            raise OSError(errno.EROFS, "Read-only file system")
+        whole(source, target)
+
+    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != tmp_path and access(path, mode))
+    monkeypatch.setattr("os.replace", replace)
+    return out
+
+
+def test_a_folder_with_nothing_beside_it_is_locked_and_emptied_where_it_is(fixed):
+    (fixed / "episode_0").mkdir()
+    (fixed / "run.json").touch()
+    with locked_folder(fixed):
+        with pytest.raises(RobocasError, match="another process"), locked_folder(fixed):
+            pass
+        with pytest.raises(OutputExistsError):
+            claim_output(fixed)
+        claim_output(fixed, overwrite=True)
+        claim_output(fixed)  # its lock is no content
+    assert list(fixed.iterdir()) == []
+
+
+def test_a_folder_with_nothing_beside_it_is_replaced_from_within(fixed):
+    (fixed / "old").touch()
+    with pytest.raises(ZeroDivisionError), replacing_folder(fixed) as folder:
+        (folder / "new").touch()
+        _ = 1 / 0
+    assert [path.name for path in fixed.iterdir()] == ["old"]
+    with replacing_folder(fixed) as folder:
+        (folder / "new").mkdir()
+    assert [path.name for path in fixed.iterdir()] == ["new"]

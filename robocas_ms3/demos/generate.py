@@ -95,9 +95,7 @@ def generate(
     if overwrite:
         check_overwrite(out, ("run.json",), "made by `robocas generate`")
     with locked_folder(out):
-        if _only_begun(out):
-            shutil.rmtree(out)
-        claim_output(out, overwrite=overwrite, resume=resume)
+        claim_output(out, overwrite=overwrite or _only_begun(out), resume=resume)
         run = {"settings": asdict(settings), "first_seed": first_seed}
         check_same_run(out / "run.json", run)
         make_folder(out)
@@ -108,7 +106,7 @@ def generate(
 
 def _only_begun(out: Path) -> bool:
     """Whether a run was begun here, and ended before it was through with a seed."""
-    if not (out / "run.json").is_file() or {path.name for path in out.iterdir()} - _BEGINNINGS:
+    if not (out / "run.json").is_file() or {path.name for path in out.iterdir() if path.name != ".lock"} - _BEGINNINGS:
         return False
     return not _finished(out, out / "episodes", Ledger(out / FAILURES_FILE))
 
@@ -154,7 +152,7 @@ def _generate_in(
                     )
     except RobocasError:
         if not (results or earlier):
-            shutil.rmtree(out)  # it never began
+            shutil.rmtree(out, ignore_errors=True)  # it never began
         raise
     return _finish(out, shards, ledger, results, earlier)
 

@@ -23,7 +23,7 @@ from robocas_ms3.datasets.writing.players import Player, Request, open_env
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import check_same, claim_output, kept_if_begun, locked_folder, sweep
+from robocas_ms3.outputs import check_same, claim_output, is_taken, kept_if_begun, locked_folder, sweep
 
 Codec = Literal["h264", "av1"]
 
@@ -187,7 +187,7 @@ def _check_resume(out: Path, plan: dict[str, Any]) -> None:
     Raises:
         DatasetError: another one was begun in ``out``, or something else is there.
     """
-    if not out.is_dir() or not any(out.iterdir()):
+    if not is_taken(out):
         return
     path = out / CONVERSION_FILE if (out / INFO_FILE).is_file() else out / PARTS / _PLAN
     try:

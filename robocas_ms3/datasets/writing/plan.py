@@ -16,7 +16,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.split import SPLIT_RULE
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.outputs import check_same
+from robocas_ms3.outputs import check_same, is_taken
 
 Entries = Sequence[dict[str, Any]]
 """What is to be converted, see `players.Player.entries`."""
@@ -61,7 +61,7 @@ def resumed_plan(out: Path, entries: Entries, settings: dict[str, Any]) -> Plan:
     Raises:
         DatasetError: another conversion was begun there.
     """
-    if not out.is_dir() or not any(out.iterdir()):
+    if not is_taken(out):
         return new_plan(entries, settings)
     before = _read(out, missing="can't resume: no conversion was begun here", fix="Pass --overwrite.")
     _check_settings(out, before, settings, "resume", "Pass --overwrite, or the settings of before.")
