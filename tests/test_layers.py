@@ -17,6 +17,7 @@ LAYERS = (
         "errors",
         "paths",
         "files",
+        "documents",
         "outputs",
         "arrays",
         "poses",
@@ -200,7 +201,7 @@ def test_the_builtin_formulas_are_imported_by_their_command_alone():
 
 
 def test_mesh_tools_know_only_the_lowest_layers():
-    allowed = {"errors", "paths", "files", "outputs", "poses", "processes", "strict", "assets"}
+    allowed = {"errors", "paths", "files", "documents", "outputs", "poses", "processes", "strict", "assets"}
     for module, path in MESH_TOOLS.items():
         for name, _ in imports(module, path):
             if name.startswith("robocas_ms3"):

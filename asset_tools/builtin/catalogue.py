@@ -11,13 +11,13 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_type_hints
 
 import numpy as np
 import trimesh
-import yaml
 from pydantic import Field, create_model, model_validator
 
 from asset_tools.builtin import animals, bottles, fruits, labels, planes, shapes, skins, tools, toys
 from asset_tools.builtin.mesh import Shape
 from asset_tools.builtin.models import Model
 from robocas_ms3.assets.manifest import Name, Positive, Share
+from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import AssetError
 from robocas_ms3.strict import StrictModel, parse
 
@@ -141,9 +141,9 @@ def load_products(folder: Path) -> dict[str, Product]:
     found: dict[str, Product] = {}
     for path in sorted(folder.glob("*.yaml")):
         try:
-            entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise AssetError("products can't be read", where=path, found=" ".join(str(error).split())) from error
+            entries = load_yaml(path)
+        except (OSError, DocumentError) as error:
+            raise AssetError("products can't be read", where=path, found=error) from error
         if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
             raise AssetError("products can't be read", where=path, expected="a mapping of products by id")
         for id_, entry in entries.items():

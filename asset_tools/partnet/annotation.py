@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import yaml
 from pydantic import Field
 
 from robocas_ms3.assets.manifest import Name, NotNegative, Positive, Quaternion, Surface, Vec3
+from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import AssetError
 from robocas_ms3.strict import StrictModel, parse
 
@@ -77,7 +77,7 @@ def load_annotation(path: Path) -> Annotation:
         AssetError: it can't be read, or a key is unknown, missing or wrong: naming the first.
     """
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise AssetError("the annotation can't be read", where=path, found=" ".join(str(error).split())) from error
+        data = load_yaml(path)
+    except (OSError, DocumentError) as error:
+        raise AssetError("the annotation can't be read", where=path, found=error) from error
     return parse(Annotation, data, AssetError, where=path, about="the annotation is wrong")

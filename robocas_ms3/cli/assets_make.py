@@ -222,19 +222,18 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
 
 
 def _masses(path: Path | None) -> dict[str, float]:
-    import yaml
-
+    from robocas_ms3.documents import load_yaml
     from robocas_ms3.errors import AssetError
 
     if path is None:
         return {}
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = load_yaml(path)
         masses = {str(key): float(value) for key, value in data.items()}
         if not all(0 < mass < 1000 for mass in masses.values()):
             raise ValueError("masses must be positive")
         return masses
-    except (OSError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
+    except (OSError, AttributeError, TypeError, ValueError) as error:
         raise AssetError(
             "can't read the masses", where=path, expected="a YAML mapping: object id: kg", found=error
         ) from error

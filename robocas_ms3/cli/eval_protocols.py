@@ -20,9 +20,8 @@ def protocols() -> int:
 
 def freeze(plan: Path, out: Path | None) -> int:
     """Make a protocol."""
-    import yaml
-
     from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.documents import DocumentError, load_yaml
     from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.freeze import Plan
     from robocas_ms3.evaluation.freeze import freeze as make
@@ -34,9 +33,9 @@ def freeze(plan: Path, out: Path | None) -> int:
         raise EvaluationError("where to?", where="--out", expected="a folder")
     what = "no plan of a protocol"
     try:
-        data = yaml.safe_load(plan.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise EvaluationError(what, where=plan, found=" ".join(str(error).split())) from error
+        data = load_yaml(plan)
+    except (OSError, DocumentError) as error:
+        raise EvaluationError(what, where=plan, found=error) from error
     read = parse(Plan, data, EvaluationError, where=plan, about=what)
     check_absent(out, EvaluationError)
     with bar("episodes") as shown:

@@ -6,32 +6,15 @@ import logging
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from robocas_ms3.benchmark import TaskSpec
 from robocas_ms3.config.supports import SUPPORTS
 from robocas_ms3.config.task import TaskConfig
+from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.paths import task_configs_dir
 from robocas_ms3.strict import nearest, parse
 
 _log = logging.getLogger(__name__)
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML in which a key given twice is an error, not the last one silently winning."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
-        """Build a mapping, refusing repeated keys."""
-        seen = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=deep)
-            if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} is given twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep=deep)
 
 
 def shipped_configs() -> dict[str, Path]:
@@ -76,9 +59,9 @@ def load_task_config(config: str | Path | dict | TaskConfig) -> TaskConfig:
         return parse_task_config(config, where="config")
     path = _find(config)
     try:
-        data = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)  # noqa: S506  (a SafeLoader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError("this is not valid YAML", where=path, found=" ".join(str(error).split())) from error
+        data = load_yaml(path)
+    except DocumentError as error:
+        raise ConfigError("this is not valid YAML", where=path, found=error) from error
     except OSError as error:
         raise ConfigError("can't read this file", where=path, found=error.strerror) from error
     parsed = parse_task_config(data, where=str(path))

@@ -20,10 +20,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
-import yaml
 from pydantic import Field, model_validator
 
 from robocas_ms3.benchmark import TASKS
+from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Wants
@@ -212,9 +212,9 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
 
 def _rules(path: Path) -> Protocol:
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise EvaluationError(NO_RULES, where=path, found=" ".join(str(error).split())) from error
+        data = load_yaml(path)
+    except (OSError, DocumentError) as error:
+        raise EvaluationError(NO_RULES, where=path, found=error) from error
     return parse(Protocol, data, EvaluationError, where=path, about=NO_RULES)
 
 

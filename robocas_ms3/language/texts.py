@@ -7,11 +7,11 @@ from pathlib import Path
 from string import Formatter
 from typing import Annotated, Literal, TypeVar
 
-import yaml
 from pydantic import Field, model_validator
 
 from robocas_ms3.benchmark import TASKS, TaskSpec
 from robocas_ms3.config.relations import Relation
+from robocas_ms3.documents import load_yaml
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.strict import StrictModel, parse
 
@@ -135,7 +135,7 @@ def read_texts(path: Path, model: type[_Model]) -> _Model:
     Raises:
         ConfigError: unknown keys, wrong types, a template with wrong fields: the first mistake.
     """
-    return parse(model, yaml.safe_load(path.read_text(encoding="utf-8")), ConfigError, where=path)
+    return parse(model, load_yaml(path), ConfigError, where=path)
 
 
 def _check_fields(template: str, *, needed: set[str], allowed: set[str]) -> None:

@@ -1,0 +1,99 @@
+"""JSON and YAML files of others, bounded before anything is built of them: a small file must not take all memory.
+
+What is wrong with a file is a `DocumentError`, and thereby a ``ValueError``; that it can't be read an ``OSError``.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+JSON_LIMIT = 256 * 2**20
+"""Bytes: a hundred thousand recordings have 230 MB of it."""
+YAML_LIMIT = 4 * 2**20
+YAML_DEPTH = 64
+YAML_NODES = 500_000
+"""Values, those that aliases stand for counted each time: nine aliases of nine aliases of ... are a billion."""
+
+
+class DocumentError(ValueError):
+    """A file that is too large, nested too deeply, or not of its language; in one line."""
+
+
+def load_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        DocumentError: it is no JSON, or too large or deep.
+        OSError: it can't be read.
+    """
+    text = _text(path, JSON_LIMIT)
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise DocumentError(str(error)) from error
+    except RecursionError as error:
+        raise DocumentError("nested too deeply") from error
+
+
+def load_yaml(path: Path) -> Any:
+    """Read a YAML file; a key given twice in a mapping is an error.
+
+    Raises:
+        DocumentError: it is no YAML, or too large or deep, or its aliases stand for too much.
+        OSError: it can't be read.
+    """
+    text = _text(path, YAML_LIMIT)
+    try:
+        return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
+    except (yaml.YAMLError, ValueError) as error:  # such as the 30th of February
+        raise DocumentError(" ".join(str(error).split())) from error
+
+
+def _text(path: Path, limit: int) -> str:
+    with path.open("rb") as file:
+        content = file.read(limit + 1)
+    if len(content) > limit:
+        raise DocumentError(f"more than {limit >> 20} MB")
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise DocumentError(str(error)) from error
+
+
+class _Loader(yaml.SafeLoader):
+    """Counts what it composes, and takes no key twice."""
+
+    def __init__(self, stream: Any) -> None:
+        super().__init__(stream)
+        self._depth = self._nodes = 0
+        self._sizes: dict[str, int] = {}  # anchor -> values below it
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Compose a value and what is in it."""
+        event: Any = self.peek_event()
+        self._nodes += self._sizes.get(event.anchor, 0) if isinstance(event, yaml.AliasEvent) else 1
+        if self._nodes > YAML_NODES:
+            raise DocumentError(f"more than {YAML_NODES} values, with those that aliases stand for")
+        if self._depth >= YAML_DEPTH:
+            raise DocumentError(f"nested more than {YAML_DEPTH} deep")
+        before = self._nodes
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        if not isinstance(event, yaml.AliasEvent) and event.anchor is not None:
+            self._sizes[event.anchor] = 1 + self._nodes - before
+        return node
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        """Compose a mapping, refusing repeated keys."""
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in seen:
+                raise yaml.MarkedYAMLError(None, None, f"the key {key.value!r} is given twice", key.start_mark)
+            seen.add((key.tag, str(key.value)))
+        return node
