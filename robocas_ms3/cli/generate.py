@@ -64,18 +64,20 @@ class Generate:
 
 def main(cfg: Generate) -> int:
     """Run the command."""
+    from robocas_ms3.config import load_task_config, shipped_configs
+
+    name = cfg.config or TASKS[cfg.task].default_config
+    loaded = load_task_config(name)  # before seconds go by for what is imported next
     import torch
     from rich.console import Console
     from rich.progress import Progress
 
     from robocas_ms3.cli.bars import columns
-    from robocas_ms3.config import load_task_config, shipped_configs
     from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, recordable_config
     from robocas_ms3.demos.generate import generate
 
     torch.set_num_threads(1)  # threads of small operations wait for each other
-    name = cfg.config or TASKS[cfg.task].default_config
-    config = recordable_config(load_task_config(name), name if name in shipped_configs() else None)
+    config = recordable_config(loaded, name if name in shipped_configs() else None)
     out = cfg.out or Path("demos") / f"{Path(name).stem}-{Path(cfg.pack).name}"
     rate = cfg.replay_rate
     if rate is None:

@@ -95,6 +95,11 @@ def _dispatch(arguments: list[str]) -> int:
         module = module_of(name)
         cfg = tyro.cli(config_type(module, name), prog=f"robocas {name}", args=rest, config=CLI_STYLE)
         return module.main(cfg)
+    if arguments and not arguments[0].startswith("-"):
+        from robocas_ms3.strict import nearest
+
+        fix = nearest(arguments[0], COMMANDS) or f"There are: {', '.join(COMMANDS)}."
+        return _say(f"error: {arguments[0]}: no such command. {fix}", sys.stderr, 2)
     modules = {name: module_of(name) for name in COMMANDS}
     choices = [Annotated[config_type(module, name), tyro.conf.subcommand(name)] for name, module in modules.items()]
     choice: Any = reduce(operator.or_, choices)

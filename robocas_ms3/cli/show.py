@@ -27,19 +27,22 @@ class Show:
 
 def main(cfg: Show) -> int:
     """Run the command."""
+    from robocas_ms3.config import load_task_config
+    from robocas_ms3.errors import RobocasError
+
+    config = load_task_config(cfg.config)  # before seconds go by for what is imported next
+    if cfg.shader.startswith("rt"):
+        _require_gpu(cfg.shader)
     import gymnasium as gym
     from rich.console import Console
 
     import robocas_ms3.tasks  # noqa: F401  (registers the environments)
     from robocas_ms3.benchmark import TASKS
-    from robocas_ms3.config import load_task_config
     from robocas_ms3.demos.checks import GREATEST_SEED, check_number
-    from robocas_ms3.errors import RobocasError
     from robocas_ms3.files import make_folder, replacing
     from robocas_ms3.tasks.transfer import TransferEnv
 
     check_number("seed", cfg.seed, 0, GREATEST_SEED)
-    config = load_task_config(cfg.config)
     shader = {"shader_pack": cfg.shader}
     env = gym.make(
         TASKS[config.task].env_id,
@@ -73,3 +76,16 @@ def main(cfg: Show) -> int:
     console.print(f"instruction: {base_env.get_language_instruction()[0]}")
     env.close()
     return 0
+
+
+def _require_gpu(shader: str) -> None:
+    """A software renderer says that it traces rays, and takes hours for a picture."""
+    import sapien
+
+    from robocas_ms3.errors import RobocasError
+
+    try:
+        sapien.Device("cuda")
+    except RuntimeError as error:
+        fix = "Pass --shader default."
+        raise RobocasError("ray tracing needs a GPU", where=f"--shader {shader}", found="none", fix=fix) from error

@@ -76,6 +76,28 @@ def test_every_command_explains_itself(name, capsys):
     assert config_type.__doc__.strip().split()[0] in out
 
 
+@pytest.mark.parametrize(
+    ("word", "fix"), [("generat", "Did you mean generate?"), ("fly", "There are: doctor, list, show,")]
+)
+def test_a_misspelt_command_is_one_line(word, fix, capsys):
+    assert cli.run([word, "pick"]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {word}: no such command. {fix}")
+
+
+@pytest.mark.parametrize("command", [["generate", "pick", "--config"], ["show"]])
+def test_a_misspelt_configuration_is_told_before_anything_heavy_is_imported(command):
+    code = (
+        "import sys; from robocas_ms3.cli.main import run\n"
+        f"assert run({command!r} + ['pick_tabel_scattered']) == 1\n"
+        "assert not {'torch', 'sapien', 'mani_skill', 'gymnasium'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "pick_tabel_scattered: no such task configuration" in done.stderr
+    assert "Did you mean pick_table_scattered" in done.stderr
+    assert "open_pick_cabinet_door" not in done.stderr  # not all forty
+
+
 def test_no_arguments_show_the_overview(capsys):
     with pytest.raises(SystemExit) as exit_info:
         cli.run([])
@@ -83,7 +105,7 @@ def test_no_arguments_show_the_overview(capsys):
     assert "generate" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["lst"], ["list", "--jsn"], ["convert"]])
+@pytest.mark.parametrize("words", [["list", "--jsn"], ["convert"]])
 def test_wrong_arguments_are_exit_code_2(words, capsys):
     with pytest.raises(SystemExit) as exit_info:
         cli.run(words)

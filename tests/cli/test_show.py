@@ -1,3 +1,4 @@
+import time
 from typing import get_args, get_type_hints
 
 import pytest
@@ -20,3 +21,15 @@ def test_wrong_arguments_leave_no_folder(tmp_path, capsys):
 
 def test_shaders_are_maniskills():
     assert set(get_args(get_type_hints(Show)["shader"])) == PREBUILT_SHADER_CONFIGS.keys()
+
+
+def test_ray_tracing_without_a_gpu_is_refused_at_once(tmp_path, monkeypatch, capsys):
+    def none(name):
+        raise RuntimeError(f'failed to find device "{name}"')
+
+    monkeypatch.setattr("sapien.Device", none)
+    begun = time.perf_counter()
+    assert run(["show", "--shader", "rt", "--out", str(tmp_path / "out")]) == 1
+    assert time.perf_counter() - begun < 2
+    assert "--shader rt: ray tracing needs a GPU (found none). Pass --shader default." in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
