@@ -31,6 +31,9 @@ def replacing(path: Path | str) -> Iterator[Path]:
     try:
         yield tmp
         os.replace(tmp, path)
+    except OSError as error:
+        error.filename = error.filename or str(path)  # writing says no name
+        raise
     finally:
         if tmp.is_dir():
             shutil.rmtree(tmp, ignore_errors=True)
@@ -58,6 +61,9 @@ def replacing_folder(path: Path | str) -> Iterator[Path]:
                 os.replace(entry, path / entry.name)
         else:
             _move_in(tmp, path)
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
     finally:
         shutil.rmtree(tmp, ignore_errors=True)
 

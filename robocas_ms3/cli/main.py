@@ -7,9 +7,12 @@ import importlib
 import logging
 import operator
 import os
+import shutil
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from functools import reduce
+from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any, TextIO
 
@@ -45,7 +48,8 @@ DESCRIPTION = (
 )
 CLI_STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
 INTERRUPTED = 130  # what a shell reports of a program that Ctrl-C ended
-_ENVIRONMENT = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}
+_FULL = {errno.ENOSPC, errno.EDQUOT}
+_ENVIRONMENT = {*_FULL, errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -86,7 +90,7 @@ def run(argv: Sequence[str]) -> int:
         if debug or error.errno not in _ENVIRONMENT:
             raise
         where = f"{error.filename}: " if error.filename else ""
-        return _say(f"error: {where}{os.strerror(error.errno)}", sys.stderr, 1)
+        return _say(f"error: {where}{os.strerror(error.errno)}{_room(error, arguments[0])}", sys.stderr, 1)
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -105,6 +109,16 @@ def _dispatch(arguments: list[str]) -> int:
     choice: Any = reduce(operator.or_, choices)
     tyro.cli(choice, prog="robocas", description=DESCRIPTION, args=arguments or ["--help"], config=CLI_STYLE)
     raise AssertionError("tyro leaves the process on --help and on an unknown command")
+
+
+def _room(error: OSError, command: str) -> str:
+    """How much there is where it does not suffice, and what to do then."""
+    if error.errno not in _FULL:
+        return ""
+    folders = [folder for folder in Path(error.filename or "").absolute().parents if folder.is_dir()]
+    free = f" ({shutil.disk_usage(folders[0]).free / 2**20:.0f} MB free)" if error.filename else ""
+    goes_on = any(field.name == "resume" for field in fields(config_type(module_of(command), command)))
+    return f"{free}. Make room" + (", then go on with --resume." if goes_on else ".")
 
 
 def module_of(name: str) -> ModuleType:

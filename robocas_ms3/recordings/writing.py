@@ -21,10 +21,12 @@ from robocas_ms3.files import replacing, write_json
 from robocas_ms3.recordings.entries import read_json
 from robocas_ms3.recordings.environment import recorded_id
 from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.whole import reserved, write_whole
 from robocas_ms3.tasks.base import RoboCASEnv
 
 # Settings of one machine or one run; a trajectory has to replay without them.
 _LOCAL_KWARGS = ("layouts", "render_backend", "render_mode", "sim_backend", "reward_mode")
+_MARGIN = 4096  # bytes an episode may need in a file of many beyond those of its own
 _PICTURES = ("rgb", "depth", "seg")
 
 
@@ -83,15 +85,18 @@ class EpisodeRecorder(gym.Wrapper):
         """
         steps, env = self._steps, self._base_env
         terminated, truncated, success, fail = np.array(steps.flags, bool).reshape(-1, 4).T
+
+        def fill(file: h5py.File) -> None:
+            group = file.create_group("traj_0", track_order=True)
+            _write(group, "obs", _stacked(steps.observations))
+            group.create_dataset("actions", data=np.stack(steps.actions), dtype=np.float32)
+            flags = {"terminated": terminated, "truncated": truncated, "success": success, "fail": fail}
+            for name, values in flags.items():
+                group.create_dataset(name, data=values, dtype=bool)
+            _write(group, "env_states", {**self.states, **_stacked(steps.beside_bodies)})
+
         with replacing(self._trajectory) as tmp:
-            with h5py.File(tmp, "w") as file:
-                group = file.create_group("traj_0", track_order=True)
-                _write(group, "obs", _stacked(steps.observations))
-                group.create_dataset("actions", data=np.stack(steps.actions), dtype=np.float32)
-                flags = {"terminated": terminated, "truncated": truncated, "success": success, "fail": fail}
-                for name, values in flags.items():
-                    group.create_dataset(name, data=values, dtype=bool)
-                _write(group, "env_states", {**self.states, **_stacked(steps.beside_bodies)})
+            write_whole(tmp, fill)
             # the JSON first: an HDF5 file that is there always has its JSON
             write_json(
                 self._trajectory.with_suffix(".json"),
@@ -184,8 +189,9 @@ def merge(shards: list[Path], out: Path) -> None:
     """
     merged: dict[str, Any] = {}
     episodes: list[dict[str, Any]] = []
+    sizes = [shard.stat().st_size for shard in shards]
     with replacing(out) as tmp:
-        with h5py.File(tmp, "w") as target:
+        with reserved(tmp, sum(sizes) + _MARGIN * (1 + len(sizes))) as target:
             for shard in shards:
                 data = read_json(shard)
                 merged = merged or {key: value for key, value in data.items() if key != "episodes"}

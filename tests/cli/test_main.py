@@ -1,6 +1,7 @@
 import dataclasses
 import errno
 import os
+import re
 import subprocess
 import sys
 import time
@@ -145,10 +146,21 @@ def test_interrupt(failing, capsys):
 def test_a_full_disk_is_one_line_but_a_bug_is_not(failing, capsys):
     failing(OSError(errno.ENOSPC, "No space left on device", "out/x.h5"))
     assert cli.run(["list"]) == 1
-    assert capsys.readouterr().err == "error: out/x.h5: No space left on device\n"
+    said = r"error: out/x.h5: No space left on device \(\d+ MB free\)\. Make room\.\n"
+    assert re.fullmatch(said, capsys.readouterr().err)
+
     failing(FileNotFoundError(errno.ENOENT, "No such file or directory", "x"))
     with pytest.raises(FileNotFoundError):
         cli.run(["list"])
+
+
+def test_a_full_disk_says_how_to_go_on(monkeypatch, tmp_path, capsys):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path / "gone" / "x"))
+
+    monkeypatch.setattr("robocas_ms3.cli.generate.main", full)
+    assert cli.run(["generate", "pick"]) == 1
+    assert capsys.readouterr().err.endswith(" MB free). Make room, then go on with --resume.\n")
 
 
 def test_a_mistake_of_the_user_in_a_real_process(tmp_path):
