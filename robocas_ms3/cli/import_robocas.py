@@ -49,9 +49,9 @@ def main(cfg: ImportRobocas) -> int:
 
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.datasets.manage.importing import import_robocas
-    from robocas_ms3.datasets.manage.output import check_apart
     from robocas_ms3.datasets.manage.survey import survey
     from robocas_ms3.datasets.statistics.described import count_of
+    from robocas_ms3.datasets.writing.output import check_apart
     from robocas_ms3.outputs import claim_output
 
     if cfg.out is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -106,6 +107,20 @@ class TrajectoryFile:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+    def reopened(self) -> TrajectoryFile:
+        """The same file, open again, by the JSON as it was read.
+
+        Raises:
+            DatasetError: the HDF5 file is missing or damaged.
+        """
+        file = copy(self)
+        file._file = open_trajectory(self.path)
+        return file
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the open file behind, which no other process and no copy can have."""
+        return {**self.__dict__, "_file": None}
 
     def entry(self, index: int) -> Entry:
         """What the JSON says of an episode.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.sources.protocol import EpisodeSource
+from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.seeds import one_seed
@@ -155,8 +155,8 @@ class PageContent:
         """What an episode of this scene is on the page, see `show_motion`; ``facts`` for people where they differ."""
         return show_arrays(self.source.episode(number).arrays, scene)
 
-    def _picture(self, number: int, camera: str, kind: str, step: int) -> NDArray:
-        """A picture, decoded; ``kind`` is ``rgb`` or ``depth``."""
+    def _picture(self, number: int, camera: str, kind: Kind, step: int) -> NDArray:
+        """A picture, decoded."""
         with readable(f"{self.root.name}, episode {number}"), self._reading:
             episode = self.source.episode(number)
             return episode.rgb(camera, step) if kind == "rgb" else episode.depth(camera, step)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
+from robocas_ms3.datasets.sources.protocol import Kind
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import readable, split_of, table
@@ -62,14 +63,14 @@ class LeRobotContent(PageContent):
             "facts": {"Robot": self.dataset.info.get("robot_type")},
         }
 
-    def _picture(self, number: int, camera: str, kind: str, step: int) -> NDArray:
+    def _picture(self, number: int, camera: str, kind: Kind, step: int) -> NDArray:
         if not 0 <= step < self.dataset.episode(number).steps:
             raise DatasetError("no such step", where=f"{self.root}, episode {number}", found=step)
         with self._reading:
             key = number, camera, kind, step // _AT_ONCE
             return self._kept.get(key, lambda: self._decode(*key))[step % _AT_ONCE]
 
-    def _decode(self, number: int, camera: str, kind: str, group: int) -> list[NDArray]:
+    def _decode(self, number: int, camera: str, kind: Kind, group: int) -> list[NDArray]:
         episode, first = self.dataset.episode(number), group * _AT_ONCE
         inside(episode.video(camera, kind)[0], self.root)
         return list(episode.frames(camera, kind, first, min(_AT_ONCE, episode.steps - first)))

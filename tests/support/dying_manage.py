@@ -6,10 +6,11 @@ from dying import die_at
 
 from robocas_ms3 import files
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets.manage import assemble, importing, output
+from robocas_ms3.datasets.manage import assemble, importing
+from robocas_ms3.datasets.writing import output
 
 PLACES = {  # moment -> (module, function, which call is the last)
-    "file": (output.Placed, "file", 70),  # in the second episode
+    "file": (output.Placer, "file", 70),  # in the second episode
     "rename": (files, "_move_in", 2),
     "merge overview": (assemble, "write_info", 1),
     "import overview": (importing, "write_info", 1),

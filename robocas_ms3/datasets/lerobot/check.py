@@ -22,7 +22,7 @@ from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_videos import TOLERANCE, check_videos
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.stats import QUANTILES
-from robocas_ms3.datasets.lerobot.tables import numbers
+from robocas_ms3.datasets.lerobot.tables import numbers, read_rows
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
 
 _KEYS = ("codebase_version", "total_episodes", "total_frames", "total_tasks", "fps", "splits", "features", "data_path")
@@ -160,7 +160,7 @@ def _check_data(
 
 
 def _read_frames(path: Path, name: str, row: Mapping[str, Any], features: Mapping[str, Any]) -> Frames:
-    table = pq.read_table(path, filters=[("episode_index", "=", row["episode_index"])])
+    table = read_rows(path, row["episode_index"])
     numeric = [key for key, feature in features.items() if feature["dtype"] not in ("video", "string", "image")]
     key = schema.SUBGOAL_TYPE.key
     types = table.column(key).to_pylist() if key in table.column_names else []

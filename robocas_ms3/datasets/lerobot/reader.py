@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,9 +16,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.tables import numbers, read_texts
+from robocas_ms3.datasets.lerobot.tables import numbers, read_rows, read_texts
 from robocas_ms3.datasets.lerobot.video import read_frames
-from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side, SourceEpisode
+from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, Side, SourceEpisode
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.datasets.sources.tolerant import first_line
 from robocas_ms3.errors import DatasetError
@@ -202,7 +202,7 @@ class LeRobotEpisode(SourceEpisode):
             self.dataset.root, schema.DATA_PATH, row["data/chunk_index"], row["data/file_index"]
         )  # fmt: skip
         with _readable(path):
-            return pq.read_table(path, filters=[("episode_index", "=", self.number)])
+            return read_rows(path, self.number)
 
     @cached_property
     def columns(self) -> dict[str, NDArray]:
@@ -245,8 +245,8 @@ class LeRobotEpisode(SourceEpisode):
         """(4, 4) OpenCV camera frame in its parent."""
         return np.array(self._ours["cameras"][camera]["camera_in_parent"])
 
-    def video(self, camera: str, kind: str) -> tuple[Path, int]:
-        """File of a camera's video and the number of its first frame there; ``kind`` is ``rgb`` or ``depth``."""
+    def video(self, camera: str, kind: Kind) -> tuple[Path, int]:
+        """File of a camera's video and the number of its first frame there."""
         names = {"video_key": schema.image_key(camera), "camera": camera}
         start = f"videos/{names['video_key']}" if kind == "rgb" else f"depth/{camera}"
         pattern = schema.VIDEO_PATH if kind == "rgb" else schema.DEPTH_PATH
@@ -256,19 +256,23 @@ class LeRobotEpisode(SourceEpisode):
         )  # fmt: skip
         return path, round(row[f"{start}/from_timestamp"] * self.dataset.info["fps"])
 
-    def frames(self, camera: str, kind: str = "rgb", first: int = 0, count: int | None = None) -> Iterator[NDArray]:
-        """Pictures one after the other, which is quicker than one by one."""
+    def frames(
+        self, camera: str, kind: Kind = "rgb", first: int = 0, count: int | None = None
+    ) -> Generator[NDArray, None, None]:
+        """Pictures one after the other, for which their video is opened once."""
         path, start = self.video(camera, kind)
         count = self.steps - first if count is None else count
         return read_frames(path, start + first, count, self.dataset.info["fps"])
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
         """(H, W, 3) RGB."""
-        return next(iter(list(self.frames(camera, "rgb", step, 1))))
+        (picture,) = self.frames(camera, "rgb", step, 1)
+        return picture
 
     def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
         """(H, W) mm, 0 = nothing."""
-        return next(iter(list(self.frames(camera, "depth", step, 1))))
+        (picture,) = self.frames(camera, "depth", step, 1)
+        return picture
 
 
 @contextmanager

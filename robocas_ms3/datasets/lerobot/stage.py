@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Generator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -92,8 +92,8 @@ def stage_episode(job: StageJob, player: Player, index: int, number: int) -> Wri
     started, timing, fps = time.perf_counter(), Timing(), whole_rate(player.rate_hz)
     with replacing_folder(part_folder(job.parts, index)) as folder:
         played = player.open(number, timing)
-        with _Videos(folder, job.codec, fps, timing) as videos:
-            for frame in played.frames():
+        with _Videos(folder, job.codec, fps, timing) as videos, closing(played.frames()) as frames:
+            for frame in frames:
                 videos.add(frame)
         begun, arrays, cameras = time.perf_counter(), played.arrays, played.cameras()
         steps = int(arrays["episode_length"])

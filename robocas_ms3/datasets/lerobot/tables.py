@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets.lerobot.schema import CHUNK_FILES
+
+_EPISODE = "episode_index"
 
 
 def column(values: NDArray) -> pa.Array:
@@ -85,6 +89,30 @@ class RollingTable:
             assert self._writer is not None
             self._writer.write_table(pa.concat_tables(self._waiting).combine_chunks())
             self._waiting.clear()
+
+
+def read_rows(path: Path, number: int) -> pa.Table:
+    """An episode's rows of a file of the data; only row groups that may hold some of them are read.
+
+    Raises:
+        OSError, pa.ArrowException, LookupError: the file is missing, damaged, or does not say whose a row is.
+    """
+    footer, spans = _footer(path, path.stat().st_mtime_ns)
+    groups = [group for group, (low, high) in enumerate(spans) if low <= number <= high]
+    with pq.ParquetFile(path, metadata=footer) as file:
+        table = file.read_row_groups(groups)
+    return table.filter(pc.field(_EPISODE) == number)
+
+
+@lru_cache(maxsize=8)
+def _footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[tuple[float, float]]]:
+    """A file's footer, which takes long to read where it is of many episodes, and each row group's span of these."""
+    with pq.ParquetFile(path) as file:
+        footer = file.metadata
+    place = {name: place for place, name in enumerate(footer.schema.names)}.get(_EPISODE)
+    groups = range(footer.num_row_groups)
+    found = [None if place is None else footer.row_group(group).column(place).statistics for group in groups]
+    return footer, [(s.min, s.max) if s and s.has_min_max and type(s.min) is int else (-np.inf, np.inf) for s in found]
 
 
 def write_texts(path: Path, name: str, texts: Sequence[str]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -189,8 +189,8 @@ class Joiner:
         return round(Fraction(frame, self._fps) / time_base)
 
 
-def read_frames(path: Path, first: int, count: int, fps: int) -> Iterator[NDArray]:
-    """Frames of a video, (H, W, 3) uint8 RGB or (H, W) uint16, from number ``first`` on.
+def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArray, None, None]:
+    """Frames of a video, (H, W, 3) uint8 RGB or (H, W) uint16, from number ``first`` on; it is open until it is closed.
 
     Raises:
         DatasetError: the file is missing, damaged, or ends before.
@@ -201,15 +201,16 @@ def read_frames(path: Path, first: int, count: int, fps: int) -> Iterator[NDArra
             stream: Any = video.streams.video[0]
             layout = "gray16le" if stream.codec_context.pix_fmt == "gray16le" else "rgb24"
             video.seek(round(Fraction(first, fps) / stream.time_base), stream=stream, backward=True)
-            for frame in video.decode(stream):
-                if round(frame.pts * stream.time_base * fps) < first + given:
+            for frame in video.decode(stream) if count > 0 else ():
+                place = round(frame.pts * stream.time_base * fps)
+                if place < first + given:
                     continue  # between the key frame and the one asked for
-                if given == count:
-                    break
-                if round(frame.pts * stream.time_base * fps) != first + given:
+                if place != first + given:
                     break
                 yield frame.to_ndarray(format=layout)
                 given += 1
+                if given == count:
+                    break
     except FFmpegError as error:
         raise DatasetError("can't read this video", where=path, found=error.strerror) from error
     if given < count:

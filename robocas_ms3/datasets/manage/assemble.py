@@ -10,10 +10,10 @@ from typing import Any, Literal
 import robocas_ms3
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.input_check import check_episodes
-from robocas_ms3.datasets.manage.output import Placed, begun_output, check_apart
 from robocas_ms3.datasets.manage.parts import Part
 from robocas_ms3.datasets.statistics.described import count_of
 from robocas_ms3.datasets.writing.info import write_info
+from robocas_ms3.datasets.writing.output import Placer, begun_output, check_apart
 from robocas_ms3.datasets.writing.plan import SETTINGS
 from robocas_ms3.files import replacing_folder
 from robocas_ms3.outputs import claim_output
@@ -111,19 +111,19 @@ def assemble(
     """
     inputs = list(dict.fromkeys(member.part.root for member in members))
     with begun_output(out, _plan(members, split_rule), inputs=inputs, overwrite=overwrite, resume=resume):
-        placed = Placed(link)
+        placer = Placer(link)
         missing = [n for n in range(len(members)) if not (out / schema.episode_folder(n)).is_dir()]
         if on_start:
             on_start(len(missing))
         for number in missing:
             member = members[number]
             with replacing_folder(out / schema.episode_folder(number)) as folder:
-                placed.tree(member.part.root / schema.episode_folder(member.number), folder)
+                placer.tree(member.part.root / schema.episode_folder(member.number), folder)
             if on_episode:
                 on_episode(number)
         sides = [[n for n, member in enumerate(members) if member.side == side] for side in ("train", "val")]
         write_info(out, (sides[0], sides[1]))
-    return Assembly(out, len(members), len(members) - len(missing), placed.linked, placed.copied)
+    return Assembly(out, len(members), len(members) - len(missing), placer.linked, placer.copied)
 
 
 def _plan(members: Sequence[Member], split_rule: str) -> dict[str, Any]:

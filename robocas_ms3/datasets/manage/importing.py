@@ -15,7 +15,6 @@ import robocas_ms3
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.eef import about_z
 from robocas_ms3.datasets.manage.findings import EMBEDDINGS, EpisodeImport
-from robocas_ms3.datasets.manage.output import Placed, begun_output
 from robocas_ms3.datasets.manage.parts import schema_version
 from robocas_ms3.datasets.manage.reading import read_episode
 from robocas_ms3.datasets.manage.survey import Survey, read_info
@@ -24,6 +23,7 @@ from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
 from robocas_ms3.datasets.writing.frames import CameraModel
 from robocas_ms3.datasets.writing.info import write_info
+from robocas_ms3.datasets.writing.output import Placer, begun_output
 from robocas_ms3.datasets.writing.plan import dataset_settings
 from robocas_ms3.datasets.writing.writer import write_cameras
 from robocas_ms3.errors import DatasetError
@@ -76,7 +76,7 @@ def import_robocas(
     embedded = surveyed.embeddings or embed is not None
     plan = _plan(dataset, surveyed, embedded)
     with begun_output(out, plan, inputs=[surveyed.root], overwrite=overwrite, resume=resume):
-        placed = Placed(link)
+        placer = Placer(link)
         missing = [n for n in surveyed.taken if not (out / schema.episode_folder(n)).is_dir()]
         if on_start:
             on_start(len(missing))
@@ -89,7 +89,7 @@ def import_robocas(
                 raise DatasetError("this episode changed meanwhile", where=where)
             taken = replace(read, stored=_embedded(read, embedded, embed))
             with replacing_folder(out / schema.episode_folder(number)) as folder:
-                _write(folder, dataset.episode(number), taken, surveyed, placed)
+                _write(folder, dataset.episode(number), taken, surveyed, placer)
             if on_episode:
                 on_episode(number)
         write_json(out / REPORT_FILE, surveyed.as_json())
@@ -136,7 +136,7 @@ def _embedded(read: EpisodeImport, wanted: bool, embed: Embed | None) -> Episode
     return replace(stored, arrays={**stored.arrays, **made}, derived={**stored.derived, **sources})
 
 
-def _write(folder: Path, episode: Episode, taken: EpisodeImport, surveyed: Survey, placed: Placed) -> None:
+def _write(folder: Path, episode: Episode, taken: EpisodeImport, surveyed: Survey, placer: Placer) -> None:
     assert surveyed.pictures is not None
     pictures = surveyed.pictures
     cameras = {
@@ -155,7 +155,7 @@ def _write(folder: Path, episode: Episode, taken: EpisodeImport, surveyed: Surve
             (folder / camera / kind).mkdir(parents=True)
             for step in range(taken.stored.steps):
                 source = episode.image_path(camera, kind, step)
-                placed.file(source, schema.image_path(folder, camera, kind, step, pictures.image_format))
+                placer.file(source, schema.image_path(folder, camera, kind, step, pictures.image_format))
     write_cameras(folder, cameras)
     arrays = {key: taken.stored.arrays[key] for key in SPECS if key in taken.stored.arrays}
     np.savez(folder / schema.EPISODE_FILE, **arrays)

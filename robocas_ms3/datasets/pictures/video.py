@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from robocas_ms3.datasets.pictures.drawing import (
     stack_rows,
 )
 from robocas_ms3.datasets.pictures.png import encode_png
-from robocas_ms3.datasets.sources.protocol import EpisodeSource, SourceEpisode
+from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, SourceEpisode, shots
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing
 
@@ -56,7 +57,13 @@ def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Any
 
 
 def write_video(
-    dataset: EpisodeSource, number: int, path: Path | str, *, speed: float = 1.0, kind: str = "rgb", panel: Size = PANEL
+    dataset: EpisodeSource,
+    number: int,
+    path: Path | str,
+    *,
+    speed: float = 1.0,
+    kind: Kind = "rgb",
+    panel: Size = PANEL,
 ) -> Path:
     """Write an episode as MP4 (H.264, yuv420p): the cameras side by side, instruction and sub-goal below.
 
@@ -75,14 +82,19 @@ def write_video(
         raise DatasetError("no such speed", where="speed", expected="> 0", found=speed)
     path = Path(path)
     episode = dataset.episode(number)
-    with replacing(path) as tmp, open_video(tmp, dataset.rate_hz * speed) as video:
-        for step in range(episode.steps):
-            video.append_data(video_frame(episode, step, number=number, kind=kind, panel=panel))
+    story = Story.of(number, episode.arrays)
+    with (
+        replacing(path) as tmp,
+        open_video(tmp, dataset.rate_hz * speed) as video,
+        closing(shots(episode, episode.cameras, kind)) as run,
+    ):
+        for step, pictures in enumerate(run):
+            video.append_data(draw_frame(story, step, _coloured(pictures, kind), panel))
     return path
 
 
 def video_frame(
-    episode: SourceEpisode, step: int, *, number: int = 0, kind: str = "rgb", panel: Size = PANEL
+    episode: SourceEpisode, step: int, *, number: int = 0, kind: Kind = "rgb", panel: Size = PANEL
 ) -> NDArray[np.uint8]:
     """One picture of the video, (H, W, 3) RGB, both even."""
     return draw_frame(Story.of(number, episode.arrays), step, _pictures(episode, step, kind), panel)
@@ -95,7 +107,7 @@ def contact_sheet(
     episodes: Sequence[int] | None = None,
     columns: int = COLUMNS,
     thumbnail: Size = THUMBNAIL,
-    kind: str = "rgb",
+    kind: Kind = "rgb",
 ) -> Path:
     """Write a PNG with a row for each episode and camera, of evenly spaced steps from first to last.
 
@@ -112,7 +124,7 @@ def contact_sheet(
 
 
 def sheet_row(
-    dataset: EpisodeSource, number: int, columns: int = COLUMNS, thumbnail: Size = THUMBNAIL, kind: str = "rgb"
+    dataset: EpisodeSource, number: int, columns: int = COLUMNS, thumbnail: Size = THUMBNAIL, kind: Kind = "rgb"
 ) -> NDArray[np.uint8]:
     """An episode's part of a contact sheet, (H, W, 3) RGB."""
     episode = dataset.episode(number)
@@ -136,7 +148,12 @@ def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return colours.astype(np.uint8)
 
 
-def _pictures(episode: SourceEpisode, step: int, kind: str) -> Pictures:
-    if kind == "rgb":
-        return {camera: episode.rgb(camera, step) for camera in episode.cameras}
-    return {camera: colour_depth(episode.depth(camera, step)) for camera in episode.cameras}
+def _pictures(episode: SourceEpisode, step: int, kind: Kind) -> Pictures:
+    """Of every camera."""
+    picture = episode.rgb if kind == "rgb" else episode.depth
+    return _coloured({camera: picture(camera, step) for camera in episode.cameras}, kind)
+
+
+def _coloured(pictures: Mapping[str, NDArray], kind: Kind) -> Pictures:
+    """Depth as colours, RGB as it is."""
+    return {camera: picture if kind == "rgb" else colour_depth(picture) for camera, picture in pictures.items()}

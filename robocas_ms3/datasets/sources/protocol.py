@@ -6,7 +6,8 @@ be pickled and forked.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -22,6 +23,8 @@ from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
 
 Side = Literal["train", "val", "all"]
 """Of the split into training and validation."""
+Kind = Literal["rgb", "depth"]
+"""Of picture."""
 
 
 class SourceEpisode(Protocol):
@@ -89,6 +92,18 @@ class SourceEpisode(Protocol):
         """(H, W) mm, 0 = nothing."""
         ...
 
+    def frames(
+        self, camera: str, kind: Kind = "rgb", first: int = 0, count: int | None = None
+    ) -> Generator[NDArray, None, None]:
+        """Pictures of steps one after the other, as `rgb` or `depth` gives them.
+
+        A file may be open meanwhile: who does not read to the end closes it. Here they are read one by one; a format
+        that is quicker in a run, as a video is, has a method of its own.
+        """
+        picture = self.rgb if kind == "rgb" else self.depth
+        for step in range(first, self.steps if count is None else first + count):
+            yield picture(camera, step)
+
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
         """(4,) fx, fy, cx, cy in pixels."""
         ...
@@ -96,6 +111,17 @@ class SourceEpisode(Protocol):
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
         """(4, 4) OpenCV camera frame in its parent, see ``schema.CAMERAS``."""
         ...
+
+
+def shots(
+    episode: SourceEpisode, cameras: Sequence[str], kind: Kind = "rgb"
+) -> Generator[dict[str, NDArray], None, None]:
+    """Pictures of every step of an episode, by camera; who does not read to the end closes it."""
+    steps = episode.steps
+    with ExitStack() as stack:
+        runs = {camera: stack.enter_context(closing(episode.frames(camera, kind, 0, steps))) for camera in cameras}
+        for _ in range(steps):
+            yield {camera: next(run) for camera, run in runs.items()}
 
 
 class EpisodeSource(Protocol):

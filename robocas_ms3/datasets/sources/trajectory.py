@@ -71,7 +71,7 @@ class TrajectorySource(EpisodeSource):
             self.stride = sample_stride(file.control_freq, self.rate_hz)
             self.index = [n for n, e in enumerate(file.episodes) if include_failed or succeeded(e)]
             self._said = [_attempt(file, index) for index in self.index]
-        self.numbers = list(range(len(self.index)))
+        self.numbers, self._closed = list(range(len(self.index))), file
 
     def said(self, number: int) -> SaidOfRecording:
         """What the JSON says of an episode.
@@ -104,8 +104,17 @@ class TrajectorySource(EpisodeSource):
 
     def entry(self, number: int) -> Mapping[str, Any]:
         """Which recording it is."""
-        with TrajectoryFile(self.root) as file:
+        with self._closed.reopened() as file:
             return recording_entry(file, self.index[number])
+
+    def recording(self, number: int, *, bodies: bool = True) -> Recording:
+        """All control steps of an episode, with the states of all bodies or of the robot alone.
+
+        Raises:
+            DatasetError: it is damaged.
+        """
+        with self._closed.reopened() as file:
+            return file.recording(self.index[number], bodies=bodies)
 
     def episode(self, number: int) -> RecordedEpisode:
         """Open an episode.
@@ -189,8 +198,7 @@ class RecordedEpisode(SourceEpisode):
         Raises:
             DatasetError: it is damaged.
         """
-        with TrajectoryFile(self._source.root) as file:
-            return file.recording(self._source.index[self._number], bodies=bodies)
+        return self._source.recording(self._number, bodies=bodies)
 
     def _no_pictures(self) -> DatasetError:
         fix = "Convert it with robocas convert."

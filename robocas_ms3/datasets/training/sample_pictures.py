@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import get_worker_info
 
-from robocas_ms3.datasets.sources.protocol import SourceEpisode
+from robocas_ms3.datasets.sources.protocol import Kind, SourceEpisode
 from robocas_ms3.errors import DatasetError
 
 _settled = -1  # the process that was settled last
@@ -32,14 +33,12 @@ class PictureStack:
     size: tuple[int, int] | None
     float_images: bool
 
-    def read(
-        self, episode: SourceEpisode, observed: NDArray[np.int64], kind: Literal["rgb", "depth"], *, zero: bool
-    ) -> torch.Tensor:
+    def read(self, episode: SourceEpisode, observed: NDArray[np.int64], kind: Kind, *, zero: bool) -> torch.Tensor:
         """Read the pictures of some steps: (H, C, 3, h, w) or (H, C, h, w).
 
         Args:
             episode: they are in.
-            observed: (H,) steps; below 0 before the episode.
+            observed: (H,) steps, one after the other; below 0 before the episode.
             kind: of picture.
             zero: whether what is before the episode is zeros; else it is the first picture.
 
@@ -48,33 +47,39 @@ class PictureStack:
         """
         _settle_process()
         steps = np.maximum(observed, 0)
-        decoded = {int(s): self._stack(episode, int(s), kind) for s in np.unique(steps)}
-        shapes = {picture.shape for picture in decoded.values()}
+        first, count = int(steps[0]), int(steps[-1] - steps[0]) + 1
+        runs = [self._run(episode, camera, kind, first, count) for camera in self.cameras]
+        decoded = [self._stack(episode, shots) for shots in zip(*runs, strict=True)]
+        shapes = {picture.shape for picture in decoded}
         if len(shapes) > 1:
             raise DatasetError("pictures differ in size", where=episode.where, found=sorted(shapes), fix="Pass a size.")
-        stack = np.stack([decoded[int(step)] for step in steps])
+        stack = np.stack([decoded[step - first] for step in steps])
         if zero:
             stack[observed < 0] = 0
         return torch.from_numpy(stack)
 
-    def _stack(self, episode: SourceEpisode, step: int, kind: Literal["rgb", "depth"]) -> NDArray:
-        """One step's pictures, cameras first: (C, 3, h, w) or (C, h, w)."""
+    def _run(self, episode: SourceEpisode, camera: str, kind: Kind, first: int, count: int) -> list[NDArray]:
+        """One camera's pictures of steps one after the other, scaled."""
         shots = []
-        for camera in self.cameras:
-            picture = episode.rgb(camera, step) if kind == "rgb" else episode.depth(camera, step)
-            if (picture.ndim, picture.dtype) != ((3, np.uint8) if kind == "rgb" else (2, np.uint16)):
-                raise DatasetError(
-                    "not a picture of this kind",
-                    where=f"{episode.where}/{camera}/{kind}, step {step}",
-                    expected="(H, W, 3) uint8" if kind == "rgb" else "(H, W) uint16",
-                    found=f"{picture.shape} {picture.dtype}",
-                )
-            shots.append(_resize(picture, self.size))
+        with closing(episode.frames(camera, kind, first, count)) as pictures:
+            for step, picture in enumerate(pictures, start=first):
+                if (picture.ndim, picture.dtype) != ((3, np.uint8) if kind == "rgb" else (2, np.uint16)):
+                    raise DatasetError(
+                        "not a picture of this kind",
+                        where=f"{episode.where}/{camera}/{kind}, step {step}",
+                        expected="(H, W, 3) uint8" if kind == "rgb" else "(H, W) uint16",
+                        found=f"{picture.shape} {picture.dtype}",
+                    )
+                shots.append(_resize(picture, self.size))
+        return shots
+
+    def _stack(self, episode: SourceEpisode, shots: Sequence[NDArray]) -> NDArray:
+        """One step's pictures, cameras first: (C, 3, h, w) or (C, h, w)."""
         if len({shot.shape for shot in shots}) > 1:
             found = [shot.shape for shot in shots]
             raise DatasetError("cameras differ in size", where=episode.where, found=found, fix="Pass a size.")
         stack = np.stack(shots)
-        if kind == "depth":
+        if stack.ndim == 3:
             return stack.astype(np.float32) / 1000
         stack = np.ascontiguousarray(stack.transpose(0, 3, 1, 2))
         return stack.astype(np.float32) / 255 if self.float_images else stack

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Mapping
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.sources.protocol import EpisodeSource, SourceEpisode
+from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, SourceEpisode, shots
 from robocas_ms3.datasets.sources.tolerant import DAMAGED, arrays_fingerprint
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame
 from robocas_ms3.datasets.writing.players import Played, Player, RecordingPlayer, Request
@@ -113,27 +114,33 @@ class _PlayedEpisode:
     with_depth: bool
     timing: Timing
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Generator[Frame, None, None]:
         """Read every step's; an encoder would take one of another size and scale it, so that is checked.
 
         Raises:
             DatasetError: one is damaged, or of another size than the dataset's.
         """
-        for step in range(self.episode.steps):
-            with self.timing.measure("load"):
-                rgb = {camera: self.episode.rgb(camera, step) for camera in self.sizes}
-                depth = {camera: self.episode.depth(camera, step) for camera in self.sizes} if self.with_depth else {}
-            for kind, shots in (("rgb", rgb), ("depth", depth)):
-                for camera, picture in shots.items():
-                    if _size(picture) != self.sizes[camera]:
-                        raise DatasetError(
-                            "this picture is not of the dataset's size",
-                            where=f"{self.episode.where}, {camera}/{kind}, step {step}",
-                            expected="{} x {}".format(*self.sizes[camera]),
-                            found="{} x {}".format(*_size(picture)),
-                            fix=_VALIDATE,
-                        )
-            yield Frame(rgb, depth)
+        kinds: tuple[Kind, ...] = ("rgb", "depth") if self.with_depth else ("rgb",)
+        with ExitStack() as stack:
+            cameras = tuple(self.sizes)
+            runs = {kind: stack.enter_context(closing(shots(self.episode, cameras, kind))) for kind in kinds}
+            for step in range(self.episode.steps):
+                with self.timing.measure("load"):
+                    found = {kind: next(run) for kind, run in runs.items()}
+                for kind, pictures in found.items():
+                    self._check_sizes(kind, step, pictures)
+                yield Frame(found["rgb"], found.get("depth", {}))
+
+    def _check_sizes(self, kind: str, step: int, pictures: Mapping[str, NDArray]) -> None:
+        for camera, picture in pictures.items():
+            if _size(picture) != self.sizes[camera]:
+                raise DatasetError(
+                    "this picture is not of the dataset's size",
+                    where=f"{self.episode.where}, {camera}/{kind}, step {step}",
+                    expected="{} x {}".format(*self.sizes[camera]),
+                    found="{} x {}".format(*_size(picture)),
+                    fix=_VALIDATE,
+                )
 
     def cameras(self) -> dict[str, CameraModel]:
         episode = self.episode

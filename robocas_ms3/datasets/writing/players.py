@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -75,8 +75,8 @@ class Played(Protocol):
         """All but the embeddings, by the schema's keys."""
         ...
 
-    def frames(self) -> Iterator[Frame]:
-        """One a step."""
+    def frames(self) -> Generator[Frame, None, None]:
+        """One a step; files may be open until it is closed."""
         ...
 
     def cameras(self) -> dict[str, CameraModel]:
@@ -197,7 +197,7 @@ class _PlayedRecording:
     arrays: dict[str, NDArray]
     timing: Timing
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Generator[Frame, None, None]:
         begun = time.perf_counter()
         for frame in self.shown.frames(self.recording, self.samples):
             self.timing.render += time.perf_counter() - begun

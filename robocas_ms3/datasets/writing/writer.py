@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,10 +75,14 @@ def write_episode(
             for kind in pictures.kinds:
                 (folder / camera / kind).mkdir(parents=True)
         played = player.open(source, timing)
-        with ExitStack() as previews, _Encoders(folder, pictures, timing) as encoders:
+        with (
+            ExitStack() as previews,
+            _Encoders(folder, pictures, timing) as encoders,
+            closing(played.frames()) as frames,
+        ):
             if open_preview:  # finished after the encoders
                 encoders.preview = previews.enter_context(open_preview(Story.of(number, played.arrays)))
-            for step, frame in enumerate(played.frames()):
+            for step, frame in enumerate(frames):
                 encoders.add(step, frame)
         with timing.measure("write"):
             cameras = played.cameras()

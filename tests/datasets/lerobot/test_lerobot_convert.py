@@ -19,6 +19,8 @@ from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.schema import Limits
+from robocas_ms3.datasets.manage.importing import import_robocas
+from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
@@ -300,13 +302,38 @@ def test_what_breaks_is_gone_on_with(trajectory, lerobot, tmp_path):
     assert files_of(out) == files_of(lerobot)
 
 
+def test_an_imported_folder_is_gone_on_with(dataset, tmp_path):
+    """Nobody knows its recordings, so its episodes are told by their arrays."""
+    for path in [dataset / "conversion.json", *dataset.glob("*/scene.json")]:
+        path.unlink()
+    imported, out, whole = tmp_path / "imported", tmp_path / "out", tmp_path / "whole"
+    import_robocas(survey(dataset), imported)
+
+    def stop(episode):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(imported, out, on_episode=stop)
+    assert {path.name for path in out.iterdir()} == {".parts"}
+    done = run(imported, out, resume=True)
+    assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
+    run(imported, whole)
+    assert files_of(out) == files_of(whole)
+    marks = [f"arrays {arrays_fingerprint(Dataset(imported).episode(number).arrays)}" for number in (0, 1)]
+    assert [entry["recording"] for entry in LeRobotDataset(out).settings["episodes"]] == marks
+    assert run(imported, out, resume=True).kept == 2
+    with pytest.raises(DatasetError, match="these episodes are not what was begun here"):
+        shutil.rmtree(imported / "episode_0000001")
+        run(imported, out, resume=True)
+
+
 @pytest.mark.parametrize("moment", ["frame", "part", "plan", "join", "table", "overview", "rename", "joined", "sweep"])
 def test_killed_and_resumed_is_as_if_never_killed(trajectory, lerobot, tmp_path, moment):
     """kill -9 in a process of its own; nothing lies under a final name that is not whole."""
     out = tmp_path / "out"
     command = [
         sys.executable,
-        str(Path(__file__).parents[1] / "support" / "dying_lerobot.py"),
+        str(Path(__file__).parents[2] / "support" / "dying_lerobot.py"),
         moment,
         str(trajectory),
         str(out),

@@ -21,7 +21,7 @@ from robocas_ms3.datasets.pictures.video import _pictures, contact_sheet
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing import convert as conversion
 
-SUPPORT = Path(__file__).parents[1] / "support"
+SUPPORT = Path(__file__).parents[2] / "support"
 
 
 @pytest.fixture

@@ -63,7 +63,7 @@ def test_actions_worked_out_by_hand():
 
 
 def test_the_documentation_names_every_feature():
-    text = (Path(__file__).parents[2] / "docs/lerobot.md").read_text()
+    text = (Path(__file__).parents[3] / "docs/lerobot.md").read_text()
     for feature in FEATURES:
         assert f"| `{feature.key}` | {feature.width} |" in text
     assert set(features_json({})) <= set(re.findall(r"`([\w.]+)`", text))

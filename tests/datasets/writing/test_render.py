@@ -191,7 +191,7 @@ def test_the_benchmark_runs(recorded, monkeypatch, capsys):
     """Every case, and workers; of pictures this small everything but rendering is what takes time."""
     pytest.importorskip("av", reason="needs the extra 'lerobot'")
     pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
-    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[2] / "benchmarks")
+    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[3] / "benchmarks")
     benchmark = importlib.import_module("convert")
     benchmark.main(benchmark.Benchmark(recorded[0], episodes=2, turns=1, size=(32, 24), jobs=2, jobs_episodes=2))
     report = json.loads(capsys.readouterr().out)

@@ -8,12 +8,12 @@ from synthetic import RayCaster, write_trajectory
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.merging import merge
-from robocas_ms3.datasets.manage.output import Placed
 from robocas_ms3.datasets.manage.parts import names_of
 from robocas_ms3.datasets.manage.splitting import Share, resplit
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.datasets.writing.output import Placer
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.outputs import locked_folder
 
@@ -66,9 +66,9 @@ def test_links_that_the_file_system_refuses_become_copies(tmp_path, monkeypatch)
 
     (tmp_path / "a").write_text("1")
     monkeypatch.setattr("os.link", refuse)
-    placed = Placed(link=True)
-    placed.file(tmp_path / "a", tmp_path / "b")
-    assert (placed.linked, placed.copied, placed.link) == (0, 1, False)
+    placer = Placer(link=True)
+    placer.file(tmp_path / "a", tmp_path / "b")
+    assert (placer.linked, placer.copied, placer.link) == (0, 1, False)
     assert (tmp_path / "b").read_text() == "1"
 
 

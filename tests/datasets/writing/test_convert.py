@@ -305,7 +305,7 @@ def test_killed_and_resumed_is_as_if_never_killed(trajectory, tmp_path, moment):
         shutil.copytree(tmp_path / "whole", out)
     command = [
         sys.executable,
-        str(Path(__file__).parents[1] / "support" / "dying.py"),
+        str(Path(__file__).parents[2] / "support" / "dying.py"),
         moment,
         str(trajectory),
         str(out),

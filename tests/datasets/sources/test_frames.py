@@ -1,0 +1,134 @@
+"""Pictures of steps in a run: the same as one by one, each video opened once, and closed whatever happens."""
+
+import inspect
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from synthetic import RayCaster
+
+pytest.importorskip("av", reason="needs the extra 'lerobot'")
+pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
+
+from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.lerobot import reader, video
+from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+from robocas_ms3.datasets.pictures.video import write_video
+from robocas_ms3.datasets.sources.protocol import shots
+from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
+
+CAMERAS = ("base_camera", "gripper_camera", "static_camera")
+STEPS = 7
+SIZES = 2 * len(CAMERAS)
+"""First pictures read for their size, where a conversion is planned and where it is done."""
+
+
+@pytest.fixture(scope="module")
+def lerobot(made, tmp_path_factory):
+    """A dataset of two episodes that nobody may change."""
+    out = tmp_path_factory.mktemp("lerobot") / "dataset"
+    convert_lerobot(made, out, open_source=RayCaster)
+    return out
+
+
+@pytest.fixture
+def folders(made, lerobot):
+    return {"robocas": made, "lerobot": lerobot}
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """Every run of frames that is read out of a video; held here, so that none is closed because nobody has it."""
+    found, read = [], reader.read_frames
+
+    def held(*args):
+        found.append(read(*args))
+        return found[-1]
+
+    monkeypatch.setattr(reader, "read_frames", held)
+    return found
+
+
+def all_closed(runs):
+    return {inspect.getgeneratorstate(run) for run in runs} == {inspect.GEN_CLOSED}
+
+
+@pytest.mark.parametrize("name", ["robocas", "lerobot"])
+@pytest.mark.parametrize("kind", ["rgb", "depth"])
+def test_a_run_is_what_its_steps_are_one_by_one(folders, name, kind):
+    episode = open_source(folders[name]).episode(1)
+    for camera in episode.cameras:
+        alone = [getattr(episode, kind)(camera, step) for step in range(STEPS)]
+        for span, steps in (((), range(STEPS)), ((3,), range(3, STEPS)), ((1, 4), range(1, 5)), ((2, 0), ())):
+            run = list(episode.frames(camera, kind, *span))
+            assert len(run) == len(steps)
+            for picture, step in zip(run, steps, strict=True):
+                np.testing.assert_array_equal(picture, alone[step])
+
+
+def test_cameras_in_step_are_closed_with_the_run(lerobot, runs):
+    episode = open_source(lerobot).episode(0)
+    run = shots(episode, CAMERAS, "depth")
+    seen = [next(run), next(run)]
+    assert len(runs) == 3
+    assert not all_closed(runs)
+    run.close()
+    assert all_closed(runs)
+    for step, pictures in enumerate(seen):
+        assert list(pictures) == list(CAMERAS)
+        for camera in CAMERAS:
+            np.testing.assert_array_equal(pictures[camera], episode.depth(camera, step))
+
+
+def test_a_conversion_opens_each_video_once_an_episode(lerobot, tmp_path, runs):
+    convert_lerobot(lerobot, tmp_path / "out")
+    assert len(runs) == SIZES + 2 * 2 * len(CAMERAS)
+    assert all_closed(runs)
+    again = open_source(tmp_path / "out").episode(1)
+    np.testing.assert_array_equal(
+        np.stack(list(again.frames("static_camera", "depth"))),
+        np.stack(list(open_source(lerobot).episode(1).frames("static_camera", "depth"))),
+    )
+
+
+def test_a_conversion_that_fails_leaves_no_video_open(lerobot, tmp_path, runs, monkeypatch):
+    add = video.Encoder.add
+
+    def full(self, picture):
+        if self.frames == 2:
+            raise OSError("no space left")
+        add(self, picture)
+
+    monkeypatch.setattr(video.Encoder, "add", full)
+    with pytest.raises(OSError, match="no space left"):
+        convert_lerobot(lerobot, tmp_path / "out")
+    assert len(runs) == SIZES + 2 * len(CAMERAS)
+    assert all_closed(runs)
+
+
+@pytest.mark.parametrize("padding", ["hold", "zero"])
+def test_a_window_of_steps_opens_each_video_once(lerobot, runs, padding):
+    dataset = RoboCASDataset(lerobot, split="all", observation_horizon=4, size=None, depth=True, padding=padding)
+    for step, steps in ((5, [2, 3, 4, 5]), (1, [0, 0, 0, 1])):
+        sample = dataset[dataset.index(1, step)]
+        assert len(runs) == 4  # two cameras, RGB and depth
+        assert all_closed(runs)
+        episode = open_source(lerobot).episode(1)
+        for row, of in enumerate(steps):
+            there = padding == "hold" or bool(sample["observation_mask"][row])
+            for place, camera in enumerate(dataset.cameras):
+                rgb = episode.rgb(camera, of).transpose(2, 0, 1) * there
+                np.testing.assert_array_equal(sample["rgb"][row, place], rgb)
+                depth = episode.depth(camera, of).astype(np.float32) / 1000 * there
+                np.testing.assert_array_equal(sample["depth"][row, place], depth)
+        runs.clear()
+
+
+def test_a_film_opens_each_video_once(lerobot, tmp_path, runs):
+    assert write_video(open_source(lerobot), 1, tmp_path / "e.mp4").stat().st_size > 1000
+    assert len(runs) == len(CAMERAS)
+    assert all_closed(runs)
+
+
+def test_an_episode_without_cameras_has_steps_without_pictures():
+    assert list(shots(SimpleNamespace(steps=2), ())) == [{}, {}]
