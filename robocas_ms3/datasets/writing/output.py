@@ -16,7 +16,7 @@ from robocas_ms3 import outputs
 from robocas_ms3.datasets import schema
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import claim_output, kept_if_begun, locked_folder, sweep
+from robocas_ms3.outputs import claim_output, is_taken, kept_if_begun, locked_folder, sweep
 
 MARKS = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
 """A folder with one of these is a RoboCAS dataset, whole or not."""
@@ -120,7 +120,7 @@ def check_apart(out: Path, inputs: Sequence[Path]) -> None:
 
 
 def _check_begun(out: Path, plan: Mapping[str, Any]) -> None:
-    if not out.is_dir() or not any(out.iterdir()):
+    if not is_taken(out):
         return
     path = out / schema.CONVERSION_FILE
     try:
