@@ -57,7 +57,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Made:
+class JobResult:
     """What became of a job.
 
     Attributes:
@@ -75,7 +75,7 @@ class Made:
     seconds: float = 0.0
 
 
-def make_assets(jobs: Sequence[Job], out: Path, kept: Path, *, processes: int = 1) -> Iterator[Made]:
+def make_assets(jobs: Sequence[Job], out: Path, kept: Path, *, processes: int = 1) -> Iterator[JobResult]:
     """Make assets into ``out/<id>``, or copy them from where earlier runs kept them; yields each as it gets done.
 
     A run that was interrupted goes on where it stopped, since every finished asset is kept.
@@ -94,13 +94,13 @@ def make_assets(jobs: Sequence[Job], out: Path, kept: Path, *, processes: int = 
         if asset is None:
             todo.append((job, place))
         else:
-            yield Made(job.id, asset, reused=True)
+            yield JobResult(job.id, asset, reused=True)
     for made, place in _run(todo, processes):
         # another run may be replacing it by the same just now
         if made.asset is None or _copied(place, out / made.id) or _copied(place, out / made.id):
             yield made
         else:
-            yield Made(made.id, None, f"{made.id}: what was made is gone from {place.parent}")
+            yield JobResult(made.id, None, f"{made.id}: what was made is gone from {place.parent}")
 
 
 def content_hash(*parts: object, files: Iterable[Path] = (), packages: Sequence[str] = ()) -> str:
@@ -133,17 +133,17 @@ def _code(package: str) -> str:
     return digest.hexdigest()
 
 
-def _run(todo: list[tuple[Job, Path]], processes: int) -> Iterator[tuple[Made, Path]]:
+def _run(todo: list[tuple[Job, Path]], processes: int) -> Iterator[tuple[JobResult, Path]]:
     with Pool(partial(Calls, _make), min(processes, len(todo)), died=_died) as pool:
         yield from pool.do(todo)
 
 
-def _died(task: tuple[Job, Path]) -> tuple[Made, Path]:
+def _died(task: tuple[Job, Path]) -> tuple[JobResult, Path]:
     job, place = task
-    return Made(job.id, None, f"{job.id}: the process that made it was killed; is there memory enough?"), place
+    return JobResult(job.id, None, f"{job.id}: the process that made it was killed; is there memory enough?"), place
 
 
-def _make(task: tuple[Job, Path]) -> tuple[Made, Path]:
+def _make(task: tuple[Job, Path]) -> tuple[JobResult, Path]:
     job, place = task
     start = time.perf_counter()
     try:
@@ -158,12 +158,12 @@ def _make(task: tuple[Job, Path]) -> tuple[Made, Path]:
         log.exception("%s failed", job.id)
         made = _failed(job, f"{type(error).__name__}: {' '.join(str(error).split())}")
     else:
-        made = Made(job.id, asset, seconds=time.perf_counter() - start)
+        made = JobResult(job.id, asset, seconds=time.perf_counter() - start)
     return made, place
 
 
-def _failed(job: Job, message: str) -> Made:
-    return Made(job.id, None, message if message.startswith(job.id) else f"{job.id}: {message}")
+def _failed(job: Job, message: str) -> JobResult:
+    return JobResult(job.id, None, message if message.startswith(job.id) else f"{job.id}: {message}")
 
 
 def _copied(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset | None:
@@ -196,8 +196,8 @@ def write_pack(
     processes: int = 1,
     skip_bad: bool = False,
     record: bool = True,
-    on_made: Callable[[Made], None] = lambda made: None,
-) -> list[Made]:
+    on_made: Callable[[JobResult], None] = lambda made: None,
+) -> list[JobResult]:
     """Make a pack of assets: it appears at ``folder`` when all are done, or not at all.
 
     Args:
@@ -233,7 +233,7 @@ def write_pack(
     return results
 
 
-def _without_miscooked(results: list[Made], folder: Path, skip_bad: bool) -> list[Made]:
+def _without_miscooked(results: list[JobResult], folder: Path, skip_bad: bool) -> list[JobResult]:
     """Give up, or leave them out, where the physics engine makes less of hulls than their files say."""
     faults: dict[str, str] = {}
     for fault in cooking_faults(folder):
@@ -242,7 +242,7 @@ def _without_miscooked(results: list[Made], folder: Path, skip_bad: bool) -> lis
         raise AssetError("; ".join(faults.values()), fix="Mend it, or pass --skip-bad to leave it out.")
     for name in faults:
         shutil.rmtree(folder / name)
-    return [Made(made.id, None, faults[made.id]) if made.id in faults else made for made in results]
+    return [JobResult(made.id, None, faults[made.id]) if made.id in faults else made for made in results]
 
 
 def check_target(folder: Path) -> None:

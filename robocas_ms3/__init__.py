@@ -24,10 +24,10 @@ def _register() -> None:
     register()
 
 
-_after_import("gymnasium", _register)
-
-
 def __getattr__(name: str) -> object:
     if name in _MODULES:
         return getattr(_import_module(_MODULES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+_after_import("gymnasium", _register)  # the last: packages that bring tasks may import this one

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from functools import cached_property
@@ -11,6 +10,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
+from robocas_ms3.after_import import half_imported
 from robocas_ms3.errors import ExtensionError
 
 _log = logging.getLogger(__name__)
@@ -20,8 +20,8 @@ T = TypeVar("T")
 class Table(Mapping[str, T]):
     """Rows by name. What other packages bring is looked for when it is asked for, and loaded row by row.
 
-    A row that can't be loaded is an error for who asks for it; who asks for all gets the others, and one warning. One
-    whose module is just being imported is not there yet.
+    A row that can't be loaded, or that several packages have, is an error for who asks for it; who asks for all gets
+    the others, and one warning. One whose module is just being imported is not there yet (`unfinished`).
 
     Args:
         kind: what a row is, for messages.
@@ -38,14 +38,14 @@ class Table(Mapping[str, T]):
     def __getitem__(self, name: str) -> T:
         if name in self.builtin:
             return self.builtin[name]
-        point = self._points[name]
+        points = self.points[name]
         if name in self._broken:
             raise self._broken[name].with_traceback(None)
         if name not in self._loaded:
-            if _being_imported(point.module):
+            if half_imported(points[0].module):
                 raise KeyError(name)
             try:
-                self._loaded[name] = self._load(point)
+                self._loaded[name] = self._load(points)
             except ExtensionError as error:
                 self._broken[name] = error
                 raise
@@ -53,7 +53,7 @@ class Table(Mapping[str, T]):
 
     def __iter__(self) -> Iterator[str]:
         yield from self.builtin
-        for name in self._points:
+        for name in self.points:
             known = name in self._broken
             try:
                 if name in self:
@@ -79,19 +79,31 @@ class Table(Mapping[str, T]):
         raise ExtensionError(f"no such {self.kind}", where=where, expected=f"one of {known}", found=repr(name), fix=fix)
 
     @cached_property
-    def _points(self) -> dict[str, EntryPoint]:
-        found: dict[str, EntryPoint] = {}
-        for point in sorted(entry_points(group=self.group), key=lambda point: (point.name, point.value)):
-            if point.name in self.builtin or found.setdefault(point.name, point).value != point.value:
+    def points(self) -> dict[str, list[EntryPoint]]:
+        """By name, the entry points of other packages, of which nothing is loaded; one each, if all is well."""
+        found: dict[str, list[EntryPoint]] = {}
+        for point in sorted(entry_points(group=self.group), key=lambda point: (point.name, package_of(point))):
+            if point.name in self.builtin:
                 _log.warning("a second %s %r, of %s, is left out", self.kind, point.name, point.value)
+            elif point.value not in {other.value for other in found.setdefault(point.name, [])}:
+                found[point.name].append(point)
         return found
 
-    def _load(self, point: EntryPoint) -> T:
-        fix = f"Mend or uninstall {point.dist.name}." if point.dist else ""
+    def unfinished(self) -> list[str]:
+        """Modules of rows that are not there yet, as their import has not ended."""
+        modules = [points[0].module for name, points in self.points.items() if name not in self._loaded]
+        return [module for module in dict.fromkeys(modules) if half_imported(module)]
+
+    def _load(self, points: list[EntryPoint]) -> T:
+        point = points[0]
+        if len(points) > 1:
+            what, packages = f"several packages have a {self.kind} of this name", ", ".join(map(package_of, points))
+            raise ExtensionError(what, where=point.name, found=packages, fix="Uninstall all but one.")
+        fix = f"Mend or uninstall {package_of(point)}."
         try:
             row = point.load()
         except Exception as error:  # whatever another package's module meets
-            what, found = f"this {self.kind} can't be loaded", f"{type(error).__name__}: {error}"
+            what, found = f"this {self.kind} can't be loaded", " ".join(f"{type(error).__name__}: {error}".split())
             raise ExtensionError(what, where=f"{point.name} = {point.value}", found=found, fix=fix) from error
         if not isinstance(row, self.row):
             expected = f"a {self.row.__name__}"
@@ -100,9 +112,9 @@ class Table(Mapping[str, T]):
         return row
 
 
-def _being_imported(module: str) -> bool:
-    """Whether a module is half imported: it is what imports us."""
-    return getattr(getattr(sys.modules.get(module), "__spec__", None), "_initializing", False)
+def package_of(point: EntryPoint) -> str:
+    """Name of the package that has an entry point."""
+    return point.dist.name if point.dist else point.module.partition(".")[0]
 
 
 def load(path: str) -> Any:

@@ -1,14 +1,16 @@
 """Folders that runs write into: whose they may be, what becomes of what is there, and who else may write there.
 
 A run that writes one episode after the other takes these steps, all under `locked_folder`: `claim_output` refuses what
-is there unless the user said what to do with it; `check_overwrite` keeps what is none of ours from being deleted;
-`sweep` removes what a killed run left half written; `kept_if_begun` leaves no folder behind of which nothing came.
+is there unless the user said what to do with it; `check_overwrite` keeps what is none of ours from being deleted, and
+`check_run` what is another command's; `sweep` removes what a killed run left half written; `kept_if_begun` leaves no
+folder behind of which nothing came.
 """
 
 from __future__ import annotations
 
 import fcntl
 import glob
+import json
 import os
 import shutil
 import tempfile
@@ -124,6 +126,30 @@ def check_same(
     if different:
         expected = ", ".join(f"{key} {before.get(key)}" for key in different)
         raise error(what, where=where, expected=expected, found=", ".join(f"{k} {now[k]}" for k in different), fix=fix)
+
+
+def check_run(path: Path, key: str, command: str, error: type[RobocasError] = OutputExistsError) -> None:
+    """See that notes of a run are those of a command, as several commands keep some under one name.
+
+    Args:
+        path: of the file, which may not be there.
+        key: that those of the command have.
+        command: that wants to write there.
+        error: to be raised.
+
+    Raises:
+        RobocasError: ``error``: they are of another one.
+    """
+    if not path.is_file():
+        return
+    try:
+        run = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        run = None
+    if not isinstance(run, dict) or key not in run:
+        found = ", ".join(run) if isinstance(run, dict) else ""
+        what, fix = f"refusing to write over what `robocas {command}` has not made", "Choose another --out."
+        raise error(what, where=path, expected=key, found=found or "nothing of the kind", fix=fix)
 
 
 @contextmanager

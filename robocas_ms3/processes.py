@@ -1,4 +1,4 @@
-"""Tasks done by several processes, and the watch that ends a process with the one that started it.
+"""Tasks done by several processes, errors sent between them, and the watch that ends one with its starter.
 
 What `Pool` promises, wherever it is used:
 
@@ -14,16 +14,18 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Generic, Protocol, TypeVar
+from traceback import format_exception
+from typing import Any, Generic, NoReturn, Protocol, TypeVar
 
 from robocas_ms3.errors import RobocasError
 
@@ -155,6 +157,64 @@ class Pool(Generic[Task, Result]):
         if self._worker is not None:
             self._worker.close()
             self._worker = None
+
+
+@dataclass(frozen=True)
+class SentError:
+    """An error as it can be sent to another process, through a pipe.
+
+    Attributes:
+        error: it, or what says the same in its stead.
+        where: it was raised first, such as "a branch".
+        traceback: of there.
+    """
+
+    error: BaseException
+    where: str
+    traceback: str
+
+    @classmethod
+    def of(
+        cls,
+        error: BaseException,
+        where: str,
+        *,
+        sendable: type[BaseException] = BaseException,
+        otherwise: type[Exception] = RuntimeError,
+    ) -> SentError:
+        """Make an error ready to be sent.
+
+        Args:
+            error: it.
+            where: this process is what; of an error that was sent here, where it came from remains.
+            sendable: what is sent as it is, if it pickles.
+            otherwise: the type of what takes an error's place if not.
+        """
+        cause = error.__cause__
+        place = cause.args if isinstance(cause, SentTraceback) else (where, "".join(format_exception(error)))
+        with suppress(Exception):  # whatever its class does
+            if isinstance(error, sendable) and type(pickle.loads(pickle.dumps(error))) is type(error):
+                return cls(error, *place)
+        return cls(otherwise(f"{type(error).__name__}: {error}"), *place)
+
+    def reraise(self) -> NoReturn:
+        """Raise the error here."""
+        raise self.error from SentTraceback(self.where, self.traceback)
+
+
+class SentTraceback(Exception):  # noqa: N818  (shown as the cause of an error, as `concurrent.futures` does)
+    """Where in another process an error came from, as text: tracebacks can't be sent."""
+
+    def __str__(self) -> str:
+        where, text = self.args
+        return f"in {where}:\n{text}"
+
+
+def use_one_torch_thread() -> None:
+    """Leave torch one thread for good: those of small operations wait for each other. For commands and workers."""
+    import torch
+
+    torch.set_num_threads(1)
 
 
 def leave_with(parent: int, look: Callable[[], object] = lambda: time.sleep(_LOOK)) -> None:

@@ -6,6 +6,7 @@ import logging
 from functools import partial
 from typing import Any
 
+from robocas_ms3.after_import import after_import
 from robocas_ms3.benchmark import TASKS, TaskSpec
 
 _log = logging.getLogger(__name__)
@@ -14,7 +15,8 @@ _log = logging.getLogger(__name__)
 def register() -> None:
     """Register the environments of all tasks that are not registered yet, those of other packages as well.
 
-    It happens when this package and gymnasium have been imported, in either order.
+    It happens when this package and gymnasium have been imported, in either order; tasks of a module that is half
+    imported then, as it imports this package, follow when it is through.
     """
     from gymnasium.envs.registration import registry  # not above: importing it calls this
 
@@ -25,6 +27,8 @@ def register() -> None:
             registry[task.env_id] = _spec(task)
         except Exception as error:  # an id or numbers that gymnasium does not take; the others are there all the same
             _log.warning("the task %s can't be registered: %s", task.name, error)
+    for module in TASKS.unfinished():
+        after_import(module, register)
 
 
 def _spec(task: TaskSpec) -> Any:

@@ -57,6 +57,7 @@ def main() -> None:
     say({name: version(name) for name in ("lerobot", "lerobot_env_robocas", "torch", "numpy", "gymnasium")})
     register_third_party_plugins()
     assert "robocas" in EnvConfig.get_known_choices()
+    assert EnvConfig.get_choice_class("robocas")(task="all", protocol="paper-v1").tasks == ["pick", "search"]
     with tempfile.TemporaryDirectory() as folder:
         untrained(Path(folder))
         recorded(Path(folder))

@@ -58,6 +58,23 @@ def test_what_is_broken_is_an_error_for_who_asks_for_it_and_one_warning_for_othe
             numbers.find("bad")
 
 
+def test_a_name_that_several_packages_have_is_nobodys(tmp_path, monkeypatch, caplog):
+    for package in ("ours", "yours"):
+        info = tmp_path / f"{package}-1.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1\n")
+        points = f"[a.group]\nseven = numbers_of_two:{package.upper()}\nsix = numbers_of_two:SIX\n"
+        (info / "entry_points.txt").write_text(points)
+    (tmp_path / "numbers_of_two.py").write_text("OURS, YOURS, SIX = 7, 8, 6")
+    monkeypatch.syspath_prepend(tmp_path)
+    numbers = table()
+    assert dict(numbers) == {"one": 1, "six": 6}  # the same twice is no other
+    said = "seven: several packages have a number of this name (found ours, yours). Uninstall all but one."
+    assert caplog.messages == [said]
+    with pytest.raises(ExtensionError, match="several packages have a number of this name"):
+        numbers.find("seven")
+
+
 def test_an_unknown_name_gets_the_nearest_ones():
     with pytest.raises(ExtensionError) as error:
         table().find("onne", where="here")
@@ -73,6 +90,24 @@ def test_a_row_whose_module_asks_for_the_table_while_it_is_imported_comes_after(
 
     assert a_stranger.BEFORE == ["one"]
     assert list(test_extensions_table.NUMBERS) == ["one", "seven"]
+
+
+def test_so_does_one_whose_package_is_imported_yet(package, tmp_path):
+    """A row's own module may want what its package has not come to."""
+    table_ = "from robocas_ms3.extensions import Table\nNUMBERS = Table('number', 'a.group', int, {'one': 1})"
+    package({"seven": "a_package.row:SEVEN"}, test_extensions_table=table_)
+    (tmp_path / "a_package").mkdir()
+    (tmp_path / "a_package" / "__init__.py").write_text(
+        "import test_extensions_table\nBEFORE = list(test_extensions_table.NUMBERS)\n"
+        "UNFINISHED = test_extensions_table.NUMBERS.unfinished()\nNUMBER = 7"
+    )
+    (tmp_path / "a_package" / "row.py").write_text("from a_package import NUMBER as SEVEN")
+    import a_package  # pyright: ignore[reportMissingImports]
+    import test_extensions_table  # pyright: ignore[reportMissingImports]
+
+    assert (a_package.BEFORE, a_package.UNFINISHED) == (["one"], ["a_package.row"])
+    assert list(test_extensions_table.NUMBERS) == ["one", "seven"]
+    assert test_extensions_table.NUMBERS.unfinished() == []
 
 
 def test_objects_by_import_path():

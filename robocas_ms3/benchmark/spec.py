@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 STANDARD_FREQ = 20  # Hz, of control; gymnasium's horizon is for it
+STAGES = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_target", "target_grasped", "target_lifted")
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class TaskSpec:
         checks: what its configurations have to be besides well-formed: functions that raise ValueError.
         instructions: its templates by split, ``upstream``, ``train`` and ``held_out``; default: those of
             ``language/instructions.yaml``.
+        stages: those of its environment that an episode comes through, in order; an evaluation names the one that it
+            did not come to. Default: the benchmark's, of which an environment may lack some.
     """
 
     name: str
@@ -40,6 +43,7 @@ class TaskSpec:
     slots: tuple[str, ...] = ()
     checks: tuple[str, ...] = ()
     instructions: Mapping[str, Sequence[str]] = field(default_factory=dict, hash=False)
+    stages: tuple[str, ...] = STAGES
 
     def steps(self, control_freq: int) -> int:
         """The horizon in control steps at a rate, Hz."""

@@ -192,7 +192,7 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
     from rich.console import Console
     from rich.progress import Progress
 
-    from asset_tools.pipeline import Made, write_pack
+    from asset_tools.pipeline import JobResult, write_pack
     from robocas_ms3.cli.assets_show import Info, info
     from robocas_ms3.cli.bars import columns
     from robocas_ms3.paths import cache_dir
@@ -201,7 +201,7 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
     with Progress(*columns(), console=Console(stderr=True)) as progress:
         bar = progress.add_task(out.name, total=len(jobs))
 
-        def on_made(made: Made) -> None:
+        def on_made(made: JobResult) -> None:
             progress.advance(bar)
             if made.asset is None:
                 progress.console.print(f"left out: {made.error}", highlight=False, soft_wrap=True)

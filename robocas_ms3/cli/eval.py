@@ -100,6 +100,7 @@ def run(cfg: Eval) -> int:
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.run import Settings, evaluate
     from robocas_ms3.evaluation.tables import markdown
+    from robocas_ms3.processes import use_one_torch_thread
     from robocas_ms3.strict import nearest
 
     for word in cfg.words:
@@ -111,6 +112,7 @@ def run(cfg: Eval) -> int:
             check_number(name, number, 1)
     if cfg.retry_errors and not cfg.resume:
         raise EvaluationError("there is nothing to retry", where="--retry-errors", fix="Pass --resume too.")
+    use_one_torch_thread()
     protocol = load_protocol(cfg.protocol or "ms3-v1")
     name = re.sub(r"[^\w.-]+", "_", cfg.policy) + ("_weld" if cfg.weld else "")
     out = cfg.out or Path("eval") / protocol.rules.name / name

@@ -21,22 +21,15 @@ def protocols() -> int:
 def freeze(plan: Path, out: Path | None) -> int:
     """Make a protocol."""
     from robocas_ms3.cli.bars import bar, say
-    from robocas_ms3.documents import DocumentError, load_yaml
     from robocas_ms3.errors import EvaluationError
-    from robocas_ms3.evaluation.freeze import Plan
     from robocas_ms3.evaluation.freeze import freeze as make
+    from robocas_ms3.evaluation.freeze import read_plan
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.outputs import check_absent
-    from robocas_ms3.strict import parse
 
     if out is None:
         raise EvaluationError("where to?", where="--out", expected="a folder")
-    what = "no plan of a protocol"
-    try:
-        data = load_yaml(plan)
-    except (OSError, DocumentError) as error:
-        raise EvaluationError(what, where=plan, found=error) from error
-    read = parse(Plan, data, EvaluationError, where=plan, about=what)
+    read = read_plan(plan)
     check_absent(out, EvaluationError)
     with bar("episodes") as shown:
         for done, total in make(read, out):

@@ -84,16 +84,18 @@ def videos(folder: Path, protocol: str | None, policy: str, count: int) -> int:
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.demos.checks import check_number
     from robocas_ms3.errors import EvaluationError
-    from robocas_ms3.evaluation.policies import BUILTIN, open_policy
+    from robocas_ms3.evaluation.policies import POLICIES, open_policy
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.videos import failed_of_each_kind, film
+    from robocas_ms3.processes import use_one_torch_thread
 
     check_number("count", count, 1)
+    use_one_torch_thread()
     result = read(folder)
     loaded = protocol_of(result, protocol)
     numbers = failed_of_each_kind(result, count)
     name = str(result.run["policy"]["name"])
-    if name not in BUILTIN and policy != name:
+    if name not in POLICIES.builtin and policy != name:
         fix = f"Name it yourself, if you trust it: --policy {name}"
         raise EvaluationError("this result is of a policy of somebody's own", where=folder, found=name, fix=fix)
     with open_policy(name) as played, bar("videos") as shown:

@@ -68,15 +68,15 @@ def main(cfg: Generate) -> int:
 
     name = cfg.config or TASKS[cfg.task].default_config
     loaded = load_task_config(name)  # before seconds go by for what is imported next
-    import torch
     from rich.console import Console
     from rich.progress import Progress
 
     from robocas_ms3.cli.bars import columns
     from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, recordable_config
     from robocas_ms3.demos.generate import generate
+    from robocas_ms3.processes import use_one_torch_thread
 
-    torch.set_num_threads(1)  # threads of small operations wait for each other
+    use_one_torch_thread()
     config = recordable_config(loaded, name if name in shipped_configs() else None)
     out = cfg.out or Path("demos") / f"{Path(name).stem}-{Path(cfg.pack).name}"
     rate = cfg.replay_rate

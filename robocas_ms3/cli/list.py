@@ -43,7 +43,8 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     from robocas_ms3.benchmark import TASKS
     from robocas_ms3.config import load_task_config, shipped_configs
     from robocas_ms3.errors import AssetError
-    from robocas_ms3.evaluation.policies import BUILTIN, installed_policies, package_of
+    from robocas_ms3.evaluation.policies import POLICIES
+    from robocas_ms3.extensions import package_of
 
     tasks = [
         {"name": task.name, "env_id": task.env_id, "default_config": task.default_config, "summary": task.summary}
@@ -54,9 +55,9 @@ def collect() -> dict[str, list[dict[str, Any]]]:
         config = load_task_config(path)
         scene = f"{config.objects.count} objects, {config.layout.kind}, on the {config.support}"
         configs.append({"name": name, "task": config.task, "scene": scene, "description": config.description})
-    policies = [{"name": name, "package": "robocas_ms3", "of": "builtin"} for name in BUILTIN]
-    for entries in installed_policies().values():
-        policies += [{"name": entry.name, "package": package_of(entry), "of": entry.value} for entry in entries]
+    policies = [{"name": name, "package": "robocas_ms3", "of": "builtin"} for name in POLICIES.builtin]
+    for points in POLICIES.points.values():
+        policies += [{"name": point.name, "package": package_of(point), "of": point.value} for point in points]
     packs = []
     for name, folder in pack_folders().items():
         row: dict[str, Any] = {"name": name, "folder": str(folder), "megabytes": round(_size(folder) / 1e6, 1)}

@@ -39,14 +39,14 @@ class Replay:
 def main(cfg: Replay) -> int:
     """Run the command."""
     import numpy as np
-    import torch
     from rich.console import Console
     from rich.progress import track
 
     from robocas_ms3.demos.replay import replay
+    from robocas_ms3.processes import use_one_torch_thread
     from robocas_ms3.recordings.entries import read_json
 
-    torch.set_num_threads(1)  # threads of small operations wait for each other
+    use_one_torch_thread()
     trajectory = cfg.trajectory / "trajectory.h5" if cfg.trajectory.is_dir() else cfg.trajectory
     total = len(read_json(trajectory)["episodes"][: cfg.count])
     results = replay(

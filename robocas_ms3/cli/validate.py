@@ -79,11 +79,11 @@ def main(cfg: Validate) -> int:
 
 
 def _replay(root: Path, pack: str | None) -> ReplayReport:
-    import torch
 
     from robocas_ms3.datasets.checks.replay import replay_dataset
+    from robocas_ms3.processes import use_one_torch_thread
 
-    torch.set_num_threads(1)  # threads of small operations wait for each other
+    use_one_torch_thread()
     with bar("replaying", transient=True) as shown:
         return replay_dataset(root, pack=pack, on_episode=lambda _, count: shown.next_of(count))
 

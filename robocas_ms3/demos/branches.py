@@ -21,9 +21,10 @@ from multiprocessing.connection import Connection
 from typing import Any, NoReturn, TypeVar
 
 from robocas_ms3.demos.backtracking import DeadEnd, Tally, turns
-from robocas_ms3.demos.forking import BranchTraceback, Child, ChildCrash, ChildGone, SentError, fork, set_up_child
+from robocas_ms3.demos.forking import Child, ChildCrash, ChildGone, fork, set_up_child
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort
+from robocas_ms3.processes import SentError
 
 T = TypeVar("T")
 
@@ -65,7 +66,7 @@ class ForkedBranches:
             ended_well = False
         except BaseException as error:
             if self._pipe is not None:
-                self._say_and_leave(SentError.of(error))
+                self._say_and_leave(SentError.of(error, "a branch"))
             raise
         if self._pipe is not None:
             self._say_and_leave(ended_well)
@@ -162,11 +163,11 @@ class ForkedBranches:
 
         Raises:
             ChildCrash: it is gone (`ChildGone`), or says nothing.
-            BaseException: what it ended with, caused by a `BranchTraceback`.
+            BaseException: what it ended with, caused by a `SentTraceback`.
         """
         answer, tally = child.hear(limit)
         if isinstance(answer, SentError):
-            raise answer.error from BranchTraceback(answer.traceback)
+            answer.reraise()
         self._tally.adopt(tally)
         return answer
 
@@ -187,7 +188,7 @@ class ForkedBranches:
         except PlanningFailed as error:
             self._say_and_leave(error)
         except BaseException as error:
-            self._say_and_leave(SentError.of(error))
+            self._say_and_leave(SentError.of(error, "a branch"))
         assert self._pipe is not None
         try:
             self._pipe.send((score, self._tally))

@@ -1,4 +1,4 @@
-"""Fork a process: whether that is safe here, the child, a pipe between the two, and errors as they can be sent."""
+"""Fork a process: whether that is safe here, the child, and a pipe between the two."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import ctypes
 import gc
 import logging
 import os
-import pickle
 import signal
 import sys
-import traceback
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing import Pipe
@@ -104,37 +102,6 @@ def set_up_child(parent: int) -> None:
     sys.stdout, sys.stderr = (
         stream and os.fdopen(os.dup(fd), "w", buffering=1) for fd, stream in ((1, sys.stdout), (2, sys.stderr))
     )
-
-
-@dataclass(frozen=True)
-class SentError:
-    """An error of a child as it can be sent.
-
-    Attributes:
-        error: it, or what says the same where it can't be pickled.
-        traceback: of the process where it was raised first.
-    """
-
-    error: BaseException
-    traceback: str
-
-    @classmethod
-    def of(cls, error: BaseException) -> SentError:
-        """Make it ready to be sent."""
-        cause = error.__cause__
-        text = cause.args[0] if isinstance(cause, BranchTraceback) else "".join(traceback.format_exception(error))
-        try:
-            pickle.loads(pickle.dumps(error))
-        except Exception:  # noqa: BLE001  (its class decides what that raises)
-            return cls(RuntimeError(f"{type(error).__name__}: {error}"), text)
-        return cls(error, text)
-
-
-class BranchTraceback(Exception):  # noqa: N818  (shown as the cause of an error, as `concurrent.futures` does)
-    """Where in a child an error came from, as text: tracebacks can't be sent."""
-
-    def __str__(self) -> str:
-        return f"in a branch\n\n{self.args[0]}"
 
 
 def why_not_fork(*, renders: bool) -> str:

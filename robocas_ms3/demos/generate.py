@@ -17,13 +17,14 @@ from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_st
 from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import check_overwrite, claim_output, locked_folder
+from robocas_ms3.outputs import check_overwrite, check_run, claim_output, locked_folder
 from robocas_ms3.planning.executor import Seconds
 from robocas_ms3.recordings.entries import read_json
 from robocas_ms3.recordings.reading import open_trajectory
 from robocas_ms3.recordings.writing import merge
 
-_BEGINNINGS = {"run.json", FAILURES_FILE, "episodes"}  # of a run that has not finished a seed yet
+RUN = "run.json"
+_BEGINNINGS = {RUN, FAILURES_FILE, "episodes"}  # of a run that has not finished a seed yet
 
 
 @dataclass(frozen=True)
@@ -87,26 +88,27 @@ def generate(
         on_result: called for each seed, in order.
 
     Raises:
-        OutputExistsError: ``out`` has content and neither flag is set.
+        OutputExistsError: ``out`` has content and neither flag is set, or what was made by another command.
         RobocasError: an argument is wrong, which leaves no trace; ``out`` was made with other settings, or another
             process writes there; far too many seeds fail.
     """
     check_arguments(settings, episodes=episodes, first_seed=first_seed, jobs=jobs)
     if overwrite:
-        check_overwrite(out, ("run.json",), "made by `robocas generate`")
+        check_overwrite(out, (RUN,), "made by `robocas generate`")
+    check_run(out / RUN, "settings", "generate")
     with locked_folder(out):
         claim_output(out, overwrite=overwrite or _only_begun(out), resume=resume)
         run = {"settings": asdict(settings), "first_seed": first_seed}
-        check_same_run(out / "run.json", run)
+        check_same_run(out / RUN, run)
         make_folder(out)
-        write_json(out / "run.json", run)
+        write_json(out / RUN, run)
         on_start()
         return _generate_in(out, settings, episodes, first_seed, jobs, fork, on_result)
 
 
 def _only_begun(out: Path) -> bool:
     """Whether a run was begun here, and ended before it was through with a seed."""
-    if not (out / "run.json").is_file() or {path.name for path in out.iterdir() if path.name != ".lock"} - _BEGINNINGS:
+    if not (out / RUN).is_file() or {path.name for path in out.iterdir() if path.name != ".lock"} - _BEGINNINGS:
         return False
     return not _finished(out, out / "episodes", Ledger(out / FAILURES_FILE))
 

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import torch
-
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.ledger import Failure
-from robocas_ms3.processes import Pool
+from robocas_ms3.processes import Pool, use_one_torch_thread
 
 
 def shard_name(seed: int) -> str:
@@ -45,7 +43,7 @@ class _Generates:
 
 def _open(settings: EpisodeSettings, folder: Path, fork: bool) -> _Generates:
     if multiprocessing.parent_process():  # one of ours; the user's own keeps its threads
-        torch.set_num_threads(1)  # threads of small operations wait for each other
+        use_one_torch_thread()
     return _Generates(EpisodeGenerator(settings, fork=fork), folder)
 
 

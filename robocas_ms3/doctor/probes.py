@@ -13,7 +13,7 @@ from pathlib import Path
 ABSENT = 3
 
 
-class Absent(Exception):
+class MissingDevice(Exception):
     """The machine lacks what was to be tried."""
 
 
@@ -44,7 +44,7 @@ def physx_cuda() -> str:
     import torch
 
     if not torch.cuda.is_available():
-        raise Absent("no CUDA device that this build of torch can use")
+        raise MissingDevice("no CUDA device that this build of torch can use")
     import sapien
 
     sapien.physx.enable_gpu()
@@ -110,7 +110,7 @@ def _main() -> int:
     os.dup2(2, 1)
     try:
         found = PROBES[sys.argv[1]]()
-    except Absent as error:
+    except MissingDevice as error:
         sys.stderr.write(f"{error}\n")
         return ABSENT
     except Exception as error:  # whatever the trial meets is its answer

@@ -14,7 +14,8 @@ from pydantic import Field
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import TaskConfig, load_task_config
+from robocas_ms3.config import TaskConfig, load_task_config, shipped_configs
+from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import EvaluationError, LayoutError
 from robocas_ms3.evaluation.protocol import CONFIGS, EPISODES, LAYOUTS, NO_RULES, RULES, TRAIN, Episode, Protocol
 from robocas_ms3.files import make_folder, replacing, replacing_folder
@@ -23,13 +24,14 @@ from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.strict import StrictModel, parse
 from robocas_ms3.tasks.transfer import TransferEnv
 
+NO_PLAN = "no plan of a protocol"
 _WRONG = 300  # stream of the object that a wrong instruction names
 
 
 class Scene(StrictModel):
     """A configuration, and what of it is changed."""
 
-    config: str = Field(description="name of a shipped configuration, or a YAML file")
+    config: str = Field(description="name of a shipped configuration, or a YAML file, from the plan's folder")
     name: str = Field(
         default="",
         pattern=r"^[A-Za-z0-9_-]*$",
@@ -75,6 +77,27 @@ class Plan(StrictModel):
     parts: list[Part]
     train: list[Scene] = Field(default=[], description="configurations to train on")
     lists: dict[str, Any] = Field(default={}, description="what is left to YAML's anchors: lists that changes refer to")
+
+
+def read_plan(path: Path) -> Plan:
+    """Read a plan; configurations that it names by files lie where it does, or where the command runs.
+
+    Raises:
+        EvaluationError: it is none.
+    """
+    try:
+        data = load_yaml(path)
+    except (OSError, DocumentError) as error:
+        raise EvaluationError(NO_PLAN, where=path, found=error) from error
+    plan = parse(Plan, data, EvaluationError, where=path, about=NO_PLAN)
+    beside = {name: [_beside(path, scene) for scene in getattr(plan, name)] for name in ("parts", "train")}
+    return plan.model_copy(update=beside)
+
+
+def _beside(path: Path, scene: Scene) -> Scene:
+    file = path.parent / scene.config
+    shipped = scene.config in shipped_configs()
+    return scene if shipped or not file.is_file() else scene.model_copy(update={"config": str(file)})
 
 
 def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Iterator[tuple[int, int]]:

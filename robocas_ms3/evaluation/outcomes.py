@@ -4,15 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import ValidatorFunctionWrapHandler, WrapValidator
+
+from robocas_ms3.benchmark import TASKS
+from robocas_ms3.benchmark.spec import STAGES as STAGES_ON_THE_WAY
 from robocas_ms3.evaluation import retrieval
 from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.evaluation.rollout import Rollout
 
 # evaluation_v0.md and the paper's table: reach, pick, recognise, clear
 STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
-_ORDER = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_target", "target_grasped", "target_lifted")
+
+
+def _as_written(value: Any, check: ValidatorFunctionWrapHandler) -> Any:
+    check(value)
+    return value
+
+
+Number = Annotated[float, WrapValidator(_as_written)]
+"""Whole if the file has it whole: what is written again says the same."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +39,7 @@ class Outcome:
         split: of the protocol.
         success: the task had succeeded at some moment.
         success_at_end: it had at the last one.
-        success_v0: upstream's rule held at the last one.
+        success_v0: upstream's rule held at the last one; never where there is no basket.
         steps: policy steps.
         seconds: of the scene.
         failure_stage: see `failure_stage`; empty: it succeeded.
@@ -37,7 +49,7 @@ class Outcome:
         measures: ``path_length`` m, ``contact_impulse`` N s, ``disturbed_most``, ``fallen``; ``welds`` with the weld.
         inference_ms: clock time of the policy a step.
         p_vis: share of the target that is seen from above.
-        retrieval: search: what was moved before the target, see `retrieval.outcome`.
+        retrieval: in tasks with obstacles to clear: what was moved before the target, see `retrieval.outcome`.
     """
 
     episode: int
@@ -49,14 +61,14 @@ class Outcome:
     success_at_end: bool
     success_v0: bool
     steps: int
-    seconds: float
+    seconds: Number
     failure_stage: str
     error: str = ""
     flags: dict[str, int | None] = field(default_factory=dict)
-    flag_seconds: dict[str, float | None] = field(default_factory=dict)
-    measures: dict[str, float] = field(default_factory=dict)
-    inference_ms: float = 0.0
-    p_vis: float | None = None
+    flag_seconds: dict[str, Number | None] = field(default_factory=dict)
+    measures: dict[str, Number] = field(default_factory=dict)
+    inference_ms: Number = 0.0
+    p_vis: Number | None = None
     retrieval: dict[str, Any] | None = None
 
     @classmethod
@@ -77,7 +89,7 @@ class Outcome:
             success_v0=played.at_end.get("success_v0", False),
             steps=played.steps,
             seconds=round(played.seconds, 4),
-            failure_stage=failure_stage(flags, played.error),
+            failure_stage=failure_stage(flags, played.error, TASKS[episode.task].stages),
             error=played.error,
             flags=flags,
             flag_seconds=played.flag_seconds,
@@ -92,17 +104,23 @@ class Outcome:
         return {name: value for name, value in asdict(self).items() if name != "inference_ms"}
 
 
-def failure_stage(flags: dict[str, int | None], error: str = "") -> str:
+def failure_stage(flags: dict[str, int | None], error: str = "", order: Sequence[str] = STAGES_ON_THE_WAY) -> str:
     """The stage an episode did not come to, next after the furthest that it did come to.
 
     A target that is pulled out of its heap was reached though its obstacles were never cleared, so stages that were
-    left out on the way do not count. ``placed``: it was lifted; ``error``: the episode was broken off; empty: success.
+    left out on the way do not count. ``placed``: it came to all of them, as when the target was lifted; ``error``: the
+    episode was broken off; empty: success.
+
+    Args:
+        flags: by stage, when it was come to; stages that are not there are not the environment's.
+        error: that broke the episode off.
+        order: of the stages, a task's (`TaskSpec.stages`).
     """
     if error:
         return "error"
     if flags.get("success") is not None:
         return ""
-    stages = [stage for stage in _ORDER if stage in flags]
+    stages = [stage for stage in order if stage in flags]
     came = [number for number, stage in enumerate(stages) if flags[stage] is not None]
     following = came[-1] + 1 if came else 0
     return stages[following] if following < len(stages) else "placed"

@@ -22,7 +22,7 @@ from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import Share, share
 from robocas_ms3.files import make_folder, replacing_folder, write_json
 from robocas_ms3.ledger import Ledger
-from robocas_ms3.outputs import check_absent
+from robocas_ms3.outputs import check_absent, check_run
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
@@ -88,10 +88,11 @@ def begin(folder: Path, run: dict[str, Any], *, resume: bool, again: bool = Fals
         What is there already.
 
     Raises:
-        EvaluationError: it was measured with something else.
+        EvaluationError: it was measured with something else, or the folder is no evaluation's.
     """
-    make_folder(folder)
     path = folder / RUN
+    check_run(path, "protocol_hash", "eval", EvaluationError)
+    make_folder(folder)
     if not (folder / OUTCOMES).is_file():  # without an episode it is of nothing yet
         write_json(path, run)
         return {}

@@ -107,7 +107,8 @@ def chosen(episodes: Sequence[Episode], settings: Settings) -> list[Episode]:
         known = dict.fromkeys(str(getattr(episode, what)) for episode in episodes)
         for name in wanted:
             if name not in known:
-                expected, fix = ", ".join(known), nearest(name, known)
+                other = "Name a protocol that has it, or make one: robocas eval freeze."
+                expected, fix = ", ".join(known), nearest(name, known) or other
                 raise EvaluationError(f"the protocol has no such {what}", expected=expected, found=name, fix=fix)
     number, of = settings.shard
     taken: dict[str, int] = {}

@@ -5,8 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import torch
-
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.benchmark import TASKS
 from robocas_ms3.evaluation.policy import CAMERAS, Start, Wants
@@ -36,7 +34,6 @@ def make_env(
         weld: whether what is lifted is welded to the hand (`weld`).
         kwargs: further ones of `make_vec`.
     """
-    torch.set_num_threads(1)
     stepped = partial(
         PolicyStepping,
         convention=wants.convention,

@@ -44,7 +44,7 @@ def markdown(result: Result) -> str:
             str(len(outcomes)),
             percent(result.rate("success", outcomes)),
             percent(result.rate("success_at_end", outcomes), interval=False),
-            percent(result.rate("success_v0", outcomes), interval=False),
+            _stage(result, "success_v0", outcomes),
             *(_stage(result, stage, outcomes) for stage in STAGES.values()),
             f"{_mean([one.steps for one in outcomes]):.0f}",
             f"{_mean([one.seconds for one in outcomes]):.1f}",

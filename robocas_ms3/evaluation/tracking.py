@@ -89,10 +89,11 @@ class Tracker:
 
         ``sums`` (N, 5), see ``SUMS``: m of the TCP's path; N s between gripper and objects; numbers of objects
         disturbed at once, and fallen; policy steps that upstream's rule has held. ``success_v0`` (N,) bool, that rule
-        at this moment. Of search also ``retrieval``, `Retrieval.read`.
+        at this moment, where there is a basket. Of search also ``retrieval``, `Retrieval.read`.
         """
         order = {} if self._retrieval is None else {"retrieval": self._retrieval.read()}
-        return {"sums": as_tensor(self._sums).clone(), "success_v0": as_tensor(self._in_v0), **order}
+        v0 = {} if self._env.model.basket is None else {"success_v0": as_tensor(self._in_v0)}
+        return {"sums": as_tensor(self._sums).clone(), **v0, **order}
 
 
 def summed(info: dict[str, Any], name: str) -> Any:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.evaluation.outcomes import Outcome, failure_stage
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol
 from robocas_ms3.evaluation.results import Result
@@ -33,7 +34,8 @@ def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
         for name in ("task", "config", "seed", "split", "p_vis"):
             if getattr(outcome, name) != getattr(episode, name):
                 found.append(f"episode {number}: {name} is {getattr(outcome, name)}, not {getattr(episode, name)}")
-        said = [*_too_long(outcome, protocol, result.run), *_at_odds(outcome, protocol)]
+        order = TASKS[episode.task].stages
+        said = [*_too_long(outcome, protocol, result.run), *_at_odds(outcome, protocol, order)]
         found += [f"episode {number}: {problem}" for problem in said]
     missing = len(set(range(len(protocol.episodes))) - result.outcomes.keys())
     if missing:
@@ -72,7 +74,7 @@ def _of_retrieval(outcome: Outcome) -> Iterator[str]:
         right = sum(move["needed"] and move["in_order"] for move in order["moved"])
         held, of = outcome.flags.get("target_grasped"), len(order["moved"]) + order["left"]
         score = None if held is None else 1.0 if of == 0 else round(right / of, 4)
-        if outcome.task != "search" or late or order["left"] < 0 or order["score"] != score:
+        if "obstacles_cleared" not in outcome.flags or late or order["left"] < 0 or order["score"] != score:
             yield "its order of retrieval does not agree with itself"
     except (TypeError, KeyError, ZeroDivisionError):
         yield "its order of retrieval is none"
@@ -87,8 +89,8 @@ def _of_seconds(outcome: Outcome) -> Iterator[str]:
         yield f"{', '.join(late)} held first after its {outcome.seconds:g} s"
 
 
-def _at_odds(outcome: Outcome, protocol: LoadedProtocol) -> Iterator[str]:
-    """What an outcome says against itself."""
+def _at_odds(outcome: Outcome, protocol: LoadedProtocol, order: Sequence[str]) -> Iterator[str]:
+    """What an outcome says against itself; order: of its task's stages."""
     flags = outcome.flags
     yield from _of_retrieval(outcome)
     if outcome.success != (flags.get("success") is not None):
@@ -100,7 +102,7 @@ def _at_odds(outcome: Outcome, protocol: LoadedProtocol) -> Iterator[str]:
     if any(not 0 <= value < math.inf for value in (outcome.seconds, outcome.inference_ms, *outcome.measures.values())):
         yield "a measure is no number from 0 on"
     yield from _of_seconds(outcome)
-    stage = failure_stage(flags, outcome.error)
+    stage = failure_stage(flags, outcome.error, order)
     if outcome.failure_stage != stage:
         yield f"failure_stage is {outcome.failure_stage or 'none'}, by its flags {stage or 'none'}"
     late = [name for name, step in flags.items() if step is not None and step > outcome.steps]

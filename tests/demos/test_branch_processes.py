@@ -17,9 +17,10 @@ from branch_notes import Notes
 
 from robocas_ms3.demos import branches
 from robocas_ms3.demos.branches import ForkedBranches
-from robocas_ms3.demos.forking import BranchTraceback, why_not_fork
+from robocas_ms3.demos.forking import why_not_fork
 from robocas_ms3.errors import PlanningFailed, RobocasError
 from robocas_ms3.planning.decisions import Effort
+from robocas_ms3.processes import SentTraceback
 
 
 def children() -> set[int]:
@@ -243,7 +244,7 @@ def test_an_error_says_where_in_a_child_it_came_from():
 
     with pytest.raises(ZeroDivisionError) as caught:
         forked(decide)
-    assert isinstance(caught.value.__cause__, BranchTraceback)
+    assert isinstance(caught.value.__cause__, SentTraceback)
     text = str(caught.value.__cause__)
     assert text.count("in divide") == 1
     assert text.count("Traceback") == 1
@@ -291,7 +292,7 @@ def test_an_interrupt_in_a_new_child_ends_the_run_not_its_siblings(monkeypatch):
     try:
         with pytest.raises(KeyboardInterrupt) as caught:
             forked(decide)
-        assert isinstance(caught.value.__cause__, BranchTraceback)
+        assert isinstance(caught.value.__cause__, SentTraceback)
     finally:
         if os.getpid() != me:  # a child that takes itself for the root
             os._exit(1)
@@ -310,6 +311,7 @@ SLEEPER = """
 import os, sys, time
 from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.planning.decisions import Effort
+from robocas_ms3.processes import SentTraceback
 class Notes:
     exhausted = False
     def failed(self, error): pass

@@ -102,6 +102,17 @@ def test_what_a_run_has_found_out_stays(tmp_path, hopeless):
     assert (out / "notes.txt").read_text() == "mine"
 
 
+@pytest.mark.parametrize("flags", [{}, {"resume": True}, {"overwrite": True}])
+@pytest.mark.parametrize("notes", ['{"protocol": "smoke", "protocol_hash": "ab"}', '"settings"', ""])
+def test_results_of_an_evaluation_are_not_touched(tmp_path, hopeless, notes, flags):
+    """They have a run.json as well, before their first episode nothing else."""
+    (tmp_path / "run.json").write_text(notes)
+    with pytest.raises(OutputExistsError, match=r"run.json: refusing to write over what `robocas gen") as said:
+        generate(SETTINGS, tmp_path, episodes=1, **flags)
+    assert "(expected settings, found " in str(said.value)
+    assert (tmp_path / "run.json").read_text() == notes
+
+
 def test_two_runs_do_not_share_a_folder(tmp_path, hopeless):
     out = begun(tmp_path / "out")
     with locked_folder(out), pytest.raises(RobocasError, match="another process is writing here"):

@@ -7,7 +7,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli import eval as command
 from robocas_ms3.config import load_task_config
 from robocas_ms3.errors import EvaluationError, RobocasError
-from robocas_ms3.evaluation.freeze import Plan, freeze
+from robocas_ms3.evaluation.freeze import Plan, freeze, read_plan
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.scenes.frozen import FrozenLayouts
 
@@ -81,6 +81,19 @@ def test_parts_that_can_not_be(tmp_path, second, said):
     with pytest.raises(RobocasError, match=said):
         list(freeze(Plan.model_validate(plan), tmp_path / "out"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_configuration_is_found_beside_the_plan(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plans").mkdir()
+    config = load_task_config("pick_table_scattered").model_dump(mode="json")
+    (tmp_path / "plans" / "mine.yaml").write_text(yaml.safe_dump(config))
+    scenes = [{"config": name} for name in ("mine.yaml", "pick_table_scattered")]
+    plan = {**PLAN, "parts": [{**PLAN["parts"][0], **scene} for scene in scenes], "train": scenes}
+    (tmp_path / "plans" / "plan.yaml").write_text(yaml.safe_dump(plan))
+    read = read_plan(tmp_path / "plans" / "plan.yaml")
+    assert [part.file for part in read.parts] == ["mine-mine", "pick_table_scattered-mine"]
+    assert [scene.changed().task for scene in (*read.parts, *read.train)] == ["pick"] * 4
 
 
 @pytest.mark.parametrize("text", ["parts: []", "rules: [", "rules: {}\nparts: [{config: x}]"])

@@ -152,6 +152,17 @@ def test_merged_parts_are_a_result_that_can_be_gone_on_with(tmp_path):
         merge(folders, tmp_path / "all")
 
 
+def test_merged_parts_say_what_they_said(tmp_path):
+    """A whole number stays one."""
+    counts = {"path_length": 1.0, "fallen": 3, "disturbed_most": 0}
+    write(tmp_path / "a", [outcome(0, measures=counts, seconds=40, p_vis=1, inference_ms=2, flag_seconds={"fail": 5})])
+    write(tmp_path / "b", [outcome(1)])
+    merge([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
+    lines = [(tmp_path / name / OUTCOMES).read_text() for name in "abc"]
+    assert lines[2] == lines[0] + lines[1]
+    assert '"fallen": 3,' in lines[2]
+
+
 def test_parts_that_do_not_fit_leave_nothing_behind(tmp_path):
     write(tmp_path / "a", [outcome(0)])
     write(tmp_path / "b", [outcome(0, came_to=1)])
@@ -234,6 +245,16 @@ def test_a_run_that_died_before_its_first_episode_is_in_nobodys_way(tmp_path):
     begin(tmp_path / "a", {**RUN_OF, "policy": {"name": "another"}}, resume=False)
     append(tmp_path / "a", outcome(0))
     assert read(tmp_path / "a").run["policy"] == {"name": "another"}
+
+
+@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.parametrize("notes", ['{"settings": {"task": "pick"}, "first_seed": 0}', "[]", "{"])
+def test_the_folder_of_another_command_stays_as_it_is(tmp_path, notes, resume):
+    """Demonstrations have a run.json too."""
+    (tmp_path / RUN).write_text(notes)
+    with pytest.raises(EvaluationError, match=r"run.json: refusing to write over what `robocas eval` has not made"):
+        begin(tmp_path, RUN_OF, resume=resume)
+    assert (tmp_path / RUN).read_text() == notes
 
 
 def test_episodes_without_what_they_were_measured_with_are_not_gone_on_with(tmp_path):

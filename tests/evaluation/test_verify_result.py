@@ -2,10 +2,12 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 from made_up_results import of_protocol
 
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.cli import eval as command
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import load_protocol
@@ -136,12 +138,26 @@ ORDER = {"moved": [MOVE], "needed": ["lid"], "left": 1, "score": 0.5}
     ],
 )
 def test_an_order_of_retrieval_agrees_with_itself(folder, protocol, changed, well):
-    number = next(one.episode for one in protocol.episodes if one.task == "search")
-    tamper(folder, number, retrieval={**ORDER, **changed})
-    said = [problem for problem in problems(read(folder), protocol) if "retrieval" in problem]
-    assert len(said) == (0 if well else 1)
-    tamper(folder, 0, retrieval=ORDER)  # of pick
-    assert any("episode 0: its order" in problem for problem in problems(read(folder), protocol))
+    """Whatever the task is called, there were obstacles to clear."""
+    before = read(folder).outcomes[0]
+    flags, seconds = before.flags | {"obstacles_cleared": 20}, before.flag_seconds | {"obstacles_cleared": 1.0}
+    tamper(folder, 0, flags=flags, flag_seconds=seconds, retrieval={**ORDER, **changed})
+    assert len(problems(read(folder), protocol)) == (0 if well else 1)
+    tamper(folder, 1, retrieval=ORDER)
+    assert "episode 1: its order of retrieval does not agree with itself" in problems(read(folder), protocol)
+
+
+def test_the_stages_of_an_episode_are_those_of_its_task(folder, protocol, monkeypatch):
+    row = replace(TASKS["pick"], stages=("reached_target", "aligned"))
+    monkeypatch.setitem(TASKS.builtin, "pick", row)
+    flags = {"reached_any": 1, "reached_target": 2, "aligned": None, "success": None}
+    failed = {"success": False, "success_at_end": False, "success_v0": False, "failure_stage": "aligned"}
+    tamper(
+        folder, 0, flags=flags, flag_seconds=dict.fromkeys(flags, 0.5) | {"aligned": None, "success": None}, **failed
+    )
+    assert problems(read(folder), protocol) == []
+    monkeypatch.undo()
+    assert problems(read(folder), protocol) == ["episode 0: failure_stage is aligned, by its flags placed"]
 
 
 def test_a_result_chooses_no_folder(folder, tmp_path, monkeypatch, capsys):

@@ -34,15 +34,15 @@ def install(section: str, site: Path) -> Path:
     return site
 
 
-def python(site: Path, *words: object) -> str:
-    """Run Python with a folder of packages; what it says."""
+def python(site: Path, *words: object, cwd: Path | None = None) -> str:
+    """Run Python with a folder of packages, and in a folder; what it says."""
     path = os.pathsep.join([str(site), str(ROOT), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, "-W", "ignore", *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": path})
+    env, command = os.environ | {"PYTHONPATH": path}, [sys.executable, "-W", "ignore", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd, env=env)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
-def robocas(site: Path, *words: object) -> str:
-    """Run the command line with a folder of packages; what it says."""
-    return python(site, ROOT / "robocas_cli.py", *words)
+def robocas(site: Path, *words: object, cwd: Path | None = None) -> str:
+    """Run the command line with a folder of packages, and in a folder; what it says."""
+    return python(site, ROOT / "robocas_cli.py", *words, cwd=cwd)

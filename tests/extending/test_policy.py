@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.cli.list import collect
-from robocas_ms3.errors import EvaluationError
-from robocas_ms3.evaluation import results
+from robocas_ms3.errors import EvaluationError, ExtensionError
+from robocas_ms3.evaluation import policies, results
 from robocas_ms3.evaluation.policies import GROUP, make_policy
 from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.extensions import Table
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8").split("## A policy\n")[1].split("\n## ")[0]
@@ -46,6 +47,9 @@ def site(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(folder)
     for name in ("my_policies", "spoilt_policies", "rival_policies"):
         monkeypatch.delitem(sys.modules, name, raising=False)
+    builtin = policies.POLICIES
+    table = Table(builtin.kind, builtin.group, builtin.row, builtin.builtin)
+    monkeypatch.setattr(policies, "POLICIES", table)  # as if the process had begun now
     return folder
 
 
@@ -61,10 +65,15 @@ def test_it_is_found_and_listed_by_its_name(site):
 @pytest.mark.parametrize(
     ("module", "entry", "message"),
     [
-        ("import not_there_at_all", "it = spoilt_policies:It", "it: .*spoilt-policies can't be .*not_there_at_all"),
-        ("def (", "it = spoilt_policies:It", "it: .*spoilt-policies can't be imported .*SyntaxError"),
-        ("", "it = spoilt_policies:It", "it: .*spoilt-policies can't be imported .*no attribute 'It'"),
-        ("", "it = nowhere_at_all:It", "it: .*spoilt-policies can't be imported .*No module named 'nowhere_at_all'"),
+        (
+            "import not_there_at_all",
+            "it = spoilt_policies:It",
+            "it = .*not_there_at_all.*uninstall spoilt-policies",
+        ),
+        ("def (", "it = spoilt_policies:It", "it = .*: this policy can't be loaded .*SyntaxError"),
+        ("", "it = spoilt_policies:It", "it = .*: this policy can't be loaded .*no attribute 'It'"),
+        ("", "it = nowhere_at_all:It", "it = .*: this policy can't be loaded .*No module named 'nowhere_at_all'"),
+        ("It = 7", "it = spoilt_policies:It", "it = .*: no policy .*found int"),
         ("def It(size): ...", "it = spoilt_policies:It", "it: this policy can't be made .*takes no arguments"),
         ("It = object", "it = spoilt_policies:It", "it: a policy without wants"),
     ],
@@ -73,7 +82,7 @@ def test_a_broken_one_is_one_line_and_only_when_it_is_chosen(site, module, entry
     install(site, "spoilt-policies", module, entry)
     assert "it" in {row["name"] for row in collect()["policies"]}
     assert type(make_policy("descend")).__name__ == "Descend"
-    with pytest.raises(EvaluationError, match=message) as caught:
+    with pytest.raises((EvaluationError, ExtensionError), match=message) as caught:
         make_policy("it")
     assert "\n" not in str(caught.value)
 
@@ -81,7 +90,7 @@ def test_a_broken_one_is_one_line_and_only_when_it_is_chosen(site, module, entry
 def test_names_are_nobodys_to_take(site):
     install(site, "rival-policies", "", "descend = rival_policies:Mine\nstill = rival_policies:Mine")
     assert type(make_policy("still")).__module__ == "robocas_ms3.evaluation.policies.plain"
-    with pytest.raises(EvaluationError, match="descend: several packages have .*my-policies.*rival-policies"):
+    with pytest.raises(ExtensionError, match="descend: several packages have .*my-policies.*rival-policies"):
         make_policy("descend")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from strangers import install, python, robocas
+from strangers import PAGE, install, python, robocas
 
 MAKE = """
 import gymnasium as gym, robocas_ms3, numpy as np, torch
@@ -134,7 +134,55 @@ for _ in range(3):
     tracker.look(np.array([True]))
     tracker.end_step()
 read = tracker.read()
-print(tuple(read["sums"].shape), bool(read["sums"][0, 4]), read["success_v0"].tolist())
+print(tuple(read["sums"].shape), bool(read["sums"][0, 4]), sorted(read))
 """,
     )
-    assert said.strip() == "(1, 5) False [False]"
+    assert said.strip() == "(1, 5) False ['sums']"
+
+
+@pytest.fixture(scope="module")
+def measured(site, tmp_path_factory):
+    """A folder where the page's commands were run, with fewer episodes; and what they said, by their words."""
+    folder = tmp_path_factory.mktemp("measured")
+    plan = site / "push-zone-v1.yaml"  # beside the package: it names a file of that
+    plan.write_text(plan.read_text().replace("count: 200", "count: 2"))
+    lines = [line.split()[1:] for line in PAGE.splitlines() if line.startswith("robocas eval") and "push-zone" in line]
+    lines += [line.split()[1:] for line in PAGE.splitlines() if line.startswith("robocas eval compare")]
+    assert [line[1] for line in lines] == ["freeze", "--protocol", "--protocol", "verify", "compare"]
+    lines[0][2] = str(plan)
+    return folder, [robocas(site, *line, cwd=folder) for line in lines]
+
+
+@pytest.mark.slow
+def test_a_protocol_of_its_own_is_frozen_and_measured_with(measured):
+    folder, (frozen, scripted, still, verified, compared) = measured
+    assert "2 episodes" in frozen
+    assert "| push_zone | 2 | 100 % (16 to 100) | 100 % |  | 100 % | 0 % | 100 % |  |" in scripted
+    assert "| push_zone | reached_any 2 |" in still
+    assert "2 episodes of push-zone-v1, all well" in verified
+    assert "| push_zone | A, B | 2 | 0 | 2 |" in compared
+    page = (folder / "eval" / "still" / "report.html").read_text()
+    assert "target in zone" in page
+    assert "target lifted" not in page
+
+
+@pytest.mark.slow
+def test_its_results_are_measured_in_parts_and_merged(site, measured):
+    folder, _ = measured
+    words = ("eval", "push_zone", "--protocol", "protocols/push-zone-v1", "--policy", "random")
+    for number in (0, 1):
+        robocas(site, *words, "--shard", f"{number}/2", "--out", f"eval/{number}", cwd=folder)
+    robocas(site, "eval", "merge", "eval/0", "eval/1", "--out", "eval/random", cwd=folder)
+    verified = robocas(site, "eval", "verify", "eval/random", "--protocol", "protocols/push-zone-v1", cwd=folder)
+    assert "2 episodes of push-zone-v1, all well" in verified
+    outcomes = [json.loads(line) for line in (folder / "eval" / "random" / "episodes.jsonl").read_text().splitlines()]
+    assert [outcome["task"] for outcome in outcomes] == ["push_zone"] * 2
+    assert "success_v0" not in outcomes[0]["flags"]
+
+
+ELSEWHERE = r"no such task .*found push_zone\)\. Name a protocol that has it, or make one: robocas eval freeze"
+
+
+def test_a_protocol_that_has_not_the_task_says_what_to_do(site):
+    with pytest.raises(AssertionError, match=ELSEWHERE):
+        robocas(site, "eval", "push_zone", "--policy", "still", "--protocol", "smoke")

@@ -8,9 +8,8 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE, OBS_STR
 
-from lerobot_env_robocas.vector_env import RoboCASVectorEnv
+from lerobot_env_robocas.vector_env import RoboCASVectorEnv, tasks_of
 
-TASKS = ("pick", "select", "search", "open_pick")
 ACTION_SIZES = {
     "robocas": 7,
     "delta_euler": 7,
@@ -32,7 +31,7 @@ class RoboCASEnvConfig(EnvConfig):
     """RoboCAS. Defaults are those of the LeRobot datasets that robocas_ms3 writes.
 
     Attributes:
-        task: ``pick``, ``select``, ``search``, ``open_pick``; several with commas between them; ``all``.
+        task: of the protocol's, ``pick``, say; several with commas between them; ``all`` of them.
         fps: actions a second; what the policy was trained at.
         protocol: which frozen episodes are played: ``ms3-v1``, ``smoke``, ... or a folder.
         split: which of its episodes, such as ``seen`` or ``new`` of ``objects-v1``; empty: all.
@@ -79,8 +78,14 @@ class RoboCASEnvConfig(EnvConfig):
 
     @property
     def tasks(self) -> list[str]:
-        """The tasks, in order."""
-        return list(TASKS) if self.task == "all" else _listed(self.task or "", "env.task")
+        """The tasks, in order; ``all`` are those that the simulating process finds in the protocol.
+
+        Raises:
+            RoboCASProcessError: it can't be asked, or there is no such protocol.
+        """
+        if self.task == "all":
+            return tasks_of(self.protocol, self.split, python=self.python, timeout_s=self.timeout_s)
+        return _listed(self.task or "", "env.task")
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

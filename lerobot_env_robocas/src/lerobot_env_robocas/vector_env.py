@@ -26,7 +26,7 @@ class RoboCASVectorEnv(gym.vector.VectorEnv):
     ends as a success, else 0. ``info["is_success"]`` (N,) whether it has.
 
     Args:
-        task: ``pick``, ``select``, ``search`` or ``open_pick``.
+        task: one of the protocol's.
         num_envs: N.
         protocol: a shipped one of robocas_ms3, or a folder.
         split: which of its episodes; empty: all.
@@ -170,6 +170,17 @@ class RoboCASVectorEnv(gym.vector.VectorEnv):
 
     def _info(self) -> dict[str, Any]:
         return {"is_success": self._success.copy(), "_is_success": np.ones(self.num_envs, bool)}
+
+
+def tasks_of(protocol: str, split: str = "", *, python: str | None = None, timeout_s: float = 600.0) -> list[str]:
+    """The tasks of a protocol, in its order; the other arguments are those of `RoboCASVectorEnv`.
+
+    Raises:
+        RoboCASProcessError: there is no such protocol or split, or no process that knows.
+    """
+    process = Process(python, {"version": VERSION, "tasks_of": protocol, "split": split}, timeout_s)
+    process.close()
+    return list(process.ready["tasks"])
 
 
 def _space(cameras: dict[str, tuple[int, int]], widths: dict[str, int]) -> gym.spaces.Dict:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NoReturn, TypeVar
 
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.processes import Pool, Worker
+from robocas_ms3.processes import Pool, Worker, use_one_torch_thread
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -54,7 +54,7 @@ def one_torch_thread() -> Iterator[None]:
     import torch
 
     before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    use_one_torch_thread()
     try:
         yield
     finally:
@@ -65,7 +65,5 @@ def _open_renderer(open_worker: Callable[[], Worker[Task, Result]]) -> Worker[Ta
     """In one of several processes."""
     # One thread a process: several that render in software on all cores get in each other's way.
     os.environ.setdefault("LP_NUM_THREADS", "1")
-    import torch
-
-    torch.set_num_threads(1)
+    use_one_torch_thread()
     return open_worker()

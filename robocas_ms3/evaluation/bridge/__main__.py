@@ -13,6 +13,7 @@ from contextlib import suppress
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.evaluation.bridge.channel import Channel, leave_with_starter
+from robocas_ms3.processes import use_one_torch_thread
 
 
 def main(fd: int, starter: int) -> int:
@@ -29,6 +30,7 @@ def main(fd: int, starter: int) -> int:
     try:
         from robocas_ms3.evaluation.bridge.server import open_bridge  # the simulator, which takes seconds
 
+        use_one_torch_thread()
         bridge = open_bridge(channel)
         channel.send({"ready": bridge.ready()})
         bridge.run()

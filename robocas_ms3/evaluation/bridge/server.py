@@ -58,6 +58,54 @@ class BridgeRequest(StrictModel):
     name: str = "bridge"
 
 
+class TasksRequest(StrictModel):
+    """Another first message: which tasks there are.
+
+    Attributes:
+        version: of the messages.
+        tasks_of: name of a shipped protocol, or folder.
+        split: the tasks of this split's episodes alone; empty: of all.
+    """
+
+    version: int
+    tasks_of: str
+    split: str = ""
+
+
+class TaskList:
+    """Says which tasks a protocol has; nothing is played.
+
+    Args:
+        asked: the first message.
+        channel: it came by.
+
+    Raises:
+        EvaluationError: there is no such protocol, or split.
+    """
+
+    def __init__(self, asked: TasksRequest, channel: Channel) -> None:
+        self._channel = channel
+        episodes = chosen(load_protocol(asked.tasks_of).episodes, Settings(split=asked.split))
+        self._tasks = list(dict.fromkeys(episode.task for episode in episodes))
+
+    def ready(self) -> dict[str, Any]:
+        """The tasks, in the protocol's order."""
+        return {"tasks": self._tasks}
+
+    def run(self) -> None:
+        """Wait until the other end is closed.
+
+        Raises:
+            EOFError: it is.
+            EvaluationError: it asked for more.
+        """
+        message = self._channel.receive()
+        raise EvaluationError("nothing is played here", found=str(message)[:200])
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
 class Bridge:
     """Plays what it was asked for, in batches of as many episodes as there are envs.
 
@@ -168,7 +216,7 @@ class Bridge:
         return self._env
 
 
-def open_bridge(channel: Channel) -> Bridge:
+def open_bridge(channel: Channel) -> Bridge | TaskList:
     """Read the first message, and make what it asks for.
 
     Raises:
@@ -184,8 +232,9 @@ def open_bridge(channel: Channel) -> Bridge:
             found=message.get("version"),
             fix="Install robocas-ms3 and lerobot_env_robocas of one release.",
         )
+    form = TasksRequest if "tasks_of" in message else BridgeRequest
     try:
-        asked = BridgeRequest.model_validate(message)
+        asked = form.model_validate(message)
     except ValidationError as error:
-        raise refusal(error, BridgeRequest, EvaluationError, where="", about="can't play that") from error
-    return Bridge(asked, channel)
+        raise refusal(error, form, EvaluationError, where="", about="can't play that") from error
+    return TaskList(asked, channel) if isinstance(asked, TasksRequest) else Bridge(asked, channel)

@@ -12,13 +12,13 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Literal
 
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policies.plain import RandomPolicy, StillPolicy
 from robocas_ms3.evaluation.policy import Policy, Wants
+from robocas_ms3.extensions import Table
 from robocas_ms3.strict import nearest
 
 GROUP = "robocas_ms3.policies"
@@ -30,26 +30,18 @@ def _scripted(speaks: Literal["joint_positions", "robocas"]) -> Policy:
     return ScriptedPolicy(speaks)
 
 
-BUILTIN: dict[str, Callable[[], Policy]] = {
-    "scripted": partial(_scripted, "joint_positions"),
-    "scripted-motions": partial(_scripted, "robocas"),
-    "random": RandomPolicy,
-    "still": StillPolicy,
-}
-
-
-def installed_policies() -> dict[str, list[EntryPoint]]:
-    """Policies of installed packages by name; none is imported. One that two packages have can't be chosen."""
-    found: dict[str, list[EntryPoint]] = {}
-    for entry in sorted(entry_points(group=GROUP), key=lambda entry: (entry.name, package_of(entry))):
-        if entry.name not in BUILTIN:  # what is installed can't hide a builtin one
-            found.setdefault(entry.name, []).append(entry)
-    return found
-
-
-def package_of(entry: EntryPoint) -> str:
-    """Name of the package that has an entry point."""
-    return entry.dist.name if entry.dist else entry.module.partition(".")[0]
+POLICIES: Table[Callable[[], Policy]] = Table(
+    "policy",
+    GROUP,
+    Callable,
+    {
+        "scripted": partial(_scripted, "joint_positions"),
+        "scripted-motions": partial(_scripted, "robocas"),
+        "random": RandomPolicy,
+        "still": StillPolicy,
+    },
+)
+"""By name, what makes them."""
 
 
 def make_policy(name: str) -> Policy:
@@ -60,7 +52,8 @@ def make_policy(name: str) -> Policy:
             own, called without arguments; or the address of a server (`remote.address.read_address`).
 
     Raises:
-        EvaluationError: there is no such policy, or that of a package is broken.
+        EvaluationError: there is no such policy, or it is none.
+        ExtensionError: that of a package can't be loaded, or several have it.
         MissingExtraError: it is elsewhere, and the ``remote`` extra is not installed.
     """
     policy = _made(name)
@@ -76,8 +69,8 @@ def make_policy(name: str) -> Policy:
 
 
 def _made(name: str) -> Policy:
-    if name in BUILTIN:
-        return BUILTIN[name]()
+    if name in POLICIES.builtin:
+        return POLICIES[name]()
     kind, _, rest = name.partition(":")
     if kind in ("ws", "wss") and rest:
         from robocas_ms3.evaluation.remote.client import RemotePolicy
@@ -87,29 +80,13 @@ def _made(name: str) -> Policy:
         from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 
         return ReplayPolicy(Path(rest))
-    installed = installed_policies()
-    if name in installed:
-        return _installed(name, installed[name])
+    if name in POLICIES:
+        return _call(name, POLICIES[name])
     if not re.fullmatch(r"\w+(\.\w+)*", kind) or not rest.isidentifier():
-        known = [*BUILTIN, *installed]
+        known = [*POLICIES.builtin, *POLICIES.points]
         expected = f"{', '.join(known)}, replay:TRAJECTORY.h5, module:Class or ws://host:port"
         raise EvaluationError("no such policy", where=name, expected=expected, fix=nearest(name, known))
     return _own(name, kind, rest)
-
-
-def _installed(name: str, entries: list[EntryPoint]) -> Policy:
-    """A policy of an installed package."""
-    packages = ", ".join(map(package_of, entries))
-    if len(entries) > 1:
-        fix = "Uninstall one, or name it by module:Class."
-        raise EvaluationError("several packages have a policy of this name", where=name, found=packages, fix=fix)
-    try:
-        made: Any = entries[0].load()
-    except Exception as error:
-        found = " ".join(f"{type(error).__name__}: {error}".split())
-        what, fix = f"this policy of the package {packages} can't be imported", "Mend or uninstall that package."
-        raise EvaluationError(what, where=name, found=found, fix=fix) from error
-    return _call(name, made)
 
 
 def _own(name: str, module: str, of: str) -> Policy:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.report.marks import section, table
-from robocas_ms3.evaluation.report.stages import FAILURES
+from robocas_ms3.evaluation.report.stages import failure_of
 from robocas_ms3.evaluation.results import Result
 
 VIDEOS = "videos"
@@ -29,7 +29,7 @@ def failed_episodes(result: Result, folder: Path | None) -> str:
         for said, column, values in (
             ("configuration", 1, {outcome.config for outcome in failed}),
             ("split", 3, {outcome.split for outcome in failed}),
-            ("not come to", 4, {FAILURES.get(outcome.failure_stage, outcome.failure_stage) for outcome in failed}),
+            ("not come to", 4, {failure_of(outcome.failure_stage) for outcome in failed}),
         )
     )
     rows = [
@@ -38,7 +38,7 @@ def failed_episodes(result: Result, folder: Path | None) -> str:
             escape(outcome.config),
             str(outcome.seed),
             escape(outcome.split),
-            escape(FAILURES.get(outcome.failure_stage, outcome.failure_stage)),
+            escape(failure_of(outcome.failure_stage)),
             _ended_by(outcome),
             str(outcome.steps),
             f"{outcome.seconds:.1f}",

@@ -14,7 +14,7 @@ from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.background import measured_with
 from robocas_ms3.evaluation.report.failed import failed_episodes
 from robocas_ms3.evaluation.report.marks import axis, bar, rate, round_up, section, spread, table
-from robocas_ms3.evaluation.report.stages import FAILURES, STAGES
+from robocas_ms3.evaluation.report.stages import FAILURES, failure_of, funnel_of
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, share, success_by
@@ -72,7 +72,9 @@ def _headline(result: Result) -> str:
         found = result.rate("success", outcomes)
         seconds = float(np.mean([outcome.seconds for outcome in outcomes]))
         steps = float(np.mean([outcome.steps for outcome in outcomes]))
-        others = [rate(result.rate(name, outcomes)) for name in ("success_at_end", "success_v0")]
+        has_v0 = any("success_v0" in outcome.flags for outcome in outcomes)  # not where there is no basket
+        v0 = result.rate("success_v0", outcomes) if has_v0 else None
+        others = [rate(result.rate("success_at_end", outcomes)), rate(v0)]
         task = ", ".join(sorted({outcome.task for outcome in outcomes})) if config in groups else ""
         rows.append(
             [escape(config), escape(task), str(found.n), rate(found), bar(found, "good"), *others]
@@ -114,7 +116,7 @@ def _funnels(result: Result) -> str:
     cards = []
     for config, outcomes in result.by("config").items():
         rows = []
-        for stage, said in STAGES.items():
+        for stage, said in funnel_of(outcomes[0].task).items():
             if any(stage in outcome.flags for outcome in outcomes):
                 rows.append(_row(said, result.rate(stage, outcomes), "good" if stage == "success" else ""))
         cards.append(f"<figure><figcaption>{escape(config)}, n {len(outcomes)}</figcaption>{''.join(rows)}</figure>\n")
@@ -139,7 +141,7 @@ def _failures(result: Result) -> str:
             for stage in stages
         ]
         rows.append([escape(config), str(n), str(count.total()), *cells])
-    heads = ("configuration", "n#", "failed#", *(f"{escape(FAILURES.get(stage, stage))}#" for stage in stages))
+    heads = ("configuration", "n#", "failed#", *(f"{escape(failure_of(stage))}#" for stage in stages))
     said = "Episodes by the stage that they did not come to, next after the furthest one that they did."
     return section("Where episodes failed", said, table(heads, rows, "heats"))
 

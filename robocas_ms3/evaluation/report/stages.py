@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from robocas_ms3.benchmark import TASKS
+from robocas_ms3.benchmark.spec import STAGES as ON_THE_WAY
+
 STAGES = {
     "furniture_opened": "furniture opened",
     "reached_any": "an object touched (RA)",
@@ -20,3 +23,20 @@ FAILURES = {
     "error": "broken off",
 }
 """What an episode did not come to (`outcomes.failure_stage`)."""
+
+
+def funnel_of(task: str) -> dict[str, str]:
+    """What the stages of a task are called, in their order; those of another package's by their own names."""
+    row = TASKS.get(task)
+    if row is None or row.stages == ON_THE_WAY:
+        return STAGES
+    return {stage: STAGES.get(stage, _plain(stage)) for stage in (*row.stages, "success")}
+
+
+def failure_of(stage: str) -> str:
+    """What it is called that an episode did not come to this stage."""
+    return FAILURES.get(stage, _plain(stage))
+
+
+def _plain(stage: str) -> str:
+    return stage.replace("_", " ")

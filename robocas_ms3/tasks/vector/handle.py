@@ -11,9 +11,8 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import Any, NoReturn
+from typing import Any
 
 from numpy.typing import NDArray
 
@@ -31,29 +30,6 @@ sys.path[:] = {path!r}
 from robocas_ms3.tasks.vector.worker import main
 main({connection}, {memory}, {parent})
 """
-
-
-class EnvTraceback(Exception):
-    """Where in a worker an error arose: the cause of the error, as tracebacks show it."""
-
-
-@dataclass(frozen=True)
-class EnvFailed:
-    """An environment raised an error.
-
-    Attributes:
-        where: which one.
-        error: the error.
-        trace: its traceback.
-    """
-
-    where: str
-    error: Exception
-    trace: str
-
-    def reraise(self) -> NoReturn:
-        """Raise the error here."""
-        raise self.error from EnvTraceback(f"in {self.where}:\n{self.trace}")
 
 
 class WorkerHandle:
@@ -112,7 +88,7 @@ class WorkerHandle:
             raise self._died() from error
 
     def receive(self) -> Any:
-        """The answer to what was asked last; None where there is nothing to say, an `EnvFailed` if an env failed.
+        """The answer to what was asked last; None where there is nothing to say, a `SentError` if an env failed.
 
         Raises:
             WorkerDied: the process is no more.

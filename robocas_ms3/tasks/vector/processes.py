@@ -17,10 +17,11 @@ from mani_skill.utils.common import torch_clone_dict
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from robocas_ms3.errors import VectorEnvError, WorkerDied
+from robocas_ms3.processes import SentError
 from robocas_ms3.tasks.seeds import following_seeds
 from robocas_ms3.tasks.vector.block import Block, nest, open_memory
-from robocas_ms3.tasks.vector.handle import STEP, EnvFailed, WorkerHandle, close_all, name_envs
-from robocas_ms3.tasks.vector.worker import Call, Made, Order, Reset, Row, Share
+from robocas_ms3.tasks.vector.handle import STEP, WorkerHandle, close_all, name_envs
+from robocas_ms3.tasks.vector.messages import Call, EnvDescription, Order, Reset, Row, Share
 
 
 class ProcessEnv(gym.Env):
@@ -74,7 +75,7 @@ class ProcessEnv(gym.Env):
         self._close = weakref.finalize(self, close_all, self._workers, memory, os.getpid())
         try:
             self._workers += [WorkerHandle(share, memory) for share in shares]
-            made: list[Made] = self._ask(orders)
+            made: list[EnvDescription] = self._ask(orders)
             if any(set(one.fields) != set(made[0].fields) for one in made):  # pictures come in any order
                 raise VectorEnvError("environments differ in what they observe", where=env_id)
             self._share(Block(memory, made[0].fields, num_envs))
@@ -194,7 +195,7 @@ class ProcessEnv(gym.Env):
             self.close()
             raise
         for answer in answers:
-            if isinstance(answer, EnvFailed):
+            if isinstance(answer, SentError):
                 answer.reraise()
         return answers
 

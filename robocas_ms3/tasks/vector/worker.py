@@ -7,10 +7,8 @@ import importlib
 import logging
 import os
 import pickle
-import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -20,111 +18,13 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import LayoutError, VectorEnvError
-from robocas_ms3.processes import leave_with
+from robocas_ms3.processes import SentError, leave_with, use_one_torch_thread
 from robocas_ms3.tasks.vector.block import Block, Field, Path, leaves, space_fields
-from robocas_ms3.tasks.vector.handle import LEAVE, NUMBER, STEP, EnvFailed, name_envs
+from robocas_ms3.tasks.vector.handle import LEAVE, NUMBER, STEP, name_envs
+from robocas_ms3.tasks.vector.messages import Call, EnvDescription, Order, Reset, Row, Share
 
 FIRST_SEED = 2022  # of env 0's resets without a seed, as in ManiSkill; env 1 has the next
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Order:
-    """What a worker is to make.
-
-    Attributes:
-        env_id: gymnasium's.
-        module: where that environment is registered.
-        envs: numbers of the worker's environments.
-        kwargs: for ``gym.make``.
-        wrappers: put around each environment, the first one first.
-    """
-
-    env_id: str
-    module: str
-    envs: range
-    kwargs: dict[str, Any]
-    wrappers: Sequence[Callable[[gym.Env], gym.Env]]
-
-
-@dataclass(frozen=True)
-class Made:
-    """What a worker has made.
-
-    Attributes:
-        observation_space: of one environment.
-        action_space: of one environment.
-        fields: what the environments share with their starter.
-        render_mode: theirs.
-        metadata: theirs.
-    """
-
-    observation_space: gym.Space
-    action_space: gym.Space
-    fields: tuple[Field, ...]
-    render_mode: str | None
-    metadata: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Share:
-    """A command, the first: share memory.
-
-    Attributes:
-        fields: what lies there.
-        num_envs: how many environments there are in all processes.
-    """
-
-    fields: tuple[Field, ...]
-    num_envs: int
-
-
-@dataclass(frozen=True)
-class Reset:
-    """A command: reset some environments.
-
-    Attributes:
-        seeds: of each env to be reset its seed or None, and whether another may take its place if it has no layout.
-        options: for each of them.
-    """
-
-    seeds: dict[int, tuple[int | None, bool]]
-    options: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Call:
-    """A command: call a method of every environment, or read an attribute."""
-
-    name: str
-    args: tuple
-    kwargs: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Row:
-    """A tensor (1, ...) of an info as it is sent: as an array, which takes a thirtieth of a tensor's time to pickle.
-
-    Attributes:
-        array: (1, ...).
-    """
-
-    array: NDArray[Any]
-
-    @staticmethod
-    def of(leaf: Any) -> Any:
-        """The row, or what is none as it is."""
-        if not isinstance(leaf, torch.Tensor) or leaf.shape[:1] != (1,) or leaf.dtype == torch.bfloat16:
-            return leaf  # NumPy knows no bfloat16
-        return Row(leaf.detach().cpu().numpy())
-
-    @staticmethod
-    def join(said: list[Any]) -> Any:
-        """One tensor (N, ...) of the rows of all envs; where some have none, or of another shape, a list."""
-        rows = [leaf.array for leaf in said if isinstance(leaf, Row)]
-        if len(rows) == len(said) and len({row.shape for row in rows}) == 1:
-            return torch.from_numpy(np.concatenate(rows))
-        return [torch.from_numpy(leaf.array) if isinstance(leaf, Row) else leaf for leaf in said]
 
 
 def main(connection: int, memory: int, parent: int) -> None:
@@ -139,7 +39,7 @@ def main(connection: int, memory: int, parent: int) -> None:
     leave_with(parent)
     for descriptor in (connection, memory):
         os.set_inheritable(descriptor, False)
-    torch.set_num_threads(1)
+    use_one_torch_thread()
     with suppress(EOFError, OSError):  # nobody is there any more
         _Worker(Connection(connection), memory).serve()
     os._exit(0)  # environments are closed; what else would be torn down takes long, and may crash
@@ -169,7 +69,7 @@ class _Worker:
         """Send what was found, with the number of the message; of None there is nothing to say."""
         self.connection.send_bytes(self.number + (b"" if found is None else pickle.dumps(found)))
 
-    def each(self, envs: Iterable[int], act: Callable[[int], None]) -> EnvFailed | None:
+    def each(self, envs: Iterable[int], act: Callable[[int], None]) -> SentError | None:
         """Do something with each environment; the first error, after which the others have their turn all the same.
 
         So what becomes of an environment does not depend on which others are in its process.
@@ -180,18 +80,18 @@ class _Worker:
             try:
                 act(env)
             except BaseException as error:  # noqa: BLE001  (it is raised again where it can be dealt with)
-                failed = failed or EnvFailed(name_envs([env]), _sendable(error), traceback.format_exc())
+                failed = failed or _failed(name_envs([env]), error)
             self.at_work[env] = False
         return failed
 
-    def start(self, message: bytes) -> Made | EnvFailed:
+    def start(self, message: bytes) -> EnvDescription | SentError:
         """Make what was ordered."""
         try:
             order: Order = pickle.loads(message).fn
             failed = self.each(order.envs, lambda env: self.make(order, env))
             return failed or _describe(self.envs[order.envs[0]])
         except BaseException as error:  # noqa: BLE001  (as in `each`)
-            return EnvFailed("a worker", _sendable(error), traceback.format_exc())
+            return _failed("a worker", error)
 
     def make(self, order: Order, env: int) -> None:
         """Make an environment, whose resets without a seed draw from a stream of its own."""
@@ -218,7 +118,7 @@ class _Worker:
         self.rest: dict[int, bytes] = {}  # pickled infos for which the shared memory has no place, by their paths
 
     def obey(self, command: Share | Reset | Call | None) -> Any:
-        """Do as told, None: step. What is to be answered: an `EnvFailed`, results of a call, `rest`, or None."""
+        """Do as told, None: step. What is to be answered: a `SentError`, results of a call, `rest`, or None."""
         if isinstance(command, Share):
             return self.share(command)
         results: dict[int, Any] = {}
@@ -289,7 +189,7 @@ def _write(leaf: Any, row: NDArray[Any], path: Path) -> None:
     row[...] = leaf.cpu().numpy() if isinstance(leaf, torch.Tensor) else leaf
 
 
-def _describe(env: gym.Env) -> Made:
+def _describe(env: gym.Env) -> EnvDescription:
     """What environments like this one share.
 
     Raises:
@@ -309,14 +209,9 @@ def _describe(env: gym.Env) -> Made:
         *space_fields(observations, ("obs",)),
         *(Field(("info", *path), array.shape[1:], array.dtype.name) for path, array in infos),
     ]
-    return Made(observations, actions, tuple(fields), env.render_mode, dict(env.metadata))
+    return EnvDescription(observations, actions, tuple(fields), env.render_mode, dict(env.metadata))
 
 
-def _sendable(error: BaseException) -> Exception:
-    """The error as it can be sent: itself, if it is one that pickles."""
-    try:
-        if isinstance(error, Exception) and isinstance(pickle.loads(pickle.dumps(error)), type(error)):
-            return error
-    except Exception:  # noqa: BLE001, S110  (whatever its class does)
-        pass
-    return VectorEnvError(f"{type(error).__name__}: {error}")
+def _failed(where: str, error: BaseException) -> SentError:
+    """An error of an environment; what is none of an `Exception` must not end the starter."""
+    return SentError.of(error, where, sendable=Exception, otherwise=VectorEnvError)

@@ -98,6 +98,11 @@ def test_it_leaves_with_who_started_it_though_killed(forked):
     assert gone(child, 10)
 
 
+def test_the_tasks_of_a_protocol():
+    """What ``--env.task=all`` plays."""
+    assert theirs("vector_env").tasks_of("paper-v1", python=sys.executable, timeout_s=120) == ["pick", "search"]
+
+
 def test_the_interpreter_that_is_taken(tmp_path, monkeypatch):
     monkeypatch.delenv("ROBOCAS_SIM_PYTHON", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))

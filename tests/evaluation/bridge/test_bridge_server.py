@@ -1,6 +1,7 @@
 """The server's side, over a real socket, with an environment of nothing but numbers."""
 
 import json
+import re
 import socket
 import threading
 
@@ -66,6 +67,38 @@ def act(end: Channel, *first: float) -> dict:
 def ask(end: Channel, **changed) -> dict:
     end.send({**ASKED, **changed})
     return end.receive()["ready"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "tasks"),
+    [
+        ({"tasks_of": "smoke"}, ["pick", "select", "search", "open_pick"]),
+        ({"tasks_of": "objects-v1", "split": "new"}, ["pick", "search"]),
+    ],
+)
+def test_it_says_which_tasks_there_are(end, asked, tasks):
+    end.send({"version": 1, **asked})
+    assert end.receive()["ready"] == {"tasks": tasks}
+    end.send({"play": [0]})
+    with pytest.raises(EOFError):
+        end.receive()
+    assert "nothing is played here" in str(end.raised[0])
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"tasks_of": "smoky"}, "no such protocol"),
+        ({"tasks_of": "smoke", "split": "new"}, "no such split"),
+        ({"tasks_of": "smoke", "task": "pick"}, "can't play that.*task"),
+    ],
+)
+def test_it_says_why_there_are_none(end, asked, said):
+    end.send({"version": 1, **asked})
+    with pytest.raises(EOFError):
+        end.receive()
+    assert len(end.raised) == 1
+    assert re.search(said, str(end.raised[0]))
 
 
 def test_a_batch_is_played_to_its_end(end, tmp_path):
