@@ -35,6 +35,7 @@ from robocas_ms3.demos.open_loop import Noise
 from robocas_ms3.recordings.motion import Motion, sample_states, sample_stride
 from robocas_ms3.recordings.reading import open_trajectory
 from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.table import PANDA
 
 FRESH = 1000  # first number of the noise drawn here; trials while generating have smaller ones
 
@@ -179,7 +180,7 @@ def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> N
         return
     world = generator.worlds[0]
     stride = sample_stride(generator.settings.control_freq, world.rate_hz)
-    own = Motion.of(states, actions[:, 7], sample_states(len(actions), stride)).actions[:-1].astype(np.float64)
+    own = Motion.of(PANDA, states, actions[:, 7], sample_states(len(actions), stride)).actions[:-1].astype(np.float64)
     noise = Noise(args.noise[0] / 1000, float(np.deg2rad(args.noise[1])))
     for draw in range(-1, args.draws):
         world.reset(found.seed)

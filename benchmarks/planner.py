@@ -17,6 +17,7 @@ from collections.abc import Callable
 import numpy as np
 
 from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.mplib_backend import MplibPlanner
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.reachability import Reachability
@@ -100,8 +101,8 @@ def main() -> None:
     options = parser.parse_args()
 
     files, watch, points, seconds = robot_files(), Stopwatch(), [], []
-    planner = MplibPlanner(files.arm_urdf, files.arm_srdf, dt=0.05)
-    reachability = Reachability(files.arm_urdf)
+    planner = MplibPlanner(files.arm_urdf, files.arm_srdf, robot=MOBILE_PANDA, dt=0.05)
+    reachability = Reachability(ArmChain(files.arm_urdf, MOBILE_PANDA))
     for scene in range(options.seed, options.seed + options.scenes):
         rng = np.random.default_rng(scene)
         cloud = table(rng)

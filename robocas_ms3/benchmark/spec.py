@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+SIM_FREQ = 100  # Hz, of physics
 STANDARD_FREQ = 20  # Hz, of control; gymnasium's horizon is for it
 STAGES = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_target", "target_grasped", "target_lifted")
 

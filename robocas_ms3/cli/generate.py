@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from robocas_ms3.benchmark import TASKS
+from robocas_ms3.robots.table import DEFAULT
 
 if TYPE_CHECKING:
     TaskName = str
@@ -52,6 +53,8 @@ class Generate:
     """Attempts that may fail for noise alone; after so many an episode counts without, and its record says so."""
     planner: str = "mplib"
     """Motion planner: mplib, or another package's (see docs/extending.md)."""
+    robot: str = DEFAULT
+    """Robot: ours, or another package's (see docs/extending.md)."""
     fork: bool = True
     """Undo what fails by forking the process, where that is safe. The episodes are the same without, only slower."""
     keep_recoveries: bool = False
@@ -94,6 +97,7 @@ def main(cfg: Generate) -> int:
         cfg.noisy_failures,
         *cfg.noise,
         planner=cfg.planner,
+        robot=cfg.robot,
     )
     progress = Progress(*columns(), console=Console(stderr=True))  # shown once there is something to do
 

@@ -1,4 +1,4 @@
-"""``robocas list``: tasks, shipped configurations, policies, asset packs."""
+"""``robocas list``: tasks, shipped configurations, robots, policies, asset packs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 @dataclass
 class List:
-    """List the tasks, the shipped task configurations, the policies and the asset packs."""
+    """List the tasks, the shipped task configurations, the robots, the policies and the asset packs."""
 
     json: bool = False
     """Print a machine-readable list."""
@@ -33,8 +33,9 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     """Gather what there is, verifying every pack.
 
     Returns:
-        ``tasks``, ``configs``, ``policies`` and ``packs``, mappings of plain values. A damaged pack has an ``error``
-        and no objects; policies of other packages are not imported, so a broken one shows only when it is chosen.
+        ``tasks``, ``configs``, ``robots``, ``policies`` and ``packs``, mappings of plain values. A damaged pack has
+        an ``error`` and no objects; policies of other packages are not imported, so a broken one shows only when it is
+        chosen.
 
     Raises:
         ConfigError: a shipped configuration is damaged.
@@ -45,6 +46,7 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     from robocas_ms3.errors import AssetError
     from robocas_ms3.evaluation.policies import POLICIES
     from robocas_ms3.extensions import package_of
+    from robocas_ms3.robots.table import ROBOTS
 
     tasks = [
         {"name": task.name, "env_id": task.env_id, "default_config": task.default_config, "summary": task.summary}
@@ -55,6 +57,7 @@ def collect() -> dict[str, list[dict[str, Any]]]:
         config = load_task_config(path)
         scene = f"{config.objects.count} objects, {config.layout.kind}, on the {config.support}"
         configs.append({"name": name, "task": config.task, "scene": scene, "description": config.description})
+    robots = [{"name": name, "agent": robot.agent} for name, robot in ROBOTS.items()]
     policies = [{"name": name, "package": "robocas_ms3", "of": "builtin"} for name in POLICIES.builtin]
     for points in POLICIES.points.values():
         policies += [{"name": point.name, "package": package_of(point), "of": point.value} for point in points]
@@ -66,7 +69,7 @@ def collect() -> dict[str, list[dict[str, Any]]]:
             packs.append(row | {"objects": sorted(pack.objects), "furniture": sorted(pack.furniture), "error": ""})
         except AssetError as error:
             packs.append(row | {"objects": [], "furniture": [], "error": str(error)})
-    return {"tasks": tasks, "configs": configs, "policies": policies, "packs": packs}
+    return {"tasks": tasks, "configs": configs, "robots": robots, "policies": policies, "packs": packs}
 
 
 def _size(folder: Path) -> int:
@@ -82,6 +85,7 @@ def _print(found: dict[str, list[dict[str, Any]]]) -> None:
     tables = {
         "tasks": ("name", "env_id", "default_config", "summary"),
         "configs": ("name", "task", "scene", "description"),
+        "robots": ("name", "agent"),
         "policies": ("name", "package", "of"),
         "packs": ("name", "objects", "furniture", "megabytes", "folder"),
     }

@@ -10,14 +10,14 @@ from typing import Any
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.benchmark import TASKS
+from robocas_ms3.benchmark.spec import SIM_FREQ
 from robocas_ms3.config import load_config_of
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.planning.backends import BACKENDS
-from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.model import SceneModel
 
-SIM_FREQ = MOBILE_PANDA.sim_freq
 GREATEST_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
 
 
@@ -36,7 +36,8 @@ def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int
     """Check what a run is asked for, before anything is written.
 
     Raises:
-        RobocasError: a number is out of its range, the task can't run the configuration, or there is no such pack.
+        RobocasError: a number is out of its range, the task can't run the configuration, or there is no such planner,
+            robot or pack.
     """
     check_number("episodes", episodes, 1)
     check_number("seed", first_seed, 0, GREATEST_SEED)
@@ -63,6 +64,7 @@ def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int
             found=settings.replay_rate,
         )
     BACKENDS.find(settings.planner, where="planner")
+    find_robot(settings.robot)
     config = load_config_of(TASKS[settings.task], settings.config)
     SceneModel.load(config, load_pack(settings.pack), load_pack("builtin"))
 

@@ -12,11 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.poses import from_wxyz, inverse
-from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.ee_controller import RoboCASEEPoseController
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.robots.forward import chain
-from robocas_ms3.robots.urdf import robot_files
 from robocas_ms3.tasks.base import RoboCASEnv
 
 _JOINT_DELTA_SCALE = 0.1  # rad at |action| = 1 of pd_joint_delta_pos
@@ -33,13 +31,13 @@ def convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
     Returns:
         The action of the environment's control mode, within its bounds.
     """
-    arm, gripper = action[:7].astype(float), action[7:]
+    arm, gripper, robot = action[:7].astype(float), action[7:], env.robot_spec.description
     if env.control_mode == "pd_joint_pos":
         return action
     if env.control_mode == "pd_joint_delta_pos":
-        now = env.agent.robot.get_qpos()[0, MOBILE_PANDA.arm_slice].cpu().numpy()
+        now = env.agent.robot.get_qpos()[0, robot.arm_slice].cpu().numpy()
         return np.append(np.clip((arm - now) / _JOINT_DELTA_SCALE, -1, 1), gripper).astype(np.float32)
-    tcp_in_base = chain(robot_files().urdf, MOBILE_PANDA.arm_base_link, MOBILE_PANDA.tcp_link, arm[None])[0]
+    tcp_in_base = chain(env.robot_spec.files().urdf, robot.arm_base_link, robot.tcp_link, arm[None])[0]
     if env.control_mode == "pd_ee_pose":
         euler = Rotation.from_matrix(tcp_in_base[:3, :3]).as_euler("XYZ")
         return np.concatenate([tcp_in_base[:3, 3], euler, gripper]).astype(np.float32)

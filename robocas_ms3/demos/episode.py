@@ -12,6 +12,7 @@ from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.backends import DEFAULT
 from robocas_ms3.planning.executor import Seconds
+from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
 
 NOISY = "noisy_"  # begins the reasons of attempts that failed for noise alone
 
@@ -36,6 +37,7 @@ class EpisodeSettings:
         noise_deg: the same of its Euler angles.
         layouts: where layouts come from, see ``RoboCASEnv``.
         planner: name of the motion planner.
+        robot: name of the robot.
     """
 
     task: str
@@ -51,6 +53,7 @@ class EpisodeSettings:
     noise_deg: float = 0.2
     layouts: str = "auto"
     planner: str = DEFAULT
+    robot: str = DEFAULT_ROBOT
 
 
 @dataclass

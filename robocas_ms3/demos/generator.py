@@ -22,6 +22,7 @@ from robocas_ms3.demos.trials import Trials
 from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.extensions import load
 from robocas_ms3.planning.backends import make_planner
+from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.decisions import Decisions, StraightDecisions
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Planner
@@ -32,7 +33,7 @@ from robocas_ms3.recordings.environment import RecordedEnv
 from robocas_ms3.recordings.motion import sample_stride
 from robocas_ms3.recordings.subgoals import SubGoal
 from robocas_ms3.recordings.writing import EpisodeRecorder
-from robocas_ms3.robots.urdf import robot_files
+from robocas_ms3.robots.table import DEFAULT, find_robot
 from robocas_ms3.tasks.base import RoboCASEnv
 
 
@@ -49,7 +50,8 @@ class EpisodeGenerator:
 
     def __init__(self, settings: EpisodeSettings, *, fork: bool = True) -> None:
         self.settings = settings
-        config = load_task_config(settings.config)
+        config, robot = load_task_config(settings.config), find_robot(settings.robot)
+        chosen: dict[str, Any] = {} if settings.robot == DEFAULT else {"robot_uids": settings.robot}
         self.horizon = TASKS[settings.task].steps(settings.control_freq)
         self.env = gym.make(
             TASKS[settings.task].env_id,
@@ -57,6 +59,7 @@ class EpisodeGenerator:
             config=settings.config,
             pack=settings.pack,
             layouts=settings.layouts,
+            **chosen,
             obs_mode="none",
             reward_mode="none",
             control_mode="pd_joint_pos_base" if config.base_motion else "pd_joint_pos",
@@ -65,17 +68,14 @@ class EpisodeGenerator:
         )
         base_env = self.env.unwrapped
         assert isinstance(base_env, RoboCASEnv)
-        files = robot_files()
-        self.planner: Planner = make_planner(
-            settings.planner, files.arm_urdf, files.arm_srdf, dt=base_env.control_timestep
-        )
-        self.reachability = Reachability(str(files.arm_urdf))
+        self.planner: Planner = make_planner(settings.planner, robot, dt=base_env.control_timestep)
+        self.reachability = Reachability(ArmChain(robot.files().arm_urdf, robot.description))
         # a scripted policy tries once, from wherever the episode stands, and raises PlanningFailed
         self.policy: Callable[[Arm], None] = load(TASKS[settings.task].solver)
         self.worlds: list[OpenLoop] = []
         self.trials: Trials | None = None
         if settings.replay_rate and not config.base_motion:
-            scene = {"config": settings.config, "layouts": settings.layouts}
+            scene = {"config": settings.config, "layouts": settings.layouts, **chosen}
             env = RecordedEnv(TASKS[settings.task].env_id, None, scene).with_pack(settings.pack)
             self.worlds = [OpenLoop(env, settings.replay_rate) for _ in range(1 + settings.noisy_trials)]
             noise = Noise(settings.noise_mm / 1000, float(np.deg2rad(settings.noise_deg)))

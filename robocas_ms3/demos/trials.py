@@ -15,7 +15,6 @@ from robocas_ms3.demos.episode import NOISY
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.errors import EpisodeLost
 from robocas_ms3.recordings.motion import Motion, sample_states
-from robocas_ms3.robots.description import MOBILE_PANDA
 
 # m by which the target may be off the recording at the end of a part. What else lies about may roll elsewhere: where
 # that matters, what comes next goes wrong, and shows it.
@@ -35,6 +34,7 @@ class Trials:
 
     def __init__(self, worlds: Sequence[OpenLoop], noise: Noise, stride: int) -> None:
         self._worlds, self._noise, self._stride = worlds, noise, stride
+        self._robot = worlds[0].env.robot_spec
         self._seed, self._played = 0, 0
 
     def reset(self, seed: int) -> None:
@@ -62,7 +62,8 @@ class Trials:
         if not finished:
             samples = samples[samples % self._stride == 0]
         new = samples[self._played :]
-        actions = Motion.of(states["articulations"][MOBILE_PANDA.uid], gripper, new).actions[:-1].astype(np.float64)
+        recorded = states["articulations"][self._robot.description.uid]
+        actions = Motion.of(self._robot, recorded, gripper, new).actions[:-1].astype(np.float64)
         for number, world in enumerate(self._worlds if noisy else self._worlds[:1]):
             for action in self._with_noise(actions, number) if number else actions:
                 world.step(action)

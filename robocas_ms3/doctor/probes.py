@@ -68,12 +68,12 @@ def planner() -> str:
     import numpy as np
 
     from robocas_ms3.planning.mplib_backend import MplibPlanner
-    from robocas_ms3.robots.description import MOBILE_PANDA
-    from robocas_ms3.robots.urdf import robot_files
+    from robocas_ms3.robots.table import find_robot
 
-    files = robot_files()
-    planner = MplibPlanner(files.arm_urdf, files.arm_srdf, dt=0.05)
-    start = np.asarray(MOBILE_PANDA.arm_rest, dtype=np.float64)
+    robot = find_robot(None)
+    files = robot.files()
+    planner = MplibPlanner(files.arm_urdf, files.arm_srdf, robot=robot.description, dt=0.05)
+    start = np.asarray(robot.description.arm_rest, dtype=np.float64)
     path = planner.plan_to_qpos(start, [start + 0.2], stage="doctor")
     return f"works, planned {len(path.qpos)} steps"
 

@@ -19,6 +19,7 @@ from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import EvaluationError, LayoutError
 from robocas_ms3.evaluation.protocol import CONFIGS, EPISODES, LAYOUTS, NO_RULES, RULES, TRAIN, Episode, Protocol
 from robocas_ms3.files import make_folder, replacing, replacing_folder
+from robocas_ms3.robots.table import DEFAULT
 from robocas_ms3.scenes.frozen import write_frozen
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.strict import StrictModel, parse
@@ -136,7 +137,8 @@ def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Ite
             write_frozen(tmp / LAYOUTS / f"{name}.npy", pack.objects, found)
         with replacing(tmp / EPISODES) as file:
             file.write_text("".join(f"{episode.model_dump_json()}\n" for episode in episodes), encoding="utf-8")
-        said = yaml.safe_dump(rules.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+        dumped = rules.model_dump(mode="json", exclude={"robot"} if rules.robot == DEFAULT else None)
+        said = yaml.safe_dump(dumped, sort_keys=False, allow_unicode=True)  # one that names no robot has the default
         (tmp / RULES).write_text(said, encoding="utf-8")
 
 

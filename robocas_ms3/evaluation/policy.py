@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
+from robocas_ms3.robots.table import DEFAULT
 
 Language = Literal["none", "text", "embedding"]
 Reference = Literal["tcp", "target"]
@@ -65,6 +66,7 @@ class Start:
         pack: object pack.
         seed: of its scene.
         instruction: what is asked.
+        robot: name of the one that acts.
     """
 
     env: int
@@ -75,6 +77,7 @@ class Start:
     pack: str
     seed: int
     instruction: str
+    robot: str = DEFAULT
 
 
 @dataclass(frozen=True)

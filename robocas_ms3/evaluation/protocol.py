@@ -28,6 +28,7 @@ from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.paths import protocols_dir
+from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
 from robocas_ms3.strict import StrictModel, nearest, parse, parse_json
 
 NO_RULES = "no rules of a protocol"
@@ -60,6 +61,7 @@ class Protocol(StrictModel):
     max_v0_steps: Annotated[int, Field(ge=1)] | None = Field(
         default=None, description="it also ends when upstream's success has held after so many actions"
     )
+    robot: str = Field(default=DEFAULT_ROBOT, description="that acts")
     pack: str = Field(default="builtin", description="object pack")
     pack_hash: str = Field(description="sha256 of its manifest")
 

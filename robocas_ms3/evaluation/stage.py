@@ -52,6 +52,7 @@ def make_env(
         config=str(protocol.config_file(episode.config)),
         layouts=str(protocol.layouts_file(episode.config)),
         pack=protocol.rules.pack,
+        robot_uids=protocol.rules.robot,
         control_mode=control_mode(wants.convention),
         reward_mode="none",
         sim_config={"control_freq": rate_of(protocol, wants)},
@@ -77,6 +78,7 @@ def start_of(protocol: LoadedProtocol, episode: Episode) -> Start:
         pack=protocol.rules.pack,
         seed=episode.seed,
         instruction=episode.instruction,
+        robot=protocol.rules.robot,
     )
 
 

@@ -13,7 +13,6 @@ import sapien
 import torch
 
 from robocas_ms3.errors import EvaluationError
-from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.tasks import terms
 
 RAISED = 0.03  # m above where it stood (evaluation_v0.md)
@@ -99,7 +98,7 @@ class Weld:
         return {"welds": torch.tensor([float(self._count)]), "success": info["success"] & ~welded}
 
     def _fix(self, body: Any) -> None:
-        hand = self._env.agent.robot.links_map[MOBILE_PANDA.hand_link]._bodies[0]
+        hand = self._env.agent.hand_link._bodies[0]
         drive = sapien.physx.PhysxDriveComponent(body)
         drive.parent = hand
         drive.pose_in_parent, drive.pose_in_child = hand.entity_pose.inv() * body.entity_pose, sapien.Pose()

@@ -1,5 +1,8 @@
 """Closed-form inverse kinematics of the Panda for many poses at once, given joint 7.
 
+An arm whose joints stand otherwise to each other brings a class of its own with this ``solve``, and names it in its
+description (``inverse_kinematics``).
+
 The geometry is that of Y. He and S. Liu, "Analytical Inverse Kinematics for Franka Emika Panda" (2021): with joint 7
 given, the wrist is known, the elbow lies on a circle that the fixed elbow angle cuts at up to two places, and each of
 them has two shoulders.
@@ -39,7 +42,12 @@ class PandaGeometry:
             for link, place in zip((one, two, three, four, five, six), places, strict=True)
         )
         if not (rotations_fit and places_fit and np.allclose(seven[:3, 3], (self.a7, 0, 0))):
-            raise RobocasError("not a Panda", where="arm_urdf", expected="joints as the Panda's stand to each other")
+            raise RobocasError(
+                "this closed form is not for this arm",
+                where=chain.robot.uid,
+                expected="joints as the Panda's stand to each other",
+                fix="Name one of its own as inverse_kinematics of its description.",
+            )
         self.link7_in_tcp = np.linalg.inv(tcp)
         self.lower, self.upper = chain.lower, chain.upper
 
@@ -51,7 +59,7 @@ class PandaGeometry:
             joint7: (M,) rad.
 
         Returns:
-            (M, 4, 7) rad; NaN where a branch doesn't exist or breaks a joint limit.
+            (M, 4, 7) rad, or another number of branches; NaN where a branch doesn't exist or breaks a joint limit.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             return self._solve(

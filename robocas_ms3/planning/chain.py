@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.planning.protocol import Array
-from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.description import RobotDescription
 
 LIMIT_MARGIN = 0.02  # rad kept from every joint limit
 
@@ -23,39 +23,39 @@ class ArmChain:
     """Seven joints that turn about z of their own links, and the TCP fixed to the last.
 
     Args:
-        arm_urdf: the arm alone, rooted at ``panda_link0``, with the TCP as ``panda_hand_tcp``.
+        arm_urdf: the arm alone, rooted at its base.
+        robot: whose arm it is.
 
     Attributes:
+        robot: the same.
         links: eight fixed transforms 4x4: from each link to the next one at 0 rad, the last to the TCP.
         hand_in_tcp: 4x4.
         lower: (7,) joint limits with a margin, rad.
         upper: (7,).
 
     Raises:
-        RobocasError: the file is missing or is not the Panda's.
+        RobocasError: the file is missing or is not that arm's.
     """
 
-    def __init__(self, arm_urdf: Path | str) -> None:
+    def __init__(self, arm_urdf: Path | str, robot: RobotDescription) -> None:
+        self.robot = robot
         if not Path(arm_urdf).is_file():
             raise RobocasError("no such robot description", where=arm_urdf)
         root = ElementTree.parse(arm_urdf).getroot()
         joints = {child.attrib["link"]: joint for joint in root.iterfind("joint") for child in joint.findall("child")}
         chain: list[ElementTree.Element] = []
-        link = MOBILE_PANDA.tcp_link
-        while link in joints and link != MOBILE_PANDA.arm_base_link:
+        link = robot.tcp_link
+        while link in joints and link != robot.arm_base_link:
             chain.insert(0, joints[link])
             link = next(parent.attrib["link"] for parent in joints[link].findall("parent"))
         turning = [joint for joint in chain if joint.attrib["type"] == "revolute"]
         names = tuple(joint.attrib["name"] for joint in turning)
         axes = [axis.attrib["xyz"].split() for joint in turning for axis in joint.findall("axis")]
-        if (
-            link != MOBILE_PANDA.arm_base_link
-            or names != MOBILE_PANDA.arm_joints
-            or any([float(v) for v in axis] != [0, 0, 1] for axis in axes)
-        ):
-            raise RobocasError(
-                "not a Panda", where=arm_urdf, expected=", ".join(MOBILE_PANDA.arm_joints), found=", ".join(names)
-            )
+        about_z = all([float(v) for v in axis] == [0, 0, 1] for axis in axes)
+        if link != robot.arm_base_link or names != robot.arm_joints or not about_z:
+            what = f"not the arm of {robot.uid}"
+            expected = f"{', '.join(robot.arm_joints)}, each about z"
+            raise RobocasError(what, where=arm_urdf, expected=expected, found=", ".join(names))
         self.links, self.hand_in_tcp = [], np.eye(4)
         pending, after_hand = np.eye(4), False
         for joint in chain:
@@ -65,7 +65,7 @@ class ArmChain:
             if joint in turning:
                 self.links.append(pending)
                 pending = np.eye(4)
-            after_hand |= any(child.attrib["link"] == MOBILE_PANDA.hand_link for child in joint.findall("child"))
+            after_hand |= any(child.attrib["link"] == robot.hand_link for child in joint.findall("child"))
         self.links.append(pending)
         self.hand_in_tcp = np.linalg.inv(self.hand_in_tcp)
         limits = np.array(

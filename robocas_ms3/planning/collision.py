@@ -23,11 +23,9 @@ from robocas_ms3.errors import RobocasError
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle
 from robocas_ms3.planning.shapes import CollisionShapes, Pieces, bounds, matrix_to_pose
-from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.description import RobotDescription
 
-STATIC_LINKS = (MOBILE_PANDA.arm_base_link, MOBILE_PANDA.base_link)  # what carries the arm may be missing
 CLOUD, ATTACHED = "cloud", "attached"
-HITTABLE = (*STATIC_LINKS, *MOBILE_PANDA.arm_links[:-1])  # by a held object
 REACH = 1.5  # m; obstacle points further from the arm's base never matter
 BASE_MARGIN = 0.015  # m around the parts that never move within which points of the cloud are cut out
 SPARSE = 12  # every so manieth configuration of a path is checked before all others
@@ -73,15 +71,16 @@ class ArmWorld:
     """The arm, the obstacles and the held object.
 
     Args:
-        urdf: the arm alone, rooted at ``panda_link0``.
+        urdf: the arm alone, rooted at its base.
         srdf: its pairs of links that may touch.
+        robot: whose arm it is.
         voxel: edge of the cloud's voxels = spacing of its points, m.
 
     Raises:
         RobocasError: numpy 2, a missing file, or a link or joint is missing.
     """
 
-    def __init__(self, urdf: Path | str, srdf: Path | str, *, voxel: float = 0.005) -> None:
+    def __init__(self, urdf: Path | str, srdf: Path | str, robot: RobotDescription, *, voxel: float = 0.005) -> None:
         require_numpy_1()
         for path in (urdf, srdf):
             if not Path(path).is_file():
@@ -101,19 +100,17 @@ class ArmWorld:
                 expected="meshes by relative path, each with its hull beside it (NAME.convex.stl)",
                 found=str(error).splitlines()[0],
             ) from error
-        self.chain = ArmChain(urdf)
+        self.chain = ArmChain(urdf, robot)
         self.kinematics = self._robot.get_pinocchio_model()
         links, joints = self.kinematics.get_link_names(), self.kinematics.get_joint_names()
-        self._robot.set_move_group(MOBILE_PANDA.tcp_link)
-        self.tcp_index = links.index(MOBILE_PANDA.tcp_link)
-        self.arm_indices = np.array([joints.index(name) for name in MOBILE_PANDA.arm_joints])
-        self._fingers = np.array(
-            [joints.index(name) for name in MOBILE_PANDA.finger_joints if name in joints], dtype=int
-        )
+        self._robot.set_move_group(robot.tcp_link)
+        self.tcp_index = links.index(robot.tcp_link)
+        self.arm_indices = np.array([joints.index(name) for name in robot.arm_joints])
+        self._fingers = np.array([joints.index(name) for name in robot.finger_joints if name in joints], dtype=int)
         self.state_size = len(joints)
         self.limits = np.concatenate(self.kinematics.get_joint_limits())[self.arm_indices]
         self.checks = 0  # configurations checked so far
-        self.finger_width = MOBILE_PANDA.open_width
+        self.open_width = self.finger_width = robot.open_width
         self._request = fcl.CollisionRequest()
         self._object_in_tcp = np.eye(4)
         self._body: Any = None
@@ -122,16 +119,17 @@ class ArmWorld:
 
     def _read_parts(self) -> None:
         """Find each part's box in the frame of the link that carries it, and which parts may touch each other."""
-        model = self._robot.get_fcl_model()
+        model, robot = self._robot.get_fcl_model(), self.chain.robot
+        static = (robot.arm_base_link, robot.base_link)  # what carries the arm may be missing
         self._names: list[str] = [*model.get_collision_link_names(), ATTACHED]
         self._parts: list[Any] = [*model.get_collision_objects(), None]
         body = len(self._parts) - 1
-        carriers = dict.fromkeys(STATIC_LINKS, -1) | {link: i for i, link in enumerate(MOBILE_PANDA.arm_links)}
+        carriers = dict.fromkeys(static, -1) | {link: i for i, link in enumerate(robot.arm_links)}
         self._carrier = np.array([carriers.get(name, 7) for name in self._names])  # 7: what is rigid with the TCP
         rotations, positions = self.chain.frames(np.zeros((1, 7)))
         frames = [*zip(rotations[:, 0], positions[:, 0], strict=True), (np.eye(3), np.zeros(3))]
         boxes = []
-        for width in (0.0, MOBILE_PANDA.open_width):
+        for width in (0.0, self.open_width):
             self._robot.set_qpos(self._full(np.zeros(7), width), True)
             boxes.append([bounds(part, *frames[c]) for part, c in zip(self._parts[:-1], self._carrier, strict=False)])
             boxes[-1].append(np.zeros((2, 3)))
@@ -139,7 +137,7 @@ class ArmWorld:
         self._moving = np.flatnonzero(self._carrier >= 0)
         self._cut = self._box[self._carrier < 0]
         # The hand, the fingers and link 7 are rigid with the held object, whose hull may touch them.
-        hittable = [i for i, name in enumerate(self._names[:-1]) if name in HITTABLE]
+        hittable = [i for i, name in enumerate(self._names[:-1]) if name in (*static, *robot.arm_links[:-1])]
         self._own_pairs = len(model.get_collision_pairs())  # without the held object
         self._pairs = np.array([*model.get_collision_pairs(), *((i, body) for i in hittable)])
 
@@ -269,7 +267,7 @@ class ArmWorld:
 
     def _overlapping(self, rotations: Array, positions: Array, width: float, obstacles: bool) -> _Pairs:
         """The broad phase: links 1 to 7 and the TCP at rotations (8, M, 3, 3) and positions (8, M, 3)."""
-        box = self._box + (self._box_opened - self._box) * (width / MOBILE_PANDA.open_width)
+        box = self._box + (self._box_opened - self._box) * (width / self.open_width)
         moving = self._moving if self._body is not None else self._moving[:-1]
         carrier, count = self._carrier[moving], rotations.shape[1]
         turned = rotations[carrier]  # (P, M, 3, 3)

@@ -19,7 +19,7 @@ from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle, Traject
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.rrt import PathSearch
 from robocas_ms3.planning.timing import JointPath, blended, rounded, stopping, thinned, through, timed
-from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.description import RobotDescription
 
 CHECKS_PER_SECOND = 10_000  # turns a planning time into a budget of collision checks, which load can't change
 SPACING = 0.03  # rad between checks while searching
@@ -39,17 +39,18 @@ class MplibPlanner:
     """Plan for the arm in its base frame; implements ``planning.protocol.Planner``.
 
     Args:
-        urdf: the arm alone, rooted at ``panda_link0``, with the TCP as ``panda_hand_tcp``.
+        urdf: the arm alone, rooted at its base.
         srdf: its pairs of links that may touch.
+        robot: whose arm it is.
         dt: seconds between rows of a trajectory.
-        velocity_limit: of every joint, rad/s.
-        acceleration_limit: of every joint, rad/s^2.
+        velocity_limit: of every joint, rad/s; default: the robot's.
+        acceleration_limit: of every joint, rad/s^2; default: the robot's.
         rrt_range: longest extension of a tree, rad.
         planning_time: budget of one search, in seconds of a quiet core; counted in collision checks, not by the clock.
         voxel: edge of the cloud's voxels = spacing of its points, m.
 
     Raises:
-        RobocasError: numpy 2, missing files, a description without the Panda's links.
+        RobocasError: numpy 2, missing files, a description without the robot's links.
     """
 
     def __init__(
@@ -57,20 +58,24 @@ class MplibPlanner:
         urdf: Path | str,
         srdf: Path | str,
         *,
+        robot: RobotDescription,
         dt: float,
-        velocity_limit: float = MOBILE_PANDA.arm_velocity_limit,
-        acceleration_limit: float = MOBILE_PANDA.arm_acceleration_limit,
+        velocity_limit: float | None = None,
+        acceleration_limit: float | None = None,
         rrt_range: float = 0.25,
         planning_time: float = 2.0,
         voxel: float = 0.005,
     ) -> None:
         if not dt > 0:
             raise RobocasError("the time step must be positive", where="dt", found=dt)
-        self._world = ArmWorld(urdf, srdf, voxel=voxel)
+        self._world = ArmWorld(urdf, srdf, robot, voxel=voxel)
         self._kinematics = ArmKinematics(self._world)
         self._reachability = Reachability(self._world.chain)
         self._dt = dt
-        self._limits = {"velocity": velocity_limit, "acceleration": acceleration_limit}
+        self._limits = {
+            "velocity": robot.arm_velocity_limit if velocity_limit is None else velocity_limit,
+            "acceleration": robot.arm_acceleration_limit if acceleration_limit is None else acceleration_limit,
+        }
         self._budget = int(planning_time * CHECKS_PER_SECOND)
         self._search = PathSearch(
             self._world.free_until, self._kinematics.lower, self._kinematics.upper, step=rrt_range, spacing=SPACING
@@ -84,7 +89,7 @@ class MplibPlanner:
 
     @finger_width.setter
     def finger_width(self, width: float) -> None:
-        self._world.finger_width = float(np.clip(width, 0.0, MOBILE_PANDA.open_width))
+        self._world.finger_width = float(np.clip(width, 0.0, self._world.open_width))
 
     @property
     def collision_checks(self) -> int:
@@ -110,13 +115,15 @@ class MplibPlanner:
         """Give the TCP's pose in the base frame (4x4) at joints (7,)."""
         return self._world.tcp(qpos)
 
-    def collisions(self, qpos: Array, finger_width: float = MOBILE_PANDA.open_width) -> list[str]:
-        """Name what touches at a configuration (7,): links, 'cloud', 'attached'."""
-        return self._world.contacts(np.asarray(qpos, dtype=np.float64), finger_width)
+    def collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
+        """Name what touches at a configuration (7,): links, 'cloud', 'attached'; see the protocol."""
+        width = self._world.open_width if finger_width is None else finger_width
+        return self._world.contacts(np.asarray(qpos, dtype=np.float64), width)
 
-    def free(self, qpos: Array, finger_width: float = MOBILE_PANDA.open_width) -> NDArray[np.bool_]:
-        """Say which configurations (M, 7) touch nothing: (M,)."""
-        return self._world.free(np.asarray(qpos, dtype=np.float64).reshape(-1, 7), finger_width=finger_width)
+    def free(self, qpos: Array, finger_width: float | None = None) -> NDArray[np.bool_]:
+        """Say which configurations (M, 7) touch nothing: (M,); see the protocol."""
+        width = self._world.open_width if finger_width is None else finger_width
+        return self._world.free(np.asarray(qpos, dtype=np.float64).reshape(-1, 7), finger_width=width)
 
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
         """Solve inverse kinematics; see the protocol."""

@@ -1,6 +1,6 @@
 """The small interface between scripted policies and a motion planner.
 
-Everything is in the arm's base frame (``panda_link0``), so the mobile base never matters to a backend. Poses are 4x4
+Everything is in the arm's base frame, so the mobile base never matters to a backend. Poses are 4x4
 float64 matrices in metres; ``tcp_in_base`` is ManiSkill's TCP (z approach, y closing). ``qpos`` are the 7 arm joints in
 rad.
 """
@@ -13,8 +13,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
-from robocas_ms3.robots.description import MOBILE_PANDA
 
 Array = NDArray[np.float64]
 
@@ -112,11 +110,16 @@ class Planner(Protocol):
         """Forward kinematics: (7,) -> 4x4 TCP in the arm's base frame."""
         ...
 
-    def collisions(self, qpos: Array, finger_width: float = MOBILE_PANDA.open_width) -> list[str]:
-        """Name what touches at a configuration: links, obstacles ('cloud': of points), 'attached'. Empty: free."""
+    def collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
+        """Name what touches at a configuration: links, obstacles ('cloud': of points), 'attached'. Empty: free.
+
+        Args:
+            qpos: (7,).
+            finger_width: m; default: of the open gripper.
+        """
         ...
 
-    def free(self, qpos: Array, finger_width: float = MOBILE_PANDA.open_width) -> NDArray[np.bool_]:
+    def free(self, qpos: Array, finger_width: float | None = None) -> NDArray[np.bool_]:
         """Say which configurations (M, 7) touch nothing: (M,). Far cheaper than one at a time."""
         ...
 

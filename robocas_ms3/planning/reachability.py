@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.planning.analytic import PandaGeometry
+from robocas_ms3.extensions import load
 from robocas_ms3.planning.chain import ArmChain, turn_between
 from robocas_ms3.planning.protocol import Array
 
@@ -21,16 +19,16 @@ class Reachability:
     """Inverse kinematics of one arm; collisions do not count.
 
     Args:
-        arm: its description, rooted at ``panda_link0``, with the TCP as ``panda_hand_tcp``; or its chain.
+        chain: the arm.
 
     Raises:
-        RobocasError: the file is missing or is not the Panda's.
+        RobocasError: the closed form that its robot names is not there, or for other arms.
     """
 
-    def __init__(self, arm: Path | str | ArmChain) -> None:
-        self.chain = arm if isinstance(arm, ArmChain) else ArmChain(arm)
+    def __init__(self, chain: ArmChain) -> None:
+        self.chain = chain
         self.lower, self.upper = self.chain.lower, self.chain.upper
-        self._geometry = PandaGeometry(self.chain)
+        self._geometry = load(self.chain.robot.inverse_kinematics)(self.chain)
 
     def reachable(self, tcp_in_base: Array, near: Array) -> tuple[NDArray[np.bool_], Array]:
         """Solve inverse kinematics for many poses at once.

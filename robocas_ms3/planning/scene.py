@@ -13,7 +13,6 @@ from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.pack import Part
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape
 from robocas_ms3.poses import from_wxyz, inverse, transform
-from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.tasks.transfer import TransferEnv
 
 # Upstream's: samples of the meshes at 5 mm, none farther than 1.5 m from the robot
@@ -86,7 +85,7 @@ class PlanningScene:
 
     @property
     def arm_base_in_world(self) -> Array:
-        """4x4 of ``panda_link0`` in the world."""
+        """4x4 of the arm's base in the world."""
         return from_wxyz(self.env.agent.arm_base_link.pose.raw_pose[0])
 
     @property
@@ -97,7 +96,7 @@ class PlanningScene:
     @property
     def arm_qpos(self) -> Array:
         """(7,) rad, where the arm is."""
-        return self.env.agent.robot.get_qpos()[0, MOBILE_PANDA.arm_slice].cpu().numpy().astype(float)
+        return self.env.agent.robot.get_qpos()[0, self.env.agent.description.arm_slice].cpu().numpy().astype(float)
 
     def object_in_base(self, slot: int) -> Array:
         """4x4 of an object in the arm's base frame."""

@@ -17,7 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
 
 from robocas_ms3.assets.pack import pack_folders
 from robocas_ms3.config.load import shipped_configs
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.errors import DatasetError, ExtensionError
+from robocas_ms3.robots.table import RobotSpec, find_robot
 from robocas_ms3.strict import StrictModel, mistakes
 
 _PREFIX = "robocas_ms3:"  # lets gymnasium import this package by itself: ManiSkill's own tools then work
@@ -91,6 +92,18 @@ class RecordedEnv:
         named = str(pack) if str(pack) in pack_folders() else str(Path(pack).absolute())
         return replace(self, kwargs={**self.kwargs, "pack": named})
 
+    def robot(self, where: object = "robot_uids") -> RobotSpec:
+        """The robot that it was.
+
+        Raises:
+            DatasetError: none of its name is installed.
+        """
+        try:
+            return find_robot(self.kwargs.get("robot_uids"), where=where)
+        except ExtensionError as error:
+            fix = error.fix or "Install the package that has it."
+            raise DatasetError(error.what, where=where, expected=error.expected, found=error.found, fix=fix) from error
+
     def make(self, **kwargs: Any) -> Any:
         """Make it.
 
@@ -98,8 +111,8 @@ class RecordedEnv:
             kwargs: further ones of ``gym.make``, which win over its own.
 
         Raises:
-            DatasetError: no such task is registered, configuration shipped, or pack installed; what lies in the
-                folder where we run is none, whatever its name.
+            DatasetError: no such task is registered, configuration shipped, or robot or pack installed; what lies in
+                the folder where we run is none, whatever its name.
         """
         import gymnasium as gym
 
@@ -108,6 +121,7 @@ class RecordedEnv:
         known = sorted(spec.env_id for spec in TASKS.values())
         if self.env_id not in known:
             raise DatasetError("no such task", where="env_id", expected=f"one of {known}", found=self.env_id)
+        self.robot()
         config = self.kwargs.get("config")
         if isinstance(config, str) and config not in shipped_configs():
             raise DatasetError("no such configuration", where="config", expected="a shipped one", found=config)

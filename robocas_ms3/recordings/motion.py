@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_wxyz, inverse
-from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.forward import link_poses
+from robocas_ms3.robots.table import RobotSpec
 
 Array = NDArray[np.float64]
 
 _POSE = 13  # of a state: position 3, quaternion wxyz 4, linear and angular velocity 6
-OPEN_WIDTH = MOBILE_PANDA.open_width / 2
-"""A gripper commanded wider than this counts as open, m."""
+_JOINTS = RobotDescription.finger_slice.stop
 
 
 def sample_stride(control_freq: float, rate_hz: float) -> int:
@@ -50,6 +50,7 @@ def sample_states(control_steps: int, stride: int) -> NDArray[np.int64]:
 
 
 def gripper_open(
+    robot: RobotDescription,
     commands: NDArray[np.floating],
     samples: NDArray[np.int64],
     *,
@@ -57,9 +58,11 @@ def gripper_open(
 ) -> NDArray[np.bool_]:
     """Gripper command in force at each sampled state: that of the action which led there.
 
-    So ``gripper_status[t + 1]`` is what was commanded between t and t + 1, as the released loader reads it.
+    So ``gripper_status[t + 1]`` is what was commanded between t and t + 1, as the released loader reads it. Commanded
+    wider than half of what it opens to, it counts as open.
 
     Args:
+        robot: whose gripper.
         commands: (S,) gripper actions in [-1, 1].
         samples: (T,) from ``sample_states``.
         initial_width: of the gripper at reset, m, which is its target until the first action.
@@ -67,10 +70,10 @@ def gripper_open(
     Returns:
         (T,) bool.
     """
-    low, high = MOBILE_PANDA.finger_targets
+    low, high = robot.finger_targets
     finger_targets = low + (np.clip(commands, -1, 1) + 1) / 2 * (high - low)
     widths = np.concatenate([[initial_width], 2 * finger_targets])
-    return widths[samples] > OPEN_WIDTH + 1e-6
+    return widths[samples] > robot.open_width / 2 + 1e-6
 
 
 def relative_motion(poses: Array) -> Array:
@@ -127,28 +130,41 @@ class Motion:
 
     @classmethod
     def of(
-        cls, robot_states: NDArray[np.floating], gripper: NDArray[np.floating], samples: NDArray[np.int64]
+        cls,
+        robot: RobotSpec,
+        robot_states: NDArray[np.floating],
+        gripper: NDArray[np.floating],
+        samples: NDArray[np.int64],
     ) -> Motion:
         """The one way from recorded states to what datasets hold of them, to the last bit.
 
         Args:
+            robot: whose they are.
             robot_states: (S + 1, 37) after the reset and after each control step.
             gripper: (S,) commands in [-1, 1].
             samples: (T,) indices of states, from `sample_states`, or some of them in a row.
         """
         root_in_world, qpos, qvel = split_states(robot_states[samples])
-        width = float(split_states(robot_states[:1])[1][0, MOBILE_PANDA.finger_slice].sum())
-        return cls.of_joints(root_in_world, qpos, qvel, gripper_open(gripper, samples, initial_width=width))
+        width = float(split_states(robot_states[:1])[1][0, robot.description.finger_slice].sum())
+        opened = gripper_open(robot.description, gripper, samples, initial_width=width)
+        return cls.of_joints(robot, root_in_world, qpos, qvel, opened)
 
     @classmethod
-    def of_joints(cls, root_in_world: Array, qpos: Array, qvel: Array, opened: NDArray[np.bool_]) -> Motion:
-        """Of what the attributes of these names say."""
-        return cls(qpos, qvel, root_in_world, *link_poses(root_in_world, qpos), opened)
+    def of_joints(
+        cls, robot: RobotSpec, root_in_world: Array, qpos: Array, qvel: Array, opened: NDArray[np.bool_]
+    ) -> Motion:
+        """Of a robot, and of what the attributes of these names say."""
+        return cls(qpos, qvel, root_in_world, *link_poses(robot, root_in_world, qpos), opened)
 
     @property
     def tcp_in_base(self) -> Array:
         """(T, 4, 4)."""
         return inverse(self.arm_base_in_world) @ self.tcp_in_world
+
+    @property
+    def gripper_width(self) -> Array:
+        """(T,) m."""
+        return self.qpos[:, RobotDescription.finger_slice].sum(axis=1)
 
     @property
     def actions(self) -> NDArray[np.float32]:
@@ -166,6 +182,6 @@ def split_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:
     states = np.asarray(states, dtype=np.float64)
     return (
         from_wxyz(states[:, :7]),
-        states[:, _POSE : _POSE + len(MOBILE_PANDA.joints)],
-        states[:, _POSE + len(MOBILE_PANDA.joints) :],
+        states[:, _POSE : _POSE + _JOINTS],
+        states[:, _POSE + _JOINTS :],
     )

@@ -15,9 +15,10 @@ from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.entries import Entry, read_entry, read_json, reason
 from robocas_ms3.recordings.environment import read_env
 from robocas_ms3.recordings.motion import Motion, gripper_commands
-from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.table import RobotSpec
 
-_STATE_DIM = 13 + 2 * len(MOBILE_PANDA.joints)
+_STATE_DIM = 13 + 2 * RobotDescription.finger_slice.stop
 
 
 @dataclass(frozen=True)
@@ -27,15 +28,17 @@ class Recording(Entry):
     Attributes:
         actions: (S, A).
         states: ``{"actors": {name: (S+1, 13)}, "articulations": {name: (S+1, 13 + 2 joints)}}``.
+        robot: whose it is.
     """
 
     actions: NDArray[np.float32]
     states: dict[str, dict[str, NDArray[np.float32]]]
+    robot: RobotSpec
 
     def motion(self, samples: NDArray[np.int64]) -> Motion:
         """What the robot did, at some of the states, in order."""
         commands = gripper_commands(self.actions, self.control_mode)
-        return Motion.of(self.states["articulations"][MOBILE_PANDA.uid], commands, samples)
+        return Motion.of(self.robot, self.states["articulations"][self.robot.description.uid], commands, samples)
 
     def state(self, index: int) -> dict[str, dict[str, NDArray[np.float32]]]:
         """One state as ``set_state_dict`` takes it, each array (1, D)."""
@@ -53,6 +56,7 @@ class TrajectoryFile:
         path: the HDF5 file.
         env_info: ``env_id``, ``env_kwargs``, ... of the JSON.
         env: what it was recorded in.
+        robot: whose motion it is.
         control_freq: Hz.
         versions: what it was made with.
         episodes: the JSON's entries.
@@ -76,6 +80,7 @@ class TrajectoryFile:
         self.env_info: dict[str, Any] = metadata["env_info"]
         self.episodes: list[dict[str, Any]] = metadata["episodes"]
         self.env = read_env(self.env_info, metadata_path, pack=pack)
+        self.robot = self.env.robot(f"{metadata_path}, env_info.env_kwargs.robot_uids")
         if "robocas" not in metadata:
             raise DatasetError(
                 "the JSON lacks the instructions and sub-goals",
@@ -143,7 +148,7 @@ class TrajectoryFile:
         Raises:
             DatasetError: it is damaged, or contradicts the JSON.
         """
-        where = self._where(index)
+        where, uid = self._where(index), self.robot.description.uid
         try:
             group: Any = self._file[f"traj_{self.episodes[index]['episode_id']}"]
             actions = np.asarray(group["actions"], dtype=np.float32)
@@ -151,7 +156,7 @@ class TrajectoryFile:
                 kind: {
                     key: np.asarray(data, dtype=np.float32)
                     for key, data in group["env_states"][kind].items()
-                    if bodies or key == MOBILE_PANDA.uid
+                    if bodies or key == uid
                 }
                 for kind in ("actors", "articulations")
                 if kind in group["env_states"]
@@ -171,16 +176,16 @@ class TrajectoryFile:
                 expected=f"{entry.control_steps} actions, one state more",
                 found=f"{len(actions)} actions, {sorted(lengths)} states",
             )
-        robot = states.get("articulations", {}).get(MOBILE_PANDA.uid)
+        robot = states.get("articulations", {}).get(uid)
         width = _STATE_DIM
         if robot is None or robot.shape[1] != width:
             raise DatasetError(
                 "states of another robot",
                 where=where,
-                expected=f"{MOBILE_PANDA.uid} of {width} numbers",
+                expected=f"{uid} of {width} numbers",
                 found=sorted(states.get("articulations", {})) if robot is None else robot.shape[1],
             )
-        recording = Recording(**vars(entry), actions=actions, states=states)
+        recording = Recording(**vars(entry), actions=actions, states=states, robot=self.robot)
         _check_finite(recording, where)
         return recording
 

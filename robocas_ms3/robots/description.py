@@ -7,20 +7,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import pi
+from typing import ClassVar
 
-from robocas_ms3.benchmark.spec import STANDARD_FREQ
+from robocas_ms3.errors import RobocasError
 
 Limits = tuple[tuple[float, float], ...]
+_OF_EACH_JOINT = ("joints", "limits")
 
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """A mobile base with an arm and a gripper of two fingers. ``qpos`` is base, arm, fingers.
+    """A mobile base with an arm of seven joints and a gripper of two fingers. ``qpos`` is base, arm, fingers.
+
+    How many joints there are is RoboCAS' format, not a robot's own: recordings, datasets and policies count on it.
 
     Attributes:
-        uid: ManiSkill's name of the agent.
+        base_slice, arm_slice, finger_slice: where the joints of each are in ``qpos``, of every robot.
+        uid: the robot's name: ManiSkill's of the agent, that of its row, and that of its states in recordings.
         base_joints, arm_joints, finger_joints: active joints in the order of ``qpos``.
         base_limits, arm_limits, finger_limits: least and greatest position of each.
+        root_link: stands on the floor.
         base_link: what the base's joints move; upright, no arm joint moves it.
         arm_base_link: root of the arm; planners plan in its frame.
         arm_links: those after the arm's joints.
@@ -35,8 +41,15 @@ class RobotDescription:
         stock_tcp_in_hand: z of the TCP in the hand with the maker's fingers, m.
         finger_extension: how much longer the fingers are, m.
         finger_friction: of the finger tips.
-        control_freq, sim_freq: standard rates of control and physics, Hz.
+        inverse_kinematics: import path of the arm's closed form (`planning.analytic`).
+
+    Raises:
+        RobocasError: it has another number of joints.
     """
+
+    base_slice: ClassVar[slice] = slice(0, 3)
+    arm_slice: ClassVar[slice] = slice(3, 10)
+    finger_slice: ClassVar[slice] = slice(10, 12)
 
     uid: str
     base_joints: tuple[str, ...]
@@ -45,6 +58,7 @@ class RobotDescription:
     base_limits: Limits
     arm_limits: Limits
     finger_limits: Limits
+    root_link: str
     base_link: str
     arm_base_link: str
     arm_links: tuple[str, ...]
@@ -64,8 +78,16 @@ class RobotDescription:
     stock_tcp_in_hand: float
     finger_extension: float
     finger_friction: float
-    control_freq: int = STANDARD_FREQ
-    sim_freq: int = 100
+    inverse_kinematics: str = "robocas_ms3.planning.analytic:PandaGeometry"
+
+    def __post_init__(self) -> None:
+        parts = {"base": self.base_slice, "arm": self.arm_slice, "finger": self.finger_slice}
+        sizes = {f"{part}_{what}": where.stop - where.start for part, where in parts.items() for what in _OF_EACH_JOINT}
+        sizes |= dict.fromkeys(("arm_links", "arm_rest", "arm_evaluation_start"), 7) | {"finger_links": 2}
+        for name, size in sizes.items():
+            if len(getattr(self, name)) != size:
+                where, found = f"{self.uid}, {name}", len(getattr(self, name))
+                raise RobocasError("this robot does not fit RoboCAS' format", where=where, expected=size, found=found)
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -73,20 +95,9 @@ class RobotDescription:
         return self.base_joints + self.arm_joints + self.finger_joints
 
     @property
-    def base_slice(self) -> slice:
-        """Where the base's joints are in ``qpos``."""
-        return slice(0, len(self.base_joints))
-
-    @property
-    def arm_slice(self) -> slice:
-        """Where the arm's are."""
-        first = len(self.base_joints)
-        return slice(first, first + len(self.arm_joints))
-
-    @property
-    def finger_slice(self) -> slice:
-        """Where the fingers' are."""
-        return slice(self.arm_slice.stop, len(self.joints))
+    def arm_base_height(self) -> float:
+        """Of the arm's base above the floor, m."""
+        return self.base_link_height + self.arm_base_above_base_link
 
     @property
     def open_width(self) -> float:
@@ -110,6 +121,7 @@ MOBILE_PANDA = RobotDescription(
         (-2.8973, 2.8973),
     ),
     finger_limits=((0.0, 0.04), (0.0, 0.04)),
+    root_link="root",
     base_link="base_link",
     arm_base_link="panda_link0",
     arm_links=tuple(f"panda_link{i}" for i in range(1, 8)),

@@ -10,25 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.urdf import robot_files
+from robocas_ms3.robots.table import RobotSpec
 
 Array = NDArray[np.float64]
 
 
-def link_poses(root_in_world: Array, qpos: Array) -> tuple[Array, Array]:
+def link_poses(spec: RobotSpec, root_in_world: Array, qpos: Array) -> tuple[Array, Array]:
     """Poses of the TCP and of the arm's base in the world, (T, 4, 4) each.
 
     Whatever makes dataset actions of recorded states goes this way: equal states give equal numbers to the last bit,
     with and without a renderer, which the links' poses of a simulator do not.
 
     Args:
-        root_in_world: (T, 4, 4) of the robot.
+        spec: the robot.
+        root_in_world: (T, 4, 4) of its root.
         qpos: (T, 12) m, rad.
     """
-    urdf = robot_files().urdf
-    base = root_in_world @ chain(urdf, "root", MOBILE_PANDA.arm_base_link, qpos[:, MOBILE_PANDA.base_slice])
-    return base @ chain(urdf, MOBILE_PANDA.arm_base_link, MOBILE_PANDA.tcp_link, qpos[:, MOBILE_PANDA.arm_slice]), base
+    urdf, robot = spec.files().urdf, spec.description
+    base = root_in_world @ chain(urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice])
+    return base @ chain(urdf, robot.arm_base_link, robot.tcp_link, qpos[:, robot.arm_slice]), base
 
 
 def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:

@@ -5,10 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import importlib.util
-import json
-import os
 import shutil
-import tempfile
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,10 +14,9 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.files import make_folder
 from robocas_ms3.paths import cache_dir
 from robocas_ms3.robots.description import MOBILE_PANDA as c
-from robocas_ms3.robots.meshes import decimate_glb, write_boxes_glb
+from robocas_ms3.robots.generated import made_once
 
 LINK_TRIANGLES = 1000
 
@@ -44,7 +40,7 @@ class RobotFiles:
 
     Attributes:
         urdf: mobile base, arm, hand. Its SRDF has the same stem, where SAPIEN's loader looks for it.
-        arm_urdf: rooted at ``panda_link0``, for planners and inverse kinematics: arm, hand, and the base's body as a
+        arm_urdf: rooted at the arm's base, for planners and inverse kinematics: arm, hand, and the base's body as a
             fixed link, so that the arm is kept off it. No visuals.
         arm_srdf: pairs of links of ``arm_urdf`` whose collisions are not to be checked.
         folder: holds all of them.
@@ -59,8 +55,7 @@ class RobotFiles:
 def robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
     """Return the robot's files, generating them where they are missing.
 
-    The folder's name is a hash of all they are made from, this generator's code included. Two processes may do this at
-    once: a folder appears whole, and the first one wins.
+    The folder's name is a hash of all they are made from, this generator's code included.
 
     Args:
         finger_extension: how much longer than stock the fingers are, m; 0 gives ManiSkill's own fingers.
@@ -78,37 +73,8 @@ def robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
         arm_srdf=folder / "panda_arm.srdf",
         folder=folder,
     )
-    if not _is_complete(folder):
-        make_folder(folder.parent)
-        tmp = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
-        try:
-            tmp.chmod(0o755)
-            _generate(tmp, source, finger_extension)
-            _publish(tmp, folder)
-        finally:
-            shutil.rmtree(tmp, ignore_errors=True)
+    made_once(folder, lambda tmp: _generate(tmp, source, finger_extension))
     return files
-
-
-def _publish(tmp: Path, folder: Path) -> None:
-    """Rename ``tmp`` to ``folder``; keep a complete folder another process has put there meanwhile."""
-    try:
-        os.rename(tmp, folder)
-    except OSError:
-        if _is_complete(folder):
-            return
-        damaged = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".old", dir=folder.parent))
-        os.rename(folder, damaged / "old")
-        os.rename(tmp, folder)
-        shutil.rmtree(damaged, ignore_errors=True)
-
-
-def _is_complete(folder: Path) -> bool:
-    try:
-        names = json.loads((folder / "files.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return all((folder / name).is_file() for name in names)
 
 
 def _panda_folder() -> Path:
@@ -136,6 +102,8 @@ def _fingerprint(source: Path, finger_extension: float) -> str:
 
 
 def _generate(folder: Path, source: Path, finger_extension: float) -> None:
+    from robocas_ms3.robots.meshes import decimate_glb, write_boxes_glb  # seconds, where nothing is to be made
+
     visual, collision = folder / "visual", folder / "collision"
     visual.mkdir()
     collision.mkdir()
@@ -176,9 +144,6 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
         SubElement(srdf, "disable_collisions", link1=c.base_link, link2=link, reason=reason)
     _write(srdf, folder / "panda_arm.srdf")
     _write(srdf, folder / f"{c.uid}.srdf")
-
-    names = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
-    (folder / "files.json").write_text(json.dumps(names, indent=1), encoding="utf-8")
 
 
 def _adapt_fingers(panda: Element, extension: float) -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:

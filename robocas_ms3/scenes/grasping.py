@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from robocas_ms3.assets.gripper import GRIPPER_BOXES
 from robocas_ms3.assets.pack import LoadedObject
-from robocas_ms3.robots.description import MOBILE_PANDA
 
 Array = NDArray[np.float64]
 
 Approach = Literal["top", "front"]  # from above; level, as into a shelf
 
-MAX_WIDTH = MOBILE_PANDA.open_width  # m
+MAX_WIDTH = float(2 * GRIPPER_BOXES[0, 0, 1])  # m, of the open gripper that grasps are annotated for
 MAX_CLOSING_TILT_DEG = 60.0  # of the closing axis from the horizontal
 MAX_SIDEWAYS_DEG = 45.0  # of the approach's horizontal direction from that of base -> object
 FRONT_ELEVATION_DEG = (-60.0, 10.0)  # of a front approach above the horizontal

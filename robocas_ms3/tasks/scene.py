@@ -17,10 +17,12 @@ from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
 from robocas_ms3.benchmark import TaskSpec
+from robocas_ms3.benchmark.spec import SIM_FREQ, STANDARD_FREQ
 from robocas_ms3.config import TaskConfig, load_config_of
 from robocas_ms3.errors import ConfigError
-from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.mobile_panda import RoboCASMobilePanda
+from robocas_ms3.extensions import load
+from robocas_ms3.robots.agent import MobileManipulator
+from robocas_ms3.robots.table import DEFAULT, find_robot
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.bank import layout_bank
 from robocas_ms3.scenes.layout import Array
@@ -55,19 +57,19 @@ class SceneEnv(SeededEnv):
             function that gives the layout of an objects seed and a seed.
         seeds: least and greatest seed that unseeded resets draw from, such as those of a bank built ahead; default: any
             seed, with several envs 0 to 99.
-        robot_uids: the robot; only RoboCAS's mobile Panda is supported.
+        robot_uids: name of the robot, a row of `robots.table`.
         reconfiguration_freq: see ``BaseEnv``; default 1 for one env, 0 for several.
         kwargs: passed to ``BaseEnv``.
 
     Raises:
         VectorEnvError: there are several envs and no GPU.
+        ExtensionError: there is no such robot, or it can't be loaded.
     """
 
     SPEC: ClassVar[TaskSpec]
-    SUPPORTED_ROBOTS = ["robocas_mobile_panda"]  # noqa: RUF012  (ManiSkill's form)
     SUPPORTED_REWARD_MODES = ("sparse", "none")
 
-    agent: RoboCASMobilePanda
+    agent: MobileManipulator
 
     def __init__(
         self,
@@ -78,13 +80,15 @@ class SceneEnv(SeededEnv):
         visual_level: VisualLevel = "fast",
         layouts: str | Path | LayoutSource | None = "auto",
         seeds: tuple[int, int] | None = None,
-        robot_uids: str = "robocas_mobile_panda",
+        robot_uids: str | None = DEFAULT,
         num_envs: int = 1,
         reconfiguration_freq: int | None = None,
         **kwargs: Any,
     ) -> None:
         check_one_process(num_envs, kwargs.get("sim_backend", "auto"))
         self.task_config = load_config_of(self.SPEC, config)
+        self.robot_spec = find_robot(robot_uids, where="robot_uids")
+        load(self.robot_spec.agent)  # tells ManiSkill of it
         if visual_level not in VISUALS:
             raise ConfigError("no such visual_level", expected=f"one of {list(VISUALS)}", found=visual_level)
         sees_nothing = kwargs.get("obs_mode") in {None, "none", "state", "state_dict"}
@@ -103,7 +107,7 @@ class SceneEnv(SeededEnv):
             *args,
             layouts=layout_bank(self.model, layouts),
             seeds=seeds,
-            robot_uids=robot_uids,
+            robot_uids=self.robot_spec.description.uid,
             num_envs=num_envs,
             reconfiguration_freq=reconfiguration_freq,
             **kwargs,
@@ -115,8 +119,8 @@ class SceneEnv(SeededEnv):
         objects = self.task_config.objects.count + (random.distractors.count[1] if random.distractors else 0)
         memory = gpu_memory(self.num_envs, objects)
         return SimConfig(
-            sim_freq=MOBILE_PANDA.sim_freq,
-            control_freq=MOBILE_PANDA.control_freq,
+            sim_freq=SIM_FREQ,
+            control_freq=STANDARD_FREQ,
             spacing=10,
             scene_config=contacts,
             gpu_memory_config=memory,
@@ -212,7 +216,7 @@ class SceneEnv(SeededEnv):
         self._object_rows = slice(rows[0], rows[-1] + 1)
         basket = self.fixtures.basket
         self._basket_row = None if basket is None else self.bodies.actors.index(basket.name)
-        gripper = [self.agent.finger1_link, self.agent.finger2_link, self.agent.robot.links_map[MOBILE_PANDA.hand_link]]
+        gripper = [self.agent.finger1_link, self.agent.finger2_link, self.agent.hand_link]
         self._gripper_contacts = Contacts(self.scene, gripper, self.objects)
 
     def _load_lighting(self, options: dict) -> None:

@@ -18,7 +18,7 @@ from robocas_ms3.poses import inverse
 from robocas_ms3.recordings.motion import Motion
 from robocas_ms3.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.recordings.subgoals import SubGoal
-from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.viewer import damage
 from robocas_ms3.viewer.arrays import facts_of, show_motion
 from robocas_ms3.viewer.content import PageContent
@@ -77,8 +77,8 @@ def _arrays(recording: Recording, motion: Motion) -> dict[str, NDArray]:
         "ee_orn": Rotation.from_matrix(tcp[:, :3, :3]).as_quat(),
         "base_pos": base[:, :3, 3],
         "base_orn": Rotation.from_matrix(base[:, :3, :3]).as_quat(),
-        "robot_joints": motion.qpos[:, MOBILE_PANDA.arm_slice],
-        "gripper_width": motion.qpos[:, MOBILE_PANDA.finger_slice].sum(axis=1),
+        "robot_joints": motion.qpos[:, RobotDescription.arm_slice],
+        "gripper_width": motion.gripper_width,
         "agv_pose": planar_base(motion.root_in_world, motion.qpos),
     }
 

@@ -25,9 +25,8 @@ def test_it_is_a_planner_by_name(site):
         f"""
 import numpy as np
 from robocas_ms3.planning.backends import BACKENDS, make_planner
-from robocas_ms3.robots.urdf import robot_files
-files = robot_files()
-planner = make_planner("straight", files.arm_urdf, files.arm_srdf, dt=0.05)
+from robocas_ms3.robots.table import PANDA
+planner = make_planner("straight", PANDA, dt=0.05)
 print(list(BACKENDS), all(hasattr(planner, name) for name in {members!r}))
 start = np.array([0, -1.02, 0, -2.51, 0, 1.35, 0.78])
 goal = planner.tcp(start)

@@ -6,6 +6,7 @@ import pytest
 from planning_scenes import Checker
 
 from robocas_ms3.planning.mplib_backend import MplibPlanner
+from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import RobotFiles, robot_files
 
 
@@ -22,7 +23,7 @@ def checker(panda_files: RobotFiles) -> Checker:
 @pytest.fixture
 def make_planner(panda_files: RobotFiles):
     def make(dt: float = 0.05, **settings) -> MplibPlanner:
-        return MplibPlanner(panda_files.arm_urdf, panda_files.arm_srdf, dt=dt, **settings)
+        return MplibPlanner(panda_files.arm_urdf, panda_files.arm_srdf, robot=MOBILE_PANDA, dt=dt, **settings)
 
     return make
 

@@ -9,17 +9,18 @@ from planning_scenes import REST, Box, Checker, cloud, corners, table_scene, top
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.planning.collision import ArmWorld
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 
 @pytest.fixture
 def world(panda_files) -> ArmWorld:
-    return ArmWorld(panda_files.arm_urdf, panda_files.arm_srdf)
+    return ArmWorld(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA)
 
 
 def test_numpy_2_is_refused_before_mplib_crashes(panda_files, monkeypatch):
     monkeypatch.setattr(np, "__version__", "2.1.0")
     with pytest.raises(RobocasError, match=r"numpy: .*expected < 2, found 2\.1\.0.*pip install"):
-        ArmWorld(panda_files.arm_urdf, panda_files.arm_srdf)
+        ArmWorld(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA)
 
 
 def test_kinematics_agree_with_the_description(world, checker):

@@ -75,7 +75,8 @@ import sys
 sys.path.insert(0, sys.argv[1])
 from test_determinism import session
 from robocas_ms3.planning.mplib_backend import MplibPlanner
-planner = MplibPlanner(sys.argv[2], sys.argv[3], dt=0.05)
+from robocas_ms3.robots.description import MOBILE_PANDA
+planner = MplibPlanner(sys.argv[2], sys.argv[3], robot=MOBILE_PANDA, dt=0.05)
 planner.seed(7)
 print(session(planner))
 """

@@ -12,11 +12,13 @@ from planning_scenes import REST
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.planning.pulling import reached, track, turned_about_bar
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.skills.driving import Surroundings, _routes, body_is_free, free_route
 from robocas_ms3.planning.skills.part import Part
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 SLIDE = Joint(name="slide", kind="prismatic", axis=(-1.0, 0.0, 0.0), limits=(0.0, 0.6), friction=0, damping=0)
 # 0.4 m to the right of the upright bar of the pull
@@ -27,7 +29,7 @@ HINGE = Joint(
 
 @pytest.fixture(scope="module")
 def reachability(panda_files) -> Reachability:
-    return Reachability(panda_files.arm_urdf)
+    return Reachability(ArmChain(panda_files.arm_urdf, MOBILE_PANDA))
 
 
 def level_hold(x: float, y: float, z: float) -> np.ndarray:
@@ -87,26 +89,27 @@ def test_the_body_is_free_where_no_point_is_inside_it():
     frame = np.eye(4)
     frame[:3, 3] = 1.0, 2.0, 0.49  # the arm's base, 0.49 m above the floor
     beside = np.array([[1.3, 2.0, 0.2], [1.0, 2.24, 0.2], [1.2, 2.0, 0.31], [1.14, 2.0, 0.65], [1.0, 2.0, -5.0]])
-    assert body_is_free(frame, beside)
+    assert body_is_free(MOBILE_PANDA, frame, beside)
     for hit in ([1.27, 2.0, 0.2], [1.0, 1.78, 0.2], [1.14, 2.0, 0.4], [1.08, 2.0, 0.6]):
-        assert not body_is_free(frame, np.array([hit]))
+        assert not body_is_free(MOBILE_PANDA, frame, np.array([hit]))
 
 
 def test_a_detour_backs_out_of_the_narrow_end_against_its_heading():
     narrow, wide = np.array([0.4, 0.0, np.pi / 2]), np.array([0.0, 0.5, 0.0])
-    straight, *detours = _routes(narrow, wide, leaving=True)
+    straight, *detours = _routes(narrow, wide, leaving=True, limits=MOBILE_PANDA.base_limits)
     assert len(straight) == 1
     via, goal = detours[0]
     assert via == pytest.approx([0.4, -0.15, np.pi / 2])
     assert goal == pytest.approx(wide)
-    arriving = list(_routes(wide, narrow, leaving=False))[1]
+    arriving = list(_routes(wide, narrow, leaving=False, limits=MOBILE_PANDA.base_limits))[1]
     assert arriving[0] == pytest.approx([0.4, -0.15, np.pi / 2])
     assert arriving[1] == pytest.approx(narrow)
 
 
 def test_a_drive_keeps_what_is_held_clear(planner):
     robot = SimpleNamespace(pose=SimpleNamespace(raw_pose=torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]])))
-    arm = SimpleNamespace(env=SimpleNamespace(agent=SimpleNamespace(robot=robot)), planner=planner, at=np.array(REST))
+    env = SimpleNamespace(agent=SimpleNamespace(robot=robot))
+    arm = SimpleNamespace(env=env, robot=MOBILE_PANDA, planner=planner, at=np.array(REST))
     start, goal = np.zeros(3), np.array([0.24, 0.0, 0.0])
     planner.finger_width = 0.04
     beyond = planner.tcp(arm.at) @ np.array(

@@ -10,6 +10,7 @@ from robocas_ms3.errors import PlanningFailed, RobocasError
 from robocas_ms3.planning.kinematics import pose_error
 from robocas_ms3.planning.mplib_backend import TCP_SPEED_LIMIT, MplibPlanner
 from robocas_ms3.planning.protocol import AttachedBody, Planner, Trajectory
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 WALL = Box((0.55, 0.0, 0.15), (0.4, 0.03, 0.4))
 
@@ -305,13 +306,13 @@ def test_nothing_is_printed(make_planner, capfd):
 
 def test_wrong_files_and_steps_are_refused(panda_files, tmp_path):
     with pytest.raises(RobocasError, match="no such robot description"):
-        MplibPlanner(tmp_path / "none.urdf", panda_files.arm_srdf, dt=0.05)
+        MplibPlanner(tmp_path / "none.urdf", panda_files.arm_srdf, robot=MOBILE_PANDA, dt=0.05)
     with pytest.raises(RobocasError, match="time step must be positive"):
-        MplibPlanner(panda_files.arm_urdf, panda_files.arm_srdf, dt=0.0)
+        MplibPlanner(panda_files.arm_urdf, panda_files.arm_srdf, robot=MOBILE_PANDA, dt=0.0)
     lonely = tmp_path / "panda_arm.urdf"
     lonely.write_bytes(panda_files.arm_urdf.read_bytes())  # its meshes are not beside it
     with pytest.raises(RobocasError, match="can't load this description"):
-        MplibPlanner(lonely, panda_files.arm_srdf, dt=0.05)
+        MplibPlanner(lonely, panda_files.arm_srdf, robot=MOBILE_PANDA, dt=0.05)
 
 
 def test_the_tcp_of_a_stretched_arm_keeps_its_speed_limit(planner):

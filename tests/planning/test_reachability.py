@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,11 +16,12 @@ from robocas_ms3.planning.chain import ArmChain, turn_between
 from robocas_ms3.planning.kinematics import pose_error
 from robocas_ms3.planning.pulling import twist
 from robocas_ms3.planning.reachability import DISTINCT, Reachability
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 
 @pytest.fixture(scope="module")
 def reachability(panda_files) -> Reachability:
-    return Reachability(panda_files.arm_urdf)
+    return Reachability(ArmChain(panda_files.arm_urdf, MOBILE_PANDA))
 
 
 def grasp_poses(count: int, seed: int) -> np.ndarray:
@@ -139,11 +141,11 @@ def test_no_poses_and_wrong_files(reachability, tmp_path):
     solved, qpos = reachability.reachable(np.zeros((0, 4, 4)), REST)
     assert solved.shape == (0,) and qpos.shape == (0, 7)
     with pytest.raises(RobocasError, match="no such robot description"):
-        Reachability(tmp_path / "none.urdf")
+        ArmChain(tmp_path / "none.urdf", MOBILE_PANDA)
     other = tmp_path / "other.urdf"
     other.write_text("<robot name='x'><link name='panda_link0'/></robot>")
-    with pytest.raises(RobocasError, match="not a Panda"):
-        Reachability(other)
+    with pytest.raises(RobocasError, match="not the arm of robocas_mobile_panda"):
+        ArmChain(other, MOBILE_PANDA)
 
 
 def test_256_grasps_take_hundredths_of_a_second_and_answers_repeat(reachability):
@@ -163,3 +165,29 @@ def test_answers_do_not_hang_on_where_in_memory_numbers_lie(reachability):
     for size in np.random.default_rng(0).integers(1, 400, 600):
         kept = [*kept[-20:], np.zeros(size)]
         np.testing.assert_array_equal(np.array(reachability.solutions(pose, REST)), first)
+
+
+class ElbowsDown(PandaGeometry):
+    """A closed form of a stranger's."""
+
+    def solve(self, tcp_in_base, joint7):
+        return super().solve(tcp_in_base, joint7)[:, :2]
+
+
+def test_an_arm_may_bring_a_closed_form_of_its_own(reachability, panda_files):
+    own = replace(MOBILE_PANDA, inverse_kinematics=f"{__name__}:ElbowsDown")
+    poses = grasp_poses(64, 5)
+    _, every = reachability.everything(poses, REST)
+    qpos, some = Reachability(ArmChain(panda_files.arm_urdf, own)).everything(poses, REST)
+    assert 0 < len(some) < len(every)
+    np.testing.assert_allclose(reachability.chain.tcp(qpos), poses[some], atol=1e-9)
+
+
+def test_a_chain_of_other_joints_is_told_that_it_needs_one(panda_files):
+    chain = ArmChain(panda_files.arm_urdf, MOBILE_PANDA)
+    chain.links[2] = chain.links[2].copy()
+    chain.links[2][0, 3] += 0.1
+    with pytest.raises(
+        RobocasError, match="robocas_mobile_panda: this closed form is not for this arm .*inverse_kinem"
+    ):
+        Reachability(chain)

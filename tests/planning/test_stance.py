@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from planning_scenes import REST
 
+from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.skills import stance
 from robocas_ms3.planning.skills.driving import arm_base_in_world
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 
 class _Planner:
@@ -29,7 +31,7 @@ class _Planner:
 
 @pytest.fixture(scope="module")
 def reachability(panda_files) -> Reachability:
-    return Reachability(panda_files.arm_urdf)
+    return Reachability(ArmChain(panda_files.arm_urdf, MOBILE_PANDA))
 
 
 @pytest.fixture
@@ -37,7 +39,7 @@ def arm(reachability):
     robot = SimpleNamespace(pose=SimpleNamespace(raw_pose=np.array([[0.0, 0, 0, 1, 0, 0, 0]])))
     config = SimpleNamespace(target=SimpleNamespace(approach="top"))
     env = SimpleNamespace(agent=SimpleNamespace(robot=robot), task_config=config)
-    return SimpleNamespace(env=env, reachability=reachability, planner=_Planner(), at=REST)
+    return SimpleNamespace(env=env, robot=MOBILE_PANDA, reachability=reachability, planner=_Planner(), at=REST)
 
 
 def grasps_in_world(arm) -> np.ndarray:

@@ -1,11 +1,15 @@
 """The description agrees with the robot that is built from it, and with itself."""
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from robocas_ms3.assets.gripper import GRIPPER_BOXES
+from robocas_ms3.errors import ExtensionError, RobocasError
 from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.table import DEFAULT, PANDA, ROBOTS, find_robot
 from robocas_ms3.robots.urdf import robot_files
 
 
@@ -27,3 +31,27 @@ def test_its_links_are_the_robots():
 
 def test_grasps_are_annotated_for_a_gripper_as_wide():
     assert GRIPPER_BOXES[0, 0, 1] * 2 == MOBILE_PANDA.open_width == 0.08
+
+
+@pytest.mark.parametrize(
+    ("part", "what"),
+    [("arm_joints", 7), ("arm_limits", 7), ("base_joints", 3), ("finger_links", 2), ("arm_rest", 7)],
+)
+def test_another_number_of_joints_does_not_fit(part, what):
+    fewer = getattr(MOBILE_PANDA, part)[:-1]
+    with pytest.raises(RobocasError, match=rf"six, {part}: .* RoboCAS' format \(expected {what}, found {what - 1}\)"):
+        replace(MOBILE_PANDA, uid="six", **{part: fewer})
+
+
+def test_robots_are_known_by_their_uids():
+    assert DEFAULT == "robocas_mobile_panda"
+    assert find_robot(None) is find_robot(DEFAULT) is PANDA
+    assert {name: spec.description.uid for name, spec in ROBOTS.items()} == {name: name for name in ROBOTS}
+    with pytest.raises(ExtensionError, match="here: no such robot .*Did you mean robocas_mobile_panda"):
+        find_robot("robocas_mobile_pandas", where="here")
+
+
+def test_a_row_by_another_name_is_refused(monkeypatch):
+    monkeypatch.setitem(ROBOTS.builtin, "other", PANDA)
+    with pytest.raises(ExtensionError, match="a robot by another name .expected robocas_mobile_panda, found other"):
+        find_robot("other")

@@ -103,7 +103,8 @@ def assemble(parts: Path, plan: dict[str, Any], fps: int, root: Path, limits: Li
     whole |= {schema.image_key(camera): found.stats() for camera, found in levels.items()}
     write_json(root / schema.STATS_FILE, whole)
     videos = {camera: packet_times(_video_file(root, "rgb", camera, 0, 0))[1] for camera in cameras}
-    write_json(root / schema.INFO_FILE, _info(plan, fps, start, len(tasks), videos, limits))
+    robot_type = schema.robot_type(first["scene"])
+    write_json(root / schema.INFO_FILE, _info(plan, fps, start, len(tasks), videos, limits, robot_type))
     write_json(root / schema.CONVERSION_FILE, plan)
     sums = {str(path.relative_to(root)): schema.checksum(path) for path in schema.content_files(root)}
     write_json(root / schema.CHECKSUMS_FILE, sums)
@@ -190,12 +191,18 @@ def _video_file(root: Path, kind: str, camera: str, chunk: int, file: int) -> Pa
 
 
 def _info(
-    plan: dict[str, Any], fps: int, frames: int, tasks: int, videos: dict[str, dict[str, Any]], limits: Limits
+    plan: dict[str, Any],
+    fps: int,
+    frames: int,
+    tasks: int,
+    videos: dict[str, dict[str, Any]],
+    limits: Limits,
+    robot_type: str,
 ) -> dict[str, Any]:
     count = len(plan["episodes"])
     return {
         "codebase_version": schema.CODEBASE_VERSION,
-        "robot_type": schema.ROBOT_TYPE,
+        "robot_type": robot_type,
         "total_episodes": count,
         "total_frames": frames,
         "total_tasks": tasks,

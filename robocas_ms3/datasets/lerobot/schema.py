@@ -32,9 +32,10 @@ from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import relative_motion
+from robocas_ms3.robots.table import DEFAULT
 
 CODEBASE_VERSION = "v3.0"
-ROBOT_TYPE = "mobile_panda"
+ROBOT_TYPE = "mobile_panda"  # of the default robot; another one's is its name
 INFO_FILE = "meta/info.json"
 STATS_FILE = "meta/stats.json"
 TASKS_FILE = "meta/tasks.parquet"
@@ -138,6 +139,12 @@ def image_key(camera: str) -> str:
 def camera_of(key: str) -> str:
     """Camera of a feature."""
     return key.removeprefix("observation.images.")
+
+
+def robot_type(scene: dict[str, Any]) -> str:
+    """LeRobot's word for the robot of an episode's scene."""
+    named = ((scene.get("env_info") or {}).get("env_kwargs") or {}).get("robot_uids")
+    return ROBOT_TYPE if named in (None, DEFAULT) else str(named)
 
 
 def features_json(cameras: dict[str, dict[str, Any]]) -> dict[str, Any]:

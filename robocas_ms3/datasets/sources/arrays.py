@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.recordings.motion import Motion, stored_motion
 from robocas_ms3.recordings.subgoals import SubGoal
+from robocas_ms3.robots.description import RobotDescription
 
 Array = NDArray[np.float64]
 
@@ -46,7 +47,7 @@ def planar_base(root: Array, qpos: Array) -> Array:
         root: (T, 4, 4) of the robot in the world.
         qpos: (T, 12).
     """
-    x, y, yaw = qpos[:, :3].T
+    x, y, yaw = qpos[:, RobotDescription.base_slice].T
     position = root[:, :3, 3] + np.einsum("tij,tj->ti", root[:, :3, :3], np.stack([x, y, 0 * x], axis=1))
     root_yaw = np.arctan2(root[:, 1, 0], root[:, 0, 0])
     return np.column_stack([position[:, :2], np.unwrap(wrap_angle(root_yaw + yaw))])
@@ -76,13 +77,13 @@ def episode_arrays(
         "rel_orn": rel_orn,
         "ee_pos": ee_in_base[:, :3, 3],
         "ee_orn": continuous_xyzw(ee_in_base),
-        "robot_joints": motion.qpos[:, 3:10],
-        "arm_joint_vel": motion.qvel[:, 3:10],
+        "robot_joints": motion.qpos[:, RobotDescription.arm_slice],
+        "arm_joint_vel": motion.qvel[:, RobotDescription.arm_slice],
         "base_pos": base[:, :3, 3],
         "base_orn": continuous_xyzw(base),
         "base_rel_pos": base_rel_pos,
         "base_rel_orn": base_rel_orn,
-        "gripper_width": motion.qpos[:, 10] + motion.qpos[:, 11],
+        "gripper_width": motion.gripper_width,
         "gripper_status": motion.gripper_open,
         "agv_pose": agv,
         "rel_agv_pose": agv_motion,

@@ -13,6 +13,7 @@ from robocas_ms3.evaluation.bridge.channel import Channel
 from robocas_ms3.evaluation.bridge.proprioception import WIDTHS, Proprioception
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.robots.table import find_robot
 
 
 class ObservationKeeper:
@@ -67,7 +68,7 @@ class Actor:
         self._starts = {start.env: start for start in starts}
         self._grippers = dict.fromkeys(self._starts)
         for env in self._starts:
-            self._feels.begin(env, self._watched.obs)
+            self._feels.begin(env, self._watched.obs, find_robot(self._starts[env].robot))
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Ask the other end; actions (E, A) of the envs that play.

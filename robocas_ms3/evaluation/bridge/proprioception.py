@@ -12,9 +12,8 @@ from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.poses import from_wxyz, inverse
 from robocas_ms3.recordings.motion import Motion, gripper_open
-from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.forward import chain
-from robocas_ms3.robots.urdf import robot_files
+from robocas_ms3.robots.table import RobotSpec
 
 KEYS = {
     "agent_pos": "observation.state",
@@ -33,11 +32,13 @@ class _Robot:
     """Of one episode.
 
     Attributes:
+        spec: which it is.
         root: (4, 4) in the world; it stands still.
         width: of the gripper at first, m.
         last: what was read last.
     """
 
+    spec: RobotSpec
     root: NDArray[np.float64]
     width: float
     last: dict[str, NDArray[np.float32]] | None = None
@@ -49,17 +50,19 @@ class Proprioception:
     def __init__(self) -> None:
         self._robots: dict[int, _Robot] = {}
 
-    def begin(self, env: int, obs: dict[str, Any]) -> None:
+    def begin(self, env: int, obs: dict[str, Any], spec: RobotSpec) -> None:
         """An episode begins.
 
         Args:
             env: row of the observation.
             obs: the first one.
+            spec: its robot.
         """
+        robot = spec.description
         qpos, tcp_in_base, tcp_in_world = _row(obs, env)
-        base_in_root = chain(robot_files().urdf, "root", MOBILE_PANDA.arm_base_link, qpos[:, MOBILE_PANDA.base_slice])
+        base_in_root = chain(spec.files().urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice])
         root = from_wxyz(tcp_in_world) @ inverse(from_wxyz(tcp_in_base)) @ inverse(base_in_root)
-        self._robots[env] = _Robot(root, float(qpos[0, MOBILE_PANDA.finger_slice].sum()))
+        self._robots[env] = _Robot(spec, root, float(qpos[0, robot.finger_slice].sum()))
 
     def read(self, env: int, obs: dict[str, Any], gripper: float | None) -> dict[str, NDArray[np.float32]]:
         """The numbers (D,) of `KEYS`.
@@ -72,8 +75,8 @@ class Proprioception:
         robot, qpos = self._robots[env], _row(obs, env)[0]
         qvel = obs["agent"]["qvel"][env][None].astype(np.float64)
         commands = np.array([] if gripper is None else [gripper])
-        opened = gripper_open(commands, np.array([len(commands)]), initial_width=robot.width)
-        motion = Motion.of_joints(robot.root, qpos, qvel, opened)
+        opened = gripper_open(robot.spec.description, commands, np.array([len(commands)]), initial_width=robot.width)
+        motion = Motion.of_joints(robot.spec, robot.root, qpos, qvel, opened)
         columns = frame_columns(episode_arrays(motion, "", []))
         found = {name: columns[column][0] for name, column in KEYS.items()}
         robot.last = found if robot.last is None else _continued(robot.last, found)

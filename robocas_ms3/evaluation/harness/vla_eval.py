@@ -21,6 +21,7 @@ from robocas_ms3.evaluation.policy import Observations
 from robocas_ms3.evaluation.protocol import Episode, load_protocol
 from robocas_ms3.evaluation.remote.messages import actions_of, wants_of
 from robocas_ms3.evaluation.tracking import MEASURES
+from robocas_ms3.robots.description import RobotDescription
 
 # How vla-eval calls what the numbers of an action mean, where it has a word for it.
 _ROTATIONS = {
@@ -211,7 +212,8 @@ def state_of(seen: Observations) -> NDArray[np.float32]:
     x, y, m, and yaw, rad.
     """
     tcp, qpos = seen.tcp_in_base[0], seen.qpos[0]
-    return np.concatenate([tcp[:3], tcp[[4, 5, 6, 3]], qpos[3:10], seen.gripper_width[0], qpos[:3]]).astype(np.float32)
+    arm, base = qpos[RobotDescription.arm_slice], qpos[RobotDescription.base_slice]
+    return np.concatenate([tcp[:3], tcp[[4, 5, 6, 3]], arm, seen.gripper_width[0], base]).astype(np.float32)
 
 
 def _gripper(spec: Any) -> Any:

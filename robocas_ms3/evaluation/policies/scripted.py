@@ -15,7 +15,7 @@ from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack, PoseTrack, Track
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.recordings.motion import sample_stride
-from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.table import find_robot
 
 _FREQ = 20  # Hz, at which it plans
 
@@ -54,6 +54,7 @@ class ScriptedPolicy:
                 control_freq=_FREQ,
                 replay_rate=0,
                 layouts=start.layouts_file,
+                robot=start.robot,
             )
             generator = self._generators[start.config_file] = EpisodeGenerator(settings)
         actions, states = np.zeros((0, 8)), np.zeros((1, 37))
@@ -62,12 +63,12 @@ class ScriptedPolicy:
                 with h5py.File(Path(folder) / "episode.h5") as file:
                     group: Any = file["traj_0"]
                     actions = np.array(group["actions"])[:, :8]
-                    states = np.array(group["env_states"]["articulations"][MOBILE_PANDA.uid])
+                    states = np.array(group["env_states"]["articulations"][start.robot])
         if self.wants.convention == "joint_positions":
             return JointTrack(actions)
         if not len(actions):
             return PoseTrack(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
-        return PoseTrack.of(states, actions[:, 7], sample_stride(_FREQ, 5))
+        return PoseTrack.of(find_robot(start.robot), states, actions[:, 7], sample_stride(_FREQ, 5))
 
     def close(self) -> None:
         """Close the environments that it plans in."""

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.evaluation.policy import Observations
 from robocas_ms3.recordings.motion import Motion, sample_states
-from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.table import RobotSpec
 
 Array = NDArray[np.floating]
 
@@ -39,7 +40,7 @@ class JointTrack:
     def next(self, observations: Observations, row: int) -> Array:
         """(8,) joint targets; see `Track`."""
         if not len(self.actions):
-            self.actions = np.append(observations.qpos[row, MOBILE_PANDA.arm_slice], 1.0)[None]
+            self.actions = np.append(observations.qpos[row, RobotDescription.arm_slice], 1.0)[None]
         action = self.actions[min(self.played, len(self.actions) - 1)]
         self.played += 1
         return action
@@ -60,16 +61,17 @@ class PoseTrack:
     played: int = 0
 
     @classmethod
-    def of(cls, robot_states: Array, gripper: Array, stride: int) -> PoseTrack:
+    def of(cls, robot: RobotSpec, robot_states: Array, gripper: Array, stride: int) -> PoseTrack:
         """The track of a recording.
 
         Args:
+            robot: whose it is.
             robot_states: (S + 1, 37) after the reset and after each control step.
             gripper: (S,) commands in [-1, 1].
             stride: control steps a policy step.
         """
         samples = sample_states(len(gripper), stride)
-        motion = Motion.of(robot_states, gripper, samples)
+        motion = Motion.of(robot, robot_states, gripper, samples)
         return cls(motion.tcp_in_base[1:], motion.gripper_open[1:])
 
     def next(self, observations: Observations, row: int) -> Array:

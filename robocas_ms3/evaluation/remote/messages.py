@@ -19,6 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 from robocas_ms3.errors import EvaluationError, WireError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.robots.table import DEFAULT
 from robocas_ms3.strict import refusal
 
 WANTS, POLICY = "robocas_wants", "robocas_policy"  # keys of the metadata
@@ -75,6 +76,8 @@ def observation_message(observations: Observations, row: int, start: Start | Non
     message |= {PREFIX + name: array for name, array in arrays.items()}
     if start is not None:
         message[START] = {name: value for name, value in vars(start).items() if name != "env"}
+        if start.robot == DEFAULT:  # a server may be older than that there are others
+            del message[START]["robot"]
     return message
 
 

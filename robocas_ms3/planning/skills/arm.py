@@ -14,8 +14,7 @@ from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.scene import PlanningScene
-from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.scenes.grasping import MAX_WIDTH
+from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.tasks.transfer import TransferEnv
 
 T = TypeVar("T")
@@ -87,6 +86,11 @@ class Arm:
         """The environment under its wrappers: control mode ``pd_joint_pos``, one env."""
         return self.executor.base_env
 
+    @property
+    def robot(self) -> RobotDescription:
+        """What the environment's robot is."""
+        return self.env.agent.description
+
     def planning(self):
         """Count the time spent inside as planning."""
         return self.executor.seconds.spent_on("planning")
@@ -110,7 +114,7 @@ class Arm:
     def hold_nothing(self) -> None:
         """Tell the planner that the gripper is empty and open."""
         self.planner.attach(None)
-        self.planner.finger_width = MAX_WIDTH
+        self.planner.finger_width = self.robot.open_width
 
     def holds(self, slot: int) -> bool:
         """Whether both fingers press on an object right now."""
@@ -136,7 +140,7 @@ class Arm:
 
     def plan_home(self, start: Array) -> Trajectory:
         """Plan to the rest configuration."""
-        return self.planner.plan_to_qpos(start, [np.array(MOBILE_PANDA.arm_rest)], stage="home")
+        return self.planner.plan_to_qpos(start, [np.array(self.robot.arm_rest)], stage="home")
 
     def rise_clear(self, *, without: int | Collection[int] = ()) -> None:
         """Rise in small steps, through whatever is touched, until arm and held object touch nothing.

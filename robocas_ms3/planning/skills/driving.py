@@ -16,7 +16,7 @@ from robocas_ms3.planning.scene import seen_from
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.timing import stopping
 from robocas_ms3.poses import from_wxyz, planar, transform
-from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.description import Limits, RobotDescription
 from robocas_ms3.scenes import standing
 
 SPEED, ACCELERATION = 0.25, 0.4  # m/s and rad/s; m/s^2 and rad/s^2
@@ -60,8 +60,7 @@ def base_at(arm: Arm) -> Array:
 def arm_base_in_world(arm: Arm, base: Array) -> Array:
     """4x4 of the arm's base with the base joints at a pose."""
     root = from_wxyz(arm.env.agent.robot.pose.raw_pose[0])
-    height = MOBILE_PANDA.base_link_height + MOBILE_PANDA.arm_base_above_base_link
-    return root @ planar(float(base[0]), float(base[1]), height, float(base[2]))
+    return root @ planar(float(base[0]), float(base[1]), arm.robot.arm_base_height, float(base[2]))
 
 
 def drive(arm: Arm, *goals: Array) -> None:
@@ -83,7 +82,7 @@ def drive(arm: Arm, *goals: Array) -> None:
 
 def places_before(arm: Arm, center: Array) -> Array:
     """Base poses (N, 3) in front of a point (3,) in the world, the most promising first."""
-    low, high = np.array(MOBILE_PANDA.base_limits).T + np.array([[LIMIT_MARGIN], [-LIMIT_MARGIN]])
+    low, high = np.array(arm.robot.base_limits).T + np.array([[LIMIT_MARGIN], [-LIMIT_MARGIN]])
     high[2], low[2] = MAX_YAW, -MAX_YAW
     goals = arm.rng.uniform(low, high, (SAMPLES, 3))
     frames = np.array([arm_base_in_world(arm, goal) for goal in goals])
@@ -112,7 +111,7 @@ def best_route(
     best: tuple[float, list[Array]] = (0.0, [])
     tried = 0
     for goal in goals:
-        if not body_is_free(arm_base_in_world(arm, goal), around.cloud):
+        if not body_is_free(arm.robot, arm_base_in_world(arm, goal), around.cloud):
             continue
         tried += 1
         if tried > TRIED:
@@ -137,19 +136,19 @@ def free_route(arm: Arm, start: Array, goal: Array, around: Surroundings, *, lea
         around: what is in the way.
         leaving: whether ``start`` is the narrower end, so that the robot backs out first; else it moves up last.
     """
-    for route in _routes(start, goal, leaving):
+    for route in _routes(start, goal, leaving, arm.robot.base_limits):
         poses = [start, *route]
         if all(_leg_is_free(arm, a, b, around) for a, b in zip(poses[:-1], poses[1:], strict=True)):
             return route
     return None
 
 
-def _routes(start: Array, goal: Array, leaving: bool) -> Iterator[list[Array]]:
+def _routes(start: Array, goal: Array, leaving: bool, limits: Limits) -> Iterator[list[Array]]:
     yield [goal]
     narrow = start if leaving else goal
     for distance in DETOURS:
         via = narrow - distance * np.array([np.cos(narrow[2]), np.sin(narrow[2]), 0])
-        if all(a <= v <= b for v, (a, b) in zip(via, MOBILE_PANDA.base_limits, strict=True)):
+        if all(a <= v <= b for v, (a, b) in zip(via, limits, strict=True)):
             yield [via, goal]
 
 
@@ -158,7 +157,7 @@ def _leg_is_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> b
     width = arm.planner.finger_width
     for pose in np.linspace(start, goal, count)[1:]:
         frame = arm_base_in_world(arm, pose)
-        if not body_is_free(frame, around.cloud):
+        if not body_is_free(arm.robot, frame, around.cloud):
             return False
         arm.planner.set_scene(seen_from(around.obstacles, frame))
         if arm.planner.collisions(arm.at, width):
@@ -166,8 +165,8 @@ def _leg_is_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> b
     return True
 
 
-def body_is_free(arm_base_in_world: Array, cloud: Array) -> bool:
+def body_is_free(robot: RobotDescription, arm_base_in_world: Array, cloud: Array) -> bool:
     """Whether none of the points (P, 3), world, is where the body on the floor would be."""
     root = arm_base_in_world.copy()
-    root[2, 3] -= MOBILE_PANDA.base_link_height + MOBILE_PANDA.arm_base_above_base_link  # on the floor
+    root[2, 3] -= robot.arm_base_height  # on the floor
     return standing.body_is_free(root, cloud)

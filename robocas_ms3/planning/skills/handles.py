@@ -18,13 +18,13 @@ from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.planning.timing import through, timed
 from robocas_ms3.poses import inverse, transform
-from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.scenes.grasping import HALF_TURN, MAX_WIDTH
+from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.scenes.grasping import HALF_TURN
 
 PULLS = 3  # with a new hold each, where one doesn't open far enough
 COMFORT = 0.15  # of the way from where it counts as opened to where a pull ends at most
 NEAR = 0.15  # m around the handle, in which what the fingers take hold of is looked for
-BETWEEN = (0.008, MAX_WIDTH / 2, 0.01)  # m from the TCP along its axes: what is between the pads
+BETWEEN = (0.008, 0.01)  # m from the TCP along x and z: what is between the pads
 JUDGED = 4  # ways to hold the handle that are checked for collisions where only reach is judged
 DEEPER = 0.012  # m by which the bar is farther in than the TCP, where it fits: the pads end 8 mm before the TCP
 SHIFTS = (0.0, -0.03, 0.03)  # m along the bar
@@ -124,7 +124,7 @@ def _plan_pull(arm: Arm, part: Part, deeper: float) -> PullPlan:
             away = arm.planner.plan_straight(path[0], moved_back(arm.planner.tcp(path[0]), STANDOFF), stage="approach")
             reach = arm.planner.plan_to_qpos(arm.at, [away.qpos[-1]], stage="reach")
             way_in = arm.planner.join(arm.at, reach, _reversed(away, path[0]))
-            return PullPlan(way_in, _timed(path[:free], away.dt))
+            return PullPlan(way_in, _timed(path[:free], arm.robot, away.dt))
         except PlanningFailed as error:
             failure = error
     raise failure
@@ -204,13 +204,15 @@ def _fitting(
     near = surface[np.linalg.norm(surface - (frames[0] @ part.hold)[:3, 3], axis=1) < NEAR]
     arm.planner.set_scene([*others, part.obstacle(arm, frames[0])])
 
+    width = arm.robot.open_width
+
     def holds(start: Array) -> bool:
         bar = transform(inverse(arm.planner.tcp(start)), near) + (0, 0, deeper)
-        between = np.abs(bar) < BETWEEN
+        between = np.abs(bar) < (BETWEEN[0], width / 2, BETWEEN[1])
         return bool(between.all(axis=1).any())
 
     order = [i for i in order if holds(starts[i])]
-    return [i for i, free in zip(order, arm.planner.free(starts[order], MAX_WIDTH), strict=True) if free]
+    return [i for i, free in zip(order, arm.planner.free(starts[order], width), strict=True) if free]
 
 
 def _free_length(arm: Arm, part: Part, path: Array, frames: Array, others: list[Obstacle]) -> int:
@@ -251,11 +253,11 @@ def _retreatable(arm: Arm, path: Array, least: int) -> int:
     raise PlanningFailed("pull", "no_way_back")
 
 
-def _timed(path: Array, dt: float) -> Trajectory:
+def _timed(path: Array, robot: RobotDescription, dt: float) -> Trajectory:
     motion = timed(
         through(path),
-        velocity=SPEED * MOBILE_PANDA.arm_velocity_limit,
-        acceleration=SPEED * MOBILE_PANDA.arm_acceleration_limit,
+        velocity=SPEED * robot.arm_velocity_limit,
+        acceleration=SPEED * robot.arm_acceleration_limit,
         dt=dt,
     )
     if motion is None:

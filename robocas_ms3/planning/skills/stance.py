@@ -132,7 +132,7 @@ def drive_to_handle(arm: Arm, *, elsewhere: bool = False) -> None:
 
     def share(goal: Array) -> float:
         frame = arm_base_in_world(arm, goal)
-        if not body_is_free(frame, swept):  # what opens would run into it
+        if not body_is_free(arm.robot, frame, swept):  # what opens would run into it
             return 0.0
         return pull_share(arm, part, frame, seen_from(others, frame))
 

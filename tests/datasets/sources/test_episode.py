@@ -10,6 +10,7 @@ from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw, inverse, wxyz_to_xyzw, xyzw_to_wxyz
 from robocas_ms3.recordings.motion import Motion, gripper_open, relative_motion, sample_states, sample_stride
 from robocas_ms3.recordings.subgoals import SubGoal, sample_subgoals
+from robocas_ms3.robots.description import MOBILE_PANDA
 
 
 @st.composite
@@ -179,9 +180,9 @@ def test_gripper_status_is_the_command_that_led_there():
     # Fingers go to -0.01 + (a + 1) / 2 * 0.05 m each: open (> 0.02 m) above a = 0.2.
     commands = np.array([1, 1, 1, -1, -1, 0.1, 0.3, 1], float)
     samples = np.array([0, 3, 4, 6, 7, 8])
-    status = gripper_open(commands, samples, initial_width=0.08)
+    status = gripper_open(MOBILE_PANDA, commands, samples, initial_width=0.08)
     assert status.tolist() == [True, True, False, False, True, True]
-    assert not gripper_open(commands, samples, initial_width=0.0)[0]
+    assert not gripper_open(MOBILE_PANDA, commands, samples, initial_width=0.0)[0]
 
 
 def test_the_bases_yaw_does_not_jump():

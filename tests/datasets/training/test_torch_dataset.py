@@ -26,6 +26,7 @@ from robocas_ms3.datasets.training.windows import Window
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.motion import Motion
 from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.table import PANDA
 
 CAMERAS = ("base_camera", "gripper_camera")
 SMALL = (32, 24)  # half of the synthetic pictures
@@ -342,7 +343,7 @@ def test_forward_kinematics_by_hand():
     qpos[1, 3:10] = MOBILE_PANDA.arm_evaluation_start
     root = np.tile(np.eye(4), (2, 1, 1))
     root[:, 0, 3] = 1
-    frames = Motion.of_joints(root, qpos, qpos, np.ones(2, bool))
+    frames = Motion.of_joints(PANDA, root, qpos, qpos, np.ones(2, bool))
     assert np.allclose(frames.arm_base_in_world[0, :3, 3], [1.1, 0.2, 0.49])
     assert np.allclose(frames.tcp_in_world[0, :3, 3], [1.1, 0.2 + 0.088, 0.49 + 0.926 - 0.1334])
     assert np.allclose(frames.tcp_in_world[0, :3, 2], [0, 0, -1])

@@ -11,6 +11,8 @@ from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.evaluation.bridge.proprioception import KEYS, WIDTHS, Proprioception
 from robocas_ms3.poses import from_wxyz
 from robocas_ms3.recordings.motion import Motion, gripper_open
+from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.table import PANDA
 
 STEPS = 60
 COMMANDS = np.where(np.arange(STEPS) // 7 % 2, -1.0, 1.0)
@@ -25,8 +27,8 @@ def moving(seed: int) -> Motion:
     qpos[:, 10:] = 0.04
     qpos = qpos.astype(np.float32).astype(np.float64)
     qvel = rng.normal(size=(STEPS, 12)).astype(np.float32).astype(np.float64)
-    opened = gripper_open(COMMANDS, np.arange(STEPS), initial_width=0.08)
-    return Motion.of_joints(np.tile(from_wxyz(root), (STEPS, 1, 1)), qpos, qvel, opened)
+    opened = gripper_open(MOBILE_PANDA, COMMANDS, np.arange(STEPS), initial_width=0.08)
+    return Motion.of_joints(PANDA, np.tile(from_wxyz(root), (STEPS, 1, 1)), qpos, qvel, opened)
 
 
 def observed(robots: list[Motion], step: int) -> dict:
@@ -51,7 +53,7 @@ def observed(robots: list[Motion], step: int) -> dict:
 def test_every_step_of_two_envs_is_what_a_dataset_holds():
     robots, feels = [moving(1), moving(2)], Proprioception()
     for env in range(2):
-        feels.begin(env, observed(robots, 0))
+        feels.begin(env, observed(robots, 0), PANDA)
     read: list[list[dict]] = [[], []]
     for step in range(STEPS):
         for env in range(2):

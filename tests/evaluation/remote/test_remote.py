@@ -1,7 +1,7 @@
 """Our client and our server, and openpi's client and a server as openpi writes one."""
 
 import urllib.request
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.remote.client import RemotePolicy
-from robocas_ms3.evaluation.remote.messages import observation_message
+from robocas_ms3.evaluation.remote.messages import observation_message, start_of
 from robocas_ms3.evaluation.remote.wire import pack, unpack
 
 ALL = Wants(cameras={"base_camera": CAMERA}, depth=True, state=True, rate_hz=10, reference="tcp")
@@ -80,6 +80,15 @@ def test_a_port_that_is_taken():
 
     with serving(Told()) as url, pytest.raises(EvaluationError, match="can't listen"):
         PolicyServer(Told(), port=int(url.rpartition(":")[2])).run()
+
+
+def test_a_start_names_the_robot_where_it_is_another():
+    """A server may be older than robots are several."""
+    for robot, keys in (("robocas_mobile_panda", set()), ("twin", {"robot"})):
+        start = replace(a_start(), robot=robot)
+        message = observation_message(some_observations(0), 0, start, reset=True)
+        assert message["start"].keys() & {"robot"} == keys
+        assert start_of(message, 0) == start
 
 
 def test_openpis_client_asks_our_server():

@@ -1,0 +1,242 @@
+"""An arm on a mobile base as a ManiSkill agent: controllers, cameras, what it feels."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, cast
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.agents.base_agent import BaseAgent, Keyframe
+from mani_skill.agents.controllers import deepcopy_dict
+from mani_skill.agents.registration import register_agent
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import common
+from mani_skill.utils.structs import Actor, Link, Pose
+
+from robocas_ms3.robots.combined import RobotController, State
+from robocas_ms3.robots.control_modes import control_modes
+from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.drives import EvenDrives
+from robocas_ms3.robots.ee_controller import relative_pose
+from robocas_ms3.robots.table import RobotSpec
+
+
+class _GeneratedUrdf:
+    """The URDF's path, on the class and on its instances; the file is generated when it is first asked for."""
+
+    def __get__(self, instance: object, owner: type[MobileManipulator]) -> str:
+        return str(owner.spec.files().urdf)
+
+
+def _camera(
+    uid: str, p: tuple[float, ...], rpy: tuple[float, ...], *, near: float, far: float, link: str | None
+) -> CameraConfig:
+    """640 x 480, vertical field of view 90 deg; mounted on a link, or in the world.
+
+    The shader is the cheapest one, which matters where a CPU renders; ``sensor_configs`` of ``gym.make`` changes it.
+    """
+    pose = sapien.Pose(p)
+    pose.set_rpy(rpy)
+    return CameraConfig(uid, Pose.create(pose), 640, 480, np.pi / 2, near, far, entity_uid=link, shader_pack="minimal")
+
+
+def _keyframe(robot: RobotDescription, arm: tuple[float, ...]) -> Keyframe:
+    qpos = np.array([0.0, 0.0, 0.0, *arm, robot.open_finger, robot.open_finger])
+    return Keyframe(pose=sapien.Pose(), qpos=qpos)
+
+
+class MobileManipulator(BaseAgent):
+    """A robot of the table. ``qpos``: base x, y, yaw, 7 arm joints, 2 fingers. The root link stands on the floor.
+
+    Every control mode holds the base, except those ending in ``_base``, which take 3 numbers more for x, y, yaw.
+    A robot's agent is a class of its own, derived with its row as ``spec``, and so known to ManiSkill.
+    """
+
+    spec: ClassVar[RobotSpec]
+    description: ClassVar[RobotDescription]
+    urdf_path: Any = _GeneratedUrdf()
+
+    # Arm: twice as stiff as ManiSkill's Panda, damped so that no direction overshoots. Damping / stiffness is the lag.
+    # Stiffer gains would track no better (targets are smooth) and press harder on what is touched.
+    arm_stiffness, arm_damping, arm_force_limit = 2e3, 1.5e2, 100.0
+    gripper_stiffness, gripper_damping, gripper_force_limit = 1e3, 1e2, 100.0
+    base_stiffness, base_damping, base_force_limit = 4e5, 2e4, 4e3
+    base_max_speed = 0.5  # m/s and rad/s
+
+    static_camera_pose: sapien.Pose | None = None
+    """World pose of ``static_camera``; none: upstream's, which looks at a table before the robot."""
+
+    def __init_subclass__(cls, spec: RobotSpec | None = None, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if spec is None:
+            return
+        robot = spec.description
+        cls.spec, cls.description, cls.uid = spec, robot, robot.uid
+        rubber = dict(static_friction=robot.finger_friction, dynamic_friction=robot.finger_friction, restitution=0.0)
+        finger = dict(material="gripper", patch_radius=0.1, min_patch_radius=0.1)
+        cls.urdf_config = dict(_materials=dict(gripper=rubber), link={name: finger for name in robot.finger_links})
+        starts = dict(rest=robot.arm_rest, evaluation=robot.arm_evaluation_start)
+        cls.keyframes = {name: _keyframe(robot, arm) for name, arm in starts.items()}
+        register_agent()(cls)
+
+    @property
+    def _controller_configs(self) -> dict[str, dict[str, Any]]:
+        arm = dict(stiffness=self.arm_stiffness, damping=self.arm_damping, force_limit=self.arm_force_limit)
+        gripper = dict(
+            stiffness=self.gripper_stiffness, damping=self.gripper_damping, force_limit=self.gripper_force_limit
+        )
+        base = dict(stiffness=self.base_stiffness, damping=self.base_damping, force_limit=self.base_force_limit)
+        return deepcopy_dict(control_modes(self.spec, arm, gripper, base, base_max_speed=self.base_max_speed))
+
+    @property
+    def _sensor_configs(self) -> list[CameraConfig]:
+        static = _camera("static_camera", (1, 1.5, 1.5), (0, np.pi / 3, -np.pi / 2), near=0.05, far=10, link=None)
+        if self.static_camera_pose is not None:
+            static.pose = Pose.create(self.static_camera_pose)
+        base, hand = self.description.base_link, self.description.hand_link
+        return [
+            _camera("base_camera", (0, -0.3, 1.2), (0, 0.43633, 0), near=0.005, far=5, link=base),
+            _camera("gripper_camera", (0.05, 0, 0.05), (np.pi, -np.pi / 2, 0), near=0.001, far=5, link=hand),
+            static,
+        ]
+
+    def _after_init(self) -> None:
+        links: dict[str, Link] = self.robot.links_map
+        robot = self.description
+        self.finger1_link, self.finger2_link = (links[name] for name in robot.finger_links)
+        self.tcp: Link = links[robot.tcp_link]
+        self.hand_link: Link = links[robot.hand_link]
+        self.arm_base_link: Link = links[robot.arm_base_link]
+        self.base_link: Link = links[robot.base_link]
+
+    def reset(self, init_qpos: Any = None) -> None:
+        """Stop the robot and, given a configuration, put it there, drive targets included.
+
+        Args:
+            init_qpos: (12,) or (N, 12) for the environments being reset; None leaves the robot where it is.
+        """
+        super().reset(init_qpos)
+        self._still()
+        if init_qpos is not None:
+            # Otherwise steps taken before the first action would pull the robot to its former targets.
+            joints = self.robot.active_joints
+            targets = torch.as_tensor(init_qpos, dtype=torch.float32, device=self.device).reshape(-1, len(joints))
+            self.robot.set_joint_drive_targets(targets, joints)
+
+    def set_action(self, action: Any) -> None:
+        """Hand an action (N, action size) to the controllers.
+
+        Raises:
+            ValueError: on a CPU, a number of it is NaN.
+        """
+        if not self.scene.gpu_sim_enabled and torch.isnan(action).any():
+            raise ValueError("Action cannot be NaN. Environment received:", action)
+        self.controller.set_action(action)
+
+    def before_simulation_step(self) -> None:
+        """Move on the drive targets that go from one to the next within a control step."""
+        for controller in self._within_a_step:
+            controller.before_simulation_step()
+
+    def set_control_mode(self, control_mode: str | None = None) -> None:
+        """Change the control mode; what the last one told the arm about its velocity is forgotten."""
+        mode = control_mode or self._default_control_mode
+        if mode in self.supported_control_modes and mode not in self.controllers:
+            made = RobotController(self._controller_configs[mode], self.robot, self._control_freq, scene=self.scene)
+            made.set_drive_property()
+            self.controllers[mode] = made
+            if not self.scene._gpu_sim_initialized:
+                for link in self.robot.links:  # as ManiSkill does for those that it makes
+                    link.disable_gravity = True
+        super().set_control_mode(mode)
+        self._within_a_step = [part for part in self._parts.controllers.values() if isinstance(part, EvenDrives)]
+        if hasattr(self, "tcp"):  # not while the robot is being made
+            self._still()
+            if self.scene.gpu_sim_enabled and self.scene._gpu_sim_initialized:
+                cast("Any", self.scene.px).gpu_apply_articulation_target_velocity()
+
+    @property
+    def _parts(self) -> RobotController:
+        return cast("RobotController", self.controller)
+
+    def reset_only(self, env_idx: torch.Tensor | None) -> None:
+        """Say which envs the next reset of the controllers is of; None: all."""
+        self._parts.reset_only = env_idx
+
+    def controller_targets(self) -> dict[str, dict[str, torch.Tensor]]:
+        """What the next actions start from, beside where the joints are; see `combined.RobotController.targets`."""
+        return self._parts.targets()
+
+    def set_controller_targets(self, state: State | None = None, env_idx: torch.Tensor | None = None) -> None:
+        """Let the next actions start from targets, and where there are none from where the joints are.
+
+        Args:
+            state: of `controller_targets`, a row for each env that is set.
+            env_idx: of these envs; default: all.
+        """
+        self._parts.set_targets(state, env_idx)
+
+    def _still(self) -> None:
+        """Take back the velocities that the drives were told, of the envs being reset."""
+        joints = self.robot.active_joints
+        self.robot.set_joint_drive_velocity_targets(torch.zeros(1, len(joints), device=self.device), joints)
+
+    def get_proprioception(self) -> dict[str, Any]:
+        """Joint state, TCP pose in the arm's base frame (N, 7), gripper width (N, 1), controller state."""
+        obs: dict[str, Any] = dict(
+            qpos=self.robot.get_qpos(),
+            qvel=self.robot.get_qvel(),
+            tcp_in_arm_base=self.tcp_in_arm_base.raw_pose,
+            gripper_width=self.gripper_width[:, None],
+        )
+        state = self.controller.get_state()
+        if state:
+            obs["controller"] = state
+        return obs
+
+    @property
+    def tcp_pose(self) -> Pose:
+        """TCP in the world: z approach, y closing direction."""
+        return self.tcp.pose
+
+    @property
+    def tcp_pos(self) -> torch.Tensor:
+        """(N, 3) m, TCP in the world."""
+        return self.tcp.pose.p
+
+    @property
+    def tcp_in_arm_base(self) -> Pose:
+        """TCP in the frame of the arm's base."""
+        return relative_pose(self.arm_base_link, self.tcp)
+
+    @property
+    def gripper_width(self) -> torch.Tensor:
+        """(N,) m, distance between the pads: the sum of both finger joints."""
+        return self.robot.get_qpos()[:, self.description.finger_slice].sum(dim=1)
+
+    def is_grasping(self, object: Actor, min_force: float = 0.5, max_angle: float = 85) -> torch.Tensor:
+        """Say whether both fingers press on an object.
+
+        Args:
+            object: the actor.
+            min_force: N, for each finger.
+            max_angle: degrees between a finger's opening direction and the contact force on it.
+
+        Returns:
+            (N,) bool.
+        """
+        grasping = None
+        for link, side in ((self.finger1_link, 1.0), (self.finger2_link, -1.0)):
+            force = self.scene.get_pairwise_contact_forces(link, object)
+            opening = side * link.pose.to_transformation_matrix()[..., :3, 1]
+            angle = torch.rad2deg(common.compute_angle_between(opening, force))
+            pressed = (torch.linalg.norm(force, dim=1) >= min_force) & (angle <= max_angle)
+            grasping = pressed if grasping is None else grasping & pressed
+        assert grasping is not None
+        return grasping
+
+    def is_static(self, threshold: float = 0.2) -> torch.Tensor:
+        """(N,) bool: no joint but the fingers moves faster than ``threshold`` (m/s, rad/s)."""
+        qvel = self.robot.get_qvel()[:, : self.description.finger_slice.start]
+        return qvel.abs().max(dim=1).values <= threshold

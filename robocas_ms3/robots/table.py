@@ -1,0 +1,50 @@
+"""The robots: a row each, and those of other packages (entry points ``robocas_ms3.robots``)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+from robocas_ms3.errors import ExtensionError
+from robocas_ms3.extensions import Table
+from robocas_ms3.robots.description import MOBILE_PANDA, RobotDescription
+from robocas_ms3.robots.urdf import RobotFiles, robot_files
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """A robot, declared without a simulator.
+
+    Attributes:
+        description: its names, limits and numbers; its ``uid`` is the row's name.
+        files: gives its URDF files, made where they are missing.
+        agent: import path of its ManiSkill agent, a `robots.agent.MobileManipulator`.
+    """
+
+    description: RobotDescription
+    files: Callable[[], RobotFiles]
+    agent: str
+
+
+PANDA = RobotSpec(MOBILE_PANDA, robot_files, "robocas_ms3.robots.mobile_panda:RoboCASMobilePanda")
+STOCK_FINGERS = RobotSpec(
+    replace(MOBILE_PANDA, uid=f"{MOBILE_PANDA.uid}_stock_fingers", finger_extension=0.0),
+    partial(robot_files, 0.0),
+    "robocas_ms3.robots.mobile_panda:RoboCASMobilePandaStockFingers",
+)
+DEFAULT = MOBILE_PANDA.uid
+ROBOTS = Table("robot", "robocas_ms3.robots", RobotSpec, {row.description.uid: row for row in (PANDA, STOCK_FINGERS)})
+
+
+def find_robot(name: str | None, *, where: object = "robot") -> RobotSpec:
+    """The robot of a name; None: the default one.
+
+    Raises:
+        ExtensionError: there is none, its package is broken, or its row has not the name of its ``uid``.
+    """
+    spec = ROBOTS.find(name or DEFAULT, where=where)
+    if spec.description.uid != (name or DEFAULT):
+        fix = "Name its entry point as its description's uid."
+        raise ExtensionError("a robot by another name", where=where, expected=spec.description.uid, found=name, fix=fix)
+    return spec

@@ -1,0 +1,187 @@
+"""The robot of a stranger's package, as docs/extending.md has it, used from outside: every name of it is another."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import pytest
+from strangers import PAGE, install, python, robocas
+
+SUPPORT = Path(__file__).resolve().parents[1] / "support"
+TWIN = "import sys; from robocas_ms3.robots.table import find_robot; twin = find_robot('twin')\n"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    install("A planner backend", folder)
+    return install("A robot", folder)
+
+
+@pytest.fixture(scope="module")
+def recorded(site, tmp_path_factory):
+    """Two episodes of its, and what the generator printed."""
+    out = tmp_path_factory.mktemp("recorded") / "out"
+    robocas(site, "generate", "pick", "-n", 2, "--robot", "twin", "--out", out)
+    return out / "trajectory.h5"
+
+
+def test_it_is_listed_and_read_without_a_simulator(site):
+    robots = {row["name"]: row for row in json.loads(robocas(site, "list", "--json"))["robots"]}
+    assert list(robots) == ["robocas_mobile_panda", "robocas_mobile_panda_stock_fingers", "twin"]
+    assert robots["twin"]["agent"] == "robocas_twin.agent:Twin"
+    said = python(
+        site, "-c", TWIN + "print(twin.files().urdf.is_file(), {'sapien', 'mani_skill'} & sys.modules.keys())"
+    )
+    assert said.strip() == "True set()"
+
+
+def test_its_environment_has_no_name_of_the_pandas(site):
+    said = python(
+        site,
+        "-c",
+        TWIN
+        + """
+import gymnasium as gym, numpy as np, robocas_ms3
+env = gym.make("RoboCASPick-v1", robot_uids="twin", obs_mode="state", control_mode="pd_ee_delta_pose",
+               render_backend="none", reward_mode="normalized_dense")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+agent = env.unwrapped.agent
+names = [part.name for part in (*agent.robot.joints, *agent.robot.links)]
+print(agent.uid, all(name.startswith("twin_") for name in names if name), len(names))
+print(tuple(joint.name for joint in agent.robot.active_joints) == twin.description.joints)
+print(agent.keyframes["rest"].qpos[3:10].tolist(), sorted({c.entity_uid for c in agent._sensor_configs} - {None}))
+print(sorted(env.unwrapped.get_state_dict()["articulations"]))
+""",
+    )
+    uid, joints, rest, states = said.splitlines()
+    assert uid.startswith("twin True")
+    assert joints == "True"
+    assert rest == "[0.1, -0.9, 0.0, -2.4, 0.1, 1.4, 0.7] ['twin_base_link', 'twin_panda_hand']"
+    assert states == "['twin']"
+
+
+@pytest.mark.parametrize("name", ["mplib", "straight"])
+def test_planners_plan_for_its_arm(site, name):
+    said = python(
+        site,
+        "-c",
+        TWIN
+        + f"""
+import numpy as np
+from robocas_ms3.planning.backends import make_planner
+planner, rest = make_planner({name!r}, twin, dt=0.05), np.array(twin.description.arm_rest)
+motion = planner.plan_to_qpos(rest, [rest + [1.5, 0, 0, 0, 0, 0, 0]], stage="x")
+print(np.abs(np.diff(motion.qpos, axis=0)).max() / 0.05)
+from robocas_ms3.robots.forward import chain
+tip = chain(twin.files().urdf, twin.description.arm_base_link, twin.description.tcp_link, motion.qpos[-1:])
+print(np.abs(planner.tcp(motion.qpos[-1]) - tip).max() < 1e-9, planner.collisions(rest))
+""",
+    )
+    fastest, rest = said.splitlines()
+    assert float(fastest) == pytest.approx({"mplib": 0.7, "straight": 0.5}[name], abs=0.03)  # the Panda's is 0.5
+    assert rest == "True []"
+
+
+@pytest.mark.slow
+def test_demonstrations_are_recorded_and_replayed(site, recorded):
+    data = json.loads(recorded.with_suffix(".json").read_text())
+    assert json.loads(recorded.with_name("run.json").read_text())["settings"]["robot"] == "twin"
+    assert data["env_info"]["env_kwargs"]["robot_uids"] == "twin"
+    assert [episode["success"] for episode in data["episodes"]] == [True, True]
+    with h5py.File(recorded) as file:
+        assert list(file["traj_0/env_states/articulations"]) == ["twin"]
+    assert "2 of 2 episodes succeed" in (said := robocas(site, "replay", recorded))
+    assert "final state: 0\n" in said
+    assert "2 of 2 episodes succeed" in robocas(site, "replay", recorded, "--control-mode", "pd_ee_delta_pose")
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_with_the_robot_that_it_began_with(site, recorded):
+    with pytest.raises(AssertionError, match=r"differ.*'twin'.*'robocas_mobile_panda'"):
+        robocas(site, "generate", "pick", "-n", 3, "--resume", "--out", recorded.parent)
+
+
+@pytest.mark.slow
+def test_datasets_hold_what_it_did(site, recorded, tmp_path):
+    """Arrays are the recorded states', and where the simulator has its links; LeRobot is told its name."""
+    said = python(
+        site,
+        "-c",
+        f"""
+import sys, json; sys.path.insert(0, {str(SUPPORT)!r})
+from pathlib import Path
+import numpy as np
+from synthetic import RayCaster
+from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.demos.open_loop import OpenLoop
+from robocas_ms3.poses import from_wxyz, inverse
+from robocas_ms3.recordings.motion import sample_states, stored_actions
+from robocas_ms3.recordings.reading import TrajectoryFile
+file, out = Path({str(recorded)!r}), Path({str(tmp_path)!r})
+convert(file, out / "folder", embeddings=False, open_source=RayCaster)
+convert_lerobot(out / "folder", out / "lerobot")
+print(json.loads((out / "lerobot/meta/info.json").read_text())["robot_type"])
+arrays = open_source(out / "folder").episode(0).arrays
+with TrajectoryFile(file) as opened:
+    recording = opened.recording(0)
+    env = opened.env.make(obs_mode="none", render_backend="none")
+    env.reset(seed=opened.entry(0).seed)
+    world = OpenLoop(opened.env, 5)
+    world.reset(opened.entry(0).seed)
+samples = sample_states(recording.control_steps, 4)
+qpos = recording.states["articulations"]["twin"][samples, 13:25]
+print(*(np.array_equal(arrays[name], found) for name, found in
+        (("robot_joints", qpos[:, 3:10]), ("gripper_width", qpos[:, 10:].sum(1)))))
+agent = env.unwrapped.agent
+off = []
+for step in (0, 20, len(qpos) - 1):
+    env.unwrapped.set_state_dict(recording.state(samples[step]))
+    tcp = inverse(from_wxyz(agent.arm_base_link.pose.raw_pose[0])) @ from_wxyz(agent.tcp.pose.raw_pose[0])
+    off.append(np.abs(arrays["ee_pos"][step] - tcp[:3, 3]).max())
+print(max(off) < 1e-5, len(arrays["ee_pos"]) == len(qpos))
+actions = stored_actions(*(arrays[name] for name in ("rel_pos", "rel_orn", "gripper_status")))
+print(world.play(actions[:-1]).success)
+""",
+    )
+    robot, same, near, again = said.splitlines()
+    assert robot == "twin"
+    assert same == "True True"
+    assert near == "True True"
+    assert again == "True"
+    assert "2 episodes" in robocas(site, "validate", tmp_path / "folder")
+
+
+@pytest.mark.slow
+def test_without_its_package_a_recording_says_what_is_missing(recorded, tmp_path):
+    for command in (["replay", recorded], ["stats", recorded]):
+        with pytest.raises(AssertionError, match=r"robot_uids: no such robot .*found 'twin'.*Install the package"):
+            robocas(tmp_path, *command)
+
+
+@pytest.mark.slow
+def test_an_evaluation_is_of_the_robot_that_its_protocol_names(site, tmp_path):
+    from robocas_ms3.evaluation import results
+    from robocas_ms3.evaluation.protocol import load_protocol
+
+    protocol = shutil.copytree(load_protocol("smoke").folder, tmp_path / "protocol")
+    with (protocol / "protocol.yaml").open("a") as rules:
+        rules.write("robot: twin\n")
+    words = ["--policy", "scripted", "--protocol", protocol, "--episodes", 1, "--out", tmp_path / "eval"]
+    robocas(site, "eval", "pick", *words, "--backend", "processes", "--envs", 1)
+    (outcome,) = results.read(tmp_path / "eval").outcomes.values()
+    assert outcome.error == ""
+    assert outcome.success
+
+
+def test_what_is_no_robot_is_refused(site, tmp_path):
+    with pytest.raises(AssertionError, match="error: robot: no such robot .*'twin'.*Did you mean twin"):
+        robocas(site, "generate", "pick", "--robot", "twins", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert "--robot twin" in PAGE
