@@ -99,7 +99,7 @@ def main(cfg: Benchmark) -> None:
 
 
 def repeated(source: Path, count: int, target: Path) -> Path:
-    """A trajectory of so many successful recordings of another, which begin anew where they end."""
+    """A trajectory of so many successful recordings of another, which begin anew where they end, a little changed."""
     metadata = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
     good = [episode for episode in metadata["episodes"] if episode["success"]]
     episodes = []
@@ -107,6 +107,7 @@ def repeated(source: Path, count: int, target: Path) -> Path:
         for number in range(count):
             episode = good[number % len(good)]
             old.copy(f"traj_{episode['episode_id']}", new, f"traj_{number}")
+            new[f"traj_{number}/actions"][0, 0] += 1e-5 * (number // len(good))  # a recording is converted once
             episodes.append({**episode, "episode_id": number})
     target.with_suffix(".json").write_text(json.dumps({**metadata, "episodes": episodes}), encoding="utf-8")
     return target

@@ -22,7 +22,7 @@ from robocas_ms3.files import make_folder
 from robocas_ms3.outputs import claim_output
 from robocas_ms3.recordings.entries import read_json, read_reset
 from robocas_ms3.recordings.environment import RecordedEnv, read_env
-from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.reading import open_trajectory, readable_episode
 from robocas_ms3.recordings.writing import EpisodeRecorder, merge
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -154,14 +154,18 @@ def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env
     base_env = env.unwrapped
     assert isinstance(base_env, RoboCASEnv)
     name = f"traj_{episode['episode_id']}"
+    where = f"{trajectory}, {name}"
     with open_trajectory(trajectory) as file:
         if name not in file:
             raise DatasetError("the file lacks an episode its JSON lists", where=trajectory, found=name)
-        group: Any = file[name]
-        actions, states = np.array(group["actions"]), dict_to_list_of_dicts(group["env_states"])
-    seed, options = read_reset(episode, f"{trajectory}, {name}")
+        with readable_episode(where):
+            group: Any = file[name]
+            actions, states = np.array(group["actions"]), dict_to_list_of_dicts(group["env_states"])
+            if len(states) != len(actions) + 1:
+                raise ValueError(f"{len(actions)} actions, {len(states)} states")
+    seed, options = read_reset(episode, where)
     if not np.isfinite(actions).all():
-        raise DatasetError("NaN or infinity", where=f"{trajectory}, {name}, actions", fix="Record it again.")
+        raise DatasetError("NaN or infinity", where=f"{where}, actions", fix="Record it again.")
     _, info = env.reset(seed=seed, options=options)
     converted = base_env.control_mode != episode["control_mode"]
     if use_env_states:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,7 +151,7 @@ class TrajectoryFile:
             DatasetError: it is damaged, or contradicts the JSON.
         """
         where, uid = self._where(index), self.robot.description.uid
-        try:
+        with readable_episode(where):
             group: Any = self._file[f"traj_{self.episodes[index]['episode_id']}"]
             actions = np.asarray(group["actions"], dtype=np.float32)
             states = {
@@ -163,8 +165,6 @@ class TrajectoryFile:
             }
             if any(array.ndim != 2 for arrays in states.values() for array in arrays.values()):
                 raise ValueError("states that are no rows of numbers")
-        except (OSError, KeyError, RuntimeError, AttributeError, ValueError, TypeError) as error:
-            raise DatasetError("this episode is damaged", where=where, found=reason(error)) from error
         if actions.ndim != 2 or len(actions) == 0:
             raise DatasetError("this episode has no actions", where=where)
         entry = self.entry(index)
@@ -191,6 +191,19 @@ class TrajectoryFile:
 
     def _where(self, index: int) -> str:
         return f"{self.path}, traj_{self.episodes[index]['episode_id']}"
+
+
+@contextmanager
+def readable_episode(where: str) -> Iterator[None]:
+    """Read an episode's group of an HDF5 file.
+
+    Raises:
+        DatasetError: it is damaged, whatever HDF5 says of that.
+    """
+    try:
+        yield
+    except (OSError, KeyError, RuntimeError, AttributeError, ValueError, TypeError) as error:
+        raise DatasetError("this episode is damaged", where=where, found=reason(error)) from error
 
 
 def open_trajectory(path: Path) -> h5py.File:

@@ -20,6 +20,10 @@ _QUALITY = {
 }
 
 
+LARGEST = 8192
+"""Pixels a side."""
+
+
 @dataclass(frozen=True)
 class Pictures:
     """What is rendered and stored.
@@ -52,6 +56,13 @@ class Pictures:
                 where="image_format",
                 expected=f"one of {', '.join(schema.IMAGE_FORMATS)}",
                 found=self.image_format,
+            )
+        if self.size is not None and max(self.size) > LARGEST:
+            raise DatasetError(
+                "no renderer makes pictures this large",
+                where="size",
+                expected=f"<= {LARGEST} x {LARGEST}",
+                found=list(self.size),
             )
         if self.size is not None and min(self.size) < 16:
             raise DatasetError(

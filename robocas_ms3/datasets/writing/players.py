@@ -143,7 +143,12 @@ class RecordingPlayer:
         """
         chosen = _choose(self.file, self._request.include_failed)
         _warn_untried(self.file, chosen, self.rate_hz)
-        return [{"source": index, **recording_entry(self.file, index)} for index in chosen]
+        entries = [{"source": index, **recording_entry(self.file, index)} for index in chosen]
+        once = {entry["recording"]: entry for entry in reversed(entries)}
+        if len(once) < len(entries):
+            again = [entry["trajectory_episode"] for entry in entries if once[entry["recording"]] is not entry]
+            _log.warning("%s: the same recordings again, left out: %s", self.file.path, ", ".join(map(str, again)))
+        return [entry for entry in entries if once[entry["recording"]] is entry]
 
     def texts(self, number: int) -> list[str]:
         """Instruction and sub-goals."""

@@ -343,3 +343,16 @@ def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypat
     convert(other, out, append=True, open_source=RayCaster)
     ledger = json.loads((out / "conversion.json").read_text())["episodes"]
     assert [entry["seed"] for entry in ledger.values()] == [3, 5, 10, 11]
+
+
+def test_a_recording_that_is_there_twice_is_converted_once(tmp_path, caplog):
+    trajectory = write_trajectory(tmp_path / "trajectory.h5", seeds=(3, 4, 3))
+    done = convert(trajectory, tmp_path / "out", embeddings=False, open_source=RayCaster)
+    assert [episode.number for episode in done.episodes] == [0, 1]
+    assert "the same recordings again, left out: 2" in caplog.text
+    assert validate(tmp_path / "out").violations == []
+
+
+def test_pictures_that_no_renderer_makes_are_refused_at_once(tmp_path):
+    with pytest.raises(DatasetError, match="no renderer makes pictures this large .expected <= 8192 x 8192"):
+        Pictures(size=(100_000, 100_000))
