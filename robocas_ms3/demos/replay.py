@@ -22,7 +22,7 @@ from robocas_ms3.files import make_folder
 from robocas_ms3.outputs import claim_output
 from robocas_ms3.recordings.entries import read_json, read_reset
 from robocas_ms3.recordings.environment import RecordedEnv, read_env
-from robocas_ms3.recordings.reading import open_trajectory, readable_episode
+from robocas_ms3.recordings.reading import open_trajectory, readable
 from robocas_ms3.recordings.writing import EpisodeRecorder, merge
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -158,7 +158,7 @@ def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env
     with open_trajectory(trajectory) as file:
         if name not in file:
             raise DatasetError("the file lacks an episode its JSON lists", where=trajectory, found=name)
-        with readable_episode(where):
+        with readable(where):
             group: Any = file[name]
             actions, states = np.array(group["actions"]), dict_to_list_of_dicts(group["env_states"])
             if len(states) != len(actions) + 1:

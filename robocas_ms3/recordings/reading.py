@@ -20,6 +20,7 @@ from robocas_ms3.recordings.motion import Motion, gripper_commands
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.table import RobotSpec
 
+_UNIT = 0.05  # a simulation keeps the length of quaternions better
 _STATE_DIM = 13 + 2 * RobotDescription.finger_slice.stop
 
 
@@ -93,7 +94,9 @@ class TrajectoryFile:
         self.control_freq = _frequency(metadata["robocas"], metadata_path)
         self.versions: dict[str, Any] = metadata["robocas"].get("versions", {})
         self._file = open_trajectory(self.path)
-        listed, stored = {f"traj_{episode['episode_id']}" for episode in self.episodes}, set(self._file)
+        listed = {f"traj_{episode['episode_id']}" for episode in self.episodes}
+        with readable(self.path, "this file is damaged"):
+            stored = set(self._file)
         if listed != stored:
             self.close()
             raise DatasetError(
@@ -151,7 +154,7 @@ class TrajectoryFile:
             DatasetError: it is damaged, or contradicts the JSON.
         """
         where, uid = self._where(index), self.robot.description.uid
-        with readable_episode(where):
+        with readable(where):
             group: Any = self._file[f"traj_{self.episodes[index]['episode_id']}"]
             actions = np.asarray(group["actions"], dtype=np.float32)
             states = {
@@ -194,8 +197,8 @@ class TrajectoryFile:
 
 
 @contextmanager
-def readable_episode(where: str) -> Iterator[None]:
-    """Read an episode's group of an HDF5 file.
+def readable(where: object, what: str = "this episode is damaged") -> Iterator[None]:
+    """Read of an HDF5 file.
 
     Raises:
         DatasetError: it is damaged, whatever HDF5 says of that.
@@ -203,7 +206,7 @@ def readable_episode(where: str) -> Iterator[None]:
     try:
         yield
     except (OSError, KeyError, RuntimeError, AttributeError, ValueError, TypeError) as error:
-        raise DatasetError("this episode is damaged", where=where, found=reason(error)) from error
+        raise DatasetError(what, where=where, found=reason(error)) from error
 
 
 def open_trajectory(path: Path) -> h5py.File:
@@ -234,10 +237,10 @@ def _frequency(said: Any, path: Path) -> float:
 
 
 def _check_finite(recording: Recording, where: str) -> None:
-    """A policy can't learn from what is no number, and a simulation keeps it.
+    """See that states are states: a policy can't learn from what is no number, and a simulation keeps it.
 
     Raises:
-        DatasetError: NaN or infinity.
+        DatasetError: NaN or infinity, or a quaternion that is none.
     """
     named = {f"{kind}/{name}": array for kind, of in recording.states.items() for name, array in of.items()}
     for name, values in {"actions": recording.actions, **named}.items():
@@ -245,3 +248,9 @@ def _check_finite(recording: Recording, where: str) -> None:
             step = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
             place = f"{where}, {name}, row {step}"
             raise DatasetError("NaN or infinity", where=place, expected="finite numbers", fix="Record it again.")
+    for name, values in named.items():
+        length = np.linalg.norm(values[:, 3:7].astype(np.float64), axis=1)
+        wrong = np.flatnonzero(abs(length - 1) > _UNIT)
+        if len(wrong):
+            place, found = f"{where}, {name}, row {wrong[0]}", f"{length[wrong[0]]:g}"
+            raise DatasetError("no orientation", where=place, expected="a quaternion of length 1", found=found)

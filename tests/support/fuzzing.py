@@ -1,0 +1,53 @@
+"""Files that were whole, damaged in ways that follow from a seed."""
+
+from __future__ import annotations
+
+import copy
+import json
+import random
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+VALUES = [None, True, -1, 0, 2**70, 1.5, float("nan"), float("inf"), "", "x", "../up", "a:b", "\x00", [], [[]], {}, {"x": 1}]
+
+
+def flipped(whole: bytes, seed: int) -> bytes:
+    """Some bytes are others, or the end is missing."""
+    rng = random.Random(seed)
+    data = bytearray(whole)
+    for _ in range(rng.choice((1, 3, 30))):
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    return bytes(data[: rng.randrange(len(data))] if rng.random() < 0.2 else data)
+
+
+def _places(node: Any, path: tuple = ()) -> Iterator[tuple]:
+    children = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, child in children:
+        yield (*path, key)
+        yield from _places(child, (*path, key))
+
+
+def twisted(whole: Any, seed: int) -> Any:
+    """A value of JSON is another one, or missing, or there once more under another key."""
+    rng = random.Random(seed)
+    data = copy.deepcopy(whole)
+    *way, last = rng.choice(list(_places(data)))
+    parent = data
+    for key in way:
+        parent = parent[key]
+    how = rng.random()
+    if how < 0.2:
+        del parent[last]
+    elif how < 0.3 and isinstance(parent, dict):
+        parent["more"] = parent[last]
+    else:
+        parent[last] = copy.deepcopy(rng.choice(VALUES))
+    return data
+
+
+def twist_file(path: Path, whole: Any, seed: int) -> str:
+    """Write a twisted file of JSON; gives its text."""
+    text = json.dumps(twisted(whole, seed))
+    path.write_text(text)
+    return text
