@@ -31,21 +31,21 @@ def test_bytes_of_the_hdf5(whole, tmp_path):
     path = tmp_path / "trajectory.h5"
     path.with_suffix(".json").write_text(json.dumps(whole[1]))
     refused = 0
-    for seed in range(300):
+    for seed in range(120):
         path.write_bytes(flipped(whole[0], seed))
         try:
             read_all(path)
         except RobocasError as error:
             refused += 1
             assert "\n" not in str(error)
-    assert refused > 50
+    assert refused > 20
 
 
 def test_values_of_the_json(whole, tmp_path):
     path = tmp_path / "trajectory.h5"
     path.write_bytes(whole[0])
     refused = 0
-    for seed in range(600):
+    for seed in range(300):
         said = twist_file(path.with_suffix(".json"), whole[1], seed)
         try:
             with suppress(RobocasError):
@@ -54,4 +54,4 @@ def test_values_of_the_json(whole, tmp_path):
             refused += 1
         except Exception as error:
             raise AssertionError(f"seed {seed}: {said}") from error
-    assert refused > 100
+    assert refused > 50

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-VALUES = [None, True, -1, 0, 2**70, 1.5, float("nan"), float("inf"), "", "x", "../up", "a:b", "\x00", [], [[]], {}, {"x": 1}]
+SCALARS = [None, True, -1, 0, 2**70, 1.5, float("nan"), float("inf"), "", "x", "../up", "a:b", "\x00"]
+VALUES = [*SCALARS, [], [[]], {}, {"x": 1}]
 
 
 def flipped(whole: bytes, seed: int) -> bytes:

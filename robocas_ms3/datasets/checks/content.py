@@ -17,6 +17,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.files import DAMAGED
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line, read_arrays
 
 NO_FILE = "no file"
@@ -144,7 +145,7 @@ def _camera_files(folder: Path, cameras: Iterable[schema.CameraSpec]) -> dict[st
                 found[f"{camera.name}/{name}"] = array if isinstance(array, np.ndarray) else "an archive"
             except FileNotFoundError:
                 continue
-            except (OSError, ValueError, EOFError) as error:
+            except DAMAGED as error:
                 found[f"{camera.name}/{name}"] = first_line(error)
     return found
 

@@ -104,6 +104,13 @@ def _check_info(info: Mapping[str, Any]) -> Iterator[Violation]:
         yield Violation(schema.INFO_FILE, "codebase_version", schema.CODEBASE_VERSION, found)
     elif not isinstance(info["fps"], int):
         yield Violation(schema.INFO_FILE, "fps", "a whole number", str(info["fps"]))
+    elif not (isinstance(info["features"], dict) and all(map(_is_feature, info["features"].values()))):
+        yield Violation(schema.INFO_FILE, "features", "dtype and shape of each", str(info["features"])[:80])
+
+
+def _is_feature(said: Any) -> bool:
+    shape = said.get("shape") if isinstance(said, dict) else None
+    return isinstance(shape, list) and all(type(n) is int for n in shape) and isinstance(said.get("dtype"), str)
 
 
 def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
@@ -256,17 +263,24 @@ def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Viola
             yield Violation(schema.STATS_FILE, key, ", ".join(sorted(missing)), "nothing")
             continue
         shape = (3, 1, 1) if feature["dtype"] == "video" else tuple(feature["shape"])
-        wrong = [name for name, value in found.items() if name != "count" and np.shape(value) != shape]
+        wrong = [name for name, value in found.items() if name != "count" and _shape(value) != shape]
         if wrong:
-            shown = f"{np.shape(found[wrong[0]])}"
+            shown = f"{_shape(found[wrong[0]])}"
             yield Violation(schema.STATS_FILE, f"{key}, {wrong[0]}", f"shape {shape}", shown)
         elif key in ranges:
             low, high, count = ranges[key]
             same = np.allclose(found["min"], low, atol=1e-6) and np.allclose(found["max"], high, atol=1e-6)
             if not same or found["count"] != [count]:
                 expected = f"min {low.tolist()}, max {high.tolist()}, count {count}"
-                text = f"min {found['min']}, max {found['max']}, count {found['count'][0]}"
+                text = f"min {found['min']}, max {found['max']}, count {found['count']}"
                 yield Violation(schema.STATS_FILE, key, expected, text)
+
+
+def _shape(value: Any) -> tuple[int, ...] | str:
+    try:
+        return np.asarray(value, dtype=np.float64).shape
+    except (TypeError, ValueError):
+        return "no numbers"
 
 
 def _check_checksums(root: Path) -> Iterator[Violation]:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import tokenize
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -39,6 +42,14 @@ def said_of(info: Mapping[str, Any], number: int | None) -> dict[str, Any]:
     return {k: table[str(number)] for k, table in tables.items() if isinstance(table, dict) and str(number) in table}
 
 
+DAMAGED = (
+    *(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error),
+    NotImplementedError,  # damaged flags or method of an archive's member
+    *(SyntaxError, tokenize.TokenError),  # an array's header
+)
+"""What numpy raises for damaged arrays and archives."""
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON object; empty where there is no such file.
 
@@ -66,7 +77,7 @@ def read_array(path: Path) -> NDArray[np.float64]:
         array = np.load(path, allow_pickle=False)
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
             raise ValueError("no array of numbers")
-    except (OSError, ValueError, EOFError) as error:
+    except DAMAGED as error:
         raise DatasetError(
             "this array can't be read", where=path, found=str(error).splitlines()[0], fix=SEE_VALIDATE
         ) from error

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -16,13 +14,12 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.arrays import wrap_angle
+from robocas_ms3.datasets.sources.files import DAMAGED
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import stored_motion
 
 SPECS = {spec.name: spec for spec in schema.EPISODE_INFO}
-DAMAGED = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError)
-"""What numpy raises for a damaged archive; NotImplementedError: damaged flags or method of a member."""
 PICKLED = "pickled objects, which are never loaded"
 _IDENTITY = ("ee_pos", "ee_orn", "robot_joints", "gripper_status", "language_goal", "step_lang_goals")
 
