@@ -55,6 +55,10 @@ class DatasetError(RobocasError):
     """A trajectory file or dataset can't be read or written."""
 
 
+class PlanError(RobocasError):
+    """A plan of datasets is wrong, or what it makes can't be made."""
+
+
 class MissingExtraError(RobocasError):
     """An optional dependency is needed; the message names the extra that brings it."""
 

@@ -34,3 +34,8 @@ def builtin_packs_dir() -> Path:
 def protocols_dir() -> Path:
     """The evaluation protocols that travel with the package."""
     return PACKAGE_DIR / "data" / "protocols"
+
+
+def plans_dir() -> Path:
+    """The plans that travel with the package."""
+    return PACKAGE_DIR / "data" / "plans"

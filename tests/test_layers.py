@@ -38,6 +38,7 @@ LAYERS = (
     ("planning",),
     ("demos",),
     ("datasets",),
+    ("plans",),
     ("evaluation",),
     ("viewer",),
     ("doctor",),

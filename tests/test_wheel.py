@@ -75,7 +75,7 @@ def test_configs_and_builtin_pack_travel_in_the_wheel(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     for path in (ROOT / "task_configs").glob("*.yaml"):
         assert f"robocas_ms3/data/task_configs/{path.name}" in names
-    for folder in ("asset_tools/partnet/annotations", "robocas_ms3/language"):
+    for folder in ("asset_tools/partnet/annotations", "robocas_ms3/language", "robocas_ms3/data/plans"):
         data = sorted((ROOT / folder).glob("*.yaml"))
         assert data
         assert {f"{folder}/{path.name}" for path in data} <= names
@@ -87,6 +87,7 @@ def test_configs_and_builtin_pack_travel_in_the_wheel(wheel):
     for asset in json.loads(manifest.read_text())["assets"]:
         for file in asset["files"]:
             assert f"robocas_ms3/data/packs/builtin/{asset['id']}/{file}" in names
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
     left_out = ("tests/", "scripts/", "task_configs/", "asset_tools/builtin")
     assert not [name for name in names if name.startswith(left_out)]
     assert wheel.stat().st_size < 60e6

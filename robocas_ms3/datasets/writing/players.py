@@ -135,6 +135,19 @@ class RecordingPlayer:
         self._shown: FrameSource | None = None
         self._control_mode = ""
 
+    def turn_to(self, trajectory: Path) -> None:
+        """Go on with another file, of the same environment, which stays.
+
+        Raises:
+            DatasetError: the file is unusable, or of another environment or control rate.
+        """
+        file = TrajectoryFile(trajectory, pack=self._request.pack)
+        if (file.env, file.control_freq) != (self.file.env, self.file.control_freq):
+            file.close()
+            raise DatasetError("this file is of another environment", where=trajectory, expected=self.file.path)
+        self.file.close()
+        self.file = file
+
     def entries(self) -> list[dict[str, Any]]:
         """The episodes that are wanted; warns where their actions were tried at another rate.
 

@@ -1,0 +1,168 @@
+"""``robocas plan run | status | list``: datasets of any size, from a plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass
+class Run:
+    """Make the dataset that a plan says: record, render, join. docs/scale.md.
+
+    What is there is kept, and Ctrl-C or a crash loses no episode: the same command with --resume goes on.
+    """
+
+    plan: Annotated[str, tyro.conf.Positional]
+    """Name of a shipped plan (`robocas plan list`), or a YAML file."""
+    out: Path
+    """Folder of everything the plan makes."""
+    on: Literal["local", "slurm", "ray"] = "local"
+    """Where the work is done: on this machine, by jobs of Slurm, by a Ray cluster."""
+    jobs: int | None = None
+    """How many episodes are made at once. Default: one for each CPU core of this machine."""
+    set: tuple[str, ...] = ()
+    """Options of the engine, NAME=VALUE each; docs/scale.md has them."""
+    resume: bool = False
+    """Go on with a plan that was begun."""
+    overwrite: bool = False
+    """Replace the output folder if it exists."""
+
+
+@dataclass
+class Status:
+    """Say how far a plan is, from any machine that sees its folder."""
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """The folder."""
+    json: bool = False
+    """As JSON."""
+
+
+@dataclass
+class List:
+    """List the shipped plans."""
+
+
+@dataclass
+class Plan:
+    """Make datasets of any size from a plan; docs/scale.md."""
+
+    command: (
+        Annotated[Run, tyro.conf.subcommand("run")]
+        | Annotated[Status, tyro.conf.subcommand("status")]
+        | Annotated[List, tyro.conf.subcommand("list")]
+    )
+    """What to do."""
+
+
+def main(cfg: Plan) -> int:
+    """Run the command."""
+    if isinstance(cfg.command, Run):
+        return run(cfg.command)
+    if isinstance(cfg.command, Status):
+        return show_status(cfg.command)
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.plans.plan import load_plan, shipped_plans
+
+    for name in shipped_plans():
+        plan = load_plan(name)
+        say(f"{name}: {sum(part.episodes for part in plan.parts)} episodes. {plan.description}")
+    return 0
+
+
+def run(command: Run) -> int:
+    """Run ``run``."""
+    import os
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from robocas_ms3.cli.bars import Log, columns, say
+    from robocas_ms3.demos.checks import check_number
+    from robocas_ms3.plans.engines import open_engine
+    from robocas_ms3.plans.plan import load_plan
+    from robocas_ms3.plans.run import run_plan
+
+    jobs = command.jobs if command.jobs is not None else os.cpu_count() or 1
+    check_number("jobs", jobs, 1)
+    options = dict(_option(word) for word in command.set)
+    plan = load_plan(command.plan)
+    if command.on == "local" and plan.makes_datasets:
+        from robocas_ms3.datasets.writing.render import require_renderer
+
+        require_renderer()
+    console = Console(stderr=True)
+    log = Log()
+    with Progress(*columns(), console=console, disable=not console.is_interactive) as progress:
+        bars = [progress.add_task(f"{part.name}", total=part.episodes) for part in plan.parts]
+
+        def on_progress(counts) -> None:
+            for bar, count in zip(bars, counts, strict=True):
+                progress.update(bar, completed=count)
+            if not console.is_interactive:
+                named = zip(plan.parts, counts, strict=True)
+                log.tell("; ".join(f"{part.name}: {count} of {part.episodes}" for part, count in named))
+
+        def on_stage(text: str) -> None:
+            progress.console.print(f"joining {text}", highlight=False)
+
+        report = run_plan(
+            plan,
+            command.out,
+            lambda plan, out: open_engine(command.on, plan, out, jobs, options),
+            resume=command.resume,
+            overwrite=command.overwrite,
+            jobs=jobs,
+            on_progress=on_progress,
+            on_stage=on_stage,
+        )
+    say(f"{command.out}: {report['episodes']} episodes; report.json")
+    return 0
+
+
+def _option(word: str) -> tuple[str, str]:
+    from robocas_ms3.errors import PlanError
+
+    name, sign, value = word.partition("=")
+    if not (name and sign):
+        raise PlanError("no option of an engine", where="--set", expected="NAME=VALUE", found=word)
+    return name, value
+
+
+def show_status(command: Status) -> int:
+    """Run ``status``."""
+    import json
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.plans.status import status
+
+    found = status(command.out)
+    if command.json:
+        say(json.dumps(found.as_json(), indent=2))
+        return 0
+    table = Table("part", "episodes", "seeds", "failed", "record, CPU s", "render, CPU s", "MB")
+    for part in found.parts:
+        failed = ", ".join(f"{reason} x{count}" for reason, count in part.failed.items()) or "-"
+        table.add_row(
+            part.name,
+            f"{part.done} of {part.wanted}",
+            str(part.tried),
+            failed,
+            f"{part.record_seconds:.1f}",
+            f"{part.render_seconds:.1f}",
+            f"{part.bytes / 1e6:.0f}",
+        )
+    Console().print(table)
+    if found.finished:
+        say("finished")
+    elif found.seconds_left is not None:
+        left, idle = found.seconds_left / 60, found.idle_seconds or 0.0
+        say(f"{found.episodes_an_hour:.0f} episodes an hour, {left:.0f} min left; the last {idle:.0f} s ago")
+    return 0

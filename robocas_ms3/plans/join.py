@@ -1,0 +1,109 @@
+"""Joins what the units made: demonstrations part by part, and datasets of all of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.sources.provenance import recording_entry
+from robocas_ms3.datasets.writing.info import write_info
+from robocas_ms3.datasets.writing.plan import dataset_settings, header
+from robocas_ms3.files import make_folder, write_json
+from robocas_ms3.outputs import sweep
+from robocas_ms3.plans.plan import Plan
+from robocas_ms3.plans.units import EPISODES, REPORT, UNITS, Outcome, Task, Unit
+from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.recordings.writing import merge
+
+DEMOS, DATASETS, STATISTICS = "demos", "datasets", "statistics"
+Chosen = Mapping[int, Sequence[tuple[Unit, Outcome]]]
+"""Part -> its episodes, in the order of their seeds."""
+
+
+def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Join everything; killed at any moment, it goes on and ends the same.
+
+    Args:
+        plan: it.
+        out: its folder.
+        chosen: the episodes.
+        jobs: processes.
+        say: called with what is joined.
+
+    Returns:
+        The report.
+    """
+    if not (out / REPORT).is_file():
+        tasks = {
+            number: [Task(number, outcome.seed, unit.folder(plan, out)) for unit, outcome in episodes]
+            for number, episodes in chosen.items()
+        }
+        robocas = out / DATASETS / "robocas"
+        if plan.makes_datasets and not (robocas / schema.DATA_INFO_FILE).is_file():
+            say("the dataset")
+            _join_episodes(plan, robocas, tasks)
+        for number, recorded in tasks.items():
+            path = make_folder(out / DEMOS / f"{plan.parts[number].name}") / "trajectory.h5"
+            sweep(path.parent)
+            if not path.is_file():
+                say(f"demonstrations, {plan.parts[number].name}")
+                merge([task.recording for task in recorded], path)
+        if plan.makes_datasets and "lerobot" in plan.formats:
+            say("the LeRobot dataset")
+            _convert_lerobot(robocas, out / DATASETS / "lerobot", jobs)
+        if "statistics" in plan.stages:
+            say("statistics")
+            _write_statistics(robocas, out / STATISTICS)
+        write_json(out / REPORT, _report(plan, chosen))
+    for path in [*(out / UNITS).glob("*/*/seed_*"), *(out / UNITS).glob(f"*/*/{EPISODES}")]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()  # they are joined, or more than were asked for
+    return json.loads((out / REPORT).read_text(encoding="utf-8"))
+
+
+def _join_episodes(plan: Plan, out: Path, tasks: Mapping[int, Sequence[Task]]) -> None:
+    """Move the rendered episodes into one dataset, numbered part by part."""
+    make_folder(out)
+    entries: dict[str, Any] = {}
+    for part, recorded in tasks.items():
+        for number, task in enumerate(recorded, start=plan.first_episode(part)):
+            folder = out / schema.episode_folder(number)
+            if not folder.is_dir():
+                os.replace(task.episode, folder)
+            with TrajectoryFile(task.recording) as file:
+                entries[str(number)] = recording_entry(file, 0)
+    settings = dataset_settings(plan.rate, plan.pictures.chosen(), plan.embeddings)
+    write_json(out / schema.CONVERSION_FILE, {**header(settings), "episodes": entries})
+    write_info(out)
+
+
+def _convert_lerobot(robocas: Path, out: Path, jobs: int) -> None:
+    from robocas_ms3.datasets.lerobot.convert import convert_lerobot
+
+    convert_lerobot(robocas, out, resume=True, jobs=jobs)
+
+
+def _write_statistics(robocas: Path, out: Path) -> None:
+    from robocas_ms3.datasets.statistics.collect import collect
+    from robocas_ms3.datasets.statistics.plots import write_stats
+
+    write_stats(collect(robocas), out)
+
+
+def _report(plan: Plan, chosen: Chosen) -> dict[str, Any]:
+    """What was made, without anything that a clock or another machine would say otherwise."""
+    parts = {}
+    for number, episodes in chosen.items():
+        found = [outcome for _, outcome in episodes]
+        parts[f"{plan.parts[number].name}"] = {
+            "episodes": len(found),
+            "seeds": [outcome.seed for outcome in found],
+            "steps": sum(outcome.steps for outcome in found),
+            "failed_attempts": dict(Counter(failure for outcome in found for failure in outcome.failures)),
+        }
+    return {"episodes": sum(part["episodes"] for part in parts.values()), "parts": parts}

@@ -1,0 +1,156 @@
+"""A plan: what a dataset is made of, read from YAML."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from robocas_ms3.benchmark import TASKS
+from robocas_ms3.config import load_config_of, shipped_configs
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.documents import DocumentError, load_yaml
+from robocas_ms3.errors import PlanError, RobocasError
+from robocas_ms3.paths import plans_dir
+from robocas_ms3.strict import StrictModel, nearest, parse
+
+
+class PartConfig(StrictModel):
+    """Episodes of one configuration."""
+
+    task: str
+    config: str | dict[str, Any] | None = Field(
+        default=None, description="a shipped configuration, a YAML file beside the plan, or the whole of one"
+    )
+    pack: str = "builtin"
+    episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(description="successful ones")
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = Field(default=0, description="the first; others follow")
+    name: Annotated[str, Field(pattern=r"^[\w-]+$")] | None = Field(default=None, description="of its folders")
+
+
+class PicturesConfig(StrictModel):
+    """What is rendered."""
+
+    size: tuple[Annotated[int, Field(ge=16)], Annotated[int, Field(ge=16)]] = (640, 480)
+    depth: bool = True
+    image_format: Literal["png", "jpg", "webp"] = "png"
+    cameras: list[str] | None = None
+
+    def chosen(self) -> Pictures:
+        """For writers of datasets."""
+        cameras = {} if self.cameras is None else {"cameras": tuple(self.cameras)}
+        return Pictures(size=self.size, depth=self.depth, image_format=self.image_format, **cameras)
+
+
+class LimitsConfig(StrictModel):
+    """What an episode may take; beyond it, its process is ended, and it is tried once more."""
+
+    record_seconds: Annotated[float, Field(gt=0)] = 1800.0
+    render_seconds: Annotated[float, Field(gt=0)] = 3600.0
+    memory_gb: Annotated[float, Field(gt=0)] = Field(default=8.0, description="of each process")
+
+
+Stage = Literal["demonstrations", "datasets", "statistics"]
+
+
+class Plan(StrictModel):
+    """One plan: a file of ``plans/``."""
+
+    description: str = ""
+    parts: Annotated[list[PartConfig], Field(min_length=1)]
+    stages: Annotated[list[Stage], Field(min_length=1)] = ["demonstrations", "datasets", "statistics"]
+    formats: list[Literal["robocas", "lerobot"]] = ["robocas"]
+    pictures: PicturesConfig = PicturesConfig()
+    rate: Annotated[float, Field(gt=0)] = Field(default=5.0, description="steps of a dataset a second")
+    control_freq: int = 20
+    embeddings: bool = True
+    block: Annotated[int, Field(ge=1, le=1000)] = Field(default=10, description="seeds of a unit of work")
+    limits: LimitsConfig = LimitsConfig()
+
+    @field_validator("formats")
+    @classmethod
+    def _robocas_first(cls, formats: list[str]) -> list[str]:
+        if formats[:1] != ["robocas"]:
+            raise ValueError("robocas comes first: other formats are made of it")
+        return formats
+
+    @model_validator(mode="after")
+    def _named_apart(self) -> Plan:
+        names = [part.name for part in self.parts if part.name]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"parts of one name: {', '.join(twice)}")
+        missing = {"datasets": "demonstrations", "statistics": "datasets"}
+        for stage in self.stages:
+            if stage in missing and missing[stage] not in self.stages:
+                raise ValueError(f"stages: {stage} needs {missing[stage]}")
+        return self
+
+    @property
+    def makes_datasets(self) -> bool:
+        """Whether episodes are rendered."""
+        return "datasets" in self.stages
+
+    def first_episode(self, part: int) -> int:
+        """Number of a part's first episode in the dataset."""
+        return sum(one.episodes for one in self.parts[:part])
+
+
+def shipped_plans() -> dict[str, Path]:
+    """Name -> file of the plans that travel with the package."""
+    return {path.stem: path for path in sorted(plans_dir().glob("*.yaml"))}
+
+
+def load_plan(plan: str | Path) -> Plan:
+    """Read a plan; its parts get their configurations and names.
+
+    Args:
+        plan: name of a shipped one, or a YAML file.
+
+    Raises:
+        PlanError: there is none, or a key or value is wrong.
+        ConfigError: so is a configuration.
+    """
+    path = _find(plan)
+    try:
+        data = load_yaml(path)
+    except (OSError, DocumentError) as error:
+        raise PlanError("this plan can't be read", where=path, found=error) from error
+    loaded = parse(Plan, data, PlanError, where=path, about="no plan")
+    try:
+        loaded.pictures.chosen()
+    except RobocasError as error:
+        raise PlanError("no plan: pictures", where=path, found=error) from error
+    parts = []
+    for number, part in enumerate(loaded.parts):
+        if part.task not in TASKS:
+            known, found = ", ".join(TASKS), repr(part.task)
+            raise PlanError("no plan: no such task", where=f"{path}, parts.{number}", expected=known, found=found)
+        spec = TASKS[part.task]
+        name, config = part.config or spec.default_config, part.config or spec.default_config
+        if isinstance(config, str) and config not in shipped_configs():
+            config = path.parent / config
+        loaded_config = load_config_of(spec, config)
+        shipped = isinstance(name, str) and name in shipped_configs()
+        stem = Path(name).stem if isinstance(name, str) else part.task
+        parts.append(
+            part.model_copy(
+                update={
+                    "config": name if shipped else loaded_config.model_dump(mode="json"),
+                    "name": part.name or f"{number:02d}-{stem}",
+                }
+            )
+        )
+    return loaded.model_copy(update={"parts": parts})
+
+
+def _find(plan: str | Path) -> Path:
+    shipped, path = shipped_plans(), Path(plan)
+    if str(plan) in shipped:
+        return shipped[str(plan)]
+    if path.suffix in {".yaml", ".yml"} and path.is_file():
+        return path
+    likely = nearest(str(plan), shipped)
+    expected = f"a YAML file, or one of {', '.join(shipped)}"
+    raise PlanError("no such plan", where=plan, expected=expected, fix=likely)

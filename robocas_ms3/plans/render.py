@@ -1,0 +1,68 @@
+"""Renders a recorded episode, in another process of a slot."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets.writing.frames import OpenSource
+from robocas_ms3.datasets.writing.players import RecordingPlayer, Request, open_env
+from robocas_ms3.datasets.writing.writer import write_episode
+from robocas_ms3.plans.plan import Plan
+from robocas_ms3.plans.units import Task
+from robocas_ms3.processes import use_one_torch_thread
+
+
+class Renders:
+    """Renders recorded episodes; keeps the environment from one to the next of the same part."""
+
+    def __init__(self, plan: Plan, open_source: OpenSource = open_env) -> None:
+        os.environ.setdefault("LP_NUM_THREADS", "1")  # as many processes render as there are cores
+        use_one_torch_thread()
+        self._plan, self._open_source = plan, open_source
+        self._part: int | None = None
+        self._player: RecordingPlayer | None = None
+        self._embedder: Any = None
+
+    def do(self, task: Task) -> dict[str, Any]:
+        """Render a seed's episode, and say what it takes."""
+        begun = time.process_time()
+        size = 0
+        if not task.episode.is_dir():
+            player = self._showing(task)
+            embed = self._embed if self._plan.embeddings else None
+            size = write_episode(task.episode.parent, 0, player, 0, embed=embed).size
+        return {"render_seconds": round(time.process_time() - begun, 2), "size": size or _size(task.episode)}
+
+    def _showing(self, task: Task) -> RecordingPlayer:
+        if self._player is None or self._part != task.part:
+            self.close()
+            request = Request(
+                task.recording, self._plan.rate, self._plan.pictures.chosen(), open_source=self._open_source
+            )
+            self._part, self._player = task.part, RecordingPlayer(request)
+        else:
+            self._player.turn_to(task.recording)
+        return self._player
+
+    def _embed(self, texts: list[str]) -> NDArray[np.float32]:
+        from robocas_ms3.language.embed import TextEmbedder
+
+        self._embedder = self._embedder or TextEmbedder()
+        # one at a time: in a batch the last bits depend on the others, and which are known already on who did what
+        return np.concatenate([self._embedder([text]) for text in texts])
+
+    def close(self) -> None:
+        """Close the environment."""
+        if self._player is not None:
+            self._player.close()
+            self._player = None
+
+
+def _size(folder: Path) -> int:
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

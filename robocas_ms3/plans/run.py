@@ -1,0 +1,156 @@
+"""Runs a plan: has units done until every part has its episodes, then joins them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.errors import PlanError
+from robocas_ms3.files import make_folder, write_json
+from robocas_ms3.outputs import check_overwrite, check_same, claim_output, locked_folder, sweep
+from robocas_ms3.plans.engines import Engine
+from robocas_ms3.plans.join import join
+from robocas_ms3.plans.plan import Plan
+from robocas_ms3.plans.units import PLAN, Outcome, Unit, is_done, outcomes
+from robocas_ms3.recordings.versions import versions
+
+_AHEAD = 2  # units a slot that are under way, so that none waits for the next
+_LOOK = 2.0  # s between two looks at what is under way
+OpenEngine = Callable[[Plan, Path], Engine]
+OnProgress = Callable[[Sequence[int]], None]
+"""Takes the episodes there are of each part, not more than were asked for."""
+
+
+def run_plan(
+    plan: Plan,
+    out: Path,
+    open_engine: OpenEngine,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    jobs: int = 1,
+    on_start: Callable[[], None] = lambda: None,
+    on_progress: OnProgress = lambda counts: None,
+    on_stage: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
+    """Make what a plan says; which episodes come of it depends on the plan alone.
+
+    Args:
+        plan: it.
+        out: gets ``plan.json``, ``units/``, and in the end ``demos/``, ``datasets/``, ``statistics/``, ``report.json``.
+        open_engine: where units are done.
+        resume: go on with what is in ``out``.
+        overwrite: replace what is in ``out``.
+        jobs: processes that join.
+        on_start: called once plan and output turned out right.
+        on_progress: called now and then.
+        on_stage: called with what is joined.
+
+    Returns:
+        The report: what is in ``report.json``.
+
+    Raises:
+        PlanError: ``out`` was begun with another plan or other versions, or far too many seeds of a part fail.
+        OutputExistsError: ``out`` is not empty and neither flag is set.
+        RobocasError: another run writes there; something is wrong with all episodes.
+    """
+    about = {"plan": plan.model_dump(mode="json"), "versions": versions()}
+    if overwrite:
+        check_overwrite(out, (PLAN,), "made by `robocas plan run`", PlanError)
+    with locked_folder(out):
+        claim_output(out, overwrite=overwrite, resume=resume)
+        if (out / PLAN).is_file():
+            before = json.loads((out / PLAN).read_text(encoding="utf-8"))
+            fix = "Use the same, another --out, or --overwrite."
+            check_same(before, about, "begun with another plan", where=out / PLAN, fix=fix, error=PlanError)
+        sweep(make_folder(out))
+        write_json(out / PLAN, about)
+        on_start()
+        parts = [_Part(plan, number) for number in range(len(plan.parts))]
+        engine = open_engine(plan, out)
+        try:
+            _do_units(plan, out, engine, parts, on_progress)
+        finally:
+            engine.close()
+        return join(plan, out, {part.number: list(part.chosen()) for part in parts}, jobs=jobs, say=on_stage)
+
+
+@dataclass
+class _Part:
+    """How far a part is."""
+
+    plan: Plan
+    number: int
+    done: dict[int, list[Outcome]] = field(default_factory=dict)
+    next_block: int = 0
+
+    @property
+    def good(self) -> int:
+        """Episodes of units that are done."""
+        return sum(outcome.success for block in self.done.values() for outcome in block)
+
+    @property
+    def tried(self) -> int:
+        return sum(map(len, self.done.values()))
+
+    def wants_more(self) -> bool:
+        """Whether there may be too few even if all that is under way succeeds."""
+        under_way = (self.next_block - len(self.done)) * self.plan.block
+        return self.good + under_way < self.plan.parts[self.number].episodes
+
+    def next(self) -> Unit:
+        unit = Unit(self.number, self.next_block)
+        self.next_block += 1
+        return unit
+
+    def take(self, unit: Unit, found: list[Outcome], out: Path) -> None:
+        """Note what came of a unit.
+
+        Raises:
+            PlanError: hardly anything succeeds.
+        """
+        self.done[unit.block] = found
+        failed = self.tried - self.good
+        if failed > max(20, 3 * self.good):
+            where, fix = unit.folder(self.plan, out).parent, "See seeds.jsonl there; a smaller objects.count may help."
+            raise PlanError("far too many seeds fail", where=where, found=f"{failed} of {self.tried}", fix=fix)
+
+    def chosen(self) -> Iterator[tuple[Unit, Outcome]]:
+        """The first episodes in the order of their seeds, as many as were asked for."""
+        left = self.plan.parts[self.number].episodes
+        for block in sorted(self.done):
+            for outcome in self.done[block]:
+                if outcome.success and left:
+                    left -= 1
+                    yield Unit(self.number, block), outcome
+
+
+def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_progress: OnProgress) -> None:
+    under_way: dict[Future[list[Outcome]], Unit] = {}
+    while True:
+        for part in parts:
+            while part.wants_more() and len(under_way) < _AHEAD * engine.slots:
+                unit = part.next()
+                folder = unit.folder(plan, out)
+                if is_done(folder):
+                    found = outcomes(folder)
+                    part.take(unit, [found[seed] for seed in unit.seeds(plan)], out)
+                else:
+                    under_way[engine.submit(unit)] = unit
+        on_progress(_counts(plan, out, parts, under_way))
+        if not under_way:
+            return
+        for future in wait(under_way, _LOOK, FIRST_COMPLETED).done:
+            unit = under_way.pop(future)
+            parts[unit.part].take(unit, future.result(), out)
+
+
+def _counts(plan: Plan, out: Path, parts: Sequence[_Part], under_way: Mapping[Any, Unit]) -> list[int]:
+    counts = [part.good for part in parts]
+    for unit in under_way.values():
+        counts[unit.part] += sum(outcome.success for outcome in outcomes(unit.folder(plan, out)).values())
+    return [min(count, one.episodes) for count, one in zip(counts, plan.parts, strict=True)]

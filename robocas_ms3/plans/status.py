@@ -1,0 +1,123 @@
+"""How far a plan is, read from its folder alone: by any machine that sees it, while others work there."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.documents import DocumentError, load_json
+from robocas_ms3.errors import PlanError
+from robocas_ms3.plans.plan import Plan
+from robocas_ms3.plans.units import PLAN, REPORT, Outcome, begun, outcomes
+from robocas_ms3.strict import parse
+
+RECENT = 600.0  # s that a rate is taken over
+
+
+@dataclass(frozen=True)
+class PartStatus:
+    """A part of the plan.
+
+    Attributes:
+        name: of its folders.
+        wanted: episodes asked for.
+        done: episodes there are, those beyond what was asked for left out.
+        tried: seeds.
+        failed: ``stage: reason`` -> how many seeds failed for it in the end.
+        record_seconds, render_seconds: CPU time an episode, s.
+        bytes: of pictures and arrays.
+    """
+
+    name: str
+    wanted: int
+    done: int
+    tried: int
+    failed: dict[str, int]
+    record_seconds: float
+    render_seconds: float
+    bytes: int
+
+
+@dataclass(frozen=True)
+class Status:
+    """The plan.
+
+    Attributes:
+        parts: of it.
+        episodes_an_hour: of the last ten minutes before the last episode.
+        seconds_left: until all episodes are there, at that rate; None: not known.
+        idle_seconds: since the last episode; None: there is none.
+        finished: whether everything is joined.
+    """
+
+    parts: list[PartStatus]
+    episodes_an_hour: float
+    seconds_left: float | None
+    idle_seconds: float | None
+    finished: bool
+
+    def as_json(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return asdict(self)
+
+
+def read_plan(out: Path) -> Plan:
+    """The plan that a folder was begun with.
+
+    Raises:
+        PlanError: there is none, or it is damaged.
+    """
+    path = out / PLAN
+    try:
+        about = load_json(path)
+    except (OSError, DocumentError) as error:
+        raise PlanError("no plan was begun here", where=path, found=type(error).__name__) from error
+    return parse(Plan, about.get("plan") if isinstance(about, dict) else None, PlanError, where=path, about="no plan")
+
+
+def status(out: Path) -> Status:
+    """Read how far a plan is.
+
+    Raises:
+        PlanError: no plan was begun there.
+    """
+    plan = read_plan(out)
+    parts, times = [], []
+    for number, part in enumerate(plan.parts):
+        found = [outcome for unit in begun(plan, out, number) for outcome in outcomes(unit.folder(plan, out)).values()]
+        good = [outcome for outcome in found if outcome.success]
+        times += [outcome.at for outcome in good]
+        parts.append(_part(f"{part.name}", part.episodes, found, good))
+    rate = _rate(sorted(times))
+    left = sum(part.wanted - part.done for part in parts)
+    return Status(
+        parts,
+        round(3600 * rate, 1),
+        round(left / rate, 1) if rate else None,
+        round(max(0.0, time.time() - max(times)), 1) if times else None,
+        (out / REPORT).is_file(),
+    )
+
+
+def _part(name: str, wanted: int, found: list[Outcome], good: list[Outcome]) -> PartStatus:
+    failed = Counter(outcome.failures[-1] for outcome in found if not outcome.success and outcome.failures)
+    each = max(1, len(good))
+    return PartStatus(
+        name,
+        wanted,
+        min(wanted, len(good)),
+        len(found),
+        dict(failed),
+        round(sum(outcome.record_seconds for outcome in found) / each, 2),
+        round(sum(outcome.render_seconds for outcome in found) / each, 2),
+        sum(outcome.size for outcome in good),
+    )
+
+
+def _rate(times: list[float]) -> float:
+    """Episodes a second, by when they were done; 0 where that is not known."""
+    recent = [at for at in times if at > times[-1] - RECENT]
+    return (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 and recent[-1] > recent[0] else 0.0

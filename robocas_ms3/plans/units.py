@@ -1,0 +1,119 @@
+"""Units of work: blocks of a part's seeds, and what the folder says of them.
+
+``OUT/units/PART/BLOCK`` belongs to one unit, which nobody else writes into: its ledger has a line a seed, and its
+other files are episodes that wait to be joined. A unit that is done says so in ``done.json``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from robocas_ms3.datasets.schema import episode_folder
+from robocas_ms3.ledger import Ledger
+from robocas_ms3.plans.plan import Plan
+
+PLAN, REPORT = "plan.json", "report.json"
+UNITS, LEDGER, DEATHS, DONE = "units", "seeds.jsonl", "deaths.jsonl", "done.json"
+EPISODES = "episodes"
+"""Folder of a unit with its rendered episodes."""
+
+
+@dataclass(frozen=True, order=True)
+class Unit:
+    """A block of a part's seeds."""
+
+    part: int
+    block: int
+
+    def seeds(self, plan: Plan) -> range:
+        """The seeds."""
+        first = plan.parts[self.part].seed + self.block * plan.block
+        return range(first, first + plan.block)
+
+    def folder(self, plan: Plan, out: Path) -> Path:
+        """Where its files lie."""
+        return out / UNITS / f"{plan.parts[self.part].name}" / f"{self.block:05d}"
+
+
+@dataclass(frozen=True)
+class Task:
+    """A seed of a part, and the folder of its unit."""
+
+    part: int
+    seed: int
+    folder: Path
+
+    @property
+    def recording(self) -> Path:
+        """Its recorded episode."""
+        return self.folder / f"seed_{self.seed:010d}.h5"
+
+    @property
+    def episode(self) -> Path:
+        """Its rendered episode."""
+        return self.folder / EPISODES / f"{self.seed:010d}" / episode_folder(0)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a seed.
+
+    Attributes:
+        seed: it.
+        success: whether there is an episode.
+        steps: its length in control steps.
+        failures: ``stage: reason`` of each attempt that failed.
+        record_seconds, render_seconds: CPU time, of the processes that did it.
+        size: bytes in the dataset.
+        at: when it was done, s since 1970, of the machine that did it.
+    """
+
+    seed: int
+    success: bool
+    steps: int = 0
+    failures: list[str] = field(default_factory=list)
+    record_seconds: float = 0.0
+    render_seconds: float = 0.0
+    size: int = 0
+    at: float = 0.0
+
+
+@dataclass(frozen=True)
+class Death:
+    """A process that ended at a seed, and why."""
+
+    seed: int
+    stage: str
+    why: str
+
+
+def ledger(folder: Path) -> Ledger[Outcome]:
+    """The unit's."""
+    return Ledger(folder / LEDGER, Outcome)
+
+
+def deaths(folder: Path) -> Ledger[Death]:
+    """The unit's."""
+    return Ledger(folder / DEATHS, Death)
+
+
+def outcomes(folder: Path) -> dict[int, Outcome]:
+    """Seed -> what came of it, as far as the unit got; of a line written twice the first counts."""
+    found: dict[int, Outcome] = {}
+    for outcome in ledger(folder).read():
+        found.setdefault(outcome.seed, outcome)
+    return found
+
+
+def is_done(folder: Path) -> bool:
+    """Whether all its seeds are."""
+    return (folder / DONE).is_file()
+
+
+def begun(plan: Plan, out: Path, part: int) -> Iterator[Unit]:
+    """Units of a part that have a folder, in order."""
+    folder = out / UNITS / f"{plan.parts[part].name}"
+    for path in sorted(folder.glob("[0-9]*")):
+        yield Unit(part, int(path.name))

@@ -1,0 +1,107 @@
+"""Plans as files: what is wrong with one is a line; the shipped ones are whole."""
+
+import pytest
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.errors import ConfigError, PlanError
+from robocas_ms3.plans.plan import load_plan, shipped_plans
+from robocas_ms3.plans.status import status
+from robocas_ms3.plans.units import PLAN, Outcome, Unit, ledger
+
+GOOD = "parts:\n  - {task: pick, episodes: 3}\n"
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(text):
+        path = tmp_path / "plan.yaml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+@pytest.mark.parametrize("name", shipped_plans())
+def test_shipped_plans_are_whole(name):
+    plan = load_plan(name)
+    assert plan.description
+    assert len({part.name for part in plan.parts}) == len(plan.parts)
+
+
+def test_the_paper_s_numbers():
+    parts = load_plan("paper").parts
+    of = {task: sum(part.episodes for part in parts if part.task == task) for task in ("pick", "select", "search")}
+    assert of == {"pick": 2800, "select": 3000, "search": 1500}  # robocas_v0.md, data: 7300 episodes
+
+
+def test_what_is_not_said_has_a_default(written):
+    plan = load_plan(written(GOOD))
+    assert plan.parts[0].config == "pick_table_scattered"
+    assert plan.parts[0].name == "00-pick_table_scattered"
+    assert plan.pictures.chosen().size == (640, 480)
+
+
+def test_a_configuration_beside_the_plan_is_taken_whole(written, tmp_path):
+    from robocas_ms3.config import load_task_config
+
+    config = load_task_config("pick_shelf_scattered").model_dump_json()
+    (tmp_path / "mine.yaml").write_text(config)  # JSON is YAML
+    plan = load_plan(written("parts:\n  - {task: pick, config: mine.yaml, episodes: 3}\n"))
+    assert isinstance(plan.parts[0].config, dict)
+    assert plan.parts[0].name == "00-mine"
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("parts: []\n", "at least 1 item"),
+        ("parts:\n  - {task: pick, episodes: 0}\n", "parts.0.episodes"),
+        ("parts:\n  - {task: fly, episodes: 1}\n", "no such task .expected pick, select, search, open_pick"),
+        (GOOD + "block: 10\nblok: 3\n", "unknown key 'blok'.*Did you mean block"),
+        (GOOD + "formats: [lerobot]\n", "robocas comes first"),
+        (GOOD + "stages: [datasets]\n", "datasets needs demonstrations"),
+        (GOOD + "pictures: {cameras: [nose]}\n", "no such camera"),
+        ("parts:\n  - {task: pick, episodes: 1, name: ../up}\n", "parts.0.name"),
+        ("parts:\n  - {task: pick, episodes: 1, name: a}\n  - {task: pick, episodes: 1, name: a}\n", "one name: a"),
+        ("[", "can't be read"),
+    ],
+)
+def test_what_is_wrong_with_a_plan_is_a_line(written, text, match):
+    with pytest.raises(PlanError, match=match) as error:
+        load_plan(written(text))
+    assert "\n" not in str(error.value)
+
+
+def test_a_configuration_of_another_task_is_refused(written):
+    with pytest.raises(ConfigError, match="can't run the configuration select_table_orderly"):
+        load_plan(written("parts:\n  - {task: pick, config: select_table_orderly, episodes: 1}\n"))
+
+
+def test_a_misspelt_plan_names_the_nearest(capsys):
+    assert run(["plan", "run", "tinny", "--out", "x"]) == 1
+    assert "tinny: no such plan (expected a YAML file, or one of paper, tiny). Did you mean tiny?" in (
+        capsys.readouterr().err
+    )
+
+
+def test_status_is_read_from_the_folder_alone(written, tmp_path, capsys):
+    out = tmp_path / "out"
+    plan = load_plan(written("block: 4\nparts:\n  - {task: pick, episodes: 6, name: a}\n"))
+    assert run(["plan", "status", str(out)]) == 1
+    assert "no plan was begun here" in capsys.readouterr().err
+    folders = [Unit(0, block).folder(plan, out) for block in (0, 1)]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    (out / PLAN).write_text('{"plan": ' + plan.model_dump_json() + "}")
+    assert status(out).seconds_left is None
+    good = [Outcome(seed, True, 100, [], 1.0, 3.0, 10**6, at=1000.0 + 2 * seed) for seed in (0, 1, 3)]
+    ledger(folders[0]).append([*good[:2], Outcome(2, False, failures=["a: b", "record: SIGSEGV"], record_seconds=2.0)])
+    ledger(folders[1]).append([Outcome(5, True, 100, [], 1.0, 3.0, 10**6, at=1010.0)])
+    found = status(out)
+    (part,) = found.parts
+    assert (part.done, part.wanted, part.tried, part.failed) == (3, 6, 4, {"record: SIGSEGV": 1})
+    assert (part.record_seconds, part.render_seconds, part.bytes) == (round(5 / 3, 2), 3.0, 3 * 10**6)
+    assert found.episodes_an_hour == 720.0  # two in the 10 s after the first
+    assert found.seconds_left == 15.0
+    assert run(["plan", "status", str(out)]) == 0
+    assert "3 of 6" in capsys.readouterr().out

@@ -1,0 +1,170 @@
+"""Plans over made-up episodes: the outcome follows from the plan, whoever does the units and whatever befalls them."""
+
+import filecmp
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from plan_stages import FAULTS, stages
+
+from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.errors import OutputExistsError, PlanError
+from robocas_ms3.plans.engines.local import LocalEngine
+from robocas_ms3.plans.plan import PartConfig, Plan
+from robocas_ms3.plans.run import run_plan
+from robocas_ms3.plans.slot import Slot
+from robocas_ms3.plans.status import status
+from robocas_ms3.plans.units import Unit, deaths
+from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.recordings.versions import versions
+
+PLAN = Plan(
+    parts=[
+        PartConfig(task="pick", config="pick_table_scattered", episodes=5, seed=10, name="a"),
+        PartConfig(task="pick", config="pick_shelf_scattered", episodes=2, seed=3, name="b"),
+    ],
+    stages=["demonstrations", "datasets"],
+    pictures={"size": [64, 48]},
+    embeddings=False,
+    block=3,
+    limits={"record_seconds": 20, "render_seconds": 20, "memory_gb": 4},
+)
+
+
+def run(out, plan=PLAN, jobs=2, **more):
+    return run_plan(plan, out, lambda plan, out: LocalEngine(plan, out, jobs, stages=stages()), jobs=1, **more)
+
+
+def plan_faults(out, faults):
+    out.with_name(f"{out.name}-{FAULTS}").write_text(json.dumps(faults))
+
+
+def products(out):
+    """Paths of what a plan makes, without what a clock says."""
+    return sorted(
+        path.relative_to(out)
+        for name in ("demos", "datasets", "report.json")
+        for path in ([out / name] if (out / name).is_file() else (out / name).rglob("*"))
+        if path.is_file()
+    )
+
+
+def assert_same(one, other):
+    assert products(one) == products(other)
+    different = [path for path in products(one) if not filecmp.cmp(one / path, other / path, shallow=False)]
+    assert not different
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    out = tmp_path_factory.mktemp("plan") / "out"
+    run(out, jobs=1)
+    return out
+
+
+def test_a_plan_makes_demonstrations_and_one_dataset_of_all_parts(undisturbed):
+    report = json.loads((undisturbed / "report.json").read_text())
+    assert report["episodes"] == 7
+    assert report["parts"]["a"]["seeds"] == [10, 11, 12, 13, 14]
+    assert report["parts"]["b"]["seeds"] == [3, 4]
+    dataset = Dataset(undisturbed / "datasets" / "robocas")
+    assert dataset.numbers == list(range(7))
+    assert [dataset.entry(number)["seed"] for number in range(7)] == [10, 11, 12, 13, 14, 3, 4]
+    assert validate(dataset.root).violations == []
+    with TrajectoryFile(undisturbed / "demos" / "a" / "trajectory.h5") as file:
+        assert [entry["episode_seed"] for entry in file.episodes] == [10, 11, 12, 13, 14]
+    assert not list((undisturbed / "units").rglob("*.h5"))  # nothing is kept twice
+
+
+def test_more_slots_make_the_same(undisturbed, tmp_path):
+    run(tmp_path / "out", jobs=3)
+    assert_same(undisturbed, tmp_path / "out")
+
+
+def test_a_process_that_dies_once_costs_nothing(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    plan_faults(out, {10: ["crash"], 12: ["grow"], 3: ["hang"]})
+    limits = PLAN.limits.model_copy(update={"record_seconds": 4, "memory_gb": 0.5})
+    run(out, PLAN.model_copy(update={"limits": limits}))
+    assert_same(undisturbed, out)
+    died = [death for unit in (Unit(0, 0), Unit(1, 0)) for death in deaths(unit.folder(PLAN, out)).read()]
+    assert [(death.seed, death.stage, death.why) for death in died] == [
+        (10, "record", "SIGSEGV"),
+        (12, "record", "too much memory"),
+        (3, "record", "too slow"),
+    ]
+
+
+def test_a_seed_that_kills_twice_is_left_out_and_another_takes_its_place(tmp_path):
+    out = tmp_path / "out"
+    plan_faults(out, {11: ["crash", "crash", "crash"], 12: ["fail"]})
+    report = run(out)
+    assert report["parts"]["a"]["seeds"] == [10, 13, 14, 15, 16]
+    found = status(out)
+    assert found.parts[0].failed == {"record: SIGSEGV": 1, "grasp: slipped": 1}
+    assert (found.parts[0].done, found.parts[0].wanted) == (5, 5)
+    assert found.finished
+
+
+def test_an_error_of_all_seeds_ends_the_run_which_goes_on_later(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    plan_faults(out, {13: ["refuse"]})
+    with pytest.raises(ValueError, match="a bug"):
+        run(out)
+    with pytest.raises(OutputExistsError):
+        run(out)
+    run(out, resume=True)
+    assert_same(undisturbed, out)
+    before = (out / "report.json").stat().st_mtime_ns
+    run(out, resume=True)  # nothing is left to do
+    assert (out / "report.json").stat().st_mtime_ns == before
+
+
+def test_hardly_any_success_is_an_error(tmp_path):
+    plan = PLAN.model_copy(update={"block": 8})
+    plan_faults(tmp_path / "out", {seed: ["fail"] for seed in range(200)})
+    with pytest.raises(PlanError, match="far too many seeds fail .found 24 of 24"):
+        run(tmp_path / "out", plan)
+
+
+def test_another_plan_or_run_in_the_folder_is_refused(undisturbed, tmp_path):
+    other = PLAN.model_copy(update={"block": 4})
+    with pytest.raises(PlanError, match="begun with another plan"):
+        run(undisturbed, other, resume=True)
+    (tmp_path / "thesis").write_text("")
+    with pytest.raises(PlanError, match="refusing to overwrite"):
+        run(tmp_path, overwrite=True)
+
+
+def test_a_machine_with_other_versions_does_no_unit(tmp_path):
+    about = {"versions": {**versions(), "sapien": "2.2.2"}}
+    (tmp_path / "plan.json").write_text(json.dumps(about))
+    slot = Slot(PLAN, tmp_path, stages())
+    with pytest.raises(PlanError, match=r"this machine has other versions .expected sapien 2\.2\.2, found sapien 3"):
+        slot.do(Unit(0, 0))
+    assert not (tmp_path / "units").exists()
+
+
+def test_killed_at_any_moment_it_goes_on_and_ends_the_same(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    for wait in (1.5, 3.5, 5.0):
+        process = subprocess.Popen([sys.executable, __file__, str(out)], start_new_session=True)
+        time.sleep(wait)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    run(out, resume=True)
+    assert_same(undisturbed, out)
+    for folder in (out / "units").glob("*/*"):
+        lines = [json.loads(line)["seed"] for line in (folder / "seeds.jsonl").read_text().splitlines()]
+        assert sorted(set(lines)) == sorted(lines)  # nothing is done twice
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
+    run(Path(sys.argv[1]), resume=True)

@@ -1,0 +1,70 @@
+"""Stages of an episode that need no simulator, and fail, crash, hang or grow as a file beside the units says."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+
+from synthetic import RayCaster, write_trajectory
+
+from robocas_ms3.files import replacing_folder
+from robocas_ms3.plans.render import Renders
+from robocas_ms3.plans.slot import Stages
+
+FAULTS = "faults.json"
+"""Seed -> what happens at each of its tries, the first ones first; nothing more where the list ends."""
+
+
+class MadeUp:
+    """Writes a made-up recording."""
+
+    def __init__(self, plan):
+        self.plan = plan
+
+    def do(self, task):
+        fault = _fault(task)
+        if fault == "crash":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        elif fault == "hang":
+            time.sleep(1000)
+        elif fault == "grow":
+            hog = bytearray(600 * 2**20)
+            time.sleep(1000)
+            del hog
+        elif fault == "refuse":
+            raise ValueError("a bug")
+        elif fault == "fail":
+            return {"success": False, "failures": ["grasp: slipped"]}
+        if not task.recording.is_file():
+            with replacing_folder(task.folder / f".made_{task.seed}") as folder:
+                made = write_trajectory(folder / task.recording.name, seeds=(task.seed,))
+                os.replace(made.with_suffix(".json"), task.recording.with_suffix(".json"))
+                os.replace(made, task.recording)
+            os.rmdir(task.folder / f".made_{task.seed}")
+        return {"success": True, "steps": 22}
+
+    def close(self):
+        pass
+
+
+def _fault(task):
+    out = task.folder.parents[2]
+    path = out.with_name(f"{out.name}-{FAULTS}")
+    tries = out.with_name(f"{out.name}-tries-{task.seed}")
+    if not path.is_file():
+        return None
+    planned = json.loads(path.read_text()).get(str(task.seed), [])
+    with tries.open("a") as file:
+        file.write("x")
+    number = tries.stat().st_size - 1
+    return planned[number] if number < len(planned) else None
+
+
+def render(plan):
+    return Renders(plan, RayCaster)
+
+
+def stages():
+    return Stages(MadeUp, render)
