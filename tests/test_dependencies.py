@@ -13,7 +13,11 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).resolve().parents[1]
 DISTRIBUTIONS = metadata.packages_distributions()
 # Import name -> who brings it, where that is not a declaration of ours.
-BROUGHT = {"mplib": "mani_skill pins it", "vla_eval": "only it uses the benchmark that imports it"}
+BROUGHT = {
+    "mplib": "mani_skill pins it",
+    "transformers": "sentence-transformers is made of it",
+    "vla_eval": "only it uses the benchmark that imports it",
+}
 
 
 def declared(*extras: str) -> set[str]:
