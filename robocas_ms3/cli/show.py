@@ -38,8 +38,9 @@ def main(cfg: Show) -> int:
 
     import robocas_ms3.tasks  # noqa: F401  (registers the environments)
     from robocas_ms3.benchmark import TASKS
-    from robocas_ms3.demos.checks import GREATEST_SEED, check_number
+    from robocas_ms3.demos.checks import check_number
     from robocas_ms3.files import make_folder, replacing
+    from robocas_ms3.recordings.seeds import GREATEST_SEED
     from robocas_ms3.tasks.transfer import TransferEnv
 
     check_number("seed", cfg.seed, 0, GREATEST_SEED)

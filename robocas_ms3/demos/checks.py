@@ -15,10 +15,9 @@ from robocas_ms3.config import load_config_of
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.planning.backends import BACKENDS
+from robocas_ms3.recordings.seeds import GREATEST_SEED
 from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.model import SceneModel
-
-GREATEST_SEED = 2**32 - 1  # numpy's older generators, which ManiSkill uses, take no greater one
 
 
 def check_number(name: str, value: float, least: int, greatest: int | None = None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +14,7 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import PlanError, RobocasError
 from robocas_ms3.paths import plans_dir
+from robocas_ms3.recordings.seeds import GREATEST_SEED
 from robocas_ms3.strict import StrictModel, nearest, parse
 
 
@@ -25,7 +27,7 @@ class PartConfig(StrictModel):
     )
     pack: str = "builtin"
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(description="successful ones")
-    seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = Field(default=0, description="the first; others follow")
+    seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)] = Field(default=0, description="the first; others follow")
     name: Annotated[str, Field(pattern=r"^[\w-]+$")] | None = Field(default=None, description="of its folders")
 
 
@@ -142,7 +144,30 @@ def load_plan(plan: str | Path) -> Plan:
                 }
             )
         )
+    _check_seeds(parts, path)
     return loaded.model_copy(update={"parts": parts})
+
+
+def most_seeds(episodes: int) -> int:
+    """So many seeds a part of so many episodes may try before it ends for having too few."""
+    return episodes + max(20, 3 * episodes) + 1000  # and the rest of a block
+
+
+def _check_seeds(parts: Sequence[PartConfig], path: Path) -> None:
+    """See that no seed of a scene is tried by two parts: a dataset has no episode twice."""
+    for number, part in enumerate(parts):
+        if part.seed + most_seeds(part.episodes) > GREATEST_SEED:
+            where, expected = f"{path}, parts.{number}.seed", f"<= {GREATEST_SEED - most_seeds(part.episodes)}"
+            raise PlanError(f"no plan: seeds end at {GREATEST_SEED}", where=where, expected=expected, found=part.seed)
+        for other in parts[:number]:
+            first, last = sorted((part, other), key=lambda one: one.seed)
+            apart = first.seed + most_seeds(first.episodes)
+            if (part.task, part.config, part.pack) == (other.task, other.config, other.pack) and last.seed < apart:
+                where, expected = f"{path}, parts.{number}.seed", f"one of the two from {apart} on"
+                found = f"{part.seed}, and {other.seed} of {other.name}"
+                raise PlanError(
+                    "no plan: two parts may try the same seeds", where=where, expected=expected, found=found
+                )
 
 
 def _find(plan: str | Path) -> Path:

@@ -4,7 +4,7 @@ import pytest
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.errors import ConfigError, PlanError
-from robocas_ms3.plans.plan import load_plan, shipped_plans
+from robocas_ms3.plans.plan import load_plan, most_seeds, shipped_plans
 from robocas_ms3.plans.status import status
 from robocas_ms3.plans.units import PLAN, Outcome, Unit, ledger
 
@@ -41,6 +41,14 @@ def test_what_is_not_said_has_a_default(written):
     assert plan.pictures.chosen().size == (640, 480)
 
 
+def test_parts_of_the_same_scenes_have_seeds_apart(written):
+    seed = most_seeds(5)
+    text = "parts:\n  - {{task: pick, episodes: 5}}\n  - {{task: pick, episodes: 9, seed: {}}}\n"
+    assert len(load_plan(written(text.format(seed))).parts) == 2
+    with pytest.raises(PlanError, match="may try the same seeds"):
+        load_plan(written(text.format(seed - 1)))
+
+
 def test_a_configuration_beside_the_plan_is_taken_whole(written, tmp_path):
     from robocas_ms3.config import load_task_config
 
@@ -63,6 +71,10 @@ def test_a_configuration_beside_the_plan_is_taken_whole(written, tmp_path):
         (GOOD + "pictures: {cameras: [nose]}\n", "no such camera"),
         ("parts:\n  - {task: pick, episodes: 1, name: ../up}\n", "parts.0.name"),
         ("parts:\n  - {task: pick, episodes: 1, name: a}\n  - {task: pick, episodes: 1, name: a}\n", "one name: a"),
+        (
+            "parts:\n" + 2 * "  - {task: pick, episodes: 1}\n",
+            "two parts may try the same seeds .expected one of the two from",
+        ),
         ("[", "can't be read"),
     ],
 )
