@@ -49,7 +49,7 @@ def load_yaml(path: Path) -> Any:
     text = _text(path, YAML_LIMIT)
     try:
         return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
-    except (yaml.YAMLError, ValueError) as error:  # such as the 30th of February
+    except (yaml.YAMLError, ValueError, AttributeError, LookupError, TypeError) as error:
         raise DocumentError(" ".join(str(error).split())) from error
 
 

@@ -9,6 +9,7 @@ import json
 import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, is_dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -39,6 +40,11 @@ class Line(Generic[Record]):
     cut_off: bool = False
 
 
+@lru_cache
+def _form_of(record: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(record)
+
+
 class Ledger(Generic[Record]):
     """The file.
 
@@ -49,7 +55,7 @@ class Ledger(Generic[Record]):
 
     def __init__(self, path: Path, record: Any) -> None:
         self.path = path
-        self._form: TypeAdapter[Record] = TypeAdapter(record)
+        self._form: TypeAdapter[Record] = _form_of(record)
 
     def lines(self) -> list[Line[Record]]:
         """All lines but empty ones, the damaged ones too; none where there is no file.
@@ -77,12 +83,16 @@ class Ledger(Generic[Record]):
         text = _text(records)
         if not text:
             return
-        with self.path.open("ab+") as file:
-            self._end(file)
-            file.write(text)
-            file.flush()
-            if sync:
-                os.fsync(file.fileno())
+        try:
+            with self.path.open("ab+") as file:
+                self._end(file)
+                file.write(text)
+                file.flush()
+                if sync:
+                    os.fsync(file.fileno())
+        except OSError as error:
+            error.filename = error.filename or str(self.path)  # writing says no name
+            raise
 
     def rewrite(self, records: Iterable[Record]) -> None:
         """Write the file anew, whole or not at all."""

@@ -140,7 +140,7 @@ class Pool(Generic[Task, Result]):
         if self._executor is None:  # not below: this starts a process that watches resources, and lets Ctrl-C in again
             context, initargs = multiprocessing.get_context("spawn"), (self._open_worker, os.getpid())
             self._executor = ProcessPoolExecutor(self._processes, context, _start, initargs)
-        with _uninterrupted():  # a worker is started here, which inherits that until it can deal with Ctrl-C
+        with uninterrupted():  # a worker is started here, which inherits that until it can deal with Ctrl-C
             return self._executor.submit(_do, task)
 
     def _end(self) -> None:
@@ -252,7 +252,7 @@ def _any_done(under_way: dict[int, Future[Any]]) -> int:
 
 
 @contextmanager
-def _uninterrupted() -> Iterator[None]:
+def uninterrupted() -> Iterator[None]:
     """Hold Ctrl-C back for a moment."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:

@@ -118,7 +118,8 @@ def _room(error: OSError, command: str) -> str:
         return ""
     folders = [folder for folder in Path(error.filename or "").absolute().parents if folder.is_dir()]
     free = f" ({shutil.disk_usage(folders[0]).free / 2**20:.0f} MB free)" if error.filename else ""
-    goes_on = any(field.name == "resume" for field in fields(config_type(module_of(command), command)))
+    of_command = config_type(module_of(command), command)
+    goes_on = command == "plan" or any(field.name == "resume" for field in fields(of_command))
     return f"{free}. Make room" + (", then go on with --resume." if goes_on else ".")
 
 

@@ -62,7 +62,10 @@ class Plan:
 def main(cfg: Plan) -> int:
     """Run the command."""
     if isinstance(cfg.command, Run):
-        return run(cfg.command)
+        try:
+            return run(cfg.command)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("the same command with --resume goes on") from None
     if isinstance(cfg.command, Status):
         return show_status(cfg.command)
     from robocas_ms3.cli.bars import say

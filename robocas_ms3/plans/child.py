@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -12,7 +13,8 @@ from typing import Any, Generic, TypeVar
 
 import psutil
 
-from robocas_ms3.processes import SentError, Worker, leave_with
+from robocas_ms3.errors import PlanError
+from robocas_ms3.processes import SentError, Worker, leave_with, uninterrupted
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -20,6 +22,7 @@ Result = TypeVar("Result")
 START = 900.0
 """Seconds that a process may take until it begins with its first task."""
 _LOOK = 1.0  # s between two looks at a process's memory
+_KILLED_TOO = 2.0  # s until this process hears of it as well, where somebody ends all of them at once
 
 
 class ChildDied(Exception):
@@ -40,6 +43,7 @@ class Child(Generic[Task, Result]):
 
     def __init__(self, open_worker: Callable[[], Worker[Task, Result]], memory_gb: float) -> None:
         self._open_worker, self._memory = open_worker, memory_gb * 2**30
+        self._guard = threading.Lock()  # of the process: begun, and ended by whoever comes first
         self._process: Any = None
         self._pipe: Any = None  # a Connection
         self._open = self._closed = self._busy = False
@@ -53,23 +57,28 @@ class Child(Generic[Task, Result]):
 
         Raises:
             ChildDied: the process died, or was ended for time or memory.
+            PlanError: it died before it could begin: not for the task.
+            Stopped: `stop` was called.
             Exception: whatever the task raises.
         """
-        pipe = self._started()
-        try:
+        with self._guard:
+            if self._closed:
+                raise Stopped
+            pipe = self._begun()
             self._busy = True
+        try:
             pipe.send(task)
             answer = None if self._open else self._wait(pipe, START)
             if answer is None:  # it has begun
                 self._open = True
                 answer = self._wait(pipe, seconds)
         except (EOFError, OSError) as error:
+            why = self._cause()
             if self._closed:
                 raise Stopped from error
-            self._process.join(5)
-            code = self._process.exitcode
-            why = signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
-            self.end()
+            if not self._open:
+                fix = "See what it said above; robocas doctor says what of this machine works."
+                raise PlanError("a process ended before it could begin", found=why, fix=fix) from error
             raise ChildDied(why) from error
         finally:
             self._busy = False
@@ -80,44 +89,66 @@ class Child(Generic[Task, Result]):
     def _wait(self, pipe: Any, seconds: float) -> Any:
         until = time.monotonic() + seconds
         while not pipe.poll(_LOOK):
-            if time.monotonic() > until:
+            why = "too slow" if time.monotonic() > until else "too much memory" if self._too_large() else ""
+            if why:
                 self.end()
-                raise ChildDied("too slow")
-            if self._memory_used() > self._memory:
-                self.end()
-                raise ChildDied("too much memory")
+                if self._closed:
+                    raise Stopped
+                raise ChildDied(why)
         return pipe.recv()
 
-    def _memory_used(self) -> int:
+    def _too_large(self) -> bool:
+        """Whether the process and what it forked use more than they may."""
         try:
-            return psutil.Process(self._process.pid).memory_info().rss
+            process = psutil.Process(self._process.pid)
+            return any(one.memory_info().rss > self._memory for one in (process, *process.children(recursive=True)))
         except psutil.Error:
-            return 0  # it has just died
+            return False  # it has just died
 
-    def _started(self) -> Any:
-        if self._closed:
-            raise Stopped
+    def _cause(self) -> str:
+        """Why the process died."""
+        self._process.join(5)
+        code = self._process.exitcode
+        if code in (-signal.SIGTERM, -signal.SIGKILL):
+            time.sleep(_KILLED_TOO)  # else a seed would be blamed for what befell all
+        self.end()
+        return signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
+
+    def _begun(self) -> Any:
         if self._process is None or not self._process.is_alive():
-            self.end()
+            self._end()
             context = multiprocessing.get_context("spawn")
             self._pipe, theirs = context.Pipe()
             self._process = context.Process(target=_serve, args=(self._open_worker, theirs, os.getpid()), daemon=True)
-            self._process.start()
+            with uninterrupted():  # the process inherits that until it can deal with Ctrl-C
+                self._process.start()
             self._open = False
             theirs.close()
         return self._pipe
 
-    def close(self) -> None:
-        """End the process for good; may be called while another thread waits for it, which gets `Stopped`."""
-        self._closed = True
-        if self._process is not None:
-            if not self._busy:
-                self._pipe.close()  # it leaves by itself
-                self._process.join(2)
-            self._process.kill()
+    def stop(self) -> None:
+        """Want nothing more of the process; does not wait for its end. Another thread's `do` raises `Stopped`."""
+        with self._guard:
+            self._closed = True
+            if self._process is not None:
+                if self._busy:
+                    self._process.kill()
+                else:
+                    self._pipe.close()  # it leaves by itself
+
+    def wait(self, seconds: float) -> None:
+        """Wait for the end of a process that was stopped, and end it where it takes longer."""
+        process = self._process
+        if process is not None:
+            process.join(seconds)
+            process.kill()
 
     def end(self) -> None:
         """End the process, whatever it is at; the next task gets another."""
+        with self._guard:
+            self._end()
+
+    def _end(self) -> None:
         if self._process is not None:
             self._process.kill()
             self._process.join()
@@ -129,6 +160,7 @@ class Child(Generic[Task, Result]):
 
 def _serve(open_worker: Callable[[], Worker[Any, Any]], pipe: Connection, parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     leave_with(parent)
     worker: Worker[Any, Any] | None = None
     while True:

@@ -75,7 +75,7 @@ def _join_episodes(plan: Plan, out: Path, tasks: Mapping[int, Sequence[Task]]) -
             folder = out / schema.episode_folder(number)
             if not folder.is_dir():
                 os.replace(task.episode, folder)
-            with TrajectoryFile(task.recording) as file:
+            with TrajectoryFile(task.recording, pack=plan.parts[part].pack) as file:
                 entries[str(number)] = recording_entry(file, 0)
     settings = dataset_settings(plan.rate, plan.pictures.chosen(), plan.embeddings)
     write_json(out / schema.CONVERSION_FILE, {**header(settings), "episodes": entries})

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from robocas_ms3.assets.pack import pack_folders
 from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import load_config_of, shipped_configs
+from robocas_ms3.config import load_config_of
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import PlanError, RobocasError
@@ -78,15 +80,13 @@ class Plan(StrictModel):
         return formats
 
     @model_validator(mode="after")
-    def _named_apart(self) -> Plan:
-        names = [part.name for part in self.parts if part.name]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise ValueError(f"parts of one name: {', '.join(twice)}")
+    def _stages_fit(self) -> Plan:
         missing = {"datasets": "demonstrations", "statistics": "datasets"}
         for stage in self.stages:
             if stage in missing and missing[stage] not in self.stages:
                 raise ValueError(f"stages: {stage} needs {missing[stage]}")
+        if "lerobot" in self.formats and not self.makes_datasets:
+            raise ValueError("formats: lerobot needs the stage datasets")
         return self
 
     @property
@@ -124,45 +124,60 @@ def load_plan(plan: str | Path) -> Plan:
         loaded.pictures.chosen()
     except RobocasError as error:
         raise PlanError("no plan: pictures", where=path, found=error) from error
-    parts = []
+    parts, scenes = [], []
     for number, part in enumerate(loaded.parts):
         if part.task not in TASKS:
             known, found = ", ".join(TASKS), repr(part.task)
             raise PlanError("no plan: no such task", where=f"{path}, parts.{number}", expected=known, found=found)
         spec = TASKS[part.task]
         name, config = part.config or spec.default_config, part.config or spec.default_config
-        if isinstance(config, str) and config not in shipped_configs():
+        if isinstance(config, str) and (path.parent / config).is_file():
             config = path.parent / config
         loaded_config = load_config_of(spec, config)
-        shipped = isinstance(name, str) and name in shipped_configs()
+        scenes.append((part.task, loaded_config, pack := _pack(part.pack, path.parent)))
+        shipped = isinstance(config, str)
         stem = Path(name).stem if isinstance(name, str) else part.task
         parts.append(
             part.model_copy(
                 update={
                     "config": name if shipped else loaded_config.model_dump(mode="json"),
-                    "name": part.name or f"{number:02d}-{stem}",
+                    "pack": pack,
+                    "name": part.name or re.sub(r"[^\w-]+", "-", f"{number:02d}-{stem}"),
                 }
             )
         )
-    _check_seeds(parts, path)
+    _check_names(parts, path)
+    _check_seeds(parts, scenes, loaded.block, path)
     return loaded.model_copy(update={"parts": parts})
 
 
-def most_seeds(episodes: int) -> int:
+def most_seeds(episodes: int, block: int) -> int:
     """So many seeds a part of so many episodes may try before it ends for having too few."""
-    return episodes + max(20, 3 * episodes) + 1000  # and the rest of a block
+    return episodes + max(20, 3 * episodes) + 2 * block  # the last ones are done whole
 
 
-def _check_seeds(parts: Sequence[PartConfig], path: Path) -> None:
+def _pack(named: str, folder: Path) -> str:
+    """A pack's name, or its folder, which may be named from where the plan lies."""
+    return str((folder / named).resolve()) if named not in pack_folders() and (folder / named).is_dir() else named
+
+
+def _check_names(parts: Sequence[PartConfig], path: Path) -> None:
+    names = [part.name for part in parts]
+    twice = sorted({str(name) for name in names if names.count(name) > 1})
+    if twice:
+        raise PlanError("no plan: parts of one name", where=path, found=", ".join(twice), fix="Give them a name each.")
+
+
+def _check_seeds(parts: Sequence[PartConfig], scenes: Sequence[Any], block: int, path: Path) -> None:
     """See that no seed of a scene is tried by two parts: a dataset has no episode twice."""
     for number, part in enumerate(parts):
-        if part.seed + most_seeds(part.episodes) > GREATEST_SEED:
-            where, expected = f"{path}, parts.{number}.seed", f"<= {GREATEST_SEED - most_seeds(part.episodes)}"
+        if part.seed + most_seeds(part.episodes, block) > GREATEST_SEED:
+            where, expected = f"{path}, parts.{number}.seed", f"<= {GREATEST_SEED - most_seeds(part.episodes, block)}"
             raise PlanError(f"no plan: seeds end at {GREATEST_SEED}", where=where, expected=expected, found=part.seed)
-        for other in parts[:number]:
+        for other, scene in zip(parts[:number], scenes, strict=False):
             first, last = sorted((part, other), key=lambda one: one.seed)
-            apart = first.seed + most_seeds(first.episodes)
-            if (part.task, part.config, part.pack) == (other.task, other.config, other.pack) and last.seed < apart:
+            apart = first.seed + most_seeds(first.episodes, block)
+            if scenes[number] == scene and last.seed < apart:
                 where, expected = f"{path}, parts.{number}.seed", f"one of the two from {apart} on"
                 found = f"{part.seed}, and {other.seed} of {other.name}"
                 raise PlanError(

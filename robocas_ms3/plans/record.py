@@ -17,8 +17,9 @@ from robocas_ms3.recordings.entries import read_json
 
 def settings_of(plan: Plan, part: int) -> EpisodeSettings:
     """How a part's episodes are recorded."""
-    one, rate = plan.parts[part], 5 if plan.control_freq % 5 == 0 else plan.control_freq
+    one = plan.parts[part]
     assert one.config is not None  # a loaded plan names all
+    rate = int(plan.rate) if plan.rate == int(plan.rate) else 5  # actions are tried as the dataset will hold them
     return EpisodeSettings(one.task, one.config, one.pack, plan.control_freq, replay_rate=rate)
 
 
@@ -35,11 +36,14 @@ class Records:
         """Record a seed's episode, and say what came of it."""
         begun = _cpu_seconds()
         if not task.recording.is_file():  # else it was killed between this and the ledger's line
-            result = self._of(task).generate(task.seed, task.folder, task.recording.stem)
+            made = task.recording.with_name(f".{task.recording.stem}.tmp.h5")
+            result = self._of(task).generate(task.seed, task.folder, made.stem)
             failures = [f"{failure.stage}: {failure.reason}" for failure in result.failures]
             if not result.success:
                 return {"failures": failures, "record_seconds": round(_cpu_seconds() - begun, 2)}
-            _forget_clock(task.recording, failures)
+            _forget_clock(made, failures)
+            os.replace(made.with_suffix(".json"), task.recording.with_suffix(".json"))
+            os.replace(made, task.recording)
         said = read_json(task.recording)["episodes"][0]
         return {
             "success": True,

@@ -42,9 +42,8 @@ class Renders:
     def _showing(self, task: Task) -> RecordingPlayer:
         if self._player is None or self._part != task.part:
             self.close()
-            request = Request(
-                task.recording, self._plan.rate, self._plan.pictures.chosen(), open_source=self._open_source
-            )
+            pictures, pack = self._plan.pictures.chosen(), self._plan.parts[task.part].pack
+            request = Request(task.recording, self._plan.rate, pictures, open_source=self._open_source, pack=pack)
             self._part, self._player = task.part, RecordingPlayer(request)
         else:
             self._player.turn_to(task.recording)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
@@ -11,12 +10,13 @@ from typing import Any
 
 from robocas_ms3.errors import PlanError
 from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import check_overwrite, check_same, claim_output, locked_folder, sweep
+from robocas_ms3.outputs import check_overwrite, check_run, claim_output, is_taken, locked_folder, sweep
+from robocas_ms3.plans.begun import check_plan_of, content_of
+from robocas_ms3.plans.checks import check_plan
 from robocas_ms3.plans.engines import Engine
 from robocas_ms3.plans.join import join
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.units import PLAN, Outcome, Unit, is_done, outcomes
-from robocas_ms3.recordings.versions import versions
+from robocas_ms3.plans.units import PLAN, Outcome, Unit, outcomes
 
 _AHEAD = 2  # units a slot that are under way, so that none waits for the next
 _LOOK = 2.0  # s between two looks at what is under way
@@ -58,17 +58,16 @@ def run_plan(
         OutputExistsError: ``out`` is not empty and neither flag is set.
         RobocasError: another run writes there; something is wrong with all episodes.
     """
-    about = {"plan": plan.model_dump(mode="json"), "versions": versions()}
+    check_plan(plan)
     if overwrite:
         check_overwrite(out, (PLAN,), "made by `robocas plan run`", PlanError)
+        check_run(out / PLAN, "versions", "plan run", PlanError)
     with locked_folder(out):
         claim_output(out, overwrite=overwrite, resume=resume)
-        if (out / PLAN).is_file():
-            before = json.loads((out / PLAN).read_text(encoding="utf-8"))
-            fix = "Use the same, another --out, or --overwrite."
-            check_same(before, about, "begun with another plan", where=out / PLAN, fix=fix, error=PlanError)
+        if is_taken(out):
+            check_plan_of(out, plan)
         sweep(make_folder(out))
-        write_json(out / PLAN, about)
+        write_json(out / PLAN, content_of(plan))
         on_start()
         parts = [_Part(plan, number) for number in range(len(plan.parts))]
         engine = open_engine(plan, out)
@@ -87,15 +86,12 @@ class _Part:
     number: int
     done: dict[int, list[Outcome]] = field(default_factory=dict)
     next_block: int = 0
-
-    @property
-    def good(self) -> int:
-        """Episodes of units that are done."""
-        return sum(outcome.success for block in self.done.values() for outcome in block)
-
-    @property
-    def tried(self) -> int:
-        return sum(map(len, self.done.values()))
+    good: int = 0
+    """Episodes of units that are done."""
+    judged: int = 0
+    """So many blocks without a gap have been looked at for failures: the verdict must not depend on who is first."""
+    judged_seeds: int = 0
+    judged_good: int = 0
 
     def wants_more(self) -> bool:
         """Whether there may be too few even if all that is under way succeeds."""
@@ -114,10 +110,17 @@ class _Part:
             PlanError: hardly anything succeeds.
         """
         self.done[unit.block] = found
-        failed = self.tried - self.good
-        if failed > max(20, 3 * self.good):
-            where, fix = unit.folder(self.plan, out).parent, "See seeds.jsonl there; a smaller objects.count may help."
-            raise PlanError("far too many seeds fail", where=where, found=f"{failed} of {self.tried}", fix=fix)
+        self.good += sum(outcome.success for outcome in found)
+        while self.judged in self.done:
+            block = self.done[self.judged]
+            self.judged += 1
+            self.judged_seeds += len(block)
+            self.judged_good += sum(outcome.success for outcome in block)
+            failed = self.judged_seeds - self.judged_good
+            if failed > max(20, 3 * self.judged_good):
+                where, found_now = unit.folder(self.plan, out).parent, f"{failed} of {self.judged_seeds}"
+                fix = "See seeds.jsonl there; a smaller objects.count may help."
+                raise PlanError("far too many seeds fail", where=where, found=found_now, fix=fix)
 
     def chosen(self) -> Iterator[tuple[Unit, Outcome]]:
         """The first episodes in the order of their seeds, as many as were asked for."""
@@ -135,10 +138,8 @@ def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_
         for part in parts:
             while part.wants_more() and len(under_way) < _AHEAD * engine.slots:
                 unit = part.next()
-                folder = unit.folder(plan, out)
-                if is_done(folder):
-                    found = outcomes(folder)
-                    part.take(unit, [found[seed] for seed in unit.seeds(plan)], out)
+                if unit.is_done(plan, out):
+                    part.take(unit, unit.result(plan, out), out)
                 else:
                     under_way[engine.submit(unit)] = unit
         on_progress(_counts(plan, out, parts, under_way))

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import PlanError
+from robocas_ms3.errors import MissingExtraError, PlanError
 from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import check_same, sweep
-from robocas_ms3.plans.child import Child, ChildDied
+from robocas_ms3.outputs import sweep
+from robocas_ms3.plans.begun import check_versions
+from robocas_ms3.plans.child import Child, ChildDied, Stopped
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.units import DONE, EPISODES, PLAN, Death, Outcome, Task, Unit, deaths, is_done, ledger, outcomes
+from robocas_ms3.plans.units import DONE, EPISODES, Death, Outcome, Task, Unit, deaths, ledger, outcomes
 from robocas_ms3.processes import Worker
 from robocas_ms3.recordings.versions import versions
 
@@ -72,25 +72,24 @@ class Slot:
             RobocasError: something is wrong that another seed would meet as well.
             OSError: so is the disk.
         """
-        folder = unit.folder(self._plan, self._out)
-        if not is_done(folder):
-            self._check_versions()
-            make_folder(folder / EPISODES)
-            sweep(folder)
-            sweep(folder / EPISODES)
-            done = outcomes(folder)
-            for seed in unit.seeds(self._plan):
-                if seed not in done:
-                    ledger(folder).append([self._seed(Task(unit.part, seed, folder))], sync=True)
-            write_json(folder / DONE, {"versions": versions()})
-        found = outcomes(folder)
-        return [found[seed] for seed in unit.seeds(self._plan)]
+        for _ in self.seeds(unit):
+            pass
+        return unit.result(self._plan, self._out)
 
-    def _check_versions(self) -> None:
-        """See that this machine has what the plan was begun with: a worker's environment may be another."""
-        path = self._out / PLAN
-        before, fix = load_json(path).get("versions", {}), "Install the same versions wherever units are done."
-        check_same(before, versions(), "this machine has other versions", where=path, fix=fix, error=PlanError)
+    def seeds(self, unit: Unit) -> Iterator[Outcome]:
+        """Do what is left of a unit seed by seed; of what is given, the files are whole."""
+        if unit.is_done(self._plan, self._out):
+            return
+        check_versions(self._out)
+        folder = unit.folder(self._plan, self._out)
+        _sweep(folder)
+        done = outcomes(folder)
+        for seed in unit.seeds(self._plan):
+            if seed not in done:
+                outcome = self._seed(Task(unit.part, seed, folder))
+                ledger(folder).append([outcome], sync=True)
+                yield outcome
+        write_json(folder / DONE, {"versions": versions()})
 
     def _seed(self, task: Task) -> Outcome:
         limits = self._plan.limits
@@ -110,12 +109,31 @@ class Slot:
                 return {"success": False, "failures": [f"{stage}: {died[-1].why}"]}
             try:
                 return child.do(task, seconds)
+            except (Stopped, PlanError, MissingExtraError, OSError):
+                raise  # it would befall every seed
             except ChildDied as death:
-                noted.append([Death(task.seed, stage, str(death))], sync=True)
-                sweep(task.folder)
-                sweep(task.folder / EPISODES)
+                why = str(death)
+            except Exception as error:  # a bug that this seed has found, or some memory that was missing
+                why = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+                child.end()
+            noted.append([Death(task.seed, stage, why)], sync=True)
+            _sweep(task.folder)
 
-    def close(self) -> None:
-        """End the processes, whatever they are at."""
-        self._record.close()
-        self._render.close()
+    def stop(self) -> None:
+        """Want nothing more; `do` in another thread raises `Stopped`."""
+        self._record.stop()
+        self._render.stop()
+
+    def close(self, until: float | None = None) -> None:
+        """End the processes, whatever they are at, by ``until`` of the monotonic clock; default: two seconds."""
+        self.stop()
+        until = time.monotonic() + 2 if until is None else until
+        for child in (self._record, self._render):
+            child.wait(max(0.0, until - time.monotonic()))
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what a process that died left half written."""
+    make_folder(folder / EPISODES)
+    for place in (folder, *(path for path in (folder / EPISODES).iterdir() if path.is_dir())):
+        sweep(place)

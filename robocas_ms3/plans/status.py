@@ -8,11 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.documents import DocumentError, load_json
-from robocas_ms3.errors import PlanError
-from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.units import PLAN, REPORT, Outcome, begun, outcomes
-from robocas_ms3.strict import parse
+from robocas_ms3.plans.begun import read_plan
+from robocas_ms3.plans.units import REPORT, Outcome, begun, outcomes
 
 RECENT = 600.0  # s that a rate is taken over
 
@@ -62,20 +59,6 @@ class Status:
     def as_json(self) -> dict[str, Any]:
         """For ``--json``."""
         return asdict(self)
-
-
-def read_plan(out: Path) -> Plan:
-    """The plan that a folder was begun with.
-
-    Raises:
-        PlanError: there is none, or it is damaged.
-    """
-    path = out / PLAN
-    try:
-        about = load_json(path)
-    except (OSError, DocumentError) as error:
-        raise PlanError("no plan was begun here", where=path, found=type(error).__name__) from error
-    return parse(Plan, about.get("plan") if isinstance(about, dict) else None, PlanError, where=path, about="no plan")
 
 
 def status(out: Path) -> Status:

@@ -32,6 +32,16 @@ class Unit:
         first = plan.parts[self.part].seed + self.block * plan.block
         return range(first, first + plan.block)
 
+    def is_done(self, plan: Plan, out: Path) -> bool:
+        """Whether all its seeds are; a line of the ledger that was damaged since is done again."""
+        folder = self.folder(plan, out)
+        return (folder / DONE).is_file() and outcomes(folder).keys() >= set(self.seeds(plan))
+
+    def result(self, plan: Plan, out: Path) -> list[Outcome]:
+        """What came of it, when it is done; in the order of the seeds."""
+        found = outcomes(self.folder(plan, out))
+        return [found[seed] for seed in self.seeds(plan)]
+
     def folder(self, plan: Plan, out: Path) -> Path:
         """Where its files lie."""
         return out / UNITS / f"{plan.parts[self.part].name}" / f"{self.block:05d}"
@@ -107,13 +117,9 @@ def outcomes(folder: Path) -> dict[int, Outcome]:
     return found
 
 
-def is_done(folder: Path) -> bool:
-    """Whether all its seeds are."""
-    return (folder / DONE).is_file()
-
-
 def begun(plan: Plan, out: Path, part: int) -> Iterator[Unit]:
     """Units of a part that have a folder, in order."""
     folder = out / UNITS / f"{plan.parts[part].name}"
     for path in sorted(folder.glob("[0-9]*")):
-        yield Unit(part, int(path.name))
+        if path.name.isdecimal():
+            yield Unit(part, int(path.name))

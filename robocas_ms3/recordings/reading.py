@@ -205,7 +205,7 @@ def readable(where: object, what: str = "this episode is damaged") -> Iterator[N
     """
     try:
         yield
-    except (OSError, KeyError, RuntimeError, AttributeError, ValueError, TypeError) as error:
+    except (OSError, KeyError, RuntimeError, AttributeError, ValueError, TypeError, MemoryError) as error:
         raise DatasetError(what, where=where, found=reason(error)) from error
 
 

@@ -42,7 +42,7 @@ def test_what_is_not_said_has_a_default(written):
 
 
 def test_parts_of_the_same_scenes_have_seeds_apart(written):
-    seed = most_seeds(5)
+    seed = most_seeds(5, block=10)
     text = "parts:\n  - {{task: pick, episodes: 5}}\n  - {{task: pick, episodes: 9, seed: {}}}\n"
     assert len(load_plan(written(text.format(seed))).parts) == 2
     with pytest.raises(PlanError, match="may try the same seeds"):
@@ -68,9 +68,17 @@ def test_a_configuration_beside_the_plan_is_taken_whole(written, tmp_path):
         (GOOD + "block: 10\nblok: 3\n", "unknown key 'blok'.*Did you mean block"),
         (GOOD + "formats: [lerobot]\n", "robocas comes first"),
         (GOOD + "stages: [datasets]\n", "datasets needs demonstrations"),
+        (GOOD + "stages: [demonstrations]\nformats: [robocas, lerobot]\n", "lerobot needs the stage datasets"),
+        (
+            "parts:\n  - {task: pick, episodes: 1}\n  - {task: select, episodes: 1, name: 00-pick_table_scattered}\n",
+            "one name",
+        ),
         (GOOD + "pictures: {cameras: [nose]}\n", "no such camera"),
         ("parts:\n  - {task: pick, episodes: 1, name: ../up}\n", "parts.0.name"),
-        ("parts:\n  - {task: pick, episodes: 1, name: a}\n  - {task: pick, episodes: 1, name: a}\n", "one name: a"),
+        (
+            "parts:\n  - {task: pick, episodes: 1, name: a}\n  - {task: pick, episodes: 1, name: a}\n",
+            "one name .found a",
+        ),
         (
             "parts:\n" + 2 * "  - {task: pick, episodes: 1}\n",
             "two parts may try the same seeds .expected one of the two from",
@@ -104,7 +112,7 @@ def test_status_is_read_from_the_folder_alone(written, tmp_path, capsys):
     folders = [Unit(0, block).folder(plan, out) for block in (0, 1)]
     for folder in folders:
         folder.mkdir(parents=True)
-    (out / PLAN).write_text('{"plan": ' + plan.model_dump_json() + "}")
+    (out / PLAN).write_text('{"versions": {}, "plan": ' + plan.model_dump_json() + "}")
     assert status(out).seconds_left is None
     good = [Outcome(seed, True, 100, [], 1.0, 3.0, 10**6, at=1000.0 + 2 * seed) for seed in (0, 1, 3)]
     ledger(folders[0]).append([*good[:2], Outcome(2, False, failures=["a: b", "record: SIGSEGV"], record_seconds=2.0)])

@@ -9,6 +9,7 @@ import time
 
 from synthetic import RayCaster, write_trajectory
 
+from robocas_ms3.errors import MissingExtraError
 from robocas_ms3.files import replacing_folder
 from robocas_ms3.plans.render import Renders
 from robocas_ms3.plans.slot import Stages
@@ -33,8 +34,10 @@ class MadeUp:
             hog = bytearray(600 * 2**20)
             time.sleep(1000)
             del hog
+        elif fault == "bug":
+            raise ValueError("a bug\nof two lines")
         elif fault == "refuse":
-            raise ValueError("a bug")
+            raise MissingExtraError("nothing to record with")
         elif fault == "fail":
             return {"success": False, "failures": ["grasp: slipped"]}
         if not task.recording.is_file():

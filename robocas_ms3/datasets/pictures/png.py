@@ -1,17 +1,20 @@
-"""Encodes PNG with ISA-L's deflate: six times as fast as OpenCV at level 1, and the files are no larger."""
+"""Encodes PNG with libdeflate: four times as fast as OpenCV at level 1, the files are smaller, and always the same.
+
+ISA-L's deflate is faster still, but once in some thousand pictures it gives other bytes for the same one.
+"""
 
 from __future__ import annotations
 
 import struct
 
+import deflate
 import numpy as np
-from isal import isal_zlib
 from numpy.typing import NDArray
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _GREY, _RGB = 0, 2
 _SUB = 1  # the row filter: each byte less that of the pixel to its left; of a rendered picture that leaves most zeros
-_LEVEL = 1  # of 0 to 3; 0 gives 10 % more for the same time, 2 takes 15 % longer for 0.5 % less
+_LEVEL = 1  # of 1 to 12; 2 takes 60 % longer for 4 % less
 
 
 def encode_png(picture: NDArray) -> bytes:
@@ -34,10 +37,10 @@ def encode_png(picture: NDArray) -> bytes:
     rows[:, 1 : 1 + step] = pixels[:, :step]
     np.subtract(pixels[:, step:], pixels[:, :-step], out=rows[:, 1 + step :])
     header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
-    data = isal_zlib.compress(rows, _LEVEL)
+    data = deflate.zlib_compress(rows, _LEVEL)
     return b"".join([SIGNATURE, *_chunk(b"IHDR", header), *_chunk(b"IDAT", data), *_chunk(b"IEND", b"")])
 
 
 def _chunk(kind: bytes, content: bytes) -> tuple[bytes, bytes, bytes, bytes]:
-    checksum = isal_zlib.crc32(content, isal_zlib.crc32(kind))
+    checksum = deflate.crc32(content, deflate.crc32(kind))
     return struct.pack(">I", len(content)), kind, content, struct.pack(">I", checksum)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -11,6 +12,7 @@ from robocas_ms3.plans.engines import refuse_options
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.slot import Slot, Stages
 from robocas_ms3.plans.units import Outcome, Unit
+from robocas_ms3.processes import uninterrupted
 
 
 class LocalEngine:
@@ -40,7 +42,11 @@ class LocalEngine:
 
     def close(self) -> None:
         """End the processes."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
-        for slot in self._all:
-            slot.close()
-        self._threads.shutdown()
+        with uninterrupted():  # one who is impatient would leave them behind
+            self._threads.shutdown(wait=False, cancel_futures=True)
+            for slot in self._all:
+                slot.stop()
+            until = time.monotonic() + 2
+            for slot in self._all:
+                slot.close(until)
+            self._threads.shutdown()

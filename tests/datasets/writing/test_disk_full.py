@@ -66,7 +66,8 @@ def ends_in_one_line(command, capsys):
     assert run(command) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: ")
-    assert error.endswith(": No space left on device\n")
+    assert ": No space left on device (" in error
+    assert error.endswith("Make room, then go on with --resume.\n")
     assert error.count("\n") == 1
 
 

@@ -14,13 +14,13 @@ from plan_stages import FAULTS, stages
 
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.errors import OutputExistsError, PlanError
+from robocas_ms3.errors import MissingExtraError, OutputExistsError, PlanError
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.plan import PartConfig, Plan
-from robocas_ms3.plans.run import run_plan
+from robocas_ms3.plans.run import _Part, run_plan
 from robocas_ms3.plans.slot import Slot
 from robocas_ms3.plans.status import status
-from robocas_ms3.plans.units import Unit, deaths
+from robocas_ms3.plans.units import Outcome, Unit, deaths
 from robocas_ms3.recordings.reading import TrajectoryFile
 from robocas_ms3.recordings.versions import versions
 
@@ -37,7 +37,12 @@ PLAN = Plan(
 )
 
 
-def run(out, plan=PLAN, jobs=2, **more):
+def run(out, plan=PLAN, jobs=2, stop_before_join=False, **more):
+    if stop_before_join:
+        with pytest.MonkeyPatch.context() as patch, pytest.raises(ZeroDivisionError):
+            patch.setattr("robocas_ms3.plans.run.join", lambda *_, **__: 1 / 0)
+            run(out, plan, jobs, **more)
+        return None
     return run_plan(plan, out, lambda plan, out: LocalEngine(plan, out, jobs, stages=stages()), jobs=1, **more)
 
 
@@ -89,14 +94,15 @@ def test_more_slots_make_the_same(undisturbed, tmp_path):
 
 def test_a_process_that_dies_once_costs_nothing(undisturbed, tmp_path):
     out = tmp_path / "out"
-    plan_faults(out, {10: ["crash"], 12: ["grow"], 3: ["hang"]})
+    plan_faults(out, {10: ["crash"], 12: ["grow"], 13: ["bug"], 3: ["hang"]})
     limits = PLAN.limits.model_copy(update={"record_seconds": 4, "memory_gb": 0.5})
     run(out, PLAN.model_copy(update={"limits": limits}))
     assert_same(undisturbed, out)
-    died = [death for unit in (Unit(0, 0), Unit(1, 0)) for death in deaths(unit.folder(PLAN, out)).read()]
+    died = [death for unit in (Unit(0, 0), Unit(0, 1), Unit(1, 0)) for death in deaths(unit.folder(PLAN, out)).read()]
     assert [(death.seed, death.stage, death.why) for death in died] == [
         (10, "record", "SIGSEGV"),
         (12, "record", "too much memory"),
+        (13, "record", "ValueError: a bug"),
         (3, "record", "too slow"),
     ]
 
@@ -115,7 +121,7 @@ def test_a_seed_that_kills_twice_is_left_out_and_another_takes_its_place(tmp_pat
 def test_an_error_of_all_seeds_ends_the_run_which_goes_on_later(undisturbed, tmp_path):
     out = tmp_path / "out"
     plan_faults(out, {13: ["refuse"]})
-    with pytest.raises(ValueError, match="a bug"):
+    with pytest.raises(MissingExtraError, match="nothing to record with"):
         run(out)
     with pytest.raises(OutputExistsError):
         run(out)
@@ -133,6 +139,51 @@ def test_hardly_any_success_is_an_error(tmp_path):
         run(tmp_path / "out", plan)
 
 
+def test_the_verdict_on_failures_does_not_depend_on_who_is_first(tmp_path):
+    plan = PLAN.model_copy(update={"block": 24})
+    bad = [Outcome(seed, False) for seed in range(24)]
+    good = [Outcome(seed, True) for seed in range(24, 48)]
+    part = _Part(plan, 0)
+    part.take(Unit(0, 1), good, tmp_path)
+    with pytest.raises(PlanError, match="far too many seeds fail .found 24 of 24"):
+        part.take(Unit(0, 0), bad, tmp_path)
+
+
+def test_a_line_of_a_ledger_that_was_damaged_is_done_again(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    run(out, stop_before_join=True)
+    path = Unit(0, 0).folder(PLAN, out) / "seeds.jsonl"
+    first, _, third = path.read_text().splitlines()
+    path.write_text(f"{first}\n{{garbage\n{third}\n")
+    run(out, resume=True)
+    assert_same(undisturbed, out)
+
+
+def test_a_folder_of_something_else_is_not_gone_on_with(tmp_path):
+    (tmp_path / ".bashrc.old").write_text("")
+    with pytest.raises(PlanError, match="no plan was begun here"):
+        run(tmp_path, resume=True)
+    (tmp_path / "plan.json").write_text("{}")
+    with pytest.raises(PlanError, match="refusing to write over what `robocas plan run` has not made"):
+        run(tmp_path, overwrite=True)
+    assert {path.name for path in tmp_path.iterdir()} == {".bashrc.old", "plan.json"}
+
+
+def test_ctrl_c_ends_processes_that_are_starting_and_blames_no_seed(tmp_path):
+    out = tmp_path / "out"
+    for wait in (0.8, 1.6):
+        process = subprocess.Popen(
+            [sys.executable, __file__, str(out)], start_new_session=True, stderr=subprocess.PIPE, text=True
+        )
+        time.sleep(wait)
+        begun = time.monotonic()
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=30)
+        assert time.monotonic() - begun < 6  # 3 s on a machine that is idle
+        assert said.count("Traceback") <= 1  # the runner's own
+    assert not list(out.rglob("deaths.jsonl"))
+
+
 def test_another_plan_or_run_in_the_folder_is_refused(undisturbed, tmp_path):
     other = PLAN.model_copy(update={"block": 4})
     with pytest.raises(PlanError, match="begun with another plan"):
@@ -143,7 +194,7 @@ def test_another_plan_or_run_in_the_folder_is_refused(undisturbed, tmp_path):
 
 
 def test_a_machine_with_other_versions_does_no_unit(tmp_path):
-    about = {"versions": {**versions(), "sapien": "2.2.2"}}
+    about = {"plan": {}, "versions": {**versions(), "sapien": "2.2.2"}}
     (tmp_path / "plan.json").write_text(json.dumps(about))
     slot = Slot(PLAN, tmp_path, stages())
     with pytest.raises(PlanError, match=r"this machine has other versions .expected sapien 2\.2\.2, found sapien 3"):

@@ -1,0 +1,65 @@
+"""``plan.json``: what a folder was begun with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.documents import DocumentError, load_json
+from robocas_ms3.errors import PlanError
+from robocas_ms3.outputs import check_same
+from robocas_ms3.plans.plan import Plan
+from robocas_ms3.plans.units import PLAN
+from robocas_ms3.recordings.versions import versions
+from robocas_ms3.strict import parse
+
+
+def content_of(plan: Plan) -> dict[str, Any]:
+    """What is written of a plan that begins here and now."""
+    return {"plan": plan.model_dump(mode="json"), "versions": versions()}
+
+
+def read_begun(out: Path) -> dict[str, Any]:
+    """What a folder was begun with.
+
+    Raises:
+        PlanError: nothing was, or the file is damaged.
+    """
+    path = out / PLAN
+    try:
+        about = load_json(path)
+    except (OSError, DocumentError) as error:
+        found = type(error).__name__ if isinstance(error, OSError) else error
+        raise PlanError("no plan was begun here", where=path, found=found) from error
+    if not isinstance(about, dict) or not all(isinstance(about.get(key), dict) for key in ("plan", "versions")):
+        raise PlanError("no plan was begun here", where=path, expected="plan and versions")
+    return about
+
+
+def read_plan(out: Path) -> Plan:
+    """The plan that a folder was begun with; errors of `read_begun`."""
+    return parse(Plan, read_begun(out)["plan"], PlanError, where=out / PLAN, about="no plan")
+
+
+def check_versions(out: Path) -> None:
+    """See that this machine has what the plan was begun with: that of a worker may be another.
+
+    Raises:
+        PlanError: it has something else.
+    """
+    what, fix = "this machine has other versions", "Install the same versions wherever units are done."
+    check_same(read_begun(out)["versions"], versions(), what, where=out / PLAN, fix=fix, error=PlanError)
+
+
+def check_plan_of(out: Path, plan: Plan) -> None:
+    """See that a folder was begun with this plan, by these versions.
+
+    Raises:
+        PlanError: it wasn't.
+    """
+    before, now = read_begun(out), content_of(plan)
+    different = [key for key, value in now["plan"].items() if before["plan"].get(key) != value]
+    if different:
+        found, fix = f"other {', '.join(different)}", "Use the same, another --out, or --overwrite."
+        raise PlanError("begun with another plan", where=out / PLAN, found=found, fix=fix)
+    check_versions(out)
