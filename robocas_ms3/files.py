@@ -20,6 +20,17 @@ ABANDONED = 86400.0  # s without a change: what a killed run left
 
 
 @contextmanager
+def naming(path: Path | str) -> Iterator[None]:
+    """Give errors of the system a path where they have none: writing into an open file says no name."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None or error.filename:
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
+
+
+@contextmanager
 def replacing(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; on success it replaces ``path``, on failure it is removed.
 
@@ -29,11 +40,9 @@ def replacing(path: Path | str) -> Iterator[Path]:
     make_folder(path.parent)
     tmp = path.parent / f".{path.stem}.{os.getpid()}.tmp{path.suffix}"
     try:
-        yield tmp
-        os.replace(tmp, path)
-    except OSError as error:
-        error.filename = error.filename or str(path)  # writing says no name
-        raise
+        with naming(path):
+            yield tmp
+            os.replace(tmp, path)
     finally:
         if tmp.is_dir():
             shutil.rmtree(tmp, ignore_errors=True)
@@ -54,16 +63,14 @@ def replacing_folder(path: Path | str) -> Iterator[Path]:
     tmp = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=home))
     tmp.chmod(0o755)
     try:
-        yield tmp
-        if fixed:
-            empty_folder(path, but=tmp)
-            for entry in list(tmp.iterdir()):
-                os.replace(entry, path / entry.name)
-        else:
-            _move_in(tmp, path)
-    except OSError as error:
-        error.filename = error.filename or str(path)
-        raise
+        with naming(path):
+            yield tmp
+            if fixed:
+                empty_folder(path, but=tmp)
+                for entry in list(tmp.iterdir()):
+                    os.replace(entry, path / entry.name)
+            else:
+                _move_in(tmp, path)
     finally:
         shutil.rmtree(tmp, ignore_errors=True)
 

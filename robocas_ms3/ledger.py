@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.files import replacing
+from robocas_ms3.files import naming, replacing
 from robocas_ms3.strict import refusal
 
 Record = TypeVar("Record")
@@ -83,16 +83,12 @@ class Ledger(Generic[Record]):
         text = _text(records)
         if not text:
             return
-        try:
-            with self.path.open("ab+") as file:
-                self._end(file)
-                file.write(text)
-                file.flush()
-                if sync:
-                    os.fsync(file.fileno())
-        except OSError as error:
-            error.filename = error.filename or str(self.path)  # writing says no name
-            raise
+        with naming(self.path), self.path.open("ab+") as file:
+            self._end(file)
+            file.write(text)
+            file.flush()
+            if sync:
+                os.fsync(file.fileno())
 
     def rewrite(self, records: Iterable[Record]) -> None:
         """Write the file anew, whole or not at all."""

@@ -22,7 +22,7 @@ from robocas_ms3.datasets.writing.output import check_overwrite
 from robocas_ms3.datasets.writing.players import Player, Request, open_env
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import make_folder, write_json
+from robocas_ms3.files import make_folder, naming, write_json
 from robocas_ms3.outputs import check_same, claim_output, is_taken, kept_if_begun, locked_folder, sweep
 
 Codec = Literal["h264", "av1"]
@@ -166,7 +166,8 @@ def _join(out: Path, plan: dict[str, Any], fps: int, limits: Limits) -> None:
     from robocas_ms3.datasets.lerobot.assemble import assemble
 
     joined = make_folder(out / _JOINED)
-    assemble(out / PARTS, plan, fps, joined, limits)
+    with naming(joined):
+        assemble(out / PARTS, plan, fps, joined, limits)
     for name in _FOLDERS:
         if (joined / name).is_dir():
             os.replace(joined / name, out / name)
