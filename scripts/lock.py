@@ -16,6 +16,7 @@ import tomllib
 
 ROOT = Path(__file__).resolve().parent.parent
 TORCH = "torch==2.13.0"
+NOT_INSTALLED = {"slurm", "ray"}  # extras that setup.sh leaves out
 OF_ONE_TORCH_BUILD = ("nvidia-c", "nvidia-n", "cuda-", "triton")
 HEADER = """\
 # Exact versions for `pip install -c`; written by scripts/lock.py, not by hand.
@@ -24,10 +25,12 @@ HEADER = """\
 
 
 def requirements() -> list[str]:
-    """Everything pyproject.toml asks for, all extras included, torch at its pinned version."""
+    """Everything pyproject.toml asks for, all extras that setup.sh installs included, torch at its pinned version."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     found = [*project["build-system"]["requires"], *project["project"]["dependencies"], TORCH]
-    for extra in project["project"]["optional-dependencies"].values():
+    for name, extra in project["project"]["optional-dependencies"].items():
+        if name in NOT_INSTALLED:
+            continue
         found += [item for item in extra if not item.startswith("robocas-ms3")]
     return found
 

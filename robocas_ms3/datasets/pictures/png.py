@@ -41,6 +41,6 @@ def encode_png(picture: NDArray) -> bytes:
     return b"".join([SIGNATURE, *_chunk(b"IHDR", header), *_chunk(b"IDAT", data), *_chunk(b"IEND", b"")])
 
 
-def _chunk(kind: bytes, content: bytes) -> tuple[bytes, bytes, bytes, bytes]:
+def _chunk(kind: bytes, content: bytes | bytearray) -> tuple[bytes, bytes, bytes | bytearray, bytes]:
     checksum = deflate.crc32(content, deflate.crc32(kind))
     return struct.pack(">I", len(content)), kind, content, struct.pack(">I", checksum)

@@ -1,0 +1,129 @@
+"""Who is at a unit, where jobs of several machines share nothing but a folder: no locks reach from one to the other.
+
+The claims on a unit are numbered files, and the highest one counts. Whoever wants the unit makes the next number, which
+only one can (a file is created or it is there already, on NFS too), and may do so only once the claim before is given
+back, or was not renewed for a while: its *lease*. Who holds a claim renews it ten times a lease. If it can't for half
+a lease, or finds a higher number, its process ends at once: so a job that lost its network, or one that Slurm began
+again elsewhere while the first still lived, has left before the next one comes. Ages are told by the clock of the file
+server alone: a claim's time of change against that of a file just touched. A claim that is given back is of 1970.
+
+One gap remains: a machine that is halted for longer than a lease as a whole and then wakes looks only after up to a
+tenth of it. What two could do in that time is little: episodes of a seed are the same whoever makes them, are renamed
+into place, and of two lines of a ledger the first counts.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from robocas_ms3.files import make_folder
+
+LEASE = 60.0
+"""Seconds without news after which the holder of a claim counts as dead."""
+_log = logging.getLogger(__name__)
+
+
+@contextmanager
+def claimed(path: Path, lease: float = LEASE, on_lost: Callable[[], object] = lambda: os._exit(75)) -> Iterator[None]:
+    """Hold the claim on something; waits as long as somebody else does.
+
+    Args:
+        path: of the claims, without their number.
+        lease: s; the same for all that ask.
+        on_lost: ends at once what is done inside, from another thread; by default this process.
+    """
+    token = f"{socket.gethostname()} {os.getpid()} {uuid.uuid4().hex}"
+    claim = _take(path, token, lease)
+    keeper = _Keeper(claim, token, lease, on_lost)
+    try:
+        yield
+    finally:
+        keeper.end()
+        with suppress(OSError):  # then it ends with its lease
+            if claim.read_text(encoding="utf-8") == token:
+                os.utime(claim, (0, 0))
+
+
+class _Keeper:
+    """Renews a claim, and says when it is lost; two threads, as a file server that hangs holds one up."""
+
+    def __init__(self, claim: Path, token: str, lease: float, on_lost: Callable[[], object]) -> None:
+        self._claim, self._token, self._lease, self._on_lost = claim, token, lease, on_lost
+        self._renewed, self._ended = time.monotonic(), threading.Event()
+        self._renewer = threading.Thread(target=self._renew, daemon=True)
+        for thread in (self._renewer, threading.Thread(target=self._watch, daemon=True)):
+            thread.start()
+
+    def _renew(self) -> None:
+        following = _numbered(self._claim.with_suffix(""), int(self._claim.suffix[1:]) + 1)
+        while not self._ended.wait(self._lease / 10):
+            before = time.monotonic()
+            try:
+                if following.exists() or self._claim.read_text(encoding="utf-8") != self._token:
+                    self._lose("somebody else has it")
+                    return
+                os.utime(self._claim)
+            except FileNotFoundError:
+                self._lose("its folder is gone")
+                return
+            except OSError as error:  # for a moment, mostly
+                _log.warning("%s can't be renewed: %s", self._claim, error)
+            else:
+                self._renewed = before
+
+    def _watch(self) -> None:
+        while not self._ended.wait(min(1.0, self._lease / 20)):
+            if time.monotonic() - self._renewed > self._lease / 2:
+                self._lose("it could not be renewed")
+                return
+
+    def _lose(self, why: str) -> None:
+        if not self._ended.is_set():
+            _log.error("%s is lost: %s", self._claim, why)
+            self._on_lost()
+
+    def end(self) -> None:
+        """Renew it no more."""
+        self._ended.set()
+        self._renewer.join(self._lease)
+
+
+def _take(path: Path, token: str, lease: float) -> Path:
+    make_folder(path.parent)
+    said = False
+    while True:
+        last = max((int(name.suffix[1:]) for name in path.parent.glob(f"{path.name}.[0-9]*")), default=0)
+        if not last or _age(_numbered(path, last)) >= lease:
+            claim = _numbered(path, last + 1)
+            with suppress(FileExistsError), claim.open("x", encoding="utf-8") as file:
+                file.write(token)
+                return claim
+        elif not said:
+            said = True
+            _log.warning("waiting: another process is at %s", path)
+        time.sleep(min(2.0, lease / 10))
+
+
+def _numbered(path: Path, number: int) -> Path:
+    return path.with_name(f"{path.name}.{number}")
+
+
+def _age(claim: Path) -> float:
+    """Seconds since a claim was renewed, by the file server's clock."""
+    probe = claim.with_name(f".{uuid.uuid4().hex}.tmp")
+    try:
+        probe.touch()
+        os.utime(probe)
+        now = probe.stat().st_mtime
+    finally:
+        probe.unlink(missing_ok=True)
+    with claim.open(encoding="utf-8") as file:  # to open a file asks the server; to look at its name may not
+        return now - os.fstat(file.fileno()).st_mtime

@@ -1,0 +1,116 @@
+"""Claims keep a second process out for as long as the first may live, and no longer."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from robocas_ms3.plans.claims import claimed
+
+LEASE = 3.0
+HOLD = """
+import json, sys, time
+from pathlib import Path
+from robocas_ms3.plans.claims import claimed
+path, notes, lease, seconds = Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3]), float(sys.argv[4])
+with claimed(path, lease):
+    with notes.open("a") as file:
+        file.write(json.dumps(["in", time.time()]) + "\\n")
+    time.sleep(seconds)
+    with notes.open("a") as file:
+        file.write(json.dumps(["out", time.time()]) + "\\n")
+"""
+
+
+def holding(path, notes, seconds, lease=LEASE):
+    """Another process that holds a claim for some seconds."""
+    command = [sys.executable, "-c", HOLD, path, notes, str(lease), str(seconds)]
+    return subprocess.Popen([str(word) for word in command], stderr=subprocess.DEVNULL)
+
+
+def read(notes):
+    return [json.loads(line)[0] for line in notes.read_text().splitlines()] if notes.exists() else []
+
+
+def wait_for(what, seconds=30):
+    until = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_one_after_the_other(tmp_path):
+    notes = tmp_path / "notes"
+    processes = [holding(tmp_path / "claims" / "00000", notes, 0.3) for _ in range(4)]
+    assert [process.wait(60) for process in processes] == [0] * 4
+    assert read(notes) == ["in", "out"] * 4
+
+
+def test_one_who_holds_it_for_longer_than_a_lease_is_waited_for(tmp_path):
+    path, notes = tmp_path / "00000", tmp_path / "notes"
+    process = holding(path, notes, 2.5 * LEASE)
+    wait_for(lambda: read(notes) == ["in"])
+    with claimed(path, LEASE):
+        assert read(notes) == ["in", "out"]
+    assert process.wait(10) == 0
+
+
+def test_a_killed_holder_is_waited_for_until_its_lease_ends(tmp_path):
+    path, notes = tmp_path / "00000", tmp_path / "notes"
+    process = holding(path, notes, 1000)
+    wait_for(lambda: read(notes) == ["in"])
+    process.kill()
+    process.wait()
+    begun = time.monotonic()
+    with claimed(path, LEASE):
+        assert 0.5 * LEASE < time.monotonic() - begun < 3 * LEASE
+    begun = time.monotonic()
+    with claimed(path, LEASE):  # that one was given back
+        assert time.monotonic() - begun < 0.5 * LEASE
+
+
+def test_a_holder_that_wakes_after_its_lease_leaves_at_once(tmp_path):
+    path, notes = tmp_path / "00000", tmp_path / "notes"
+    process = holding(path, notes, 1000)
+    wait_for(lambda: read(notes) == ["in"])
+    process.send_signal(19)  # SIGSTOP: it neither renews nor notices
+    with claimed(path, LEASE):
+        process.send_signal(18)
+        assert process.wait(LEASE) == 75
+        mine = max(tmp_path.glob("00000.*"))
+        assert time.time() - mine.stat().st_mtime < LEASE  # it did not give back what is not its own
+
+
+@pytest.mark.parametrize("how", ["taken", "gone", "not its own"])
+def test_a_lost_claim_is_noticed(tmp_path, how):
+    lost = threading.Event()
+    with claimed(tmp_path / "claims" / "00000", LEASE, lost.set):
+        claim = tmp_path / "claims" / "00000.1"
+        assert not lost.wait(LEASE)  # nothing is wrong yet
+        if how == "taken":
+            claim.with_suffix(".2").touch()
+        elif how == "gone":
+            os.rename(tmp_path / "claims", tmp_path / "away")
+        else:
+            claim.write_text("another's")
+        assert lost.wait(LEASE)
+
+
+def test_a_claim_that_cannot_be_renewed_is_given_up_before_others_may_take_it(tmp_path, monkeypatch):
+    lost, real = threading.Event(), os.utime
+
+    def hang(path, *more):
+        if "00000.1" in str(path) and not more:
+            time.sleep(10 * LEASE)  # as a file server does that is gone
+        real(path, *more)
+
+    monkeypatch.setattr(os, "utime", hang)
+    begun = time.monotonic()
+    keeper = claimed(tmp_path / "00000", LEASE, lost.set)
+    keeper.__enter__()
+    assert lost.wait(LEASE)
+    assert time.monotonic() - begun < LEASE

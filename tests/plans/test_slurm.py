@@ -1,0 +1,266 @@
+"""Plans by submitit's jobs: the outcome is the local engine's, whatever befalls the jobs."""
+
+import filecmp
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install "robocas-ms3[slurm]"')
+
+from plan_stages import FAULTS, stages
+
+from robocas_ms3.errors import PlanError
+from robocas_ms3.plans.engines import open_engine
+from robocas_ms3.plans.engines.local import LocalEngine
+from robocas_ms3.plans.engines.slurm import SlurmEngine
+from robocas_ms3.plans.plan import PartConfig, Plan
+from robocas_ms3.plans.run import run_plan
+from robocas_ms3.plans.units import Unit, deaths
+
+SUPPORT = Path(__file__).resolve().parents[1] / "support"
+PLAN = Plan(
+    parts=[
+        PartConfig(task="pick", config="pick_table_scattered", episodes=5, seed=10, name="a"),
+        PartConfig(task="pick", config="pick_shelf_scattered", episodes=2, seed=3, name="b"),
+    ],
+    stages=["demonstrations", "datasets"],
+    pictures={"size": [64, 48]},
+    embeddings=False,
+    block=3,
+    limits={"record_seconds": 60, "render_seconds": 60, "memory_gb": 4},
+)
+LOCAL = {"executor": "local", "lease": "6"}
+
+
+def sinfo_answers():
+    try:
+        return subprocess.run(["sinfo", "--noheader"], capture_output=True, timeout=10, check=False).returncode == 0
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+
+
+EXECUTORS = [
+    pytest.param(LOCAL, id="local"),
+    pytest.param(
+        {"executor": "slurm", "lease": "6", "time": "10", "mem_gb": "1"},
+        id="slurm",
+        marks=[
+            pytest.mark.slow,
+            pytest.mark.skipif(not sinfo_answers(), reason="no Slurm answers here: scripts/slurm_here.sh starts one"),
+        ],
+    ),
+]
+
+
+@pytest.fixture(autouse=True)
+def stages_in_jobs(monkeypatch):
+    path = [str(SUPPORT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
+
+
+def run(out, options=LOCAL, plan=PLAN, jobs=2, **more):
+    def open_slurm(plan, out):
+        return SlurmEngine(plan, out, jobs, options, stages="plan_stages:stages")
+
+    return run_plan(plan, out, open_slurm, jobs=1, **more)
+
+
+def plan_faults(out, faults):
+    out.with_name(f"{out.name}-{FAULTS}").write_text(json.dumps(faults))
+
+
+def wait_for(what, seconds=120):
+    until = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def assert_same(one, other):
+    def products(out):
+        kept = ("demos", "datasets", "report.json")
+        return sorted(p.relative_to(out) for p in out.rglob("*") if p.is_file() and p.relative_to(out).parts[0] in kept)
+
+    assert products(one) == products(other)
+    assert [path for path in products(one) if not filecmp.cmp(one / path, other / path, shallow=False)] == []
+
+
+def assert_done_once(out):
+    """Nobody did again what another had done."""
+    for folder in (out / "units").glob("*/*"):
+        lines = [json.loads(line)["seed"] for line in (folder / "seeds.jsonl").read_text().splitlines()]
+        assert sorted(set(lines)) == sorted(lines)
+
+
+def processes_of(out, word="submitit.core._submit"):
+    """Of the jobs that are at a plan: those that do units."""
+    found = []
+    for process in psutil.process_iter(["cmdline"]):
+        line = process.info["cmdline"] or []
+        if word in line and str(out / "slurm") in line and not line[0].endswith("srun"):
+            found.append(process)
+    return found
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    out = tmp_path_factory.mktemp("plan") / "out"
+    run_plan(PLAN, out, lambda plan, out: LocalEngine(plan, out, 1, stages=stages()), jobs=1)
+    return out
+
+
+@pytest.mark.parametrize("options", EXECUTORS)
+@pytest.mark.parametrize("units_per_job", [1, 2])
+def test_jobs_make_what_this_machine_makes(undisturbed, tmp_path, options, units_per_job):
+    out = tmp_path / "out"
+    run(out, options | {"units_per_job": str(units_per_job)})
+    assert_same(undisturbed, out)
+    assert_done_once(out)
+    wait_for(lambda: not processes_of(out))
+    assert len(list((out / "slurm").glob("*_log.out"))) == {1: 3, 2: 2}[units_per_job]  # of three units
+
+
+@pytest.mark.parametrize("options", EXECUTORS)
+def test_a_job_that_is_killed_costs_nothing(undisturbed, tmp_path, options):
+    out = tmp_path / "out"
+    plan_faults(out, {11: ["hang"], 4: ["hang"]})
+    runner = subprocess.Popen(
+        [sys.executable, __file__, str(out), json.dumps(options)], stderr=subprocess.PIPE, text=True
+    )
+    killed = set()
+    for seed in (11, 4):
+        tries = out.with_name(f"out-tries-{seed}")
+        wait_for(tries.exists)
+        for process in processes_of(out):
+            if process.pid not in killed and holds(process, out, seed):
+                killed.add(process.pid)
+                process.kill()
+    assert runner.wait(240) == 0, runner.stderr.read()
+    assert killed
+    assert_same(undisturbed, out)
+    assert_done_once(out)
+    assert [death for unit in (Unit(0, 0), Unit(1, 0)) for death in deaths(unit.folder(PLAN, out)).read()] == []
+
+
+def holds(process, out, seed):
+    """Whether a job has the claim on the unit of a seed."""
+    claims = out / "slurm" / "claims" / ("a" if seed >= 10 else "b")
+    return any(path.read_text().split()[1:2] == [str(process.pid)] for path in claims.glob("00000.*"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGUSR2, signal.SIGTERM], ids=["time is up", "told to end"])
+def test_a_signal_to_all_processes_of_a_job_is_blamed_on_no_seed(undisturbed, tmp_path, number):
+    out = tmp_path / "out"
+    plan_faults(out, {11: ["hang"]})
+    runner = subprocess.Popen([sys.executable, __file__, str(out), json.dumps(LOCAL)])
+    wait_for(out.with_name("out-tries-11").exists)
+    (job,) = [process for process in processes_of(out) if holds(process, out, 11)]
+    for process in [*reversed(job.children(recursive=True)), job]:  # Slurm goes through them in no order
+        process.send_signal(number)
+    assert runner.wait(240) == 0
+    assert_same(undisturbed, out)
+    assert_done_once(out)
+    assert deaths(Unit(0, 0).folder(PLAN, out)).read() == []
+
+
+@pytest.mark.parametrize("options", EXECUTORS)
+def test_ctrl_c_ends_jobs_at_once_and_the_plan_goes_on_later(undisturbed, tmp_path, options):
+    out = tmp_path / "out"
+    plan_faults(out, {10: ["hang"]})
+    runner = subprocess.Popen([sys.executable, __file__, str(out), json.dumps(options)], stderr=subprocess.DEVNULL)
+    wait_for(out.with_name("out-tries-10").exists)
+    begun = time.monotonic()
+    runner.send_signal(signal.SIGINT)
+    assert runner.wait(10) != 0
+    assert time.monotonic() - begun < 5  # 3 s are promised, to a machine that has nothing else to do
+    wait_for(lambda: not processes_of(out), 5)
+    assert not (out / "report.json").exists()
+    run(out, options, resume=True)
+    assert_same(undisturbed, out)
+    assert_done_once(out)
+
+
+@pytest.mark.parametrize("options", EXECUTORS)
+def test_jobs_of_a_killed_run_and_those_of_the_next_are_never_at_one_unit(undisturbed, tmp_path, options):
+    out = tmp_path / "out"
+    runner = subprocess.Popen([sys.executable, __file__, str(out), json.dumps(options)], stderr=subprocess.DEVNULL)
+    wait_for(lambda: list((out / "slurm").glob("claims/a/*")))
+    runner.kill()
+    runner.wait()
+    run(out, options, resume=True)
+    assert_same(undisturbed, out)
+    assert_done_once(out)
+
+
+def test_a_unit_whose_jobs_die_again_and_again_is_an_error_with_their_log(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[2]))  # no plan_stages in the jobs
+    with pytest.raises(PlanError, match=r"units/a/00000: the jobs of this unit die .*2 in a row.*_log.out") as error:
+        run(tmp_path / "out", LOCAL | {"tries": "2"})
+    log = Path(str(error.value.fix).split()[1].rstrip(";"))
+    assert "plan_stages" in log.read_text()
+
+
+def test_an_error_of_all_seeds_crosses_over_and_ends_the_run(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    plan_faults(out, {13: ["refuse"]})
+    with pytest.raises(ValueError, match="a bug"):
+        run(out)
+    wait_for(lambda: not processes_of(out), 5)
+    run(out, resume=True)
+    assert_same(undisturbed, out)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"partitoin": "x"}, "no options of the engine slurm .expected executor, .*partition.*found .'partitoin'."),
+        ({"units_per_job": "0"}, "units_per_job"),
+        ({"time": "2h"}, "time"),
+        ({"executor": "pbs"}, "'slurm' or 'local'"),
+    ],
+)
+def test_options_that_are_wrong_are_refused(tmp_path, options, said):
+    with pytest.raises(PlanError, match=said):
+        open_engine("slurm", PLAN, tmp_path, 1, options)
+
+
+def test_without_slurm_the_engine_says_so(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(PlanError, match="there is no Slurm here.*executor=local"):
+        open_engine("slurm", PLAN, tmp_path, 1, {})
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sinfo_answers(), reason="no Slurm answers here: scripts/slurm_here.sh starts one")
+def test_what_sbatch_refuses_is_said(tmp_path):
+    with pytest.raises(PlanError, match="Slurm takes no such jobs.*partition"):
+        run(tmp_path / "out", {"partition": "none_of_this_name"})
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sinfo_answers(), reason="no Slurm answers here: scripts/slurm_here.sh starts one")
+def test_a_requeued_job_goes_on(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    plan_faults(out, {11: ["hang"]})
+    options = EXECUTORS[1].values[0]
+    runner = subprocess.Popen([sys.executable, __file__, str(out), json.dumps(options)])
+    wait_for(out.with_name("out-tries-11").exists)
+    running = ["squeue", "--noheader", "--array", "--states=RUNNING", "--format=%i"]
+    for job in subprocess.run(running, capture_output=True, text=True, check=True).stdout.split():
+        subprocess.run(["scontrol", "requeue", job], check=True)
+    assert runner.wait(240) == 0
+    assert_same(undisturbed, out)
+    assert_done_once(out)
+    assert deaths(Unit(0, 0).folder(PLAN, out)).read() == []
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(SUPPORT))
+    run(Path(sys.argv[1]), json.loads(sys.argv[2]), resume=True)
