@@ -169,13 +169,13 @@ def test_a_protocol_of_its_own_is_frozen_and_measured_with(measured):
 @pytest.mark.slow
 def test_its_results_are_measured_in_parts_and_merged(site, measured):
     folder, _ = measured
-    words = ("eval", "push_zone", "--protocol", "protocols/push-zone-v1", "--policy", "random")
+    words = ("eval", "push_zone", "--protocol", "protocols/push-zone-v1", "--policy", "scripted")
     for number in (0, 1):
         robocas(site, *words, "--shard", f"{number}/2", "--out", f"eval/{number}", cwd=folder)
-    robocas(site, "eval", "merge", "eval/0", "eval/1", "--out", "eval/random", cwd=folder)
-    verified = robocas(site, "eval", "verify", "eval/random", "--protocol", "protocols/push-zone-v1", cwd=folder)
+    robocas(site, "eval", "merge", "eval/0", "eval/1", "--out", "eval/whole", cwd=folder)
+    verified = robocas(site, "eval", "verify", "eval/whole", "--protocol", "protocols/push-zone-v1", cwd=folder)
     assert "2 episodes of push-zone-v1, all well" in verified
-    outcomes = [json.loads(line) for line in (folder / "eval" / "random" / "episodes.jsonl").read_text().splitlines()]
+    outcomes = [json.loads(line) for line in (folder / "eval" / "whole" / "episodes.jsonl").read_text().splitlines()]
     assert [outcome["task"] for outcome in outcomes] == ["push_zone"] * 2
     assert "success_v0" not in outcomes[0]["flags"]
 

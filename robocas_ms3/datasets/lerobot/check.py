@@ -21,7 +21,7 @@ from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_videos import TOLERANCE, check_videos
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.stats import QUANTILES
+from robocas_ms3.datasets.lerobot.stats import QUANTILES, shape_of
 from robocas_ms3.datasets.lerobot.tables import numbers, read_rows
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
 
@@ -104,13 +104,8 @@ def _check_info(info: Mapping[str, Any]) -> Iterator[Violation]:
         yield Violation(schema.INFO_FILE, "codebase_version", schema.CODEBASE_VERSION, found)
     elif not isinstance(info["fps"], int):
         yield Violation(schema.INFO_FILE, "fps", "a whole number", str(info["fps"]))
-    elif not (isinstance(info["features"], dict) and all(map(_is_feature, info["features"].values()))):
+    elif not (isinstance(info["features"], dict) and all(map(schema.is_feature, info["features"].values()))):
         yield Violation(schema.INFO_FILE, "features", "dtype and shape of each", str(info["features"])[:80])
-
-
-def _is_feature(said: Any) -> bool:
-    shape = said.get("shape") if isinstance(said, dict) else None
-    return isinstance(shape, list) and all(type(n) is int for n in shape) and isinstance(said.get("dtype"), str)
 
 
 def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
@@ -263,9 +258,9 @@ def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Viola
             yield Violation(schema.STATS_FILE, key, ", ".join(sorted(missing)), "nothing")
             continue
         shape = (3, 1, 1) if feature["dtype"] == "video" else tuple(feature["shape"])
-        wrong = [name for name, value in found.items() if name != "count" and _shape(value) != shape]
+        wrong = [name for name, value in found.items() if name != "count" and shape_of(value) != shape]
         if wrong:
-            shown = f"{_shape(found[wrong[0]])}"
+            shown = f"{shape_of(found[wrong[0]])}"
             yield Violation(schema.STATS_FILE, f"{key}, {wrong[0]}", f"shape {shape}", shown)
         elif key in ranges:
             low, high, count = ranges[key]
@@ -274,13 +269,6 @@ def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Viola
                 expected = f"min {low.tolist()}, max {high.tolist()}, count {count}"
                 text = f"min {found['min']}, max {found['max']}, count {found['count']}"
                 yield Violation(schema.STATS_FILE, key, expected, text)
-
-
-def _shape(value: Any) -> tuple[int, ...] | str:
-    try:
-        return np.asarray(value, dtype=np.float64).shape
-    except (TypeError, ValueError):
-        return "no numbers"
 
 
 def _check_checksums(root: Path) -> Iterator[Violation]:

@@ -123,3 +123,11 @@ class Levels:
             found[name] = levels[(below < share * total[:, None]).sum(axis=1)]
         shaped = {name: row.reshape(3, 1, 1).tolist() for name, row in found.items()}
         return {**shaped, "count": [self.pictures]}
+
+
+def shape_of(value: Any) -> tuple[int, ...] | str:
+    """Shape of numbers in nested lists, or that they are none."""
+    try:
+        return np.asarray(value, dtype=np.float64).shape
+    except (TypeError, ValueError):
+        return "no numbers"
