@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, Generic, TypeVar
 
@@ -57,7 +59,7 @@ class Child(Generic[Task, Result]):
 
         Raises:
             ChildDied: the process died, or was ended for time or memory.
-            PlanError: it died before it could begin: not for the task.
+            PlanError: it died, or failed, before it could begin: not for the task.
             Stopped: `stop` was called.
             Exception: whatever the task raises.
         """
@@ -83,6 +85,8 @@ class Child(Generic[Task, Result]):
         finally:
             self._busy = False
         if isinstance(answer, SentError):
+            if not self._open:
+                raise PlanError("a process could not begin", found=answer.error) from answer.error
             answer.reraise()
         return answer
 
@@ -109,7 +113,7 @@ class Child(Generic[Task, Result]):
         """Why the process died."""
         self._process.join(5)
         code = self._process.exitcode
-        if code in (-signal.SIGTERM, -signal.SIGKILL):
+        if code in (-signal.SIGTERM, -signal.SIGKILL) and not self._closed:
             time.sleep(_KILLED_TOO)  # else a seed would be blamed for what befell all
         self.end()
         return signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
@@ -120,6 +124,7 @@ class Child(Generic[Task, Result]):
             context = multiprocessing.get_context("spawn")
             self._pipe, theirs = context.Pipe()
             self._process = context.Process(target=_serve, args=(self._open_worker, theirs, os.getpid()), daemon=True)
+            resource_tracker.ensure_running()  # not below: it lets Ctrl-C in again
             with uninterrupted():  # the process inherits that until it can deal with Ctrl-C
                 self._process.start()
             self._open = False
@@ -167,7 +172,7 @@ def _serve(open_worker: Callable[[], Worker[Any, Any]], pipe: Connection, parent
         try:
             task = pipe.recv()
         except EOFError:
-            return
+            break
         try:
             if worker is None:
                 worker = open_worker()
@@ -176,3 +181,5 @@ def _serve(open_worker: Callable[[], Worker[Any, Any]], pipe: Connection, parent
         except BaseException as error:
             answer = SentError.of(error, "a worker")
         pipe.send(answer)
+    atexit._run_exitfuncs()
+    os._exit(0)  # without what torch and SAPIEN do in the end: a second, while one waits who pressed Ctrl-C

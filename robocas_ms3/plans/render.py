@@ -24,6 +24,10 @@ class Renders:
     def __init__(self, plan: Plan, open_source: OpenSource = open_env) -> None:
         os.environ.setdefault("LP_NUM_THREADS", "1")  # as many processes render as there are cores
         use_one_torch_thread()
+        if open_source is open_env:  # where it is missing, it is for all episodes
+            from robocas_ms3.datasets.writing.render import require_renderer
+
+            require_renderer()
         self._plan, self._open_source = plan, open_source
         self._part: int | None = None
         self._player: RecordingPlayer | None = None

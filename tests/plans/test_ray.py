@@ -1,6 +1,5 @@
 """Plans on a cluster of Ray: two nodes on this machine make what one process makes, whatever befalls them."""
 
-import filecmp
 import json
 import os
 import signal
@@ -16,7 +15,7 @@ import pytest
 
 ray = pytest.importorskip("ray", reason="needs the ray extra: plans on a cluster of Ray are NOT tested")
 
-from plan_stages import MadeUp, render, stages
+from plan_stages import PLAN, MadeUp, assert_same, render, stages
 from ray.cluster_utils import Cluster
 
 from robocas_ms3.errors import PlanError
@@ -24,23 +23,12 @@ from robocas_ms3.plans.engines import ray as engine
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.engines.ray import RayEngine
 from robocas_ms3.plans.engines.ray_cluster import RayOptions, read_options
-from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.run import run_plan
 from robocas_ms3.plans.slot import Stages
 from robocas_ms3.plans.units import Unit
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
-PLAN = Plan(
-    parts=[
-        PartConfig(task="pick", config="pick_table_scattered", episodes=5, seed=10, name="a"),
-        PartConfig(task="pick", config="pick_shelf_scattered", episodes=2, seed=3, name="b"),
-    ],
-    stages=["demonstrations", "datasets"],
-    pictures={"size": [64, 48]},
-    embeddings=False,
-    block=3,
-    limits={"record_seconds": 20, "render_seconds": 20, "memory_gb": 4},
-)
+
 LEASE = 4.0
 
 
@@ -63,25 +51,6 @@ class Slow(MadeUp):
 def slow_stages(notes, seconds=1.0):
     notes.mkdir()
     return Stages(partial(Slow, notes, seconds), render)
-
-
-def products(out):
-    return {
-        path.relative_to(out)
-        for name in ("demos", "datasets", "report.json")
-        for path in ([out / name] if (out / name).is_file() else (out / name).rglob("*"))
-        if path.is_file()
-    }
-
-
-def assert_same(one, other):
-    assert products(one) == products(other) != set()
-    assert not [path for path in products(one) if not filecmp.cmp(one / path, other / path, shallow=False)]
-    for folder in (other / "units").glob("*/*"):
-        lines = [json.loads(line)["seed"] for line in (folder / "seeds.jsonl").read_text().splitlines()]
-        assert len(set(lines)) == len(lines)  # nothing is done twice
-        assert (folder / "done.json").is_file()
-        assert not list(folder.glob(".*"))
 
 
 @pytest.fixture(scope="module")

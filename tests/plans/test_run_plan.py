@@ -1,40 +1,30 @@
 """Plans over made-up episodes: the outcome follows from the plan, whoever does the units and whatever befalls them."""
 
-import filecmp
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import psutil
 import pytest
-from plan_stages import FAULTS, stages
+from plan_stages import PLAN, MadeUp, assert_same, plan_faults, stages
 
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.errors import MissingExtraError, OutputExistsError, PlanError
 from robocas_ms3.plans.engines.local import LocalEngine
-from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.run import _Part, run_plan
-from robocas_ms3.plans.slot import Slot
+from robocas_ms3.plans.slot import Slot, Stages
 from robocas_ms3.plans.status import status
 from robocas_ms3.plans.units import Outcome, Unit, deaths
 from robocas_ms3.recordings.reading import TrajectoryFile
 from robocas_ms3.recordings.versions import versions
 
-PLAN = Plan(
-    parts=[
-        PartConfig(task="pick", config="pick_table_scattered", episodes=5, seed=10, name="a"),
-        PartConfig(task="pick", config="pick_shelf_scattered", episodes=2, seed=3, name="b"),
-    ],
-    stages=["demonstrations", "datasets"],
-    pictures={"size": [64, 48]},
-    embeddings=False,
-    block=3,
-    limits={"record_seconds": 20, "render_seconds": 20, "memory_gb": 4},
-)
+SUPPORT = Path(__file__).resolve().parents[1] / "support"
 
 
 def run(out, plan=PLAN, jobs=1, stop_before_join=False, **more):
@@ -44,26 +34,6 @@ def run(out, plan=PLAN, jobs=1, stop_before_join=False, **more):
             run(out, plan, jobs, **more)
         return None
     return run_plan(plan, out, lambda plan, out: LocalEngine(plan, out, jobs, stages=stages()), jobs=1, **more)
-
-
-def plan_faults(out, faults):
-    out.with_name(f"{out.name}-{FAULTS}").write_text(json.dumps(faults))
-
-
-def products(out):
-    """Paths of what a plan makes, without what a clock says."""
-    return sorted(
-        path.relative_to(out)
-        for name in ("demos", "datasets", "report.json")
-        for path in ([out / name] if (out / name).is_file() else (out / name).rglob("*"))
-        if path.is_file()
-    )
-
-
-def assert_same(one, other):
-    assert products(one) == products(other)
-    different = [path for path in products(one) if not filecmp.cmp(one / path, other / path, shallow=False)]
-    assert not different
 
 
 @pytest.fixture(scope="module")
@@ -169,19 +139,78 @@ def test_a_folder_of_something_else_is_not_gone_on_with(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {".bashrc.old", "plan.json"}
 
 
-def test_ctrl_c_ends_processes_that_are_starting_and_blames_no_seed(tmp_path):
+@contextmanager
+def in_a_process(out):
+    """A run of two slots, in a process of its own and a group of processes of their own."""
+    path = os.pathsep.join(map(str, (SUPPORT, *sys.path)))
+    process = subprocess.Popen(
+        [sys.executable, __file__, str(out)],
+        env={**os.environ, "PYTHONPATH": path},
+        start_new_session=True,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def wait_until(what, process):
+    until = time.monotonic() + 60
+    while not what():
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def seeds_done(out):
+    return sum(len(path.read_text().splitlines()) for path in out.glob("units/*/*/seeds.jsonl"))
+
+
+def alive(group):
+    """The processes of a group that run: an orphan that ended may wait for long to be reaped."""
+    return [one for one in psutil.process_iter() if of_group(one, group) and one.status() != psutil.STATUS_ZOMBIE]
+
+
+def of_group(process, group):
+    try:
+        return os.getpgid(process.pid) == group
+    except ProcessLookupError:
+        return False
+
+
+@pytest.mark.parametrize("seeds", [0, 2])
+def test_ctrl_c_ends_all_processes_soon_and_blames_no_seed(tmp_path, seeds):
     out = tmp_path / "out"
-    for wait in (0.8, 1.6):
-        process = subprocess.Popen(
-            [sys.executable, __file__, str(out)], start_new_session=True, stderr=subprocess.PIPE, text=True
-        )
-        time.sleep(wait)
+    with in_a_process(out) as process:
+        wait_until(lambda: (out / "plan.json").is_file() and seeds_done(out) >= seeds, process)
+        time.sleep(0.3)  # processes that record or render are starting
         begun = time.monotonic()
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=30)
-        assert time.monotonic() - begun < 6  # 3 s on a machine that is idle
+        assert time.monotonic() - begun < 3
+        assert process.returncode != 0
         assert said.count("Traceback") <= 1  # the runner's own
+        assert "KeyboardInterrupt" in said
+        assert alive(process.pid) == []
     assert not list(out.rglob("deaths.jsonl"))
+
+
+def cannot_begin(plan):
+    raise OSError("no such device\nat all")
+
+
+def test_a_process_that_cannot_begin_ends_the_run_and_blames_no_seed(tmp_path):
+    def open_engine(plan, out):
+        return LocalEngine(plan, out, 1, stages=Stages(MadeUp, cannot_begin))
+
+    with pytest.raises(PlanError, match="a process could not begin .found no such device"):
+        run_plan(PLAN, tmp_path / "out", open_engine)
+    assert not list(tmp_path.rglob("deaths.jsonl"))
+    assert not Unit(0, 0).is_done(PLAN, tmp_path / "out")
 
 
 def test_another_plan_or_run_in_the_folder_is_refused(undisturbed, tmp_path):
@@ -204,18 +233,17 @@ def test_a_machine_with_other_versions_does_no_unit(tmp_path):
 
 def test_killed_at_any_moment_it_goes_on_and_ends_the_same(undisturbed, tmp_path):
     out = tmp_path / "out"
-    for wait in (2.0, 4.5):
-        process = subprocess.Popen([sys.executable, __file__, str(out)], start_new_session=True)
-        time.sleep(wait)
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+    for seeds in (0, 1, 4):
+        with in_a_process(out) as process:
+            wait_until(lambda seeds=seeds: (out / "plan.json").is_file() and seeds_done(out) >= seeds, process)
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        assert not (out / "report.json").exists()
+    assert 4 <= seeds_done(out) < 9  # three units of three
     run(out, resume=True)
     assert_same(undisturbed, out)
-    for folder in (out / "units").glob("*/*"):
-        lines = [json.loads(line)["seed"] for line in (folder / "seeds.jsonl").read_text().splitlines()]
-        assert sorted(set(lines)) == sorted(lines)  # nothing is done twice
+    assert seeds_done(out) == 9
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
     run(Path(sys.argv[1]), jobs=2, resume=True)

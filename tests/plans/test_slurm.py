@@ -1,6 +1,5 @@
 """Plans by submitit's jobs: the outcome is the local engine's, whatever befalls the jobs."""
 
-import filecmp
 import json
 import os
 import signal
@@ -14,28 +13,17 @@ import pytest
 
 pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install "robocas-ms3[slurm]"')
 
-from plan_stages import FAULTS, stages
+from plan_stages import PLAN, assert_same, plan_faults, stages
 
 from robocas_ms3.errors import PlanError
 from robocas_ms3.plans.engines import open_engine
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.engines.slurm import SlurmEngine
-from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.run import run_plan
 from robocas_ms3.plans.units import Unit, deaths
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
-PLAN = Plan(
-    parts=[
-        PartConfig(task="pick", config="pick_table_scattered", episodes=5, seed=10, name="a"),
-        PartConfig(task="pick", config="pick_shelf_scattered", episodes=2, seed=3, name="b"),
-    ],
-    stages=["demonstrations", "datasets"],
-    pictures={"size": [64, 48]},
-    embeddings=False,
-    block=3,
-    limits={"record_seconds": 60, "render_seconds": 60, "memory_gb": 4},
-)
+
 LOCAL = {"executor": "local", "lease": "6"}
 
 
@@ -72,24 +60,11 @@ def run(out, options=LOCAL, plan=PLAN, jobs=2, **more):
     return run_plan(plan, out, open_slurm, jobs=1, **more)
 
 
-def plan_faults(out, faults):
-    out.with_name(f"{out.name}-{FAULTS}").write_text(json.dumps(faults))
-
-
 def wait_for(what, seconds=120):
     until = time.monotonic() + seconds
     while not what():
         assert time.monotonic() < until
         time.sleep(0.05)
-
-
-def assert_same(one, other):
-    def products(out):
-        kept = ("demos", "datasets", "report.json")
-        return sorted(p.relative_to(out) for p in out.rglob("*") if p.is_file() and p.relative_to(out).parts[0] in kept)
-
-    assert products(one) == products(other)
-    assert [path for path in products(one) if not filecmp.cmp(one / path, other / path, shallow=False)] == []
 
 
 def assert_done_once(out):

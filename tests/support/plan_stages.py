@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import json
 import os
 import signal
@@ -11,8 +12,10 @@ from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.errors import MissingExtraError
 from robocas_ms3.files import replacing_folder
+from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.render import Renders
 from robocas_ms3.plans.slot import Stages
+from robocas_ms3.plans.units import ledger
 
 FAULTS = "faults.json"
 """Seed -> what happens at each of its tries, the first ones first; nothing more where the list ends."""
@@ -71,3 +74,45 @@ def render(plan):
 
 def stages():
     return Stages(MadeUp, render)
+
+
+PLAN = Plan.model_validate(
+    {
+        "parts": [
+            PartConfig(task="pick", config="pick_table_scattered", episodes=5, seed=10, name="a"),
+            PartConfig(task="pick", config="pick_shelf_scattered", episodes=2, seed=3, name="b"),
+        ],
+        "stages": ["demonstrations", "datasets"],
+        "pictures": {"size": [64, 48]},
+        "embeddings": False,
+        "block": 3,
+        "limits": {"record_seconds": 60, "render_seconds": 60, "memory_gb": 4},
+    },
+    strict=False,
+)
+
+
+def plan_faults(out, faults):
+    """Seed -> what happens at each of its tries."""
+    out.with_name(f"{out.name}-{FAULTS}").write_text(json.dumps(faults))
+
+
+def products(out):
+    """Paths of what a plan makes, without what a clock says."""
+    return {
+        path.relative_to(out)
+        for name in ("demos", "datasets", "report.json")
+        for path in ([out / name] if (out / name).is_file() else (out / name).rglob("*"))
+        if path.is_file()
+    }
+
+
+def assert_same(one, other):
+    """See that two plans made the same, byte for byte, and that the second did nothing twice and left nothing half."""
+    assert products(one) == products(other) != set()
+    assert not [path for path in products(one) if not filecmp.cmp(one / path, other / path, shallow=False)]
+    for folder in (other / "units").glob("*/*"):
+        seeds = [outcome.seed for outcome in ledger(folder).read()]
+        assert len(set(seeds)) == len(seeds)
+        assert (folder / "done.json").is_file()
+        assert not list(folder.glob(".*"))
