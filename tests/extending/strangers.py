@@ -6,7 +6,10 @@ import os
 import re
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
+
+from forkserver import ForkServer
 
 try:
     import tomllib
@@ -34,13 +37,23 @@ def install(section: str, site: Path) -> Path:
     return site
 
 
+@cache
+def server(site: Path) -> ForkServer:
+    """Python with a folder of packages."""
+    return ForkServer(site, ROOT)
+
+
 def python(site: Path, *words: object, cwd: Path | None = None) -> str:
     """Run Python with a folder of packages, and in a folder; what it says."""
-    path = os.pathsep.join([str(site), str(ROOT), os.environ.get("PYTHONPATH", "")])
-    env, command = os.environ | {"PYTHONPATH": path}, [sys.executable, "-W", "ignore", *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd, env=env)
+    done = server(site).run(*words, cwd=cwd)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
+
+
+def fresh_python(site: Path, *words: object) -> str:
+    """The same of one that has imported nothing."""
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True, env=env).stdout
 
 
 def robocas(site: Path, *words: object, cwd: Path | None = None) -> str:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from strangers import robocas
 
 from robocas_ms3.cli.list import collect
 from robocas_ms3.errors import EvaluationError, ExtensionError
@@ -102,16 +101,7 @@ def test_it_is_measured_by_its_name(site, tmp_path):
     rules.write_text(rules.read_text().replace("max_steps: null", "max_steps: 3"))
     (line,) = [line for line in block("bash").splitlines() if "eval" in line]
     command = line.replace("robocas eval", "eval").replace("smoke", str(protocol)).split()
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
-    done = subprocess.run(
-        [sys.executable, "-m", "robocas_cli", *command, "--backend", "processes", "--envs", "1"],
-        cwd=tmp_path,
-        env=env,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    robocas(site, *command, "--backend", "processes", "--envs", 1, cwd=tmp_path)
     result = results.read(tmp_path / "eval" / "descend")
     assert result.run["policy"]["name"] == "descend"
     assert result.run["policy"]["class"] == "my_policies:Descend"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from strangers import PAGE, install, python, robocas
+from strangers import PAGE, fresh_python, install, python, robocas
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 TWIN = "import sys; from robocas_ms3.robots.table import find_robot; twin = find_robot('twin')\n"
@@ -33,7 +33,7 @@ def test_it_is_listed_and_read_without_a_simulator(site):
     robots = {row["name"]: row for row in json.loads(robocas(site, "list", "--json"))["robots"]}
     assert list(robots) == ["robocas_mobile_panda", "robocas_mobile_panda_stock_fingers", "twin"]
     assert robots["twin"]["agent"] == "robocas_twin.agent:Twin"
-    said = python(
+    said = fresh_python(
         site, "-c", TWIN + "print(twin.files().urdf.is_file(), {'sapien', 'mani_skill'} & sys.modules.keys())"
     )
     assert said.strip() == "True set()"
