@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import PLAN, Outcome, Unit, outcomes
 
 _AHEAD = 2  # units a slot that are under way, so that none waits for the next
-_LOOK = 2.0  # s between two looks at what is under way
+_LOOK = 1.0  # s between two looks at what is under way
 OpenEngine = Callable[[Plan, Path], Engine]
 OnProgress = Callable[[Sequence[int]], None]
 """Takes the episodes there are of each part, not more than were asked for."""
@@ -134,6 +135,7 @@ class _Part:
 
 def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_progress: OnProgress) -> None:
     under_way: dict[Future[list[Outcome]], Unit] = {}
+    said = -_LOOK
     while True:
         for part in parts:
             while part.wants_more() and len(under_way) < _AHEAD * engine.slots:
@@ -142,7 +144,9 @@ def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_
                     part.take(unit, unit.result(plan, out), out)
                 else:
                     under_way[engine.submit(unit)] = unit
-        on_progress(_counts(plan, out, parts, under_way))
+        if not under_way or time.monotonic() > said + _LOOK:  # it reads as many files as there are units under way
+            on_progress(_counts(plan, out, parts, under_way))
+            said = time.monotonic()
         if not under_way:
             return
         for future in wait(under_way, _LOOK, FIRST_COMPLETED).done:

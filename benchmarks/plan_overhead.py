@@ -1,0 +1,111 @@
+"""What a plan's engine and ledgers cost beside the work: units that only wait a second, on many workers; prints JSON.
+
+python benchmarks/plan_overhead.py --units 10000 --workers 64
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from robocas_ms3.plans.engines.local import LocalEngine
+from robocas_ms3.plans.plan import PartConfig, Plan
+from robocas_ms3.plans.run import run_plan
+from robocas_ms3.plans.slot import Stages
+from robocas_ms3.plans.units import Task, Unit, outcomes
+
+
+@dataclass
+class Benchmark:
+    """Run a plan of made-up units, of a seed each, until all are done; nothing is joined."""
+
+    units: int = 10_000
+    """How many."""
+    workers: int = 64
+    """Processes that do them."""
+    seconds: float = 1.0
+    """How long a unit takes."""
+
+
+@dataclass
+class Wait:
+    """A stage that takes its time, and none of the processor's."""
+
+    seconds: float
+
+    def do(self, task: Task) -> dict[str, Any]:
+        """Do nothing for a while."""
+        time.sleep(self.seconds)
+        return {"success": True, "steps": 1}
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def wait(seconds: float, plan: Plan) -> Wait:
+    """The stage of a plan."""
+    return Wait(seconds)
+
+
+class AllDoneError(Exception):
+    """There is nothing to join."""
+
+
+def stop(stage: str) -> None:
+    """End the run where it would join."""
+    raise AllDoneError(stage)
+
+
+def main(cfg: Benchmark) -> None:
+    """Run it."""
+    plan = Plan.model_validate(
+        {
+            "parts": [PartConfig(task="pick", config="pick_table_scattered", episodes=cfg.units, name="waits")],
+            "stages": ["demonstrations"],
+            "block": 1,
+        },
+        strict=False,
+    )
+    stage = partial(wait, cfg.seconds)
+    with tempfile.TemporaryDirectory() as folder:
+        out, begun = Path(folder) / "out", time.time()
+        cpu = time.process_time()
+        with suppress(AllDoneError):
+            run_plan(
+                plan,
+                out,
+                lambda plan, out: LocalEngine(plan, out, cfg.workers, stages=Stages(stage, stage)),
+                on_stage=stop,
+            )
+        cpu = time.process_time() - cpu
+        units = [Unit(0, block) for block in range(cfg.units)]
+        at = np.sort([one.at for unit in units for one in outcomes(unit.folder(plan, out)).values()])
+    # from when every worker has begun until the first has nothing left to do
+    first, last = 2 * cfg.workers, cfg.units - cfg.workers
+    rate = (last - first) / (at[last] - at[first])
+    report = {
+        "units": cfg.units,
+        "workers": cfg.workers,
+        "cores": os.cpu_count(),
+        "seconds_a_unit": cfg.seconds,
+        "units_a_second": round(float(rate), 2),
+        "overhead_percent": round(100 * (cfg.workers / cfg.seconds / float(rate) - 1), 2),
+        "wall_seconds": round(float(at[-1] - begun), 1),
+        "seconds_to_start": round(float(at[cfg.workers - 1] - begun) - cfg.seconds, 1),
+        "runner_cpu_ms_a_unit": round(1000 * cpu / cfg.units, 2),
+    }
+    print(json.dumps(report, indent=2))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Benchmark))

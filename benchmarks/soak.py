@@ -1,0 +1,157 @@
+"""A plan run for a while and then interrupted: episodes an hour, seconds and memory they take; prints JSON.
+
+python benchmarks/soak.py --minutes 60 --jobs 2
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import tyro
+import yaml
+
+from robocas_ms3.plans.status import status
+from robocas_ms3.plans.units import DEATHS, Outcome, ledger, outcomes
+
+LOOK = 5.0  # s between two looks at memory
+
+
+@dataclass
+class Benchmark:
+    """Run `robocas plan run` on a plan that is longer than the time, then press Ctrl-C."""
+
+    minutes: float = 60.0
+    """For how long."""
+    jobs: int = 2
+    """Episodes at once."""
+    tasks: tuple[str, ...] = ("pick", "select", "search")
+    """Which take turns."""
+    turn: int = 10
+    """Episodes of a turn."""
+    pictures: bool = True
+    """Whether they are rendered: three cameras, RGB-D, 640 x 480, 5 Hz."""
+    seed: int = 0
+    """The first; take ones that were never used."""
+
+
+@dataclass
+class Memory:
+    """Of one process, as it was seen."""
+
+    at: list[float] = field(default_factory=list)
+    megabytes: list[float] = field(default_factory=list)
+
+
+def main(cfg: Benchmark) -> None:
+    """Run it."""
+    with tempfile.TemporaryDirectory() as folder:
+        plan, out = Path(folder) / "soak.yaml", Path(folder) / "out"
+        plan.write_text(yaml.safe_dump(plan_of(cfg)), encoding="utf-8")
+        words = ["plan", "run", str(plan), "--out", str(out), "--jobs", str(cfg.jobs)]
+        begun = time.monotonic()
+        process = subprocess.Popen([sys.executable, "-W", "ignore", "robocas_cli.py", *words], start_new_session=True)
+        try:
+            memory = watch(process, begun + 60 * cfg.minutes)
+            wall = time.monotonic() - begun
+            os.killpg(process.pid, signal.SIGINT)
+            interrupted = time.monotonic()
+            process.wait(60)
+            ctrl_c = time.monotonic() - interrupted
+        finally:
+            process.kill()
+        print(json.dumps(report(cfg, out, wall, ctrl_c, memory), indent=2))
+
+
+def plan_of(cfg: Benchmark) -> dict[str, Any]:
+    """Turns of the tasks, more than can be done."""
+    turns = max(1, int(cfg.minutes * cfg.jobs))
+    parts = [
+        {"task": task, "episodes": cfg.turn, "seed": cfg.seed + 1000 * turn, "name": f"{task}-{turn:04d}"}
+        for turn in range(turns)
+        for task in cfg.tasks
+    ]
+    stages = ["demonstrations", "datasets"] if cfg.pictures else ["demonstrations"]
+    return {"parts": parts, "stages": stages, "embeddings": False, "block": 1}
+
+
+def watch(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:
+    """Look at the memory of the runner's processes until it is time, or it ends."""
+    memory: dict[int, Memory] = defaultdict(Memory)
+    runner = psutil.Process(process.pid)
+    while time.monotonic() < until:
+        if process.poll() is not None:
+            raise SystemExit(f"the run ended by itself: exit code {process.returncode}")
+        for child in runner.children():
+            try:
+                memory[child.pid].megabytes.append(child.memory_info().rss / 2**20)
+                memory[child.pid].at.append(time.monotonic())
+            except psutil.Error:
+                continue
+        time.sleep(LOOK)
+    return memory
+
+
+def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[int, Memory]) -> dict[str, Any]:
+    """The figures."""
+    found: dict[str, list[Outcome]] = defaultdict(list)
+    doubled = 0
+    for folder in sorted((out / "units").glob("*/*")):
+        made = list(outcomes(folder).values())
+        doubled += len(ledger(folder).read()) - len(made)
+        found[folder.parent.name.split("-")[0]] += made
+    good = {task: [one for one in made if one.success] for task, made in found.items()}
+    cpu = {
+        task: sum(one.record_seconds + one.render_seconds for one in made) / max(1, len(good[task]))
+        for task, made in found.items()
+    }
+    episodes = sum(map(len, good.values()))
+    return {
+        "minutes": round(wall / 60, 1),
+        "jobs": cfg.jobs,
+        "episodes": {task: len(made) for task, made in good.items()},
+        "seeds": {task: len(made) for task, made in found.items()},
+        "episodes_an_hour": round(3600 * episodes / wall, 1),
+        "episodes_an_hour_lately": status(out).episodes_an_hour,
+        "cpu_seconds_an_episode": {task: round(seconds, 2) for task, seconds in cpu.items()},
+        "wall_seconds_times_jobs_an_episode": round(wall * cfg.jobs / max(1, episodes), 2),
+        "steps_an_episode": {
+            task: round(sum(one.steps for one in made) / max(1, len(made))) for task, made in good.items()
+        },
+        "megabytes_an_episode": {
+            task: round(sum(one.size for one in made) / 1e6 / max(1, len(made)), 2) for task, made in good.items()
+        },
+        "deaths": sum(len(path.read_text().splitlines()) for path in out.rglob(DEATHS)),
+        "doubled": doubled,
+        "ctrl_c_seconds": round(ctrl_c, 2),
+        "processes": [growth(one, episodes / cfg.jobs / wall) for one in memory.values() if len(one.at) * LOOK > 60],
+    }
+
+
+def growth(memory: Memory, episodes_a_second: float) -> dict[str, float]:
+    """How a process grew, from its third minute on: before, it loads what it needs."""
+    at, megabytes = np.array(memory.at), np.array(memory.megabytes)
+    later = at > at[0] + 120
+    slope = float(np.polyfit(at[later], megabytes[later], 1)[0]) if later.sum() > 10 else float("nan")
+    return {
+        "minutes": round(float(at[-1] - at[0]) / 60, 1),
+        "first_mb": round(float(megabytes[: max(1, len(megabytes) // 10)].mean())),
+        "last_mb": round(float(megabytes[-max(1, len(megabytes) // 10) :].mean())),
+        "peak_mb": round(float(megabytes.max())),
+        "growth_mb_in_500_episodes": round(500 * slope / episodes_a_second, 1) if episodes_a_second else float("nan"),
+    }
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Benchmark))
