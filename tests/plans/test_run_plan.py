@@ -25,6 +25,7 @@ from robocas_ms3.recordings.reading import TrajectoryFile
 from robocas_ms3.recordings.versions import versions
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
+SOON = 10  # s; on a machine that does nothing else it is 1.4, which is not for a test beside others to measure
 
 
 def run(out, plan=PLAN, jobs=1, stop_before_join=False, **more):
@@ -144,7 +145,7 @@ def in_a_process(out):
     """A run of two slots, in a process of its own and a group of processes of their own."""
     path = os.pathsep.join(map(str, (SUPPORT, *sys.path)))
     process = subprocess.Popen(
-        [sys.executable, __file__, str(out)],
+        [sys.executable, SUPPORT / "plan_runner.py", out],
         env={**os.environ, "PYTHONPATH": path},
         start_new_session=True,
         stderr=subprocess.PIPE,
@@ -196,12 +197,12 @@ def test_ctrl_c_ends_all_processes_soon_and_blames_no_seed(tmp_path, seeds):
         begun = time.monotonic()
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=30)
-        assert time.monotonic() - begun < 3
+        assert time.monotonic() - begun < SOON
         assert process.returncode != 0
         assert said.count("Traceback") <= 1  # the runner's own
         assert "KeyboardInterrupt" in said
         while alive(process.pid):  # an ending one of Python's own, which keeps track of semaphores, is the last
-            assert time.monotonic() - begun < 3, alive(process.pid)
+            assert time.monotonic() - begun < SOON, alive(process.pid)
     assert not list(out.rglob("deaths.jsonl"))
 
 
@@ -249,7 +250,3 @@ def test_killed_at_any_moment_it_goes_on_and_ends_the_same(undisturbed, tmp_path
     run(out, resume=True)
     assert_same(undisturbed, out)
     assert seeds_done(out) == 9
-
-
-if __name__ == "__main__":
-    run(Path(sys.argv[1]), jobs=2, resume=True)
