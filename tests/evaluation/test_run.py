@@ -91,7 +91,9 @@ def test_the_policy_of_the_docs_sees_what_it_wants(short, tmp_path, monkeypatch,
     )
     (tmp_path / "docs_policy.py").write_text(program, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
-    outcomes = play(tmp_path / "out", "docs_policy:Descend", protocol=short, num_envs=2, episodes=2, tasks=("select",))
+    outcomes = play(
+        tmp_path / "out", "docs_policy:Descend", protocol=short, num_envs=2, workers=1, episodes=2, tasks=("select",)
+    )
     assert len(outcomes) == 2
     assert all(one["measures"]["path_length"] == pytest.approx(0.2, abs=0.02) for one in outcomes.values())
 

@@ -1,12 +1,11 @@
 """Programs of the docs that run as they are printed, each in a process of its own."""
 
-import os
 import re
-import subprocess
-import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
+from forkserver import ForkServer
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 pytestmark = pytest.mark.slow
@@ -23,13 +22,16 @@ def run_first_program(page: str, cwd: Path) -> list[str]:
     return run_program(programs(page)[0], cwd)
 
 
+@cache
+def server() -> ForkServer:
+    return ForkServer()
+
+
 def run_program(program: str, cwd: Path) -> list[str]:
     """What a program prints."""
     path = cwd / "program.py"
     path.write_text(program, encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, str(path)], cwd=cwd, env=os.environ, capture_output=True, text=True, check=False
-    )
+    done = server().run(path, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 

@@ -49,7 +49,7 @@ def short(tmp_path_factory):
 
 def test_outcomes_pictures_and_instructions_are_those_of_robocas_eval(needs_renderer, short, tmp_path):
     protocol, policy = load_protocol(short), Down()
-    settings = Settings(2, "processes", tasks=("search",))
+    settings = Settings(2, "processes", workers=1, tasks=("search",))
     list(evaluate(protocol, policy, "down", tmp_path / "ours", settings))
     made = theirs("vector_env").RoboCASVectorEnv(
         "search",
