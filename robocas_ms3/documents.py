@@ -1,11 +1,16 @@
 """JSON and YAML files of others, bounded before anything is built of them: a small file must not take all memory.
 
+And what NumPy says of damaged files of arrays.
+
 What is wrong with a file is a `DocumentError`, and thereby a ``ValueError``; that it can't be read an ``OSError``.
 """
 
 from __future__ import annotations
 
 import json
+import tokenize
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +22,14 @@ YAML_LIMIT = 4 * 2**20
 YAML_DEPTH = 64
 YAML_NODES = 500_000
 """Values, those that aliases stand for counted each time: nine aliases of nine aliases of ... are a billion."""
+
+DAMAGED = (
+    *(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error),
+    NotImplementedError,  # damaged flags or method of an archive's member
+    *(SyntaxError, tokenize.TokenError),  # an array's header
+    MemoryError,  # and one that says it is larger than anything
+)
+"""What NumPy raises for damaged arrays and archives."""
 
 
 class DocumentError(ValueError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import glob
 import json
@@ -15,17 +16,23 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.errors import RobocasError
+from robocas_ms3.paths import variable_of
 
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT})  # what the system says of a disk without room
 ABANDONED = 86400.0  # s without a change: what a killed run left
 
 
 @contextmanager
 def naming(path: Path | str) -> Iterator[None]:
-    """Give errors of the system a path where they have none: writing into an open file says no name."""
+    """Give errors of the system a path where they have none: writing into an open file says no name.
+
+    What copies a file names the one it reads, and that of a full disk too: then it is this one.
+    """
     try:
         yield
     except OSError as error:
-        if error.errno is None or error.filename:
+        copied = error.filename2 and error.errno in FULL
+        if error.errno is None or (error.filename and not copied):
             raise
         raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
 
@@ -132,10 +139,34 @@ def make_folder(path: Path | str) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RobocasError("can't make this folder", where=path, found=error.strerror, fix="Choose another.") from error
+        raise RobocasError("can't make this folder", where=path, found=error.strerror, fix=_another(path)) from error
     if not os.access(path, os.W_OK | os.X_OK):
-        raise RobocasError("this folder is not writable", where=path, fix="Choose another, or change its permissions.")
+        fix = f"{_another(path)[:-1]}, or change its permissions."
+        raise RobocasError("this folder is not writable", where=path, fix=fix)
     return path
+
+
+def _another(path: Path) -> str:
+    variable = variable_of(path)
+    return f"Set {variable} to a folder that can be written to." if variable else "Choose another."
+
+
+def flush_to_disk(folder: Path | str) -> None:
+    """See that what was written on a folder's file system survives a power cut: one call for hundreds of files.
+
+    Raises:
+        OSError: it can't be written, naming the folder.
+    """
+    syncfs = getattr(ctypes.CDLL(None, use_errno=True), "syncfs", None)
+    if syncfs is None:
+        os.sync()
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        if syncfs(descriptor):
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(folder))
+    finally:
+        os.close(descriptor)
 
 
 def write_json(path: Path | str, data: Any) -> None:

@@ -8,9 +8,10 @@ folder behind of which nothing came.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import glob
-import json
+import logging
 import os
 import shutil
 import tempfile
@@ -20,9 +21,13 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import OutputExistsError, RobocasError
 from robocas_ms3.files import empty_folder, is_fixed, make_folder
 
+# What the system says where there are none: of some network file systems, or of a lock server that is gone
+_NO_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS})
+_log = logging.getLogger(__name__)
 _INSIDE = ".lock"  # of a folder that can't have it beside it
 
 
@@ -143,7 +148,7 @@ def check_run(path: Path, key: str, command: str, error: type[RobocasError] = Ou
     if not path.is_file():
         return
     try:
-        run = json.loads(path.read_text(encoding="utf-8"))
+        run = load_json(path)
     except (OSError, ValueError):
         run = None
     if not isinstance(run, dict) or key not in run:
@@ -195,14 +200,35 @@ def _locked(lock: Path, path: Path) -> TextIOWrapper:
             what = "can't write into this folder"
             raise RobocasError(what, where=lock.parent, found=error.strerror, fix="Choose another.") from error
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            with suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
-                    return file
-        except OSError as error:
+            lock_file(file, path, wait=False)
+        except BaseException:
             file.close()
-            raise RobocasError("another process is writing here", where=path, fix="Wait until it is done.") from error
+            raise
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
+                return file
         file.close()
+
+
+def lock_file(file: TextIOWrapper, path: Path, *, wait: bool) -> None:
+    """Hold a lock on an open file until it is closed; on a file system that has none go on without, and say so.
+
+    Args:
+        file: open for writing.
+        path: what the lock is for.
+        wait: until nobody else holds it.
+
+    Raises:
+        RobocasError: somebody else holds it; or it can't be had for a reason of the system's.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError as error:
+        raise RobocasError("another process is writing here", where=path, fix="Wait until it is done.") from error
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise RobocasError("can't lock this folder", where=path, found=error.strerror) from error
+        _log.warning("%s: its file system has no locks (%s): see that no other run writes there", path, error.strerror)
 
 
 def sweep(folder: Path) -> None:

@@ -1,9 +1,10 @@
+import errno
 import os
 
 import pytest
 
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.files import make_folder, replacing, replacing_folder, write_json
+from robocas_ms3.files import make_folder, naming, replacing, replacing_folder, write_json
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -45,3 +46,23 @@ def test_what_a_killed_run_left_is_swept_up_a_day_later(tmp_path):
     with replacing_folder(tmp_path / "pack"):
         pass
     assert sorted(p.name for p in tmp_path.iterdir()) == [".pack.b.tmp", ".spack.c.tmp", "pack"]
+
+
+@pytest.mark.parametrize(("variable", "folder"), [("ROBOCAS_CACHE", "cache"), ("ROBOCAS_DATA", "data"), ("", "out")])
+def test_a_folder_that_cannot_be_made_says_what_chooses_it(tmp_path, monkeypatch, variable, folder):
+    (tmp_path / "file").write_text("")
+    for name, place in (("ROBOCAS_CACHE", "cache"), ("ROBOCAS_DATA", "data")):
+        monkeypatch.setenv(name, str(tmp_path / "file" / place))
+    with pytest.raises(RobocasError) as error:
+        make_folder(tmp_path / "file" / folder / "robots")
+    assert error.value.fix.startswith(f"Set {variable} to" if variable else "Choose another")
+
+
+def test_a_full_disk_is_that_of_what_is_written_not_of_what_is_copied(tmp_path):
+    full = OSError(errno.ENOSPC, "No space left on device", "/site-packages/hand.stl", None, str(tmp_path / "hand.stl"))
+    with pytest.raises(OSError, match="No space") as error, naming(tmp_path / "outer"), naming(tmp_path / "robots"):
+        raise full
+    assert error.value.filename == str(tmp_path / "robots")
+    with pytest.raises(OSError, match="No such file") as error, naming(tmp_path / "robots"):
+        (tmp_path / "gone").read_text()
+    assert error.value.filename == str(tmp_path / "gone")

@@ -26,6 +26,7 @@ LAYERS = (
         "ledger",
         "extensions",
         "after_import",
+        "words",
     ),
     ("benchmark",),
     ("robots",),

@@ -162,3 +162,26 @@ def test_a_folder_with_nothing_beside_it_is_replaced_from_within(fixed):
     with replacing_folder(fixed) as folder:
         (folder / "new").mkdir()
     assert [path.name for path in fixed.iterdir()] == ["new"]
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
+def test_a_file_system_without_locks_is_said_and_gone_on_without(tmp_path, monkeypatch, caplog, number):
+    def flock(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with locked_folder(tmp_path / "out"):
+        (tmp_path / "out").mkdir()
+    (said,) = caplog.messages
+    assert f"{tmp_path}/out: its file system has no locks ({os.strerror(number)})" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_lock_that_fails_otherwise_blames_no_other_run(tmp_path, monkeypatch):
+    def flock(*_):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    with pytest.raises(RobocasError, match=r"out: can't lock this folder \(found Input/output error\)"):  # noqa: SIM117
+        with locked_folder(tmp_path / "out"):
+            pass

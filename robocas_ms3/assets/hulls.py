@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from robocas_ms3.errors import AssetError
+from robocas_ms3.words import count_of
 
 Array = NDArray[np.float64]
 
@@ -104,7 +105,7 @@ def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError) as error:
-        raise AssetError("the points of a convex hull lie in a plane", found=f"{len(points)} points") from error
+        raise AssetError("the points of a convex hull lie in a plane", found=count_of(len(points), "point")) from error
     used, local = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = np.asarray(points, dtype=np.float64)[used], local.reshape(-1, 3)
     corners = vertices[faces]

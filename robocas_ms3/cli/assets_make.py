@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from robocas_ms3.cli.assets_show import mesh_tools
+from robocas_ms3.cli.options import Maybe, Several
 
 # `asset_tools.pipeline.Job`, which only loads when a command runs
 Job = Any
@@ -17,7 +18,7 @@ Job = Any
 
 @dataclass(kw_only=True)
 class _Making:
-    jobs: int | None = None
+    jobs: Maybe[int] = None
     """Processes. Default: one for each CPU core."""
     skip_bad: bool = False
     """Leave out what can't be made, instead of giving up."""
@@ -38,11 +39,11 @@ class ImportScans(_Making):
     """Folder of the scans (OBJ, GLB, PLY, STL, ...)."""
     pack: str
     """Name of the new pack."""
-    units: Literal["m", "cm", "mm", "inch"] | None = None
+    units: Maybe[Literal["m", "cm", "mm", "inch"]] = None
     """Unit of the files. Default: guessed from the sizes of all of them."""
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
+    up: Maybe[Literal["x", "y", "z", "-x", "-y", "-z"]] = None
     """Axis that points up in the files. Default: guessed for each."""
-    masses: Path | None = None
+    masses: Maybe[Path] = None
     """YAML file with masses in kg by object id. Default: estimated from the volume."""
     licence: str = "unknown"
     """Licence of the scans, for the manifest."""
@@ -61,7 +62,7 @@ class ImportGraspNet(_Making):
     """GraspNet's folder, with models/NNN/textured.obj and grasp_label/NNN_labels.npz."""
     pack: str = "graspnet"
     """Name of the new pack."""
-    ids: tuple[int, ...] = ()
+    ids: Several[int] = ()
     """GraspNet's numbers. Default: RoboCAS's 46."""
 
 
@@ -69,11 +70,11 @@ class ImportGraspNet(_Making):
 class ImportYCB(_Making):
     """Make a pack from the YCB objects that ManiSkill downloads (python -m mani_skill.utils.download_asset ycb)."""
 
-    root: Annotated[Path | None, tyro.conf.Positional] = None
+    root: Annotated[Maybe[Path], tyro.conf.Positional] = None
     """ManiSkill's YCB folder. Default: where ManiSkill puts it."""
     pack: str = "ycb"
     """Name of the new pack."""
-    ids: tuple[str, ...] = ()
+    ids: Several[str] = ()
     """Names such as 005_tomato_soup_can. Default: all."""
 
 
@@ -81,13 +82,13 @@ class ImportYCB(_Making):
 class ImportPartNet(_Making):
     """Make a pack of furniture from PartNet-Mobility models."""
 
-    models: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    models: Annotated[Several[Path], tyro.conf.Positional]
     """Folders of models, each with a mobility.urdf."""
     template: bool = False
     """Import nothing; print an annotation to start from, with the joints of the first model."""
     pack: str = "partnet"
     """Name of the new pack."""
-    annotations: Path | None = None
+    annotations: Maybe[Path] = None
     """Folder with <id>.yaml for models that none is shipped for."""
 
 
@@ -95,11 +96,11 @@ class ImportPartNet(_Making):
 class Build:
     """Make the builtin pack anew from its formulas (for people who work on it, in a clone of the repository)."""
 
-    out: Path | None = None
+    out: Maybe[Path] = None
     """Its folder. Default: where the package has it."""
-    ids: tuple[str, ...] = ()
+    ids: Several[str] = ()
     """Only these assets; needs --out. Default: all."""
-    jobs: int | None = None
+    jobs: Maybe[int] = None
     """Processes. Default: one for each CPU core."""
 
 

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
     from robocas_ms3.assets.pack import Pack
 
+from robocas_ms3.cli.options import Maybe, Several
+from robocas_ms3.words import count_of
+
 
 @dataclass
 class ListPacks:
@@ -41,9 +44,9 @@ class Verify:
     """Its name, or its folder."""
     physics: bool = False
     """Drop, grasp and shake every object, move every joint, and print the table of quality."""
-    jobs: int | None = None
+    jobs: Maybe[int] = None
     """With --physics: processes. Default: one for each CPU core."""
-    json: Path | None = None
+    json: Maybe[Path] = None
     """With --physics: write the table here too."""
 
 
@@ -53,9 +56,9 @@ class Sheet:
 
     pack: Annotated[str, tyro.conf.Positional]
     """Its name, or its folder."""
-    out: Path | None = None
+    out: Maybe[Path] = None
     """PNG to write. Default: <pack>.png here."""
-    ids: tuple[str, ...] = ()
+    ids: Several[str] = ()
     """Only these assets. Default: all."""
 
 
@@ -129,7 +132,7 @@ def verify(command: Verify) -> int:
         _ = loaded.annotations
     faults = cooking_faults(pack.root)
     console = Console(highlight=False, soft_wrap=True)
-    console.print(f"{pack.name}: {len(pack.manifest.assets)} assets, every file is as it should be")
+    console.print(f"{pack.name}: {count_of(len(pack.manifest.assets), 'asset')}, every file is as it should be")
     for fault in faults:
         console.print(str(fault), style="red")
     if command.physics:
@@ -150,7 +153,7 @@ def sheet(command: Sheet) -> int:
     out = command.out or Path(f"{pack.name}.png")
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise AssetError("a sheet is a PNG or JPEG", where=out, expected=".png, .jpg", found=out.suffix or "no suffix")
-    with Console(stderr=True).status(f"drawing {len(command.ids) or len(pack.manifest.assets)} assets"):
+    with Console(stderr=True).status(f"drawing {count_of(len(command.ids) or len(pack.manifest.assets), 'asset')}"):
         contact_sheet(pack, out, ids=command.ids or None)
     Console(highlight=False, soft_wrap=True).print(f"wrote {out}")
     return 0
@@ -195,7 +198,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
         assets = {name: quality.model_dump() for name, quality in {**objects, **furniture}.items()}
         write_json(out, {"pack": pack.name, "assets": assets, "violations": [asdict(v) for v in violations]})
     if not violations:
-        console.print(f"{pack.name}: {total} assets, as good as packs should be")
+        console.print(f"{pack.name}: {count_of(total, 'asset')}, as good as packs should be")
     return 1 if violations else 0
 
 

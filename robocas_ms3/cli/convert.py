@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from robocas_ms3.datasets.formats import Format
     from robocas_ms3.datasets.writing.convert import Conversion
 
+from robocas_ms3.cli.options import Maybe
+
 
 @dataclass
 class Convert:
@@ -29,7 +31,7 @@ class Convert:
     """Format of the dataset: robocas, lerobot (LeRobot's v3.0, needs the extra 'lerobot'), or another package's."""
     codec: Literal["h264", "av1"] = "h264"
     """Of lerobot's videos; AV1 takes half the space."""
-    rate: float | None = None
+    rate: Maybe[float] = None
     """Steps a second; must divide the control frequency. Default: 5, or that of the RoboCAS dataset."""
     embeddings: bool = True
     """Embed instruction and sub-goals (needs the extra 'language'; lerobot has none)."""
@@ -43,7 +45,7 @@ class Convert:
         "static_camera",
     )
     """Which cameras."""
-    size: tuple[int, int] | None = None
+    size: Maybe[tuple[int, int]] = None
     """Width and height of the pictures; default: the cameras' own, 640 480."""
     depth: bool = True
     """Store depth beside RGB."""
@@ -59,7 +61,7 @@ class Convert:
     """Add to the dataset that is there; its episodes keep their numbers."""
     jobs: int = 1
     """Processes that render."""
-    pack: str | None = None
+    pack: Maybe[str] = None
     """Name or folder of the objects' pack, instead of the one named there; a file can't choose a folder."""
 
 
@@ -115,7 +117,7 @@ def _format(cfg: Convert) -> Format:
 def _convert(cfg: Convert) -> int:
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.datasets.pictures.stored import Pictures
-    from robocas_ms3.datasets.statistics.described import count_of
+    from robocas_ms3.words import count_of
 
     chosen = _format(cfg)
     with bar("episodes") as shown:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
+from robocas_ms3.words import count_of
+
 if TYPE_CHECKING:
     from robocas_ms3.doctor.checks import Finding
 
@@ -54,4 +56,4 @@ def _print(findings: list[Finding], failed: int) -> None:
     console.print(table)
     limited = sum(finding.status == "limited" for finding in findings)
     verdict = f"{failed} of what is needed fails" if failed else "everything needed works"
-    console.print(verdict + (f"; {limited} optional rows limited" if limited else ""))
+    console.print(verdict + (f"; {count_of(limited, 'optional row')} limited" if limited else ""))

@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from robocas_ms3.cli.options import Maybe, Several, Word
+
 
 @dataclass
 class Eval:
@@ -24,15 +26,15 @@ class Eval:
     - eval freeze PLAN.yaml --out DIR: makes a protocol of your own
     """
 
-    words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    words: Annotated[Several[str], tyro.conf.Positional] = ()
     """Tasks; or one of the words above, and what it is about."""
     policy: str = "scripted"
     """Of whom: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), random, still, replay:TRAJECTORY.h5,
     module:Class of your own, one that an installed package brings (`robocas list`), or ws://HOST:PORT, a server's
     (`robocas serve-policy`)."""
-    protocol: str | None = None
+    protocol: Maybe[str] = None
     """Name of a shipped protocol, or a folder. Default: ms3-v1; of a result, the shipped one that it names."""
-    out: Path | None = None
+    out: Maybe[Path] = None
     """Folder to write to. Default: eval/PROTOCOL/POLICY, with the weld eval/PROTOCOL/POLICY_weld."""
     resume: bool = False
     """Go on with a result that is there."""
@@ -40,16 +42,16 @@ class Eval:
     """With --resume: play episodes again that an error broke off, such as a server that was gone."""
     envs: int = 2
     """Envs at a time; the outcome does not depend on it."""
-    workers: int | None = None
+    workers: Maybe[int] = None
     """Processes. Default: one an env, no more than cores."""
     backend: Literal["auto", "processes", "gpu"] = "auto"
     """Where envs run. Auto: a GPU if there is one."""
     shard: str = "0/1"
     """Only a part of the episodes, K/N: the K-th of N runs, from 0 on. The words above take the folders of
     all parts."""
-    split: str = ""
+    split: Word = ""
     """Only the episodes of this split, such as `seen`."""
-    episodes: int | None = None
+    episodes: Maybe[int] = None
     """Only the first so many of each configuration."""
     weld: bool = False
     """Weld what closed fingers have lifted to the hand, as upstream does, until the gripper is told to open. Only in
@@ -90,23 +92,24 @@ def main(cfg: Eval) -> int:
 def run(cfg: Eval) -> int:
     """Play what a result lacks."""
     from robocas_ms3.benchmark import TASKS
+    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.strict import nearest
+
+    for word in cfg.words:  # before seconds go by for what is imported next
+        if word not in TASKS:
+            expected = f"one of {', '.join(TASKS)}; or {', '.join(WORDS)}"
+            raise EvaluationError("no such task", where=word, expected=expected, fix=nearest(word, [*TASKS, *WORDS]))
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.cli.eval_results import write_pages
-    from robocas_ms3.datasets.statistics.described import count_of
     from robocas_ms3.demos.checks import check_number
-    from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.policies import open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.run import Settings, evaluate
     from robocas_ms3.evaluation.tables import markdown
     from robocas_ms3.processes import use_one_torch_thread
-    from robocas_ms3.strict import nearest
+    from robocas_ms3.words import count_of
 
-    for word in cfg.words:
-        if word not in TASKS:
-            expected = f"one of {', '.join(TASKS)}; or {', '.join(WORDS)}"
-            raise EvaluationError("no such task", where=word, expected=expected, fix=nearest(word, [*TASKS, *WORDS]))
     for name, number in (("envs", cfg.envs), ("episodes", cfg.episodes), ("workers", cfg.workers)):
         if number is not None:
             check_number(name, number, 1)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from robocas_ms3.words import count_of
+
 
 def protocols() -> int:
     """List the protocols that are shipped."""
@@ -12,7 +14,9 @@ def protocols() -> int:
 
     for name in shipped_protocols():
         protocol = load_protocol(name)
-        say(f"{name}: {len(protocol.episodes)} episodes, {protocol.hash[:12]}: {protocol.rules.description}")
+        say(
+            f"{name}: {count_of(len(protocol.episodes), 'episode')}, {protocol.hash[:12]}: {protocol.rules.description}"
+        )
         if protocol.train_files():
             say(f"    to train on: {', '.join(map(str, protocol.train_files()))}")
     return 0
@@ -34,5 +38,5 @@ def freeze(plan: Path, out: Path | None) -> int:
     with bar("episodes") as shown:
         for done, total in make(read, out):
             shown.at(done, total)
-    say(f"{out}: {len(load_protocol(out).episodes)} episodes, {load_protocol(out).hash}")
+    say(f"{out}: {count_of(len(load_protocol(out).episodes), 'episode')}, {load_protocol(out).hash}")
     return 0

@@ -9,6 +9,8 @@ if TYPE_CHECKING:
     from robocas_ms3.evaluation.protocol import LoadedProtocol
     from robocas_ms3.evaluation.results import Result
 
+from robocas_ms3.words import count_of
+
 
 def report(folders: list[Path], out: Path | None, protocol: str | None) -> int:
     """Print a result's tables; write them and its page into its folder, those of several into another one."""
@@ -34,7 +36,7 @@ def merge(folders: list[Path], out: Path | None, protocol: str | None) -> int:
     if out is None:
         raise EvaluationError("where to?", where="--out", expected="a folder")
     result = write(folders, out)
-    say(f"{out}: {len(result.outcomes)} episodes")
+    say(f"{out}: {count_of(len(result.outcomes), 'episode')}")
     write_pages(result, out, protocol)
     return 0
 
@@ -69,9 +71,16 @@ def verify(folders: list[Path], protocol: str | None) -> int:
     for problem in found:
         say(problem)
     if broken := result.broken_off():
-        say(f"note: {broken} episodes were broken off by an error, and count as failures")
+        say(f"note: broken off by an error: {count_of(broken, 'episode')}, counted as failed")
     where = ", ".join(map(str, folders))
-    say(f"{where}: " + (f"{len(found)} problems" if found else f"{len(result.outcomes)} episodes of {name}, all well"))
+    say(
+        f"{where}: "
+        + (
+            count_of(len(found), "problem")
+            if found
+            else f"{count_of(len(result.outcomes), 'episode')} of {name}, all well"
+        )
+    )
     return 1 if found else 0
 
 

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from robocas_ms3.benchmark import TASKS
+from robocas_ms3.cli.options import Maybe
 from robocas_ms3.robots.table import DEFAULT
+from robocas_ms3.words import count_of
 
 if TYPE_CHECKING:
     TaskName = str
@@ -28,11 +30,11 @@ class Generate:
     """Which task."""
     episodes: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 10
     """How many successful episodes to record, at least 1."""
-    config: str | None = None
+    config: Maybe[str] = None
     """Name of a shipped task configuration, or a YAML file. Default: the task's own (see `robocas list`)."""
     pack: str = "builtin"
     """Object pack: its name, or its folder."""
-    out: Path | None = None
+    out: Maybe[Path] = None
     """Output folder. Default: demos/<config>-<pack>."""
     seed: int = 0
     """First seed, 0 or more; the following episodes take the seeds after it."""
@@ -42,7 +44,7 @@ class Generate:
     """Control rate in Hz (the paper's is 5); must divide 100, the rate of physics."""
     max_attempts: int = 20
     """Attempts of the policy before a seed is given up."""
-    replay_rate: int | None = None
+    replay_rate: Maybe[int] = None
     """Rate in Hz at which an episode's own 7-D actions are tried open loop; an attempt whose actions don't succeed
     again is undone. 0: no trial. Default: 5, or the control rate where 5 doesn't divide it."""
     noisy_trials: int = 1
@@ -130,7 +132,9 @@ def main(cfg: Generate) -> int:
             progress.stop()
     seconds = ", ".join(f"{part} {value:.2f}" for part, value in summary.mean_seconds.items())
     console = Console(highlight=False, soft_wrap=True)
-    console.print(f"{summary.episodes} episodes from {summary.seeds} seeds ({summary.success_rate:.0%})")
+    console.print(
+        f"{count_of(summary.episodes, 'episode')} from {count_of(summary.seeds, 'seed')} ({summary.success_rate:.0%})"
+    )
     console.print(f"mean seconds a seed: {seconds}; mean length {summary.mean_steps:.0f} steps")
     if summary.failures:
         console.print("failed attempts: " + ", ".join(f"{reason} x{n}" for reason, n in summary.failures.items()))

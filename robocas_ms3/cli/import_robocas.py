@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from robocas_ms3.cli.options import Maybe
+
 if TYPE_CHECKING:
     from robocas_ms3.datasets.manage.survey import Survey
 
@@ -25,9 +27,9 @@ class ImportRobocas:
 
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset; nothing in it changes."""
-    out: Path | None = None
+    out: Maybe[Path] = None
     """Folder of the new dataset; episodes keep their numbers."""
-    rate: float | None = None
+    rate: Maybe[float] = None
     """Its steps a second; default: what conversion.json says, 5 where there is none, as in upstream's."""
     turn_eef: bool = True
     """Turn the EEF frame to ManiSkill's TCP where the gripper camera's place says that it is turned."""
@@ -50,9 +52,9 @@ def main(cfg: ImportRobocas) -> int:
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.datasets.manage.importing import import_robocas
     from robocas_ms3.datasets.manage.survey import survey
-    from robocas_ms3.datasets.statistics.described import count_of
     from robocas_ms3.datasets.writing.output import check_apart
     from robocas_ms3.outputs import claim_output
+    from robocas_ms3.words import count_of
 
     if cfg.out is not None:
         check_apart(cfg.out, [cfg.dataset])
@@ -92,7 +94,7 @@ def _table(found: Survey) -> None:
     from rich.table import Table
 
     from robocas_ms3.cli.bars import say
-    from robocas_ms3.datasets.statistics.described import count_of
+    from robocas_ms3.words import count_of
 
     rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
     for finding in found.findings:

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from robocas_ms3.scenes.bank import LayoutBank
     from robocas_ms3.scenes.table import Engine, Pair
 
+from robocas_ms3.cli.options import Maybe
+from robocas_ms3.words import count_of
+
 
 @dataclass
 class Build:
@@ -37,13 +40,13 @@ class Build:
     """Pack of the furniture: its name, or its folder."""
     seeds: str = "0:100"
     """First seed, and the one after the last: 0:100. Each set of --objects also has its own seed's layout."""
-    objects: str | None = None
+    objects: Maybe[str] = None
     """Seeds of objects of several envs, 0:4 or 3,7. Default: those of one env."""
     engine: Literal["auto", "cpu", "gpu"] = "auto"
     """With --objects: PhysX on the CPU or on a GPU, which is to run them. Auto: a GPU if there is one."""
-    jobs: int | None = None
+    jobs: Maybe[int] = None
     """Processes. Default: one for each CPU core."""
-    out: Path | None = None
+    out: Maybe[Path] = None
     """Folder of all banks. Default: in the cache, where environments look for them."""
 
 
@@ -51,7 +54,7 @@ class Build:
 class Info:
     """List the banks that are there."""
 
-    folder: Path | None = None
+    folder: Maybe[Path] = None
     """Folder of all banks. Default: in the cache."""
 
 
@@ -108,10 +111,12 @@ def build(command: Build) -> int:
             moving = try_all(bank, engine, progress, pack=command.pack, furniture_pack=command.furniture_pack)
     console = Console(highlight=False, soft_wrap=True)
     made = len(pairs) - there - failures
-    console.print(f"{made} layouts made, {there} were there already, {failures} seeds have none")
+    console.print(f"{count_of(made, 'layout')} made, {there} there already, {count_of(failures, 'seed')} without one")
     if engine is not None and (table := bank.table(engine)) is not None:
         sets, seeds = table.rows.shape
-        console.print(f"table: {bank.table_path(engine)}, {sets} sets of objects by {seeds} seeds")
+        console.print(
+            f"table: {bank.table_path(engine)}, {count_of(sets, 'set')} of objects by {count_of(seeds, 'seed')}"
+        )
     if engine == "gpu":
         console.print(f"objects of {moving} move when the GPU lets go of them: no reset takes these")
     console.print(f"bank: {bank.folder}")
@@ -153,23 +158,22 @@ def try_all(bank: LayoutBank, engine: Engine, progress: Progress, **packs: str) 
 
 def info(command: Info) -> int:
     """Run ``info``."""
-    import json
-
     from rich.table import Table
 
     from robocas_ms3.cli.tables import table_console
+    from robocas_ms3.documents import load_json
     from robocas_ms3.scenes.bank import ABOUT, banks_folder, count_layouts
 
     root = banks_folder(command.folder or "auto")
     table = Table("bank", "layouts", "task", "layout", "objects", "object pack", "furniture")
     for path in sorted(root.glob(f"*/{ABOUT}")):
-        about = json.loads(path.read_text(encoding="utf-8"))
-        config = about["config"]
-        furniture = ", ".join(sorted(about["furniture"]))
-        cells = (config["task"], config["layout"]["kind"], str(config["objects"]["count"]))
-        table.add_row(
-            path.parent.name, str(count_layouts(path.parent)), *cells, about["object_pack"]["name"], furniture
-        )
+        try:
+            about = load_json(path)
+            config, furniture = about["config"], ", ".join(sorted(about["furniture"]))
+            of = (config["task"], config["layout"]["kind"], config["objects"]["count"], about["object_pack"]["name"])
+        except (OSError, ValueError, KeyError, TypeError):  # it is the layouts that count: they are still of use
+            of, furniture = (f"{ABOUT} is damaged", "", "", ""), ""
+        table.add_row(path.parent.name, str(count_layouts(path.parent)), *map(str, of), furniture)
     table_console().print(
         table if table.row_count else f"no banks in {root}", soft_wrap=not table.row_count, highlight=False
     )

@@ -9,17 +9,20 @@ import operator
 import os
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from functools import reduce
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any, TextIO, get_args, get_type_hints
 
+import platformdirs
 import tyro
 
 from robocas_ms3 import __version__
 from robocas_ms3.errors import RobocasError
+from robocas_ms3.files import FULL
+from robocas_ms3.paths import is_writable, temporary_cache, variable_of
 
 # Each names a module beside this one, with a dataclass called as the command and `main(cfg) -> int`; a dash in its name
 # is an underscore in the module's: import-robocas, import_robocas.py, ImportRobocas.
@@ -47,10 +50,9 @@ DESCRIPTION = (
     "RoboCAS for ManiSkill3: demonstrations and datasets of manipulation in complex object arrangements. "
     "`robocas COMMAND --help` explains a command; --debug with any of them shows tracebacks."
 )
-CLI_STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes)
+CLI_STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.DisallowNone)
 INTERRUPTED = 130  # what a shell reports of a program that Ctrl-C ended
-_FULL = {errno.ENOSPC, errno.EDQUOT}
-_ENVIRONMENT = {*_FULL, errno.EACCES, errno.EPERM, errno.EROFS}
+_ENVIRONMENT = {*FULL, errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -75,6 +77,7 @@ def run(argv: Sequence[str]) -> int:
     if not debug:
         # ManiSkill's logger (the blank is in its name) remarks on its own installation, and on CPUs without a GPU.
         logging.getLogger("mani_skill ").addFilter(lambda record: record.levelno >= logging.ERROR)
+    _lend_folders()
     try:
         return _dispatch(arguments)
     except KeyboardInterrupt as interrupt:  # a command may say how to go on
@@ -98,13 +101,14 @@ def _dispatch(arguments: list[str]) -> int:
     if arguments and arguments[0] in COMMANDS:  # only the command that is asked for is imported
         name, rest = arguments[0], arguments[1:]
         module = module_of(name)
-        cfg = tyro.cli(config_type(module, name), prog=f"robocas {name}", args=rest, config=CLI_STYLE)
+        of_command = config_type(module, name)
+        known = subcommands(of_command)
+        if known and rest and not rest[0].startswith("-") and rest[0] not in known:
+            return _unknown(rest[0], f"command of robocas {name}", known)
+        cfg = tyro.cli(of_command, prog=f"robocas {name}", args=rest, config=CLI_STYLE)
         return module.main(cfg)
     if arguments and not arguments[0].startswith("-"):
-        from robocas_ms3.strict import nearest
-
-        fix = nearest(arguments[0], COMMANDS) or f"There are: {', '.join(COMMANDS)}."
-        return _say(f"error: {arguments[0]}: no such command. {fix}", sys.stderr, 2)
+        return _unknown(arguments[0], "command", COMMANDS)
     modules = {name: module_of(name) for name in COMMANDS}
     choices = [Annotated[config_type(module, name), tyro.conf.subcommand(name)] for name, module in modules.items()]
     choice: Any = reduce(operator.or_, choices)
@@ -112,15 +116,43 @@ def _dispatch(arguments: list[str]) -> int:
     raise AssertionError("tyro leaves the process on --help and on an unknown command")
 
 
+def subcommands(of_command: type) -> dict[str, type]:
+    """Dataclasses of a command's own commands by name; empty where it has none."""
+    if "command" not in {field.name for field in fields(of_command)}:
+        return {}
+    choices = map(get_args, get_args(get_type_hints(of_command, include_extras=True)["command"]))
+    return {about.name: dataclass for dataclass, about in choices}
+
+
+def _unknown(word: str, what: str, known: Iterable[str]) -> int:
+    from robocas_ms3.strict import nearest
+
+    fix = nearest(word, known) or f"There are: {', '.join(known)}."
+    return _say(f"error: {word}: no such {what}. {fix}", sys.stderr, 2)
+
+
+def _lend_folders() -> None:
+    """Give libraries that only want a place to write one, where theirs is read-only: else each process complains."""
+    places = {
+        "MPLCONFIGDIR": platformdirs.user_config_path("matplotlib"),
+        "MESA_SHADER_CACHE_DIR": platformdirs.user_cache_path("mesa_shader_cache"),
+    }
+    for variable, usual in places.items():
+        if variable not in os.environ and not is_writable(usual) and (folder := temporary_cache()):
+            os.environ[variable] = str(folder / usual.name)
+
+
 def _room(error: OSError, command: str) -> str:
     """How much there is where it does not suffice, and what to do then."""
-    if error.errno not in _FULL:
-        return ""
+    variable = variable_of(error.filename) if error.filename else ""
+    if error.errno not in FULL:
+        return f". Set {variable} to a folder that can be written to." if variable else ""
     folders = [folder for folder in Path(error.filename or "").absolute().parents if folder.is_dir()]
     free = f" ({shutil.disk_usage(folders[0]).free / 2**20:.0f} MB free)" if error.filename else ""
     of_command = config_type(module_of(command), command)
     goes_on = command == "plan" or any(field.name == "resume" for field in fields(of_command))
-    return f"{free}. Make room" + (", then go on with --resume." if goes_on else ".")
+    elsewhere = f", or set {variable} to a folder that has some" if variable else ""
+    return f"{free}. Make room{elsewhere}" + (", then go on with --resume." if goes_on else ".")
 
 
 def module_of(name: str) -> ModuleType:

@@ -35,7 +35,7 @@ def main(cfg: Merge) -> int:
     """Merge, with a progress bar; gives the exit code."""
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.datasets.manage.merging import merge
-    from robocas_ms3.datasets.statistics.described import count_of
+    from robocas_ms3.words import count_of
 
     with bar("episodes") as shown:
         done = merge(

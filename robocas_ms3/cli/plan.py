@@ -8,6 +8,9 @@ from typing import Annotated, Literal
 
 import tyro
 
+from robocas_ms3.cli.options import Maybe, Several
+from robocas_ms3.words import count_of
+
 
 @dataclass
 class Run:
@@ -22,9 +25,9 @@ class Run:
     """Folder of everything the plan makes."""
     on: Literal["local", "slurm", "ray"] = "local"
     """Where the work is done: on this machine, by jobs of Slurm, by a Ray cluster."""
-    jobs: int | None = None
+    jobs: Maybe[int] = None
     """How many episodes are made at once. Default: one for each CPU core of this machine."""
-    set: tuple[str, ...] = ()
+    set: Several[str] = ()
     """Options of the engine, NAME=VALUE each; docs/scale.md has them."""
     resume: bool = False
     """Go on with a plan that was begun."""
@@ -73,7 +76,7 @@ def main(cfg: Plan) -> int:
 
     for name in shipped_plans():
         plan = load_plan(name)
-        say(f"{name}: {sum(part.episodes for part in plan.parts)} episodes. {plan.description}")
+        say(f"{name}: {count_of(sum(part.episodes for part in plan.parts), 'episode')}. {plan.description}")
     return 0
 
 
@@ -123,7 +126,7 @@ def run(command: Run) -> int:
             on_progress=on_progress,
             on_stage=on_stage,
         )
-    say(f"{command.out}: {report['episodes']} episodes; report.json")
+    say(f"{command.out}: {count_of(report['episodes'], 'episode')}; report.json")
     return 0
 
 
@@ -140,10 +143,10 @@ def show_status(command: Status) -> int:
     """Run ``status``."""
     import json
 
-    from rich.console import Console
     from rich.table import Table
 
     from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.tables import table_console
     from robocas_ms3.plans.status import status
 
     found = status(command.out)
@@ -162,10 +165,11 @@ def show_status(command: Status) -> int:
             f"{part.render_seconds:.1f}",
             f"{part.bytes / 1e6:.0f}",
         )
-    Console().print(table)
+    table_console().print(table)
     if found.finished:
         say("finished")
     elif found.seconds_left is not None:
         left, idle = found.seconds_left / 60, found.idle_seconds or 0.0
-        say(f"{found.episodes_an_hour:.0f} episodes an hour, {left:.0f} min left; the last {idle:.0f} s ago")
+        rate = count_of(round(found.episodes_an_hour), "episode")
+        say(f"{rate} an hour, {left:.0f} min left; the last {idle:.0f} s ago")
     return 0

@@ -8,6 +8,9 @@ from typing import Annotated
 
 import tyro
 
+from robocas_ms3.cli.options import Maybe
+from robocas_ms3.words import count_of
+
 
 @dataclass
 class Replay:
@@ -18,19 +21,19 @@ class Replay:
 
     trajectory: Annotated[Path, tyro.conf.Positional]
     """The HDF5 file, its JSON beside it; or the folder that `robocas generate` made."""
-    control_mode: Annotated[str | None, tyro.conf.arg(aliases=["-c"])] = None
+    control_mode: Annotated[Maybe[str], tyro.conf.arg(aliases=["-c"])] = None
     """Convert the actions: pd_joint_delta_pos, pd_ee_delta_pose or pd_ee_pose. Default: as recorded."""
     obs_mode: Annotated[str, tyro.conf.arg(aliases=["-o"])] = "none"
     """Observations to record with --save, e.g. rgb+depth or state."""
     use_env_states: bool = False
     """Set the recorded state after every step."""
-    count: int | None = None
+    count: Maybe[int] = None
     """Only the first so many episodes, at least 1."""
-    save: Path | None = None
+    save: Maybe[Path] = None
     """Write the replayed episodes to this HDF5 file."""
     allow_failure: bool = False
     """With --save: write failed episodes too."""
-    pack: str | None = None
+    pack: Maybe[str] = None
     """Name or folder of the objects' pack, instead of the one named there; a file can't choose a folder."""
     overwrite: bool = False
     """Replace the file given by --save if it exists."""
@@ -66,7 +69,7 @@ def main(cfg: Replay) -> int:
         if not result.success:
             console.print(f"episode {result.episode_id} (seed {result.seed}): not successful")
     good = sum(result.success for result in done)
-    console.print(f"{good} of {len(done)} episodes succeed")
+    console.print(f"{good} of {count_of(len(done), 'episode')} succeeded")
     errors = [result.state_error for result in done if result.state_error is not None]
     if errors:
         console.print(f"greatest difference from a recorded final state: {np.max(errors):.3g}")  # NaN where one is

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from robocas_ms3.cli.options import Maybe, Several
+
 
 @dataclass
 class Split:
@@ -21,19 +23,19 @@ class Split:
 
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset."""
-    out_train: Path | None = None
+    out_train: Maybe[Path] = None
     """Folder of the training episodes."""
-    out_val: Path | None = None
+    out_val: Maybe[Path] = None
     """Folder of the validation episodes."""
-    parts: tuple[float, ...] = ()
+    parts: Several[float] = ()
     """Shares of the parts; they sum to 1."""
-    out: Path | None = None
+    out: Maybe[Path] = None
     """Folder of the parts' folders."""
     in_place: bool = False
     """Write only data_info.json anew."""
-    val_share: float | None = None
+    val_share: Maybe[float] = None
     """Choose training and validation anew, with this share to validate; default: every episode keeps its side."""
-    by: Literal["seed", "target", "task"] | None = None
+    by: Maybe[Literal["seed", "target", "task"]] = None
     """What is never cut: episodes of one seed (default), target object or task."""
     copy: bool = False
     """Copy files, also where hard links would do."""
@@ -47,7 +49,7 @@ def main(cfg: Split) -> int:
     """Split, with a progress bar; gives the exit code."""
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.datasets.manage.splitting import Share, resplit, write_parts
-    from robocas_ms3.datasets.statistics.described import count_of
+    from robocas_ms3.words import count_of
 
     check(cfg)
     whole = cfg.out is not None and not cfg.parts  # each part is one task or target, which can't be cut by itself

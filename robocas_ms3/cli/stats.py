@@ -8,6 +8,9 @@ from typing import Annotated
 
 import tyro
 
+from robocas_ms3.cli.options import Maybe
+from robocas_ms3.words import count_of
+
 
 @dataclass
 class Stats:
@@ -15,11 +18,11 @@ class Stats:
 
     path: Annotated[Path, tyro.conf.Positional]
     """Folder of a RoboCAS dataset, or trajectory.h5 (its failed episodes too)."""
-    out: Path | None = None
+    out: Maybe[Path] = None
     """Folder to write to; default: DATASET/preview/stats, or TRAJECTORY_stats beside a trajectory."""
     json: bool = False
     """Print the JSON; files are written only if --out says where."""
-    rate: float | None = None
+    rate: Maybe[float] = None
     """Steps a second of a trajectory; default 5. A dataset has its own."""
 
 
@@ -44,5 +47,5 @@ def main(cfg: Stats) -> int:
         Console(soft_wrap=True, highlight=False, markup=False).print(text)
         return 0
     pictures = len(paths) - 1
-    say(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {pictures} pictures")
+    say(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {count_of(pictures, 'picture')}")
     return 0

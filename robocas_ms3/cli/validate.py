@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from robocas_ms3.cli.bars import bar
+from robocas_ms3.cli.options import Maybe
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.words import count_of
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.checks.dataset import Report
@@ -30,10 +32,10 @@ class Validate:
     """Folder of the dataset."""
     replay: bool = False
     """Play the actions too (RoboCAS folders; simulated, not rendered)."""
-    min_share: float | None = None
+    min_share: Maybe[float] = None
     """With --replay: exit code 1 where a smaller share of a task's episodes succeeds again (0 to 1), or where
     none of them could be tried."""
-    pack: str | None = None
+    pack: Maybe[str] = None
     """With --replay: name or folder of the objects' pack, instead of the one named there."""
     json: bool = False
     """Print a machine-readable report."""
@@ -45,7 +47,6 @@ def main(cfg: Validate) -> int:
 
     from robocas_ms3.datasets.checks.dataset import validate
     from robocas_ms3.datasets.formats import format_of
-    from robocas_ms3.datasets.statistics.described import count_of
 
     if cfg.min_share is not None and not cfg.replay:
         raise DatasetError("a share of replayed episodes needs --replay", where="--min-share")
@@ -98,7 +99,7 @@ def _lines(report: ReplayReport) -> Iterator[str]:
     for task, of_task in report.by_task().items():
         name = task or "unknown task"
         if not of_task["tried"]:
-            yield f"{name}: none of {of_task['skipped']} episodes could be replayed: no share is known"
+            yield f"{name}: none of {count_of(of_task['skipped'], 'episode')} could be replayed: no share is known"
         else:
             yield (
                 f"{name}: {of_task['succeeded']} of {of_task['tried']} replayed episodes succeed"

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from robocas_ms3.cli.options import Maybe, Several
+
 
 @dataclass
 class Video:
@@ -15,9 +17,9 @@ class Video:
 
     dataset: Annotated[Path, tyro.conf.Positional]
     """Folder of the dataset."""
-    out: Path | None = None
+    out: Maybe[Path] = None
     """Folder to write to; default: DATASET/preview."""
-    episodes: tuple[int, ...] = ()
+    episodes: Several[int] = ()
     """Numbers of episodes; default: all."""
     kind: Literal["rgb", "depth"] = "rgb"
     """What to show; depth is shown in colours."""

@@ -8,6 +8,9 @@ from typing import Annotated
 
 import tyro
 
+from robocas_ms3.cli.options import Maybe, Several
+from robocas_ms3.words import count_of
+
 
 @dataclass
 class View:
@@ -19,9 +22,9 @@ class View:
     """Port of 127.0.0.1 to serve at; 0 takes a free one."""
     open: bool = True
     """Open the page in the default browser."""
-    static: Path | None = None
+    static: Maybe[Path] = None
     """Write a folder that opens from disk instead of serving: this one."""
-    episodes: tuple[int, ...] = ()
+    episodes: Several[int] = ()
     """With --static: numbers of the episodes to write; default: all."""
     width: int = 480
     """With --static: width of the pictures, pixels."""
@@ -83,5 +86,5 @@ def _write(cfg: View, out: Path, source, console) -> int:
         )
     for number, wrong in damaged.items():
         console.print(f"episode {number} is damaged: {wrong}")
-    console.print(f"{count} episodes: {out / 'index.html'}")
+    console.print(f"{count_of(count, 'episode')}: {out / 'index.html'}")
     return 0

@@ -13,6 +13,7 @@ from robocas_ms3.benchmark import TASKS
 from robocas_ms3.benchmark.spec import SIM_FREQ
 from robocas_ms3.config import load_config_of
 from robocas_ms3.demos.episode import EpisodeSettings
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.planning.backends import BACKENDS
 from robocas_ms3.recordings.seeds import GREATEST_SEED
@@ -80,7 +81,7 @@ def check_same_run(path: Path, run: dict[str, Any]) -> None:
     """
     if not path.is_file():
         return
-    before = json.loads(path.read_text(encoding="utf-8"))
+    before = load_json(path)
     if isinstance(before.get("settings"), dict):  # a setting that is newer than the output had its default then
         defaults = {one.name: one.default for one in fields(EpisodeSettings) if one.default is not MISSING}
         before["settings"] = {**defaults, **before["settings"]}

@@ -6,6 +6,7 @@ They import nothing that may be broken: versions are read from metadata, everyth
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 import subprocess
@@ -136,10 +137,11 @@ def check_extra(extra: str) -> Finding:
 
 def check_folders() -> list[Finding]:
     """Whether caches can be written (needed: the robot's files are made there) and packs be imported (optional)."""
-    return [
-        check_writable("cache folder", paths.cache_dir(), "ROBOCAS_CACHE", required=True),
-        check_writable("data folder", paths.data_dir(), "ROBOCAS_DATA", required=False),
-    ]
+    cache = check_writable("cache folder", paths.cache_dir(), paths.CACHE, required=True)
+    if cache.status == "ok" and not os.environ.get(paths.CACHE) and paths.cache_dir() == paths.temporary_cache():
+        found = f"{cache.found}, as the user's can't be written to"
+        cache = Finding(cache.name, "limited", found, f"Set ${paths.CACHE} to a folder that stays.")
+    return [cache, check_writable("data folder", paths.data_dir(), paths.DATA, required=False)]
 
 
 def check_writable(name: str, folder: Path, variable: str, *, required: bool) -> Finding:

@@ -11,6 +11,7 @@ from robocas_ms3.evaluation.power import too_few
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Comparison, compare, holm
+from robocas_ms3.words import count_of
 
 _ALPHA = 0.05
 ALL = "all"
@@ -56,7 +57,7 @@ def comparison(results: Sequence[Result]) -> str:
     measured = first.run["protocol"] + (" with upstream's weld" if first.run["weld"] else "")
     said = [f"{name}: {one.run['policy']['name']} ({one.folder})" for name, one in zip(names, results, strict=True)]
     both = "both" if len(results) == 2 else "all"
-    head = f"{', '.join(said)}; {len(shared)} episodes of {measured} that {both} have."
+    head = f"{', '.join(said)}; {count_of(len(shared), 'episode')} of {measured} that {both} have."
     differing = [key for key in ("backend", "versions") if any(one.run[key] != first.run[key] for one in results)]
     if differing:
         head += f" **Measured with different {' and '.join(differing)}.**"

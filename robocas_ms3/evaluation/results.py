@@ -10,13 +10,13 @@ Parts of a result, such as shards, are read as one (`read`) or written as one (`
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import Share, share
@@ -98,7 +98,7 @@ def begin(folder: Path, run: dict[str, Any], *, resume: bool, again: bool = Fals
         return {}
     if not path.is_file():
         raise EvaluationError("episodes of nobody knows what", where=folder, expected=RUN, fix="Choose another --out.")
-    before = {**_BEFORE, **json.loads(path.read_text(encoding="utf-8"))}
+    before = {**_BEFORE, **load_json(path)}
     if not resume:
         raise EvaluationError(
             "there is a result already", where=folder, fix="Pass --resume to go on, or another --out."
@@ -196,7 +196,7 @@ def _ledger(folder: Path) -> Ledger[Outcome]:
 
 def _read(folder: Path) -> Result:
     try:
-        run = json.loads((folder / RUN).read_text(encoding="utf-8"))
+        run = load_json(folder / RUN)
         outcomes = dict(sorted(_outcomes(folder).items()))
     except (OSError, ValueError) as error:
         raise EvaluationError("no result of an evaluation", where=folder, found=error) from error

@@ -8,6 +8,7 @@ from robocas_ms3.evaluation.outcomes import STAGES, Outcome
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, success_by
+from robocas_ms3.words import count_of
 
 P_VIS_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 WELDED = (
@@ -29,11 +30,11 @@ def markdown(result: Result) -> str:
         f"# {title(result)}",
         "",
         *([f"**{WELDED}**", ""] if run["weld"] else []),
-        f"Protocol hash `{run['protocol_hash'][:16]}`, {len(result.outcomes)} episodes, {run['backend']}; "
+        f"Protocol hash `{run['protocol_hash'][:16]}`, {count_of(len(result.outcomes), 'episode')}, {run['backend']}; "
         + ", ".join(f"{name} {number}" for name, number in run["versions"].items())
         + ". Intervals are Clopper-Pearson's, 95 %. RA, PA: any object reached, lifted; RR: the target reached; "
         "CO: what hid it cleared.",
-        *(["", f"**{broken} episodes were broken off by an error. They count as failures.**"] if broken else []),
+        *(["", f"**Broken off by an error: {count_of(broken, 'episode')}, counted as failed.**"] if broken else []),
         "",
         "| configuration | n | success | at the end | upstream's | " + " | ".join(STAGES) + " | steps | s |",
         "|---|---|---|---|---|" + "---|" * (len(STAGES) + 2),

@@ -10,6 +10,7 @@ from robocas_ms3.benchmark import TASKS
 from robocas_ms3.evaluation.outcomes import Outcome, failure_stage
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol
 from robocas_ms3.evaluation.results import Result
+from robocas_ms3.words import count_of
 
 
 def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
@@ -39,7 +40,7 @@ def problems(result: Result, protocol: LoadedProtocol) -> list[str]:
         found += [f"episode {number}: {problem}" for problem in said]
     missing = len(set(range(len(protocol.episodes))) - result.outcomes.keys())
     if missing:
-        found.append(f"{missing} of {len(protocol.episodes)} episodes are missing")
+        found.append(f"missing: {missing} of {count_of(len(protocol.episodes), 'episode')}")
     return found
 
 
@@ -57,11 +58,11 @@ def _too_long(outcome: Outcome, protocol: LoadedProtocol, run: dict[str, Any]) -
     rate = rules.rate_hz or run["policy"].get("wants", {}).get("rate_hz") or DEFAULT_HZ
     limit = rules.steps(outcome.task, rate)
     if limit is not None and outcome.steps > limit:
-        yield f"{outcome.steps} steps, {limit} are allowed"
+        yield f"{count_of(outcome.steps, 'step')}, {limit} allowed"
     if rules.stepping == "timed":
         expected = outcome.steps / rate
         if abs(outcome.seconds - expected) > 1e-3:
-            yield f"{outcome.seconds:g} s, its {outcome.steps} steps take {expected:g}"
+            yield f"{outcome.seconds:g} s, its {count_of(outcome.steps, 'step')} should take {expected:g}"
 
 
 def _of_retrieval(outcome: Outcome) -> Iterator[str]:
@@ -107,8 +108,8 @@ def _at_odds(outcome: Outcome, protocol: LoadedProtocol, order: Sequence[str]) -
         yield f"failure_stage is {outcome.failure_stage or 'none'}, by its flags {stage or 'none'}"
     late = [name for name, step in flags.items() if step is not None and step > outcome.steps]
     if late:
-        yield f"{', '.join(late)} held first after its {outcome.steps} steps"
+        yield f"{', '.join(late)} held first after its {count_of(outcome.steps, 'step')}"
     for name in protocol.rules.ends_on:
         step = flags.get(name)
         if step is not None and 0 < step < outcome.steps:  # what held before the first step ended nothing
-            yield f"it went on after {name}, {step} of {outcome.steps} steps"
+            yield f"it went on after {name}, {step} of {count_of(outcome.steps, 'step')}"

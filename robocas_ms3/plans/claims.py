@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from robocas_ms3.errors import PlanError
 from robocas_ms3.files import make_folder
 
 LEASE = 60.0
@@ -50,6 +51,28 @@ def claimed(path: Path, lease: float = LEASE, on_lost: Callable[[], object] = la
         with suppress(OSError):  # then it ends with its lease
             if claim.read_text(encoding="utf-8") == token:
                 os.utime(claim, (0, 0))
+
+
+def refuse_claimed(folder: Path, within: float = 2 * LEASE) -> None:
+    """See that nobody is at anything that is claimed in a folder; whoever claims nothing could be there too.
+
+    Args:
+        folder: of all claims; need not exist.
+        within: s in which a claim that somebody holds is renewed, with room to spare.
+
+    Raises:
+        PlanError: somebody is.
+    """
+    last: dict[Path, int] = {}
+    for path in folder.glob("*/*.[0-9]*"):
+        last[path.with_suffix("")] = max(int(path.suffix[1:]), last.get(path.with_suffix(""), 0))
+    for path, number in last.items():
+        claim = _numbered(path, number)
+        with suppress(FileNotFoundError):
+            if claim.stat().st_mtime > 0 and (age := _age(claim)) < within:
+                fix = "Go on with --on slurm, or cancel its jobs and wait until the claim is not renewed any more."
+                found = f"{claim.read_text(encoding='utf-8').split(' ')[0]}, {age:.0f} s ago"
+                raise PlanError("jobs of Slurm are at this plan", where=claim, found=found, fix=fix)
 
 
 class _Keeper:

@@ -14,13 +14,15 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.provenance import recording_entry
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings, header
-from robocas_ms3.files import make_folder, write_json
+from robocas_ms3.documents import load_json
+from robocas_ms3.files import make_folder, replacing, write_json
 from robocas_ms3.outputs import sweep
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import EPISODES, REPORT, UNITS, Outcome, Task, Unit
 from robocas_ms3.recordings.reading import TrajectoryFile
 
 DEMOS, DATASETS, STATISTICS = "demos", "datasets", "statistics"
+TRAJECTORY = "trajectory.h5"
 Chosen = Mapping[int, Sequence[tuple[Unit, Outcome]]]
 """Part -> its episodes, in the order of their seeds."""
 
@@ -48,7 +50,7 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Callable[[str
             say("the dataset")
             _join_episodes(plan, robocas, tasks)
         for number, recorded in tasks.items():
-            path = make_folder(out / DEMOS / f"{plan.parts[number].name}") / "trajectory.h5"
+            path = make_folder(out / DEMOS / f"{plan.parts[number].name}") / TRAJECTORY
             sweep(path.parent)
             if not path.is_file():
                 say(f"demonstrations, {plan.parts[number].name}")
@@ -62,7 +64,7 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Callable[[str
         write_json(out / REPORT, _report(plan, chosen))
     for path in [*(out / UNITS).glob("*/*/seed_*"), *(out / UNITS).glob(f"*/*/{EPISODES}")]:
         shutil.rmtree(path) if path.is_dir() else path.unlink()  # they are joined, or more than were asked for
-    return json.loads((out / REPORT).read_text(encoding="utf-8"))
+    return load_json(out / REPORT)
 
 
 def _join_episodes(plan: Plan, out: Path, tasks: Mapping[int, Sequence[Task]]) -> None:
@@ -70,21 +72,34 @@ def _join_episodes(plan: Plan, out: Path, tasks: Mapping[int, Sequence[Task]]) -
     make_folder(out)
     entries: dict[str, Any] = {}
     for part, recorded in tasks.items():
-        for number, task in enumerate(recorded, start=plan.first_episode(part)):
+        name = plan.parts[part].name
+        for place, task in enumerate(recorded):
+            number = plan.first_episode(part) + place
+            joined = {"trajectory": f"{DEMOS}/{name}/{TRAJECTORY}"}  # not the file that goes once it is joined
             folder = out / schema.episode_folder(number)
             if not folder.is_dir():
+                _say_source(task.episode / schema.SCENE_FILE, {**joined, "episode_id": place})
                 os.replace(task.episode, folder)
             with TrajectoryFile(task.recording, pack=plan.parts[part].pack) as file:
-                entries[str(number)] = recording_entry(file, 0)
+                entry = recording_entry(file, 0)
+            entries[str(number)] = {**entry, **joined, "trajectory_episode": place}
     settings = dataset_settings(plan.rate, plan.pictures.chosen(), plan.embeddings)
     write_json(out / schema.CONVERSION_FILE, {**header(settings), "episodes": entries})
     write_info(out)
 
 
-def _merge(recordings: Sequence[Path], path: Path) -> None:
+def _merge(recordings: list[Path], path: Path) -> None:
     from robocas_ms3.recordings.writing import merge  # the simulator comes with it
 
     merge(recordings, path)
+
+
+def _say_source(path: Path, source: dict[str, Any]) -> None:
+    """Say in an episode's ``scene.json`` where its recording is in the end."""
+    scene = load_json(path)
+    text = json.dumps({**scene, "source": {**scene["source"], **source}}, indent=1, ensure_ascii=False)
+    with replacing(path) as tmp:
+        tmp.write_text(text + "\n", encoding="utf-8")
 
 
 def _convert_lerobot(robocas: Path, out: Path, jobs: int) -> None:

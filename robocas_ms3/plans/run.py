@@ -17,6 +17,7 @@ from robocas_ms3.plans.checks import check_plan
 from robocas_ms3.plans.engines import Engine
 from robocas_ms3.plans.join import join
 from robocas_ms3.plans.plan import Plan
+from robocas_ms3.plans.tally import Tally, tally_path
 from robocas_ms3.plans.units import PLAN, Outcome, Unit, outcomes
 
 _AHEAD = 2  # units a slot that are under way, so that none waits for the next
@@ -93,6 +94,10 @@ class _Part:
     """So many blocks without a gap have been looked at for failures: the verdict must not depend on who is first."""
     judged_seeds: int = 0
     judged_good: int = 0
+    tally: Tally = field(default_factory=Tally)
+    """For `status`."""
+    written: int = -1
+    """So many units the tally had when it was written last."""
 
     def wants_more(self) -> bool:
         """Whether there may be too few even if all that is under way succeeds."""
@@ -111,6 +116,7 @@ class _Part:
             PlanError: hardly anything succeeds.
         """
         self.done[unit.block] = found
+        self.tally.add(unit.block, found)
         self.good += sum(outcome.success for outcome in found)
         while self.judged in self.done:
             block = self.done[self.judged]
@@ -122,6 +128,12 @@ class _Part:
                 where, found_now = unit.folder(self.plan, out).parent, f"{failed} of {self.judged_seeds}"
                 fix = "See seeds.jsonl there; a smaller objects.count may help."
                 raise PlanError("far too many seeds fail", where=where, found=found_now, fix=fix)
+
+    def write_tally(self, out: Path) -> None:
+        """Say in the plan's folder what came of the units that are done, if there are more of them."""
+        if len(self.done) > self.written:
+            self.written = len(self.done)
+            self.tally.write(tally_path(out, f"{self.plan.parts[self.number].name}"))
 
     def chosen(self) -> Iterator[tuple[Unit, Outcome]]:
         """The first episodes in the order of their seeds, as many as were asked for."""
@@ -145,6 +157,8 @@ def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_
                 else:
                     under_way[engine.submit(unit)] = unit
         if not under_way or time.monotonic() > said + _LOOK:  # it reads as many files as there are units under way
+            for part in parts:
+                part.write_tally(out)
             on_progress(_counts(plan, out, parts, under_way))
             said = time.monotonic()
         if not under_way:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.errors import MissingExtraError, PlanError
-from robocas_ms3.files import make_folder, write_json
+from robocas_ms3.files import flush_to_disk, make_folder, write_json
 from robocas_ms3.outputs import sweep
 from robocas_ms3.plans.begun import check_versions
 from robocas_ms3.plans.child import Child, ChildDied, Stopped
@@ -87,6 +87,8 @@ class Slot:
         for seed in unit.seeds(self._plan):
             if seed not in done:
                 outcome = self._seed(Task(unit.part, seed, folder))
+                if outcome.success:
+                    flush_to_disk(folder)  # a line that is on the disk names no file that isn't
                 ledger(folder).append([outcome], sync=True)
                 yield outcome
         write_json(folder / DONE, {"versions": versions()})

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from robocas_ms3.plans.begun import read_plan
-from robocas_ms3.plans.units import REPORT, Outcome, begun, outcomes
-
-RECENT = 600.0  # s that a rate is taken over
+from robocas_ms3.plans.tally import RECENT, Tally, tally_path
+from robocas_ms3.plans.units import REPORT, begun, outcomes
 
 
 @dataclass(frozen=True)
@@ -70,10 +68,12 @@ def status(out: Path) -> Status:
     plan = read_plan(out)
     parts, times = [], []
     for number, part in enumerate(plan.parts):
-        found = [outcome for unit in begun(plan, out, number) for outcome in outcomes(unit.folder(plan, out)).values()]
-        good = [outcome for outcome in found if outcome.success]
-        times += [outcome.at for outcome in good]
-        parts.append(_part(f"{part.name}", part.episodes, found, good))
+        tally = Tally.read(tally_path(out, f"{part.name}"))
+        for unit in begun(plan, out, number):  # those under way, and those that were done just now
+            if unit.block not in tally.blocks:
+                tally.add(unit.block, outcomes(unit.folder(plan, out)).values())
+        times += tally.times
+        parts.append(_part(f"{part.name}", part.episodes, tally))
     rate = _rate(sorted(times))
     left = sum(part.wanted - part.done for part in parts)
     return Status(
@@ -85,18 +85,17 @@ def status(out: Path) -> Status:
     )
 
 
-def _part(name: str, wanted: int, found: list[Outcome], good: list[Outcome]) -> PartStatus:
-    failed = Counter(outcome.failures[-1] for outcome in found if not outcome.success and outcome.failures)
-    each = max(1, len(good))
+def _part(name: str, wanted: int, tally: Tally) -> PartStatus:
+    each = max(1, tally.good)
     return PartStatus(
         name,
         wanted,
-        min(wanted, len(good)),
-        len(found),
-        dict(failed),
-        round(sum(outcome.record_seconds for outcome in found) / each, 2),
-        round(sum(outcome.render_seconds for outcome in found) / each, 2),
-        sum(outcome.size for outcome in good),
+        min(wanted, tally.good),
+        tally.tried,
+        tally.failed,
+        round(tally.record_seconds / each, 2),
+        round(tally.render_seconds / each, 2),
+        tally.size,
     )
 
 

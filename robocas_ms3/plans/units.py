@@ -16,6 +16,8 @@ from robocas_ms3.plans.plan import Plan
 
 PLAN, REPORT = "plan.json", "report.json"
 UNITS, LEDGER, DEATHS, DONE = "units", "seeds.jsonl", "deaths.jsonl", "done.json"
+CLAIMS = Path("slurm", "claims")
+"""Folder in the plan's, of the claims that jobs of Slurm have on units."""
 EPISODES = "episodes"
 """Folder of a unit with its rendered episodes."""
 

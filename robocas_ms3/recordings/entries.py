@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.seeds import one_seed
 from robocas_ms3.recordings.subgoals import SubGoal, read_subgoals
@@ -109,7 +109,7 @@ def read_json(trajectory: Path) -> dict[str, Any]:
     if not path.is_file():
         raise DatasetError("the JSON that belongs to this trajectory is missing", where=path)
     try:
-        metadata = json.loads(path.read_text(encoding="utf-8"))
+        metadata = load_json(path)
         episodes = metadata["episodes"]
         missing = {"env_id", "env_kwargs"} - set(metadata["env_info"])
         if missing:

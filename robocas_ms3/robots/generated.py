@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from robocas_ms3.files import make_folder
+from robocas_ms3.files import make_folder, naming
 
 
 def made_once(folder: Path, make: Callable[[Path], None]) -> None:
@@ -20,19 +20,24 @@ def made_once(folder: Path, make: Callable[[Path], None]) -> None:
     Args:
         folder: its name says all that the files are made from.
         make: writes them into an empty folder.
+
+    Raises:
+        RobocasError: it can't be made there.
+        OSError: it can't be written, naming it; nothing is left of it.
     """
     if _is_complete(folder):
         return
     make_folder(folder.parent)
-    tmp = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
-    try:
-        tmp.chmod(0o755)
-        make(tmp)
-        names = sorted(str(path.relative_to(tmp)) for path in tmp.rglob("*") if path.is_file())
-        (tmp / "files.json").write_text(json.dumps(names, indent=1), encoding="utf-8")
-        _publish(tmp, folder)
-    finally:
-        shutil.rmtree(tmp, ignore_errors=True)
+    with naming(folder):
+        tmp = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".tmp", dir=folder.parent))
+        try:
+            tmp.chmod(0o755)
+            make(tmp)
+            names = sorted(str(path.relative_to(tmp)) for path in tmp.rglob("*") if path.is_file())
+            (tmp / "files.json").write_text(json.dumps(names, indent=1), encoding="utf-8")
+            _publish(tmp, folder)
+        finally:
+            shutil.rmtree(tmp, ignore_errors=True)
 
 
 def _publish(tmp: Path, folder: Path) -> None:

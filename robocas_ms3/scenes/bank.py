@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import logging
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from importlib.metadata import version
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from robocas_ms3.assets.pack import MANIFEST, LoadedFurniture, sha256
+from robocas_ms3.documents import DAMAGED
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import make_folder, replacing, write_json
+from robocas_ms3.outputs import lock_file
 from robocas_ms3.paths import cache_dir
 from robocas_ms3.scenes.frozen import FrozenLayouts
 from robocas_ms3.scenes.layout import Layout
@@ -121,7 +122,7 @@ class LayoutBank:
     def _alone(self) -> Iterator[None]:
         """While no other process changes the tables: each change begins with what is there."""
         with (make_folder(self.folder) / ".tables.lock").open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+            lock_file(file, self.folder, wait=True)
             yield
 
     def path(self, objects_seed: int, seed: int) -> Path:
@@ -138,8 +139,10 @@ class LayoutBank:
         path = self.path(objects_seed, seed)
         if path.is_file():
             try:
-                return read_layout(path)
-            except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+                layout = read_layout(path)
+                layout.check(self._names)
+                return layout
+            except (*DAMAGED, KeyError, TypeError) as error:
                 _log.warning("%s: damaged, made again (%s)", path, error)
         known = None if objects_seed == seed else self.get(objects_seed, objects_seed).object_ids
         layout = self._sample.make(objects_seed, seed, known)
@@ -185,16 +188,18 @@ def about(model: SceneModel) -> dict[str, Any]:
 
 def write_layout(layout: Layout, path: Path) -> None:
     """Write a layout as ``.npz``."""
-    with replacing(path) as tmp, tmp.open("wb") as file:
-        values = {f.name: getattr(layout, f.name) for f in fields(Layout)}
-        np.savez(file, **{name: np.zeros(0) if value is None else np.asarray(value) for name, value in values.items()})
+    values = {f.name: getattr(layout, f.name) for f in fields(Layout)}
+    made = BytesIO()  # a zip file that meets a full disk complains once more when it is forgotten
+    np.savez(made, **{name: np.zeros(0) if value is None else np.asarray(value) for name, value in values.items()})
+    with replacing(path) as tmp:
+        tmp.write_bytes(made.getbuffer())
 
 
 def read_layout(path: Path) -> Layout:
     """Read a layout.
 
     Raises:
-        ValueError: or OSError, KeyError, BadZipFile: the file is damaged.
+        ValueError: or another of `documents.DAMAGED`, or KeyError or TypeError: the file is damaged.
     """
     with np.load(path, allow_pickle=False) as file:
         values = {f.name: file[f.name] for f in fields(Layout)}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from robocas_ms3.documents import DAMAGED
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import replacing
 from robocas_ms3.scenes.layout import Layout
@@ -30,7 +31,7 @@ class FrozenLayouts:
             self._records = np.load(path, allow_pickle=False)
             check_record(self._records.dtype)
             self._places = {int(seed): i for i, seed in enumerate(self._records["seed"])}
-        except (OSError, ValueError, IndexError, KeyError, EOFError, TypeError) as error:
+        except (*DAMAGED, IndexError, KeyError, TypeError) as error:
             raise LayoutError("no frozen layouts", where=path, found=error) from error
 
     @property

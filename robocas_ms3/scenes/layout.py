@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +13,7 @@ Array = NDArray[np.float64]
 ObjectIds = tuple[str, ...]
 """Objects of a scene, one id of the object pack a slot."""
 
+_SKEW = 1e-3  # by which a rotation may differ from one, as single precision does
 PARKING_HEIGHT = -5.0  # z of the plane, m, on which slots wait that an episode does not use
 
 
@@ -44,3 +46,24 @@ class Layout:
             object.__setattr__(self, "present", np.ones(len(self.object_ids), dtype=bool))
         if len(self.visible_shares) == 0:
             object.__setattr__(self, "visible_shares", np.full(len(self.object_ids), np.nan))
+
+    def check(self, names: Collection[str]) -> None:
+        """See that it can be built, whoever wrote it.
+
+        Args:
+            names: ids of the object pack's objects.
+
+        Raises:
+            ValueError: it can't, saying why.
+        """
+        count = len(self.object_ids)
+        shapes = self.object_poses.shape, self.present.shape, self.visible_shares.shape
+        if shapes != ((count, 4, 4), (count,), (count,)) or not set(self.object_ids) <= set(names):
+            raise ValueError("other objects than those of the pack, or not as many poses as objects")
+        others = [self.robot_pose] if self.basket_pose is None else [self.robot_pose, self.basket_pose]
+        if any(pose.shape != (4, 4) for pose in others) or not 0 <= self.target < count:
+            raise ValueError("a pose is no 4x4, or the target none of the objects")
+        poses = np.concatenate([self.object_poses, others])
+        turns = poses[:, :3, :3]
+        if not np.isfinite(poses).all() or np.abs(turns @ turns.swapaxes(1, 2) - np.eye(3)).max() > _SKEW:
+            raise ValueError("a pose is no pose")

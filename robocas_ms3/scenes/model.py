@@ -12,6 +12,7 @@ from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, Pack
 from robocas_ms3.config.task import TaskConfig
 from robocas_ms3.poses import transform
+from robocas_ms3.scenes.clearance import check_clearance
 from robocas_ms3.scenes.lookup import (
     check_joints,
     find_container,
@@ -59,7 +60,7 @@ class SceneModel:
         """Look up all assets of a configuration.
 
         Raises:
-            ConfigError: an asset is unknown or can't play its part.
+            ConfigError: an asset is unknown or can't play its part, or where it stands it can't (`check_clearance`).
         """
         furniture = {
             name: find_furniture(furniture_pack, item.asset, key=f"furniture.{name}.asset")
@@ -79,6 +80,15 @@ class SceneModel:
             region=find_region(config.surface, furniture[config.surface.furniture]),
         )
         check_joints(config, furniture)
+        check_clearance(
+            config,
+            model.room,
+            furniture,
+            model.furniture_poses,
+            (basket, model.basket_pose) if basket and model.basket_pose is not None else None,
+            model.robot_pose,
+            (model.region, model.support_pose @ model.support_motion(opened=True)),
+        )
         return model
 
     @property

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.poses import planar
 from robocas_ms3.scenes.placement import Array, PlaceableObject, Region
+from robocas_ms3.words import count_of
 
 # Builtin products show their label to their own -y, and resting poses have no yaw of their own, so that in every one
 # the label looks to -y of the plane or up, text upright for someone who stands at -y.
@@ -71,7 +72,7 @@ def sample_orderly(
     (left, back), (right, edge) = corners.min(axis=0), corners.max(axis=0)
     count = int((taken <= right - left).sum()) if keep_what_fits else len(members)
     if count == 0 or taken[count - 1] > right - left:
-        raise _does_not_fit(f"{len(members)} columns side by side", taken[count - 1], right - left)
+        raise _does_not_fit(f"{count_of(len(members), 'column')} side by side", taken[count - 1], right - left)
     start = left + widths[0] / 2 + rng.uniform() * (right - left - taken[count - 1])
 
     poses, there = np.tile(np.eye(4), (len(placeables), 1, 1)), np.zeros(len(placeables), dtype=bool)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.poses import planar
+from robocas_ms3.words import count_of
 
 Array = NDArray[np.float64]
 
@@ -92,9 +93,9 @@ def sample_scattered(
             poses[index] = planar(x, y, region.z, yaws[best]) @ placeable.resting_poses[choice]
         if len(placed) == len(placeables):
             return poses
-    size = np.subtract(region.max_xy, region.min_xy)
+    size, things = np.subtract(region.max_xy, region.min_xy), count_of(len(placeables), "object")
     raise LayoutError(
-        f"{len(placeables)} objects don't fit {min_gap * 100:.1f} cm apart on {size[0]:.2f} x {size[1]:.2f} m",
+        f"no room for {things} {min_gap * 100:.1f} cm apart on {size[0]:.2f} x {size[1]:.2f} m",
         where="layout",
         found=f"{max_tries} tries used up",
         fix="Lower objects.count or layout.min_gap, enlarge the surface, or raise layout.max_tries.",

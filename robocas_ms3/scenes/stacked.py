@@ -26,6 +26,7 @@ from robocas_ms3.config.task import StackedLayout
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.poses import planar, transform
 from robocas_ms3.scenes.placement import Array, Region
+from robocas_ms3.words import count_of
 
 BUCKET_SECONDS = 1.0  # at most, after the last one
 SPREAD_SECONDS, OPEN_SECONDS = 2.0, 0.5  # at most: within a fence along the sides of the region, and without it
@@ -80,7 +81,7 @@ def drop_heap(
         if inside.all() and top - region.z < headroom:
             return poses
     raise LayoutError(
-        f"{len(assets)} objects make no heap here",
+        f"no heap here of {count_of(len(assets), 'object')}",
         where="layout",
         found=f"{_TRIES} heaps fell apart" + (f" or rose above {headroom:.3f} m" if np.isfinite(headroom) else ""),
         fix="Lower objects.count or enlarge the surface.",

@@ -11,13 +11,11 @@ from robocas_ms3.assets.physics import TIME_STEP, Solid, add_body, add_fixed, en
 from robocas_ms3.config.randomisation import PoseRandomisation
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.poses import planar, transform
+from robocas_ms3.scenes.clearance import BODY_BOXES
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.settle import add_furniture
 
-# What turns with the robot's base, the lowest link included: half sizes in x and y, height up to which it goes, m, with
-# room to spare
-BODY_BOXES = ((0.28, 0.23, 0.30), (0.15, 0.13, 0.64))
 STAND_SECONDS = 1.0
 MAX_SHIFT, MAX_TURN_DEG = 0.005, 2.0  # meanwhile, of a basket that stands
 LOAD = 0.5  # kg, of something in it

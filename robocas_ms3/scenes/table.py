@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.documents import DAMAGED
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import replacing
 from robocas_ms3.poses import from_wxyz, to_wxyz
@@ -65,7 +66,7 @@ class LayoutTable:
             self._sets, self._seeds = (self.rows[name][place].copy() for name, place in _AXES)
             self._states = self.rows["state"].copy()
             check_record(self.rows.dtype)
-        except (OSError, ValueError, IndexError, KeyError, EOFError) as error:  # of other fields
+        except (*DAMAGED, IndexError, KeyError, TypeError) as error:  # of other fields
             raise LayoutError("no table of layouts", where=path, found=error, fix=_MADE_BY) from error
 
     def places(self, objects_seeds: NDArray[np.int64], seeds: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
@@ -162,17 +163,26 @@ def as_records(
 
 
 def read_record(record: Any, names: Sequence[str]) -> Layout:
-    """The layout of a record, in single precision."""
-    return Layout(
-        object_ids=tuple(str(names[i]) for i in record["objects"].tolist()),
-        object_poses=from_wxyz(record["object_poses"]),
-        robot_pose=from_wxyz(record["robot_pose"]),
-        basket_pose=None if np.isnan(record["basket_pose"]).any() else from_wxyz(record["basket_pose"]),
-        target=int(record["target"]),
-        relation=str(record["relation"]),
-        present=record["present"].copy(),
-        visible_shares=record["visible_shares"].astype(np.float64),
-    )
+    """The layout of a record, in single precision.
+
+    Raises:
+        LayoutError: it is damaged.
+    """
+    try:
+        layout = Layout(
+            object_ids=tuple(str(names[i]) for i in record["objects"].tolist()),
+            object_poses=from_wxyz(record["object_poses"]),
+            robot_pose=from_wxyz(record["robot_pose"]),
+            basket_pose=None if np.isnan(record["basket_pose"]).any() else from_wxyz(record["basket_pose"]),
+            target=int(record["target"]),
+            relation=str(record["relation"]),
+            present=record["present"].copy(),
+            visible_shares=record["visible_shares"].astype(np.float64),
+        )
+        layout.check(names)
+    except (ValueError, IndexError) as error:
+        raise LayoutError("this layout is damaged", found=error, fix=_MADE_BY) from error
+    return layout
 
 
 def check_record(dtype: np.dtype) -> None:

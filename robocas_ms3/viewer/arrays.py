@@ -14,6 +14,7 @@ from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
 from robocas_ms3.viewer.parts import plot, rounded
 from robocas_ms3.viewer.plots import ROLL_PITCH_YAW, XYZ, base_plot, gripper_plot, motion_plots
+from robocas_ms3.words import called
 
 NEEDED = (
     *("ee_pos", "ee_orn", "base_pos", "base_orn", "rel_pos", "rel_orn", "robot_joints", "gripper_width"),
@@ -89,7 +90,7 @@ def _goal(goal: SubGoal) -> dict[str, Any]:
 
 def _objects(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
     layout, target = scene.get("layout") or {}, (scene.get("target") or {}).get("slot")
-    names = {thing["slot"]: thing["name"] for thing in scene.get("objects") or ()}
+    names = {thing["slot"]: called(thing.get("asset_id") or "", thing["name"]) for thing in scene.get("objects") or ()}
     poses = layout.get("poses") or ()
     found = [
         {"name": names[slot], "target": slot == target, "path": [pose[:3]]}

@@ -20,6 +20,7 @@ from robocas_ms3.viewer.damage import attempt, readable, together
 from robocas_ms3.viewer.failures import Failures, describe, stages
 from robocas_ms3.viewer.parts import Picture, make_index, rounded, row
 from robocas_ms3.viewer.pictures import encode_jpeg
+from robocas_ms3.words import called
 
 
 class PageContent:
@@ -111,12 +112,13 @@ class PageContent:
         instruction, _ = attempt(lambda: self.source.episode(number).instruction, "")
         recorded = scene.get("recorded") or {}
         scene = {**entry, **scene}
+        target = scene.get("target") or entry.get("target") or {}
         shown = row(
             number,
             steps=steps,
             instruction=instruction,
             task=scene.get("task") or "",
-            target=(scene.get("target") or entry.get("target") or {}).get("name", ""),
+            target=called(target.get("asset_id") or "", target.get("name") or ""),
             seed=one_seed(scene.get("seed")),
             success=scene.get("success"),
             split=split,

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from robocas_ms3.datasets.checks.scene_values import check_rate, sound
-from robocas_ms3.datasets.sources.files import DAMAGED
+from robocas_ms3.documents import DAMAGED
 from robocas_ms3.errors import DatasetError
 
 T = TypeVar("T")

@@ -25,6 +25,7 @@ from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import readable
 from robocas_ms3.viewer.parts import plot
 from robocas_ms3.viewer.plots import ARM, ROLL_PITCH_YAW, XYZ
+from robocas_ms3.words import called
 
 NOTE = "A trajectory file holds states, no pictures: `robocas convert {name} --to robocas --out DIR` renders them."
 _STILL = 0.002  # m: an object that moves less is drawn where it stands
@@ -109,8 +110,8 @@ def _objects(recording: Recording, scene: Mapping[str, Any], ids: Any, base_in_w
     """Paths of actors, thinned to one point where they stand still, without those parked far away."""
     target, world_to_base = scene.get("target") or {}, inverse(base_in_world)
     chosen = f"object_{target['slot']}" if target else ""
-    named = {f"object_{slot}": str(name).replace("_", " ") for slot, name in enumerate(ids or ())}
-    named |= {chosen: target.get("name", "")}
+    named = {f"object_{slot}": called(str(asset)) for slot, asset in enumerate(ids or ())}
+    named |= {chosen: called(target.get("asset_id") or "", target.get("name") or "")}
     found = []
     for actor, states in recording.states.get("actors", {}).items():
         path = states[:, :3].astype(float)

@@ -20,7 +20,7 @@ def test_layouts_are_made_once_and_a_later_run_goes_on(tmp_path, monkeypatch, ca
     assert build(tmp_path, "0:2") == 0
     assert build(tmp_path, "0:3") == 0
     assert made == [(0, 0), (1, 1), (2, 2)]
-    assert "1 layouts made, 2 were there already, 0 seeds have none" in capsys.readouterr().out
+    assert "1 layout made, 2 there already, 0 seeds without one" in capsys.readouterr().out
     main(Layouts(Info(tmp_path)))
     listed = capsys.readouterr().out
     assert "scattered" in listed and "builtin" in listed and " 3 " in listed
@@ -35,7 +35,7 @@ def test_seeds_without_a_layout_are_named_and_the_others_made(tmp_path, monkeypa
     monkeypatch.setattr(source, "sample_layout", fussy)
     assert build(tmp_path, "0:3") == 1
     captured = capsys.readouterr()
-    assert "2 layouts made, 0 were there already, 1 seeds have none" in captured.out
+    assert "2 layouts made, 0 there already, 1 seed without one" in captured.out
     assert "seed 1: target: no object qualifies" in captured.err
 
 

@@ -1,5 +1,6 @@
 import dataclasses
 import errno
+import inspect
 import os
 import re
 import subprocess
@@ -99,6 +100,59 @@ def test_a_misspelt_configuration_is_told_before_anything_heavy_is_imported(comm
     assert "open_pick_cabinet_door" not in done.stderr  # not all forty
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["plan", "rn"], "error: rn: no such command of robocas plan. Did you mean run?"),
+        (
+            ["assets", "importscans", "x"],
+            "error: importscans: no such command of robocas assets. Did you mean import-",
+        ),
+        (["layouts", "fly"], "error: fly: no such command of robocas layouts. There are: build, info."),
+    ],
+)
+def test_a_misspelt_command_of_a_command_is_one_line(words, said, capsys):
+    assert cli.run(words) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(said)
+    assert err.count("\n") == 1
+
+
+def test_a_misspelt_word_of_eval_is_one_line(capsys):
+    assert cli.run(["eval", "comparre", "x"]) == 1
+    assert "Did you mean compare?" in capsys.readouterr().err
+
+
+def every_help() -> list[tuple[list[str], type]]:
+    """Words of each command and of each of its own, and its dataclass."""
+    found = []
+    for name in cli.COMMANDS:
+        of_command = cli.config_type(cli.module_of(name), name)
+        found.append(([name], of_command))
+        found += [([name, word], sub) for word, sub in cli.subcommands(of_command).items()]
+    return found
+
+
+def plainly(text: str) -> str:
+    return re.sub(r"[\s│•]+", " ", text)
+
+
+def test_help_is_whole_in_a_narrow_terminal_and_says_no_default_twice(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert len(every_help()) > 30
+    for words, of_command in every_help():
+        with pytest.raises(SystemExit):
+            cli.run([*words, "--help"])
+        shown = capsys.readouterr().out
+        for line in shown.splitlines():
+            assert "(default: None)" not in line and "{None}" not in line, words
+            assert len(line) <= 80 or "│" not in line, (words, line)
+        assert "(default: )" not in plainly(shown) and "(default: None)" not in plainly(shown), words
+        said = plainly(shown)
+        for option in re.findall(r'^    """(.+?)"""$', inspect.getsource(of_command), flags=re.M | re.S)[1:]:
+            assert plainly(option).replace("``", "") in said.replace("``", ""), (words, option)
+
+
 def test_no_arguments_show_the_overview(capsys):
     with pytest.raises(SystemExit) as exit_info:
         cli.run([])
@@ -161,6 +215,35 @@ def test_a_full_disk_says_how_to_go_on(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("robocas_ms3.cli.generate.main", full)
     assert cli.run(["generate", "pick"]) == 1
     assert capsys.readouterr().err.endswith(" MB free). Make room, then go on with --resume.\n")
+
+
+def test_a_full_or_forbidden_cache_says_what_puts_it_elsewhere(failing, monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path))
+    for number, said in (
+        (
+            errno.ENOSPC,
+            r"No space left on device \(\d+ MB free\)\. Make room, or set ROBOCAS_CACHE to a folder that has",
+        ),
+        (errno.EACCES, r"Permission denied\. Set ROBOCAS_CACHE to a folder that can be written to"),
+    ):
+        failing(OSError(number, os.strerror(number), str(tmp_path / "robots" / "x")))
+        assert cli.run(["list"]) == 1
+        assert re.search(f"^error: {tmp_path}/robots/x: {said}", capsys.readouterr().err)
+
+
+def test_libraries_get_a_place_where_the_home_is_read_only(monkeypatch, tmp_path):
+    (tmp_path / "home").write_text("")
+    for name in ("MPLCONFIGDIR", "MESA_SHADER_CACHE_DIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, "")  # so that what the command sets is undone
+        monkeypatch.delenv(name)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    cli.run(["--version"])
+    cli.run(["nothing"])
+    assert "MPLCONFIGDIR" not in os.environ  # the home is as it should be
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    cli.run(["nothing"])
+    assert os.environ["MPLCONFIGDIR"] == f"{tmp_path}/robocas-{os.getuid()}/matplotlib"
+    assert os.environ["MESA_SHADER_CACHE_DIR"].startswith(f"{tmp_path}/robocas-")
 
 
 def test_a_mistake_of_the_user_in_a_real_process(tmp_path):

@@ -114,6 +114,15 @@ def test_folders_that_can_not_be_written(tmp_path, monkeypatch):
     assert not (tmp_path / "a").exists()
 
 
+def test_a_cache_among_temporary_files_is_said(tmp_path, monkeypatch):
+    monkeypatch.delenv("ROBOCAS_CACHE", raising=False)
+    monkeypatch.setattr(checks.paths, "cache_dir", lambda: tmp_path)
+    monkeypatch.setattr(checks.paths, "temporary_cache", lambda: tmp_path)
+    cache = checks.check_folders()[0]
+    assert cache.status == "limited"
+    assert "ROBOCAS_CACHE" in cache.fix
+
+
 @pytest.mark.parametrize(("free", "status"), [(50e9, "ok"), (5e9, "limited"), (0.5e9, "fail")])
 def test_disk(tmp_path, monkeypatch, free, status):
     usage = checks.shutil.disk_usage(tmp_path)._replace(free=int(free))

@@ -100,7 +100,7 @@ def test_of_different_protocols_or_of_nothing(tmp_path):
 def test_with_the_weld_it_is_compared_with_its_like_alone(tmp_path):
     without = write(tmp_path / "a", [outcome(0)])
     one, other = (write(tmp_path / name, [outcome(0)], weld=True) for name in "bc")
-    assert "1 episodes of made_up with upstream's weld that both have" in comparison([one, other])
+    assert "1 episode of made_up with upstream's weld that both have" in comparison([one, other])
     for pair in ([one, without], [without, one]):
         with pytest.raises(EvaluationError, match=r"/b: a result with upstream's weld can't be compared"):
             comparison(pair)

@@ -72,9 +72,7 @@ def test_stages_failures_and_splits(result):
     text = page(result)
     read = Reader(text)
     assert read.after("table, n 4", 3) == ["an object touched (RA)", "3 of 4: 75.0 %, 19.4 to 99.4", "75 %"]
-    assert {"placed, at rest", "broken off", "1 episodes were broken off by an error. They count as failures."} <= set(
-        read.texts
-    )
+    assert {"placed, at rest", "broken off", "Broken off by an error: 1 episode, counted as failed."} <= set(read.texts)
     assert "hard, n" in read.texts and "test, n" in read.texts
     assert "0.2 to 0.4" in read.texts
 
@@ -114,7 +112,7 @@ def test_a_result_that_lacks_episodes_says_so(tmp_path):
     whole = of_protocol(tmp_path / "whole", protocol)
     assert "8 of 8 episodes" in page(whole, protocol=protocol)
     part = write(tmp_path / "part", list(whole.outcomes.values())[:5])
-    assert "3 episodes of the protocol are missing" in page(part, protocol=protocol)
+    assert "Missing of the protocol: 3 episodes" in page(part, protocol=protocol)
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -164,7 +162,7 @@ def test_commands_on_parts(tmp_path, capsys):
     assert (tmp_path / "all" / "report.html").is_file()
     write(tmp_path / "d", [outcome(1)], policy={"name": "other"})
     assert command.main(command.Eval(("compare", words[0], words[1], words[2], str(tmp_path / "d")))) == 0
-    assert "1 episodes of made_up that both have" in capsys.readouterr().out
+    assert "1 episode of made_up that both have" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -52,12 +52,12 @@ def test_nothing_is_wrong_with_a_whole_result(folder, protocol):
         ({"p_vis": 0.9}, "episode 0: p_vis is 0.9, not None"),
         ({"success": False}, "episode 0: success does not agree with its flags"),
         ({"failure_stage": "placed"}, "episode 0: failure_stage is placed, by its flags none"),
-        ({"steps": 801}, "episode 0: 801 steps, 800 are allowed"),  # 40 s at 20 Hz
+        ({"steps": 801}, "episode 0: 801 steps, 800 allowed"),  # 40 s at 20 Hz
         ({"steps": 71}, "episode 0: it went on after success, 70 of 71 steps"),
         ({"steps": 69}, "episode 0: success, success_v0 held first after its 69 steps"),
         ({"success_at_end": True, "success": False}, "episode 0: success_at_end, but no success"),
         ({"flags": {"success_v0": None}}, "episode 0: success_v0 does not agree with its flags"),
-        ({"seconds": 3.0}, "episode 0: 3 s, its 70 steps take 3.5"),
+        ({"seconds": 3.0}, "episode 0: 3 s, its 70 steps should take 3.5"),
         ({"flag_seconds": {"success": 3.6}}, "episode 0: success held first after its 3.5 s"),
         ({"flag_seconds": {}}, "episode 0: flag_seconds are not of its flags"),
         ({"measures": {"path_length": -1.0}}, "episode 0: a measure is no number from 0 on"),
@@ -87,12 +87,12 @@ def test_the_policys_rate_is_that_of_its_steps(folder, protocol):
     tamper(folder, 0, steps=401, seconds=20.05, flags=flags, flag_seconds=flags, **failed)
     assert problems(read(folder), protocol) == []
     tamper_run(folder, policy={"name": "mine", "wants": {"rate_hz": 10}})
-    assert "episode 0: 401 steps, 400 are allowed" in problems(read(folder), protocol)
+    assert "episode 0: 401 steps, 400 allowed" in problems(read(folder), protocol)
 
 
 def test_missing_episodes_are_counted_even_if_others_take_their_place(folder, protocol):
     tamper(folder, 0, episode=99)
-    assert "1 of 8 episodes are missing" in problems(read(folder), protocol)
+    assert "missing: 1 of 8 episodes" in problems(read(folder), protocol)
 
 
 def test_another_protocol_or_pack_is_found(folder, protocol):

@@ -217,6 +217,6 @@ def test_an_evaluation_with_it_counts_it_says_so_and_is_filmed_alike(tmp_path, n
     assert outcome["success"] and outcome["measures"]["welds"] == 1
     result = results.read(folder)
     assert result.run["weld"] is True
-    assert problems(result, protocol) == ["399 of 400 episodes are missing"]
+    assert problems(result, protocol) == ["missing: 399 of 400 episodes"]
     (filmed,) = film(result, protocol, make_policy("scripted-motions"), [0])
     assert filmed.same and filmed.outcome.measures["welds"] == 1

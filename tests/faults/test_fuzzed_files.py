@@ -1,14 +1,19 @@
 """Whatever files of others hold, there is an answer or one of our errors, of one line."""
 
+import io
 import json
 import shutil
 from pathlib import Path
 
+import made_up_results
+import numpy as np
 import pytest
-from fuzzing import flipped, twist_file
+from fuzzing import VALUES, flipped, twist_file
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.cli.layouts import Info, info
+from robocas_ms3.config import load_task_config
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
@@ -16,8 +21,18 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.errors import RobocasError
+from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.comparison import comparison
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+from robocas_ms3.evaluation.report.page import page
+from robocas_ms3.evaluation.tables import markdown
 from robocas_ms3.paths import builtin_packs_dir
+from robocas_ms3.poses import planar
+from robocas_ms3.scenes.bank import ABOUT, LayoutBank
+from robocas_ms3.scenes.frozen import FrozenLayouts, write_frozen
+from robocas_ms3.scenes.layout import Layout
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.table import LayoutTable, write_table
 
 
 def read_dataset(root):
@@ -109,3 +124,125 @@ def test_files_of_a_protocol(tmp_path):
             path.write_bytes(flipped(whole, seed))
             attempt(load_protocol, root, seed)
         path.write_bytes(whole)
+
+
+NAMES = ["one", "three", "two"]
+LAYOUT = Layout(
+    ("two", "one", "two"),
+    np.stack([planar(0.1 * i, 0.2, 0.6, i) for i in range(3)]),
+    planar(0.7, 0.15, 0, 1.5),
+    planar(1.3, 0.9, 0.6, 0),
+    target=1,
+)
+
+
+@pytest.fixture
+def bank(tmp_path, monkeypatch):
+    """A bank whose layouts are drawn at no cost: all the same one."""
+    pack = load_pack("builtin")
+    bank = LayoutBank(SceneModel.load(load_task_config("pick_table_scattered"), pack, pack), tmp_path)
+    layout = Layout(
+        tuple(bank._names[:3]), *(getattr(LAYOUT, f) for f in ("object_poses", "robot_pose", "basket_pose")), 1
+    )
+    monkeypatch.setattr(bank._sample, "make", lambda *_: layout)
+    return bank
+
+
+def same(one, other):
+    return one.object_ids == other.object_ids and np.array_equal(one.object_poses, other.object_poses)
+
+
+def test_a_damaged_layout_of_a_bank_is_made_again(bank):
+    whole_layout = bank.get(0, 0)
+    path = bank.path(0, 0)
+    whole = path.read_bytes()
+    for seed in range(40):
+        path.write_bytes(flipped(whole, seed))
+        assert same(bank.get(0, 0), whole_layout), f"seed {seed}"
+    arrays = dict(np.load(io.BytesIO(whole)))
+    rng = np.random.default_rng(0)
+    for name in arrays:  # a whole file of other arrays
+        for value in (np.zeros(0), np.array("x"), rng.random((3, 4, 4)), np.array(9), np.array([True]), None):
+            others = {**arrays, name: value} if value is not None else {k: a for k, a in arrays.items() if k != name}
+            np.savez(path, **others)
+            if not same(bank.get(0, 0), whole_layout):
+                raise AssertionError(f"{name} {value}")
+
+
+def test_banks_with_damaged_notes_are_listed(bank, capsys):
+    bank.get(0, 0)
+    path = bank.folder / ABOUT
+    whole = json.loads(path.read_text())
+    for seed in range(60):
+        twist_file(path, whole, seed)
+        assert info(Info(folder=bank.folder.parent)) == 0, f"seed {seed}"
+    for value in VALUES:
+        path.write_text(json.dumps(value))
+        assert info(Info(folder=bank.folder.parent)) == 0, value
+        assert "damaged" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["table", "frozen"])
+def test_files_of_many_layouts(tmp_path, kind):
+    path, pairs = tmp_path / "layouts.npy", [(0, 0)] if kind == "frozen" else [(0, 0), (0, 1)]
+    if kind == "table":
+        write_table(path, NAMES, dict.fromkeys(pairs, LAYOUT))
+    else:
+        write_frozen(path, NAMES, {0: LAYOUT})
+
+    def read(path):
+        if kind == "table":
+            table = LayoutTable(path, NAMES)
+            found = [table.layout(pair) for pair in pairs]
+            assert table.object_ids(0) is None or set(table.object_ids(0)) <= set(NAMES)
+        else:
+            found = [FrozenLayouts(path, NAMES)(*pair) for pair in pairs]
+        for layout in found:
+            if layout is not None:
+                layout.check(NAMES)
+
+    whole = path.read_bytes()
+    refused = 0
+    for seed in range(50):
+        path.write_bytes(flipped(whole, seed))
+        refused += attempt(read, path, seed)
+    assert refused > 25
+
+
+@pytest.mark.parametrize("name", [results.RUN, results.OUTCOMES])
+def test_files_of_a_result(tmp_path, name):
+    root = tmp_path / "result"
+    made_up_results.write(root, [made_up_results.outcome(i, came_to=7 - i) for i in range(3)])
+
+    def read(folder):
+        found = results.read(folder)
+        assert markdown(found)
+        assert page(found)
+        assert comparison([found, found])
+        results.parts_of([folder])
+
+    read(root)
+    whole = (root / name).read_bytes()
+    first, *others = whole.splitlines() if name == results.OUTCOMES else [whole]
+    for seed in range(20):
+        (root / name).write_bytes(flipped(whole, seed))
+        attempt(read, root, seed)
+        text = twist_file(root / name, json.loads(first), seed)
+        (root / name).write_bytes(b"\n".join([text.encode(), *others, b""]))
+        attempt(read, root, seed)
+
+
+def test_deep_json_is_refused(made, tmp_path):
+    """A file of brackets takes no reader down."""
+    deep = "[" * 100_000
+    root = tmp_path / "result"
+    made_up_results.write(root, [made_up_results.outcome(0)])
+    (root / results.RUN).write_text(deep)
+    assert attempt(results.read, root, 0)
+    for kind, name, read in (
+        ("robocas", "data_info.json", read_dataset),
+        ("lerobot", "meta/info.json", lambda root: check_lerobot(root) and None),
+    ):
+        shutil.copytree(made / kind, tmp_path / kind)
+        (tmp_path / kind / name).write_text(deep)
+        attempt(read, tmp_path / kind, 0)

@@ -9,7 +9,10 @@ import time
 
 import pytest
 
-from robocas_ms3.plans.claims import claimed
+from robocas_ms3.errors import PlanError
+from robocas_ms3.plans.claims import claimed, refuse_claimed
+from robocas_ms3.plans.engines import open_engine
+from robocas_ms3.plans.units import CLAIMS
 
 LEASE = 3.0
 HOLD = """
@@ -114,3 +117,20 @@ def test_a_claim_that_cannot_be_renewed_is_given_up_before_others_may_take_it(tm
     keeper.__enter__()
     assert lost.wait(LEASE)
     assert time.monotonic() - begun < LEASE
+
+
+def test_what_claims_nothing_is_refused_where_somebody_is(tmp_path):
+    folder = tmp_path / CLAIMS
+    path = folder / "a" / "00003"
+    refuse_claimed(folder)  # there is nothing yet
+    with claimed(path, LEASE):
+        for engine in ("local", "ray"):
+            with pytest.raises(
+                PlanError, match=r"00003\.1: jobs of Slurm are at this plan .* s ago\)\. Go on with"
+            ) as error:
+                open_engine(engine, None, tmp_path, 1, {})
+            assert "\n" not in str(error.value)
+    refuse_claimed(folder)  # it was given back
+    with claimed(path, LEASE):
+        os.utime(path.with_name("00003.2"), (time.time() - 200,) * 2)
+        refuse_claimed(folder)  # its holder is long dead

@@ -1,9 +1,16 @@
 """Files of a unit arrive whole, however they are cut, and whenever it ends."""
 
-import pytest
+import ctypes
+import errno
 
+import pytest
+from plan_stages import PLAN
+
+from robocas_ms3.files import flush_to_disk
+from robocas_ms3.ledger import Ledger
 from robocas_ms3.plans.engines.pieces import Arriving, sent
-from robocas_ms3.plans.units import DEATHS, DONE, LEDGER, Outcome, outcomes
+from robocas_ms3.plans.slot import Slot
+from robocas_ms3.plans.units import DEATHS, DONE, LEDGER, Outcome, Unit, outcomes
 
 FILES = {
     "seed_0000000007.h5": b"0123456789",
@@ -68,3 +75,43 @@ def test_what_came_in_half_is_forgotten_and_what_was_moved_is_replaced(here, tmp
     second.keep(Outcome(7, True))
     found = contents(tmp_path / "there")
     assert {name: content for name, content in found.items() if name != LEDGER} == FILES
+
+
+@pytest.mark.parametrize("success", [True, False])
+def test_files_are_on_the_disk_before_a_line_names_them(here, tmp_path, monkeypatch, success):
+    said = []
+    whole = Ledger.append
+    monkeypatch.setattr("robocas_ms3.plans.engines.pieces.flush_to_disk", lambda folder: said.append(contents(folder)))
+    monkeypatch.setattr(Ledger, "append", lambda *a, **k: (said.append(k["sync"]), whole(*a, **k)))
+    arriving = Arriving(tmp_path / "there")
+    for pieces in sent(here):
+        arriving.take(pieces)
+    arriving.keep(Outcome(7, success))
+    assert said == ([FILES, True] if success else [True])
+
+
+def test_a_slot_does_so_too(tmp_path, monkeypatch):
+    said = []
+    monkeypatch.setattr("robocas_ms3.plans.slot.check_versions", lambda out: None)
+    monkeypatch.setattr("robocas_ms3.plans.slot.flush_to_disk", lambda folder: said.append(len(outcomes(folder))))
+    slot = Slot(PLAN, tmp_path)
+    monkeypatch.setattr(slot, "_seed", lambda task: Outcome(task.seed, task.seed != 11))
+    assert [outcome.seed for outcome in slot.do(Unit(0, 0))] == [10, 11, 12]
+    assert said == [0, 2]  # before the lines of 10 and 12
+
+
+def test_a_flush_says_which_folder_it_could_not_write(tmp_path, monkeypatch):
+    flush_to_disk(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        flush_to_disk(tmp_path / "gone")
+
+    class Full:
+        @staticmethod
+        def syncfs(descriptor):
+            ctypes.set_errno(errno.EDQUOT)
+            return -1
+
+    monkeypatch.setattr("ctypes.CDLL", lambda *_, **__: Full)
+    with pytest.raises(OSError, match="quota") as error:
+        flush_to_disk(tmp_path)
+    assert error.value.filename == str(tmp_path)

@@ -1,12 +1,15 @@
 """Plans as files: what is wrong with one is a line; the shipped ones are whole."""
 
+from dataclasses import asdict
+
 import pytest
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.errors import ConfigError, PlanError
 from robocas_ms3.plans.plan import load_plan, most_seeds, shipped_plans
 from robocas_ms3.plans.status import status
-from robocas_ms3.plans.units import PLAN, Outcome, Unit, ledger
+from robocas_ms3.plans.tally import Tally, tally_path
+from robocas_ms3.plans.units import LEDGER, PLAN, Outcome, Unit, ledger
 
 GOOD = "parts:\n  - {task: pick, episodes: 3}\n"
 
@@ -125,3 +128,21 @@ def test_status_is_read_from_the_folder_alone(written, tmp_path, capsys):
     assert found.seconds_left == 15.0
     assert run(["plan", "status", str(out)]) == 0
     assert "3 of 6" in capsys.readouterr().out
+
+    tally = Tally()  # as `robocas plan run` notes units that are done: their ledgers are not read any more
+    tally.add(0, ledger(folders[0]).read())
+    tally.write(tally_path(out, "a"))
+    (folders[0] / LEDGER).unlink()
+    assert asdict(status(out)) | {"idle_seconds": 0} == asdict(found) | {"idle_seconds": 0}
+    tally_path(out, "a").write_text('{"blocks": [0], "tried": "x"}')
+    assert status(out).parts[0].tried == 1  # a damaged one is none
+
+
+def test_a_tally_keeps_the_times_of_ten_minutes(tmp_path):
+    tally = Tally()
+    for block, at in enumerate((0.0, 500.0, 1000.0, 1150.0)):
+        tally.add(block, [Outcome(block, True, at=at)])
+    tally.write(tmp_path / "tally.json")
+    tally = Tally.read(tmp_path / "tally.json")
+    assert tally.times == [1000.0, 1150.0]
+    assert (tally.good, tally.blocks) == (4, {0, 1, 2, 3})

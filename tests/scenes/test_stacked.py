@@ -67,7 +67,7 @@ def test_the_same_seed_gives_the_same_heap_bit_for_bit():
 
 def test_a_heap_that_runs_over_is_an_error():
     pack = load_pack("builtin")
-    with pytest.raises(LayoutError, match="2 objects make no heap here"):
+    with pytest.raises(LayoutError, match="no heap here of 2 objects"):
         tiny = Region((0.0, 0.0), (0.001, 0.001), 0.0)
         assets = [pack.objects["power_drill"], pack.objects["sugar_box"]]
         drop_heap(np.random.default_rng(0), assets, tiny, LAYOUT)

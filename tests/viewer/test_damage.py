@@ -64,7 +64,7 @@ def test_the_row_says_what_is_wrong(spoilt, new, damage):
     change(spoilt / "episode_0000001/scene.json", **new)
     (_, row, _, _) = open_source(spoilt).index()["episodes"]
     assert row["damage"].startswith(damage)
-    assert (row["object"], row["seed"], row["success"]) == ("cube 4", 4, False)  # of the ledger or the scene
+    assert (row["object"], row["seed"], row["success"]) == ("cube 4 (cube)", 4, False)  # of the ledger or the scene
     assert open_source(spoilt).episode(1)["n"] == 1
 
 
@@ -135,7 +135,7 @@ def test_a_damaged_trajectory(run_folder, tmp_path):
     path.write_text(json.dumps(metadata))
     (_, row, *_) = open_source(folder).index()["episodes"]
     assert row["damage"].startswith("its entry of the JSON: the JSON's entry is incomplete")
-    assert (row["object"], row["seed"], row["success"], row["stages"]) == ("cube 4", 4, False, ["grasp"])
+    assert (row["object"], row["seed"], row["success"], row["stages"]) == ("cube 4 (cube)", 4, False, ["grasp"])
     for spoilt in ({"episodes": 3}, {"episodes": ["x"]}, {"env_info": {"env_id": 3, "env_kwargs": 4}}, {"robocas": []}):
         path.write_text(json.dumps({**whole, **spoilt}))
         with pytest.raises(DatasetError):

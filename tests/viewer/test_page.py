@@ -98,7 +98,7 @@ def test_filters(page):
     page.wait(f"{ROWS} === 'none'")
     page.click("#f-reset")
     page.wait(f"{ROWS} === '0,1,2,none'")
-    page.choose("#f-object", "cube 5")
+    page.choose("#f-object", "cube 5 (cube)")
     page.wait(f"{ROWS} === '2'")
     page.click("#f-reset")
     page.wait(f"{ROWS} === '0,1,2,none'")

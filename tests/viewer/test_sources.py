@@ -55,7 +55,7 @@ def test_a_trajectory_lists_episodes_and_seeds_that_were_given_up(run_folder):
     assert [row["stages"] for row in index["episodes"]] == [[], ["grasp"], [], ["reach"]]
     assert [row["attempts"] for row in index["episodes"]] == [None, 2, None, 1]
     assert index["episodes"][0]["task"] == "pick"
-    assert index["episodes"][0]["object"] == "cube 3"
+    assert index["episodes"][0]["object"] == "cube 3 (cube)"
     assert (index["cameras"], index["depth"], index["rate_hz"]) == ([], False, 20)
     assert "`robocas convert trajectory.h5" in index["note"]
 
@@ -80,11 +80,11 @@ def test_an_episode_of_a_trajectory(run_folder, made_up):
     # sub-goals cover all states, the last one too
     assert [(g["first"], g["last"]) for g in episode["subgoals"]] == [(0, 11), (12, steps - 1)]
     objects = {thing["name"]: thing for thing in episode["trace"]["objects"]}
-    assert set(objects) == {"cube 4", "object 1", "object 2"}
-    assert [name for name, thing in objects.items() if thing["target"]] == ["cube 4"]
-    assert len(objects["cube 4"]["path"]) == steps  # it is lifted
+    assert set(objects) == {"cube 4 (cube)", "object 1", "object 2"}
+    assert [name for name, thing in objects.items() if thing["target"]] == ["cube 4 (cube)"]
+    assert len(objects["cube 4 (cube)"]["path"]) == steps  # it is lifted
     assert len(objects["object 1"]["path"]) == 1  # it stands
-    assert objects["cube 4"]["path"][-1][2] == pytest.approx(0.66 + 0.1, abs=1e-4)
+    assert objects["cube 4 (cube)"]["path"][-1][2] == pytest.approx(0.66 + 0.1, abs=1e-4)
     assert episode["trace"]["moving"]
     assert [(f["stage"], f["reason"]) for f in episode["failures"]] == [("grasp", "slipped")]
 
@@ -116,7 +116,7 @@ def test_a_folder_lists_episodes(folder):
     assert [row["seed"] for row in index["episodes"]] == [3, 4, 5, 9]
     assert [row["success"] for row in index["episodes"]] == [True, False, True, False]
     assert [row["stages"] for row in index["episodes"]] == [[], ["grasp"], [], ["reach"]]
-    assert [row["object"] for row in index["episodes"]] == ["cube 3", "cube 4", "cube 5", ""]
+    assert [row["object"] for row in index["episodes"]] == ["cube 3 (cube)", "cube 4 (cube)", "cube 5 (cube)", ""]
     assert [row["steps"] for row in index["episodes"]] == [7, 7, 7, 0]
     assert {row["damage"] for row in index["episodes"]} == {""}
     assert index["cameras"] == ["base_camera", "gripper_camera", "static_camera"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -17,8 +16,8 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.sources.files import DAMAGED
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line, read_arrays
+from robocas_ms3.documents import DAMAGED, load_json
 
 NO_FILE = "no file"
 SURPLUS = "a file beyond them"
@@ -50,7 +49,7 @@ def read_object(
         missing: and what is found then.
     """
     try:
-        content = json.loads((root / name).read_text(encoding="utf-8"))
+        content = load_json(root / name)
     except FileNotFoundError:
         return JsonObject({}, Violation(name, "", absent, missing))
     except (OSError, ValueError) as error:

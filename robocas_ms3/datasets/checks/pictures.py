@@ -15,6 +15,7 @@ from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.pictures.headers import PictureHeader
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.poses import from_xyzw
+from robocas_ms3.words import count_of
 
 _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
 Sizes = Mapping[str, tuple[int, int]]
@@ -80,7 +81,9 @@ def check_pictures(headers: Headers, folder: str, pictures: Pictures, sizes: Siz
             if header == NO_FILE:
                 yield Violation(file, "", "a picture of every step", NO_FILE)
             elif header == SURPLUS:
-                yield Violation(file, "", f"{len(wanted)} pictures from {min(wanted, default='none')}", SURPLUS)
+                yield Violation(
+                    file, "", f"{count_of(len(wanted), 'picture')} from {min(wanted, default='none')}", SURPLUS
+                )
             elif isinstance(header, str):
                 yield Violation(file, "", "a sound picture", header)
             elif header is not None:

@@ -20,6 +20,7 @@ from robocas_ms3.datasets.lerobot.stage import EPISODE_FILE, FRAMES_FILE, SUBGOA
 from robocas_ms3.datasets.lerobot.stats import Histogram, Levels, Range, vector_stats
 from robocas_ms3.datasets.lerobot.tables import RollingTable, column, numbers, write_texts
 from robocas_ms3.datasets.lerobot.video import Joiner, packet_times
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import write_json
 
@@ -122,7 +123,7 @@ class _Parts:
     def about(self, index: int) -> dict[str, Any]:
         path = part_folder(self._folder, index) / EPISODE_FILE
         try:
-            return json.loads(path.read_text(encoding="utf-8"))
+            return load_json(path)
         except (OSError, ValueError) as error:
             raise DatasetError("this part of a conversion is damaged", where=path, fix="Pass --overwrite.") from error
 

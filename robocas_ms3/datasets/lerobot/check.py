@@ -24,6 +24,7 @@ from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.stats import QUANTILES, shape_of
 from robocas_ms3.datasets.lerobot.tables import numbers, read_rows
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
+from robocas_ms3.words import count_of
 
 _KEYS = ("codebase_version", "total_episodes", "total_frames", "total_tasks", "fps", "splits", "features", "data_path")
 _UNREADABLE = (OSError, pa.ArrowException, KeyError)
@@ -191,7 +192,7 @@ def check_frames(frames: Frames, info: Mapping[str, Any], texts: Texts) -> Itera
     """Check an episode's frames: what they count, when, of what; and that they agree with each other."""
     length, columns = frames.row["length"], frames.columns
     if frames.count != length or length == 0:
-        yield frames.violation("", f"{length} frames" if length else "frames", frames.count or "none")
+        yield frames.violation("", count_of(length, "frame") if length else "frames", frames.count or "none")
         return
     faults = [(key, fault) for key, found in columns.items() if (fault := _fault(found, info["features"][key]))]
     yield from (frames.violation(key, *fault) for key, fault in faults)

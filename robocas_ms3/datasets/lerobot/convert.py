@@ -21,9 +21,11 @@ from robocas_ms3.datasets.writing.frames import OpenSource
 from robocas_ms3.datasets.writing.output import check_overwrite
 from robocas_ms3.datasets.writing.players import Player, Request, open_env
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, naming, write_json
 from robocas_ms3.outputs import check_same, claim_output, is_taken, kept_if_begun, locked_folder, sweep
+from robocas_ms3.words import count_of
 
 Codec = Literal["h264", "av1"]
 
@@ -192,7 +194,7 @@ def _check_resume(out: Path, plan: dict[str, Any]) -> None:
         return
     path = out / CONVERSION_FILE if (out / INFO_FILE).is_file() else out / PARTS / _PLAN
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))
+        before = load_json(path)
     except (OSError, ValueError) as error:
         if (out / PARTS).is_dir() and not any((out / PARTS).glob("episode_*")):
             return  # killed before it wrote what it was to do
@@ -210,7 +212,7 @@ def _check_resume(out: Path, plan: dict[str, Any]) -> None:
         raise DatasetError(
             "can't resume: these episodes are not what was begun here",
             where=path,
-            expected=f"{len(before.get('episodes', []))} episodes",
+            expected=f"{count_of(len(before.get('episodes', [])), 'episode')}",
             found=f"{len(plan['episodes'])}",
             fix="Pass --overwrite to begin again.",
         )

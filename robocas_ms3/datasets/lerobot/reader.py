@@ -21,6 +21,7 @@ from robocas_ms3.datasets.lerobot.video import read_frames
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, Side, SourceEpisode
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.datasets.sources.tolerant import first_line
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
 
@@ -47,7 +48,7 @@ class LeRobotDataset(EpisodeSource):
         """``meta/info.json``."""
         path = self.root / schema.INFO_FILE
         try:
-            return json.loads(path.read_text(encoding="utf-8"))
+            return load_json(path)
         except (OSError, ValueError) as error:
             raise DatasetError("no LeRobot dataset here", where=path, found=type(error).__name__) from error
 
@@ -55,7 +56,7 @@ class LeRobotDataset(EpisodeSource):
     def settings(self) -> dict[str, Any]:
         """``meta/robocas/conversion.json``; empty where there is none."""
         path = self.root / schema.CONVERSION_FILE
-        return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        return load_json(path) if path.is_file() else {}
 
     @property
     def rate_hz(self) -> float:

@@ -28,6 +28,7 @@ from robocas_ms3.datasets.writing.plan import dataset_settings
 from robocas_ms3.datasets.writing.writer import write_cameras
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder, write_json
+from robocas_ms3.words import count_of
 
 Embed = Callable[[list[str]], NDArray[np.float32]]
 REPORT_FILE = "import_report.json"
@@ -68,7 +69,7 @@ def import_robocas(
         raise DatasetError(
             "no episode can be taken",
             where=surveyed.root,
-            found=f"{surveyed.episodes} episodes, all of them damaged",
+            found=f"{count_of(surveyed.episodes, 'episode')}, nothing whole",
             fix="robocas import-robocas without --out says what is wrong.",
         )
     dataset = Dataset(surveyed.root)

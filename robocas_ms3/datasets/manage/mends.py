@@ -14,6 +14,7 @@ from robocas_ms3.datasets.checks.rigid import same
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.manage.findings import EMBEDDINGS, ESSENTIAL, Finding, Outcome
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays, motion_arrays, planar_motion
+from robocas_ms3.words import count_of
 
 Treatment = tuple[EpisodeArrays, Outcome, str]
 """The arrays after it, what becomes of the episode, and the problem in words."""
@@ -69,9 +70,9 @@ def _mend_shape(stored: EpisodeArrays, violation: Violation) -> Treatment:
     if violation.key != "episode_length":
         return _drop(stored, violation, f"{violation.found}, not {violation.expected.removeprefix('shape ')}")
     if not 0 < stored.steps <= schema.MAX_STEPS:
-        return stored, "left out", f"{stored.steps} steps, not 1 to {schema.MAX_STEPS}"
+        return stored, "left out", f"{count_of(stored.steps, 'step')}, not 1 to {schema.MAX_STEPS}"
     length = SPECS["episode_length"].cast(stored.steps)
-    problem = f"says {violation.found}, the arrays have {stored.steps} steps"
+    problem = f"says {violation.found}, the arrays have {count_of(stored.steps, 'step')}"
     return _with(stored, {"episode_length": length}), "mended", problem
 
 

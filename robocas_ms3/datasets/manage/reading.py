@@ -19,8 +19,8 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.files import said_of
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, completed, load_arrays
-from robocas_ms3.datasets.statistics.described import count_of
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.words import count_of
 
 FULL_SIZE = (640, 480)
 _MOST = 3  # problems named of one camera's pictures

@@ -14,8 +14,8 @@ from robocas_ms3.datasets.manage.reading import FULL_SIZE, read_episode
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
-from robocas_ms3.datasets.statistics.described import count_of
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.words import count_of
 
 
 @dataclass

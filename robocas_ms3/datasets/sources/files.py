@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.documents import DAMAGED, load_json
 from robocas_ms3.errors import DatasetError
 
 SEE_VALIDATE = "robocas validate lists all that is wrong."
@@ -42,14 +39,6 @@ def said_of(info: Mapping[str, Any], number: int | None) -> dict[str, Any]:
     return {k: table[str(number)] for k, table in tables.items() if isinstance(table, dict) and str(number) in table}
 
 
-DAMAGED = (
-    *(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error),
-    NotImplementedError,  # damaged flags or method of an archive's member
-    *(SyntaxError, tokenize.TokenError),  # an array's header
-)
-"""What numpy raises for damaged arrays and archives."""
-
-
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON object; empty where there is no such file.
 
@@ -57,7 +46,7 @@ def read_json(path: Path) -> dict[str, Any]:
         DatasetError: it is damaged, or no object.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = load_json(path)
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:

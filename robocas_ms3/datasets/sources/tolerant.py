@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.arrays import wrap_angle
-from robocas_ms3.datasets.sources.files import DAMAGED
+from robocas_ms3.documents import DAMAGED
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import stored_motion

@@ -16,11 +16,6 @@ def counted(counter: Mapping[str, int]) -> dict[str, int]:
     return dict(sorted(counter.items(), key=lambda item: (-item[1], item[0])))
 
 
-def count_of(count: int, noun: str) -> str:
-    """``1 episode``, ``2 episodes``."""
-    return f"{count} {noun}" + ("" if count == 1 else "s")
-
-
 def described(values: Iterable[float] | NDArray) -> dict[str, Any]:
     """Count, mean, deviation and percentiles."""
     array = np.asarray(list(values) if not isinstance(values, np.ndarray) else values, dtype=np.float64)

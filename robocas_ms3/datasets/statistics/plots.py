@@ -10,10 +10,11 @@ import numpy as np
 
 from robocas_ms3.datasets.actions import ACTION_NAMES
 from robocas_ms3.datasets.statistics.collect import Stats
-from robocas_ms3.datasets.statistics.described import count_of, counted, histogram
+from robocas_ms3.datasets.statistics.described import counted, histogram
 from robocas_ms3.datasets.statistics.layout_map import LayoutMap
 from robocas_ms3.errors import MissingExtraError
 from robocas_ms3.files import make_folder, replacing, write_json
+from robocas_ms3.words import called, count_of
 
 DPI = 110
 BLUE, ORANGE, GREY = "#2f6fa8", "#e08a2e", "#9aa3ab"
@@ -107,11 +108,6 @@ def draw_lengths(stats: Stats, figure_of: FigureOf) -> Any:
     return figure
 
 
-def _named(asset: str, name: str) -> str:
-    plain = asset.replace("_", " ")
-    return plain if name in {"", plain} else f"{name} ({plain})"
-
-
 def draw_objects(stats: Stats, figure_of: FigureOf) -> Any:
     """Bars: in how many episodes each object took part, and of how many it was the target."""
     if not stats.objects and not stats.targets:
@@ -121,7 +117,7 @@ def draw_objects(stats: Stats, figure_of: FigureOf) -> Any:
     figure = figure_of(7, 1.2 + 0.2 * len(ids))
     axes = _axes(figure, 1, 1, 1)[0]
     rows = np.arange(len(ids))
-    names = [_short(_named(i, stats.names.get(i, ""))) for i in ids]
+    names = [_short(called(i, stats.names.get(i, ""))) for i in ids]
     axes.barh(rows, [stats.objects[i] for i in ids], color=GREY, height=0.8, label="took part")
     axes.barh(rows, [stats.targets[i] for i in ids], color=ORANGE, height=0.45, label="was the target")
     axes.set_yticks(rows, names)

@@ -23,6 +23,7 @@ from robocas_ms3.datasets.training.sample_pictures import PictureStack
 from robocas_ms3.datasets.training.sampling import SampleIndex, balancing_weights
 from robocas_ms3.datasets.training.windows import Padding, Window
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.words import count_of
 
 UPSTREAM_CAMERAS = ("base_camera", "gripper_camera")
 UPSTREAM_SIZE = (320, 256)
@@ -132,7 +133,11 @@ class RoboCASDataset(torch.utils.data.Dataset):
             longest = max(self.source.lengths[number] for number in self.episodes)
             needed = observation_horizon + action_horizon if padding == "drop" else 2
             raise DatasetError(
-                "no episode is long enough", where=path, expected=f"{needed} steps", found=longest, fix="Pad them."
+                "no episode is long enough",
+                where=path,
+                expected=count_of(needed, "step"),
+                found=longest,
+                fix="Pad them.",
             )
         self._stages = np.concatenate([self._stages_of(number, steps) for number, steps in samples.items()])
         self.scale: ActionScale | None = None

@@ -14,6 +14,7 @@ from typing import Any
 
 from robocas_ms3 import outputs
 from robocas_ms3.datasets import schema
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, write_json
 from robocas_ms3.outputs import claim_output, is_taken, kept_if_begun, locked_folder, sweep
@@ -124,7 +125,7 @@ def _check_begun(out: Path, plan: Mapping[str, Any]) -> None:
         return
     path = out / schema.CONVERSION_FILE
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))
+        before = load_json(path)
     except (OSError, ValueError) as error:
         raise DatasetError("can't resume: nothing was begun here", where=path, fix="Pass --overwrite.") from error
     different = sorted(key for key in plan if key != "made_with" and before.get(key) != plan[key])

@@ -15,6 +15,7 @@ import robocas_ms3
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.split import SPLIT_RULE
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.outputs import check_same, is_taken
 
@@ -146,7 +147,7 @@ def _extended(head: Mapping[str, Any], episodes: Mapping[str, Any], entries: Ent
 def _read(out: Path, missing: str, fix: str) -> dict[str, Any]:
     path = out / schema.CONVERSION_FILE
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = load_json(path)
     except (OSError, ValueError) as error:
         raise DatasetError(missing, where=path, fix=fix) from error
     schema.check_version(content.get("schema_version", 1), path)

@@ -24,6 +24,7 @@ from robocas_ms3.recordings.environment import RecordedEnv
 from robocas_ms3.recordings.motion import sample_states, sample_stride
 from robocas_ms3.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.recordings.subgoals import sample_subgoals
+from robocas_ms3.words import count_of
 
 _log = logging.getLogger(__name__)
 
@@ -237,7 +238,7 @@ def _choose(file: TrajectoryFile, include_failed: bool) -> list[int]:
         raise DatasetError(
             "no successful episodes to convert" if some else "no episodes to convert",
             where=file.path,
-            found=f"{len(file.episodes)} episodes",
+            found=count_of(len(file.episodes), "episode"),
             fix="Pass --include-failed to convert them all the same." if some else "",
         )
     return chosen

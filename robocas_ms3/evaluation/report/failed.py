@@ -9,6 +9,7 @@ from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.report.marks import section, table
 from robocas_ms3.evaluation.report.stages import failure_of
 from robocas_ms3.evaluation.results import Result
+from robocas_ms3.words import count_of
 
 VIDEOS = "videos"
 
@@ -57,8 +58,8 @@ def failed_episodes(result: Result, folder: Path | None) -> str:
         "Numbers that are links lead to videos." if linked else "<code>robocas eval videos</code> films some of them."
     )
     said = (
-        f'<span id="count">{len(failed)}</span> of {len(result.outcomes)} episodes. Ended by: the time they had, a '
-        "failure such as a target on the floor, or an error. " + films
+        f'<span id="count">{len(failed)}</span> of {count_of(len(result.outcomes), "episode")}. '
+        "Ended by: the time they had, a failure such as a target on the floor, or an error. " + films
     )
     return section("Failed episodes", said, f'<form class="filters">{filters}</form>\n' + table(heads, rows, "failed"))
 

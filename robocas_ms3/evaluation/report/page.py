@@ -20,6 +20,7 @@ from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, share, success_by
 from robocas_ms3.evaluation.tables import P_VIS_EDGES, WELDED, first_splits
 from robocas_ms3.evaluation.tables import title as title_of
+from robocas_ms3.words import count_of
 
 
 def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | None = None) -> str:
@@ -54,14 +55,19 @@ def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | 
 
 
 def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
-    count, of = len(result.outcomes), "" if protocol is None else f" of {len(protocol.episodes)}"
-    said = f"{count}{of} episodes, protocol hash <code>{escape(result.run['protocol_hash'][:16])}</code>."
+    count = len(result.outcomes)
+    whole = (
+        count_of(count, "episode") if protocol is None else f"{count} of {count_of(len(protocol.episodes), 'episode')}"
+    )
+    said = f"{whole}, protocol hash <code>{escape(result.run['protocol_hash'][:16])}</code>."
     notes = [WELDED] if result.run["weld"] else []
     if protocol is not None and count < len(protocol.episodes):
-        notes.append(f"{len(protocol.episodes) - count} episodes of the protocol are missing: this is no whole result.")
+        notes.append(
+            f"Missing of the protocol: {count_of(len(protocol.episodes) - count, 'episode')}. This is no whole result."
+        )
     broken = result.broken_off()
     if broken:
-        notes.append(f"{broken} episodes were broken off by an error. They count as failures.")
+        notes.append(f"Broken off by an error: {count_of(broken, 'episode')}, counted as failed.")
     return f'<p class="lead">{said}</p>\n' + "".join(f'<p class="note">{note}</p>\n' for note in notes)
 
 

@@ -9,8 +9,9 @@ from typing import Protocol
 
 from robocas_ms3.errors import PlanError
 from robocas_ms3.extensions import load
+from robocas_ms3.plans.claims import refuse_claimed
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.units import Outcome, Unit
+from robocas_ms3.plans.units import CLAIMS, Outcome, Unit
 
 ENGINES = {
     "local": "robocas_ms3.plans.engines.local:LocalEngine",
@@ -49,9 +50,11 @@ def open_engine(name: str, plan: Plan, out: Path, jobs: int, options: Mapping[st
         options: of the engine alone.
 
     Raises:
-        PlanError: it has no such option, or can't be used here.
+        PlanError: it has no such option, or can't be used here; or jobs of Slurm are at the plan, and it is not theirs.
         MissingExtraError: what it needs is not installed.
     """
+    if name != "slurm":
+        refuse_claimed(out / CLAIMS)
     return load(ENGINES[name])(plan, out, jobs, options)
 
 

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from robocas_ms3.files import make_folder
+from robocas_ms3.files import flush_to_disk, make_folder
 from robocas_ms3.outputs import sweep
 from robocas_ms3.plans.units import DEATHS, EPISODES, LEDGER, Outcome, ledger
 
@@ -66,4 +66,6 @@ class Arriving:
             os.replace(new, path)
         shutil.rmtree(self._new, ignore_errors=True)
         if outcome is not None:
+            if outcome.success:
+                flush_to_disk(self._folder)
             ledger(self._folder).append([outcome], sync=True)

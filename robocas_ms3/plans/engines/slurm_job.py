@@ -13,10 +13,10 @@ from robocas_ms3.extensions import load
 from robocas_ms3.plans.claims import claimed
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.plans.units import Outcome, Unit
+from robocas_ms3.plans.units import CLAIMS, Outcome, Unit
 from robocas_ms3.processes import SentError
 
-FOLDER = "slurm"
+FOLDER = CLAIMS.parent.name
 """In the plan's folder: logs of the jobs, what submitit keeps, and claims."""
 
 
@@ -59,7 +59,7 @@ class UnitsJob:
         folder = unit.folder(self.plan, self.out)
         if unit.is_done(self.plan, self.out):
             return None
-        with claimed(self.out / FOLDER / "claims" / folder.parent.name / folder.name, self.lease):
+        with claimed(self.out / CLAIMS / folder.parent.name / folder.name, self.lease):
             try:
                 future = self._submit(engine, unit)
                 wait([future])  # in its thread: what a signal raises here is no error of the unit

@@ -1,0 +1,216 @@
+"""Whether what a configuration places can be there at once, and be worked on from where the robot is. No simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations, product
+
+import numpy as np
+
+from robocas_ms3.assets.hulls import Hull
+from robocas_ms3.assets.kinematics import link_poses
+from robocas_ms3.assets.pack import LoadedFurniture
+from robocas_ms3.config.task import TaskConfig
+from robocas_ms3.errors import ConfigError
+from robocas_ms3.poses import transform
+from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.scenes.placement import Array, Region
+
+# What turns with the robot's base, the lowest link included: half sizes in x and y, height up to which it goes, m, with
+# room to spare
+BODY_BOXES = ((0.28, 0.23, 0.30), (0.15, 0.13, 0.64))
+# Along the arm's links from its base to the TCP as it starts, in the robot's root frame, m
+ARM_AT_START: dict[str, Array] = {
+    "rest": np.array(
+        [(0, 0, 0.49), (0, 0, 0.823), (-0.269, 0, 0.988), (-0.226, 0, 1.059), (0.15, 0, 1.172), (0.237, 0, 1.16)]
+        + [(0.204, 0, 0.922)]
+    ),
+    "evaluation": np.array(
+        [(0, 0, 0.49), (0, 0, 0.823), (0.05, -0.001, 1.135), (0.131, -0.004, 1.122), (0.51, -0.014, 1.019)]
+        + [(0.576, -0.01, 1.077), (0.735, -0.021, 0.897)]
+    ),
+}
+SHOULDER, REACH = 0.333, 0.98  # m: above the arm's base; from there to the TCP of an arm that is stretched
+_TOUCHING = 0.005  # m by which hulls may overlap: they are coarser than what is shown
+_STEP, _ALONG = 0.05, 0.01  # m between places of the base that are tried, and along the arm
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Something that stands somewhere.
+
+    Attributes:
+        key: what the configuration calls it.
+        hulls: vertices (V, 3) in the world, m, and faces.
+    """
+
+    key: str
+    hulls: list[Hull]
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Least and greatest corners of the boxes around its N hulls, (N, 3) each."""
+        corners = [(hull.vertices.min(axis=0), hull.vertices.max(axis=0)) for hull in self.hulls]
+        return np.array([low for low, _ in corners]), np.array([high for _, high in corners])
+
+
+def check_clearance(
+    config: TaskConfig,
+    room: LoadedFurniture,
+    furniture: Mapping[str, LoadedFurniture],
+    poses: Mapping[str, Array],
+    basket: tuple[LoadedFurniture, Array] | None,
+    robot_pose: Array,
+    region: tuple[Region, Array],
+) -> None:
+    """Check that furniture, basket and robot don't overlap, and that basket and objects are within the arm's reach.
+
+    What a seed moves is left to where it is drawn (`standing`), and reach is judged with what that may give.
+
+    Args:
+        config: the configuration.
+        room: the room, at the world's origin.
+        furniture: by the configuration's names.
+        poses: 4x4 in the world, of furniture by name.
+        basket: and its pose 4x4 in the world; None: there is none.
+        robot_pose: 4x4 in the world, of the robot's root.
+        region: for objects, and 4x4 of its frame in the world, with what has to be opened open.
+
+    Raises:
+        ConfigError: naming the two, and by how much.
+    """
+    fixed = [
+        Standing(f"furniture.{name}", _world_hulls(part, poses[name], config.furniture[name].joints))
+        for name, part in furniture.items()
+    ]
+    around = Standing("room", _world_hulls(room, np.eye(4), {}))
+    pairs = [*combinations(fixed, 2), *((one, around) for one in fixed)]
+    if basket is not None and config.randomisation.basket is None:
+        standing = Standing("basket", _world_hulls(*basket, {}))
+        pairs += [(standing, other) for other in (*fixed, around)]
+        fixed.append(standing)
+    if config.randomisation.robot is None:
+        pairs += [(_body(robot_pose), other) for other in (*fixed, around)]
+    for one, other in pairs:
+        deep = max((overlap(a, b) for a, b in _near(one, other)), default=0.0)
+        if deep > _TOUCHING:
+            fix = f"Move one of them by more than {deep:.2f} m" + ("." if other is around else ", or leave one out.")
+            raise ConfigError(f"{one.key} and {other.key} overlap", expected="apart", found=f"{deep:.3f} m", fix=fix)
+    if config.randomisation.robot is None:
+        _check_arm(transform(robot_pose, _densely(ARM_AT_START[config.robot_start])), [*fixed, around])
+    _check_reach(config, basket, robot_pose, region)
+
+
+def overlap(one: Hull, other: Hull) -> float:
+    """How far one hull has to be moved to be clear of another, m; 0 where it is (by separating axes: exact)."""
+    least = _least_overlap(one, other, np.concatenate([_normals(one), _normals(other)]))
+    if least > 0:
+        crossed = np.cross(_edges(one)[:, None], _edges(other)[None]).reshape(-1, 3)
+        lengths = np.linalg.norm(crossed, axis=1)
+        slanted = crossed[lengths > 1e-6] / lengths[lengths > 1e-6, None]
+        if len(slanted):
+            least = min(least, _least_overlap(one, other, slanted))
+    return max(least, 0.0)
+
+
+def _least_overlap(one: Hull, other: Hull, axes: Array) -> float:
+    a, b = one.vertices @ axes.T, other.vertices @ axes.T
+    return float(np.minimum(a.max(axis=0) - b.min(axis=0), b.max(axis=0) - a.min(axis=0)).min())
+
+
+def _normals(hull: Hull) -> Array:
+    a, b, c = (hull.vertices[hull.faces[:, corner]] for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    return normals[lengths > 0] / lengths[lengths > 0, None]
+
+
+def _edges(hull: Hull) -> Array:
+    """Directions (E, 3) of its edges, those along each other once."""
+    pairs = np.sort(np.concatenate([hull.faces[:, [0, 1]], hull.faces[:, [1, 2]], hull.faces[:, [2, 0]]]), axis=1)
+    ways = np.diff(hull.vertices[np.unique(pairs, axis=0)], axis=1)[:, 0]
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    ways *= np.where(np.take_along_axis(ways, np.abs(ways).argmax(axis=1)[:, None], axis=1) < 0, -1.0, 1.0)
+    return np.unique(ways.round(6), axis=0)
+
+
+def _near(one: Standing, other: Standing) -> list[tuple[Hull, Hull]]:
+    (low, high), (other_low, other_high) = one.bounds, other.bounds
+    gap = np.minimum(high[:, None] - other_low[None], other_high[None] - low[:, None]).min(axis=2)
+    return [(one.hulls[i], other.hulls[j]) for i, j in np.argwhere(gap > _TOUCHING)]
+
+
+def _world_hulls(part: LoadedFurniture, pose: Array, joints: Mapping[str, float]) -> list[Hull]:
+    hulls = [Hull(transform(pose, hull.vertices), hull.faces) for hull in part.hull_meshes]
+    for name, moved in link_poses(part.asset.links, joints).items():
+        hulls += [Hull(transform(pose @ moved, hull.vertices), hull.faces) for hull in part.links[name].hull_meshes]
+    return hulls
+
+
+def _body(robot_pose: Array) -> Standing:
+    corners = np.array(list(product((-1.0, 1.0), (-1.0, 1.0), (0.0, 1.0))))
+    sides = np.array([(0, 1, 2), (0, 1, 4), (0, 2, 4)])  # one along x, y and z each: those opposite add no axes
+    hulls = [Hull(transform(robot_pose, corners * box), sides) for box in BODY_BOXES]
+    return Standing("robot", hulls)
+
+
+def _densely(corners: Array) -> Array:
+    pieces = zip(corners[:-1], corners[1:], strict=True)
+    return np.concatenate([np.linspace(a, b, int(np.ceil(np.linalg.norm(b - a) / _ALONG)) + 1) for a, b in pieces])
+
+
+def _check_arm(points: Array, others: list[Standing]) -> None:
+    """Check that the arm does not begin inside of something. Points (P, 3) lie along it."""
+    for other in others:
+        for hull, low, high in zip(other.hulls, *other.bounds, strict=True):
+            close = points[np.all((points > low) & (points < high), axis=1)]
+            if not len(close):
+                continue
+            normals = _normals(hull)
+            along, spans = close @ normals.T, hull.vertices @ normals.T
+            if ((along > spans.min(axis=0)) & (along < spans.max(axis=0))).all(axis=1).any():
+                fix = f"Move or turn the robot or {other.key}, or choose another robot_start."
+                raise ConfigError("the robot's arm begins inside of something", where="robot", found=other.key, fix=fix)
+
+
+def _check_reach(
+    config: TaskConfig,
+    basket: tuple[LoadedFurniture, Array] | None,
+    robot_pose: Array,
+    region: tuple[Region, Array],
+) -> None:
+    """Check that the nearest points of region and basket are where a stretched arm gets, or the base brings it."""
+    moved = config.randomisation.robot
+    slack = _STEP + (np.sqrt(2) * moved.position if moved else 0.0)
+    ranges = MOBILE_PANDA.base_limits[:2] if config.base_motion else ((0.0, 0.0),) * 2
+    spans = [np.arange(low, high + _STEP, _STEP) for low, high in ranges]
+    x, y = (grid.ravel() for grid in np.meshgrid(*spans))
+    height = np.full(len(x), MOBILE_PANDA.arm_base_height + SHOULDER)
+    shoulders = transform(robot_pose, np.stack([x, y, height], axis=1))
+    area, frame = region
+    low, high = np.array([*area.min_xy, area.z]), np.array([*area.max_xy, area.z])
+    fix = "Move it or the robot" if config.base_motion else "Move it or the robot, or set base_motion"
+    _within(_distance(shoulders, frame, low, high), REACH + slack, f"surface {config.surface.name!r}", fix)
+    if basket is not None:
+        by = config.randomisation.basket
+        corners = np.concatenate(basket[0].hulls)
+        far = _distance(shoulders, basket[1], corners.min(axis=0), corners.max(axis=0))
+        _within(far, REACH + slack + (np.sqrt(2) * by.position if by else 0.0), "the basket", fix)
+
+
+def _within(distance: float, limit: float, what: str, fix: str) -> None:
+    if distance > limit:
+        raise ConfigError(
+            f"{what} is out of the arm's reach",
+            expected=f"at most {limit:.2f} m from its shoulder",
+            found=f"{distance:.2f} m",
+            fix=f"{fix}: {distance - limit:.2f} m are to be made up.",
+        )
+
+
+def _distance(points: Array, frame: Array, low: Array, high: Array) -> float:
+    """Least distance of points (P, 3) in the world from a box in a frame, m."""
+    local = transform(np.linalg.inv(frame), points)
+    return float(np.linalg.norm(local - np.clip(local, low, high), axis=1).min())

@@ -1,0 +1,126 @@
+"""Scenes that can't be are refused when they are loaded, saying which two things, by how much, and what to change."""
+
+import time
+
+import numpy as np
+import pytest
+import trimesh
+
+from robocas_ms3.assets.hulls import Hull
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.config import load_task_config, shipped_configs
+from robocas_ms3.errors import ConfigError
+from robocas_ms3.paths import protocols_dir
+from robocas_ms3.robots.forward import chain
+from robocas_ms3.robots.table import PANDA
+from robocas_ms3.scenes.clearance import ARM_AT_START, REACH, SHOULDER, overlap
+from robocas_ms3.scenes.model import SceneModel
+
+
+def load(name: str = "pick_table_scattered", **changes) -> SceneModel:
+    data = load_task_config(name).model_dump(mode="json")
+    pack = load_pack("builtin")
+    return SceneModel.load(load_task_config(data | changes), pack, pack)
+
+
+def at(x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> dict:
+    return {"position": [x, y, z], "yaw_deg": yaw}
+
+
+TABLE = {"asset": "table", "pose": at(0.9, 1.0, yaw=-90)}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (
+            {"furniture": {"table": TABLE, "twin": TABLE}},
+            r"^furniture\.table and furniture\.twin overlap \(expected apart, found 0\.\d+ m\)\. Move one of them by",
+        ),
+        ({"robot": at(0.9, 0.9, yaw=90)}, r"^robot and furniture\.table overlap .*Move one of them"),
+        (
+            {"furniture": {"table": {"asset": "table", "pose": at(0.9, 1, -0.3, -90)}}},
+            "furniture.table and room overlap",
+        ),
+        ({"basket": {"asset": "basket", "pose": at(1.3, 0.9, 0.5)}}, "basket and furniture.table overlap"),
+        ({"basket": {"asset": "basket", "pose": at(0.7, 0.15, 0.3)}}, "robot and basket overlap"),
+        (
+            {"basket": {"asset": "basket", "pose": at(3.7, 0.15)}},
+            r"^the basket is out of the arm's reach \(expected at most 1\.03 m from its shoulder, found 2\.\d\d m\)\. "
+            r"Move it or the robot, or set base_motion: 1\.\d\d m are to be made up\.$",
+        ),
+        ({"robot": at(0.7, -1.2, yaw=90)}, "^surface 'top' is out of the arm's reach"),
+    ],
+)
+def test_what_can_not_be_is_refused(changes, said):
+    with pytest.raises(ConfigError, match=said):
+        load(**changes)
+
+
+def test_an_arm_that_begins_inside_of_something_is_refused():
+    above = {"asset": "side_table", "pose": at(0.7, 0.15, 0.62)}
+    with pytest.raises(ConfigError, match=r"arm begins inside of something \(found furniture.above\). Move or turn"):
+        load(furniture={"table": TABLE, "above": above})
+
+
+def test_a_base_that_drives_reaches_farther():
+    far = {"asset": "basket", "pose": at(1.9, -0.3)}
+    with pytest.raises(ConfigError, match="the basket is out of the arm's reach"):
+        load(basket=far)
+    load(basket=far, base_motion=True)
+    with pytest.raises(ConfigError, match=r"Move it or the robot: \d\.\d\d m"):
+        load(basket={"asset": "basket", "pose": at(3.7, 0.15)}, base_motion=True)
+
+
+def test_what_a_seed_moves_is_not_judged_by_where_it_is_configured():
+    load(basket={"asset": "basket", "pose": at(1.3, 0.9, 0.5)}, randomisation={"basket": {"position": 0.1}})
+
+
+def test_all_that_is_shipped_can_be_and_is_judged_at_once():
+    pack = load_pack("builtin")
+    configs = [name for name in shipped_configs() if "partnet" not in name]
+    for config in [*configs, *protocols_dir().glob("*/configs/*.yaml")]:
+        SceneModel.load(load_task_config(config), pack, pack)
+    config = load_task_config("select_shelf_orderly")
+    seconds = []
+    for _ in range(5):
+        start = time.perf_counter()
+        SceneModel.load(config, pack, pack)
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 0.02
+
+
+def hull(mesh: trimesh.Trimesh) -> Hull:
+    return Hull(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def test_overlaps_by_numbers_worked_out_by_hand():
+    cube = trimesh.creation.box((1, 1, 1))
+    assert overlap(hull(cube), hull(cube.copy().apply_translation((0.7, 0.2, 0)))) == pytest.approx(0.3)
+    assert overlap(hull(cube), hull(cube.copy().apply_translation((1.1, 0, 0)))) == 0
+    # two edges, crossed at right angles: faces alone would have them meet
+    one, other = cube.copy(), cube.copy()
+    one.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 4, (0, 1, 0)))
+    other.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 4, (1, 0, 0)))
+    for gap in (0.05, -0.05):
+        moved = other.copy().apply_translation((0, 0, np.sqrt(2) + gap))
+        assert overlap(hull(one), hull(moved)) == pytest.approx(max(-gap, 0))
+
+
+def test_what_is_known_of_the_arm_is_so():
+    urdf, robot = PANDA.files().urdf, PANDA.description
+    base = chain(urdf, robot.root_link, robot.arm_base_link, np.zeros((1, 3)))[0]
+    for start, qpos in (("rest", robot.arm_rest), ("evaluation", robot.arm_evaluation_start)):
+        arm = np.array(qpos)[None]
+        links = [
+            base @ chain(urdf, robot.arm_base_link, link, arm[:, :n])[0] for n, link in enumerate(robot.arm_links, 1)
+        ]
+        tcp = base @ chain(urdf, robot.arm_base_link, robot.tcp_link, arm)[0]
+        # the second link turns where the first does, the sixth where the fifth
+        origins = np.array([base[:3, 3], *(links[i][:3, 3] for i in (0, 2, 3, 4, 6)), tcp[:3, 3]])
+        np.testing.assert_allclose(ARM_AT_START[start], origins, atol=1e-3)
+    shoulder = chain(urdf, robot.arm_base_link, robot.arm_links[0], np.zeros((1, 1)))[0][:3, 3]
+    assert shoulder[2] == pytest.approx(SHOULDER)
+    many = np.random.default_rng(0).uniform(*np.array(robot.arm_limits).T, (20_000, 7))
+    far = np.linalg.norm(chain(urdf, robot.arm_base_link, robot.tcp_link, many)[:, :3, 3] - shoulder, axis=1).max()
+    assert REACH - 0.08 < far < REACH
