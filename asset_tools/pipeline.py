@@ -138,9 +138,9 @@ def _run(todo: list[tuple[Job, Path]], processes: int) -> Iterator[tuple[JobResu
         yield from pool.do(todo)
 
 
-def _died(task: tuple[Job, Path]) -> tuple[JobResult, Path]:
+def _died(task: tuple[Job, Path], why: str) -> tuple[JobResult, Path]:
     job, place = task
-    return JobResult(job.id, None, f"{job.id}: the process that made it was killed; is there memory enough?"), place
+    return JobResult(job.id, None, f"{job.id}: the process that made it died ({why}); is there memory enough?"), place
 
 
 def _make(task: tuple[Job, Path]) -> tuple[JobResult, Path]:

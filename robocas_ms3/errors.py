@@ -68,7 +68,13 @@ class VectorEnvError(RobocasError):
 
 
 class WorkerDied(VectorEnvError):
-    """A process that ran some of several environments is no more."""
+    """A process that ran some of several environments is no more.
+
+    Attributes:
+        envs: those it was at, or all that it had.
+    """
+
+    envs: tuple[int, ...] = ()
 
 
 class EvaluationError(RobocasError):

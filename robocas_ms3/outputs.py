@@ -93,6 +93,34 @@ def check_absent(out: Path, error: type[RobocasError] = OutputExistsError) -> No
         raise error("there is something already", where=out, fix="Choose another --out.")
 
 
+def check_there(mark: Path, error: type[RobocasError] = RobocasError) -> None:
+    """See that the folder a run writes into is there still: what writes makes its folders, and would begin another.
+
+    Args:
+        mark: a file that the run wrote there first.
+        error: to be raised.
+
+    Raises:
+        RobocasError: ``error``: somebody removed it.
+    """
+    if not mark.is_file():
+        what, fix = "the output folder is gone, or emptied, while it was written to", "Begin again."
+        raise error(what, where=mark.parent, expected=mark.name, fix=fix)
+
+
+@contextmanager
+def while_there(mark: Path, error: type[RobocasError] = RobocasError) -> Iterator[None]:
+    """Let a file that is missed inside be the fault of who removed the folder, if somebody did: see `check_there`."""
+    try:
+        yield
+    except FileNotFoundError as missed:
+        try:
+            check_there(mark, error)
+        except RobocasError as gone:
+            raise gone from missed
+        raise
+
+
 def check_overwrite(out: Path, marks: Sequence[str], what: str, error: type[RobocasError] = OutputExistsError) -> None:
     """See that what will be replaced is ours, whatever path was named by mistake.
 

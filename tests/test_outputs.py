@@ -9,7 +9,7 @@ import pytest
 
 from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.files import make_folder, replacing_folder
-from robocas_ms3.outputs import check_overwrite, claim_output, kept_if_begun, locked_folder, sweep
+from robocas_ms3.outputs import check_overwrite, claim_output, kept_if_begun, locked_folder, sweep, while_there
 
 
 def test_existing_output_needs_a_flag(tmp_path):
@@ -185,3 +185,15 @@ def test_a_lock_that_fails_otherwise_blames_no_other_run(tmp_path, monkeypatch):
     with pytest.raises(RobocasError, match=r"out: can't lock this folder \(found Input/output error\)"):  # noqa: SIM117
         with locked_folder(tmp_path / "out"):
             pass
+
+
+def test_a_file_that_is_missed_is_the_fault_of_who_removed_the_folder(tmp_path):
+    mark = tmp_path / "out" / "run.json"
+    make_folder(mark.parent)
+    mark.touch()
+    with pytest.raises(FileNotFoundError), while_there(mark, DatasetError):  # a mistake of ours remains one
+        (mark.parent / "none").read_text()
+    mark.unlink()
+    said = r"out: the output folder is gone, or emptied.*\(expected run.json\)"
+    with pytest.raises(DatasetError, match=said), while_there(mark, DatasetError):
+        mark.read_text()

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.errors import AssetError, RobocasError
-from robocas_ms3.processes import Calls, Pool
+from robocas_ms3.processes import Calls, Limits, Pool
 
 
 class Slow:
@@ -25,7 +25,16 @@ class Slow:
 
     def do(self, task):
         if task == "die":
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if task == "die once" and not (self.log.parent / "died").exists():
+            (self.log.parent / "died").touch()
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if task == "hang":
+            time.sleep(1000)
+        if task == "grow":
+            hog = bytearray(600 * 2**20)
+            time.sleep(1000)
+            del hog
         if task == "fail":
             raise AssetError("no such thing", where="it")
         if isinstance(task, float):
@@ -93,7 +102,7 @@ def test_an_error_of_a_task_or_of_opening_is_raised_as_it_is(worker, message):
 @pytest.mark.parametrize("in_order", [True, False])
 def test_a_death_costs_no_task_but_its_own(in_order):
     tasks = ["a", "b", "die", "c", "die", "d", "e"]
-    with Pool(Slow, 2, died=lambda task: (f"{task}d", 0, 0)) as pool:
+    with Pool(Slow, 2, died=lambda task, why: (f"{task}d", 0, 0)) as pool:
         found = tasks_of(pool.do(tasks, in_order=in_order))
     expected = ["a", "b", "died", "c", "died", "d", "e"]
     assert found == expected if in_order else sorted(found) == sorted(expected)
@@ -101,17 +110,47 @@ def test_a_death_costs_no_task_but_its_own(in_order):
 
 def test_what_was_done_before_a_death_is_not_done_again(tmp_path):
     tasks = [0.5, "fast", "fast too", "die"]
-    with Pool(partial(Slow, log=tmp_path / "log"), 2, died=lambda task: (task, 0, 0)) as pool:
+    with Pool(partial(Slow, log=tmp_path / "log"), 2, died=lambda task, why: (task, 0, 0)) as pool:
         assert tasks_of(pool.do(tasks, in_order=True)) == tasks
     done = (tmp_path / "log").read_text().split("\n")
     assert [done.count(task) for task in ("fast", "fast too")] == [1, 1]
 
 
 def test_a_death_is_an_error_where_nothing_else_was_asked_for():
-    with pytest.raises(RobocasError, match="die: the process that was at this died"), Pool(Slow, 2) as pool:
+    with (
+        pytest.raises(RobocasError, match="die: the process that was at this died .found SIGSEGV"),
+        Pool(Slow, 2) as pool,
+    ):
         list(pool.do(["die", "a"]))
     with pytest.raises(RobocasError, match="die: the process"), Pool(Slow, 1, here=False) as pool:
         list(pool.do(["die"]))  # not this one, though one is enough
+
+
+@pytest.mark.parametrize(
+    ("task", "limits", "why"),
+    [("hang", Limits(seconds=1.2), "too slow"), ("grow", Limits(memory_gb=0.3), "too much memory")],
+)
+def test_a_task_that_takes_more_than_it_may_is_begun_again_once(tmp_path, caplog, task, limits, why):
+    def died(task, why):
+        return f"{task}: {why}", 0, 0
+
+    with Pool(partial(Slow, log=tmp_path / "log"), 1, died=died, here=False, limits=limits) as pool:
+        results = list(pool.do(["a", task, "die once"], in_order=True))
+    assert tasks_of(results) == ["a", f"{task}: {why}", "die once"]
+    said = "the process that was at this died"
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{task}: {said} ({why}); it is begun again",
+        f"die once: {said} (SIGSEGV); it is begun again",
+    ]
+
+
+def unsendable(task):
+    return lambda: task
+
+
+def test_a_result_that_cannot_be_sent_is_an_error():
+    with pytest.raises(Exception, match="pickle"), Pool(partial(Calls, unsendable), 1, here=False) as pool:
+        list(pool.do([1]))
 
 
 PROGRAM = """
@@ -196,3 +235,16 @@ def test_ctrl_c_ends_what_is_under_way_begins_nothing_and_prints_nothing(running
     assert program.stderr.read() == ""
     assert all_gone(workers)
     assert len(list((tmp_path / "begun").iterdir())) == 2
+
+
+class TooLarge(Slow):
+    def __init__(self):
+        self.hog = bytearray(300 * 2**20)
+        time.sleep(1000)
+
+
+def test_a_process_that_is_too_large_before_it_begins_blames_no_task():
+    said = "a process ended before it could begin .found too much memory"
+    limits = Limits(memory_gb=0.2)
+    with pytest.raises(RobocasError, match=said), Pool(TooLarge, 1, here=False, limits=limits) as pool:
+        list(pool.do(["a"]))

@@ -59,6 +59,6 @@ def _measure(asset: LoadedObject | LoadedFurniture) -> tuple[str, Quality]:
     return asset.asset.id, remeasure(asset) if isinstance(asset, LoadedObject) else measure_furniture(asset)
 
 
-def _died(asset: LoadedObject | LoadedFurniture) -> NoReturn:
+def _died(asset: LoadedObject | LoadedFurniture, why: str) -> NoReturn:
     fix = "Is memory short? Use fewer --jobs."
-    raise AssetError("the process that measured it died", where=asset.asset.id, fix=fix)
+    raise AssetError("the process that measured it died", where=asset.asset.id, found=why, fix=fix)

@@ -82,8 +82,8 @@ def cooking_faults(folder: Path) -> list[CookingFault]:
         return []
     pieces = [vertices for _, _, vertices in named]
 
-    def died(task: object) -> NoReturn:
-        raise AssetError("the process that cooked its hulls died", where=folder, fix="Is memory short?")
+    def died(task: object, why: str) -> NoReturn:
+        raise AssetError("the process that cooked its hulls died", where=folder, found=why, fix="Is memory short?")
 
     with Pool(_as_a_gpu_does, 1, died=died, here=False) as pool:
         (on_gpu,) = pool.do([pieces])

@@ -61,6 +61,11 @@ class Convert:
     """Add to the dataset that is there; its episodes keep their numbers."""
     jobs: int = 1
     """Processes that render."""
+    episode_seconds: float = 3600.0
+    """Seconds an episode may take. One that takes longer, or more memory, or crashes, is begun again once, by another
+    process; then it is left out, and named in the end."""
+    memory_gb: float = 8.0
+    """GB of memory a process may use."""
     pack: Maybe[str] = None
     """Name or folder of the objects' pack, instead of the one named there; a file can't choose a folder."""
 
@@ -90,6 +95,9 @@ def _check(cfg: Convert) -> None:
         )
     if cfg.jobs < 1:
         raise DatasetError("not a number of processes", where="--jobs", expected="1 or more", found=cfg.jobs)
+    if not (cfg.episode_seconds >= 1 and cfg.memory_gb > 0):
+        found = f"--episode-seconds {cfg.episode_seconds:g} --memory-gb {cfg.memory_gb:g}"
+        raise DatasetError("no episode can be written within that", where="convert", found=found)
     if len(set(cfg.cameras)) < len(cfg.cameras):
         found = " ".join(cfg.cameras)
         raise DatasetError("a camera is named twice", where="--cameras", expected="each once", found=found)
@@ -117,6 +125,7 @@ def _format(cfg: Convert) -> Format:
 def _convert(cfg: Convert) -> int:
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.datasets.pictures.stored import Pictures
+    from robocas_ms3.processes import Limits
     from robocas_ms3.words import count_of
 
     chosen = _format(cfg)
@@ -126,6 +135,7 @@ def _convert(cfg: Convert) -> int:
             "embeddings": cfg.embeddings,
             "previews": (True if cfg.all_videos else None) if cfg.video else False,
             "codec": cfg.codec,
+            "episode_limits": Limits(cfg.episode_seconds, cfg.memory_gb),
         }
         done: Conversion = chosen.part("writer")(
             cfg.trajectory,

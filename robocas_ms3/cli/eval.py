@@ -44,6 +44,11 @@ class Eval:
     """Envs at a time; the outcome does not depend on it."""
     workers: Maybe[int] = None
     """Processes. Default: one an env, no more than cores."""
+    step_seconds: float = 300.0
+    """Seconds that envs of a process may take for a step or a reset. Where they take longer, or more memory, or crash,
+    the episode is played again once; then it counts as failed, broken off by an error. Policies have no limit."""
+    memory_gb: float = 8.0
+    """GB of memory that a process of envs may use."""
     backend: Literal["auto", "processes", "gpu"] = "auto"
     """Where envs run. Auto: a GPU if there is one."""
     shard: str = "0/1"
@@ -107,12 +112,14 @@ def run(cfg: Eval) -> int:
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.run import Settings, evaluate
     from robocas_ms3.evaluation.tables import markdown
-    from robocas_ms3.processes import use_one_torch_thread
+    from robocas_ms3.processes import Limits, use_one_torch_thread
     from robocas_ms3.words import count_of
 
     for name, number in (("envs", cfg.envs), ("episodes", cfg.episodes), ("workers", cfg.workers)):
         if number is not None:
             check_number(name, number, 1)
+    check_number("step_seconds", cfg.step_seconds, 1)
+    check_number("memory_gb", cfg.memory_gb, 0.1)
     if cfg.retry_errors and not cfg.resume:
         raise EvaluationError("there is nothing to retry", where="--retry-errors", fix="Pass --resume too.")
     use_one_torch_thread()
@@ -128,6 +135,7 @@ def run(cfg: Eval) -> int:
         episodes=cfg.episodes,
         split=cfg.split,
         weld=cfg.weld,
+        limits=Limits(cfg.step_seconds, cfg.memory_gb),
     )
     succeeded = played = 0
     with open_policy(cfg.policy) as policy, bar("episodes") as shown:

@@ -40,6 +40,11 @@ class Generate:
     """First seed, 0 or more; the following episodes take the seeds after it."""
     jobs: int = 1
     """Worker processes. The outcome does not depend on it."""
+    episode_seconds: float = 1800.0
+    """Seconds an episode may take. One that takes longer, or more memory, or crashes, is begun again once, by another
+    process; then its seed is given up."""
+    memory_gb: float = 8.0
+    """GB of memory a process may use."""
     control_freq: int = 20
     """Control rate in Hz (the paper's is 5); must divide 100, the rate of physics."""
     max_attempts: int = 20
@@ -69,6 +74,14 @@ class Generate:
 
 def main(cfg: Generate) -> int:
     """Run the command."""
+    try:
+        return run(cfg)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("the same command with --resume goes on") from None
+
+
+def run(cfg: Generate) -> int:
+    """Generate, with a progress bar."""
     from robocas_ms3.config import load_task_config, shipped_configs
 
     name = cfg.config or TASKS[cfg.task].default_config
@@ -77,11 +90,12 @@ def main(cfg: Generate) -> int:
     from rich.progress import Progress
 
     from robocas_ms3.cli.bars import columns
+    from robocas_ms3.demos.checks import check_limits
     from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, recordable_config
     from robocas_ms3.demos.generate import generate
-    from robocas_ms3.processes import use_one_torch_thread
+    from robocas_ms3.processes import Limits
 
-    use_one_torch_thread()
+    check_limits(cfg.episode_seconds, cfg.memory_gb)
     config = recordable_config(loaded, name if name in shipped_configs() else None)
     out = cfg.out or Path("demos") / f"{Path(name).stem}-{Path(cfg.pack).name}"
     rate = cfg.replay_rate
@@ -122,6 +136,7 @@ def main(cfg: Generate) -> int:
             first_seed=cfg.seed,
             jobs=cfg.jobs,
             fork=cfg.fork,
+            limits=Limits(cfg.episode_seconds, cfg.memory_gb),
             resume=cfg.resume,
             overwrite=cfg.overwrite,
             on_start=on_start,

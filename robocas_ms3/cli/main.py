@@ -20,6 +20,7 @@ import platformdirs
 import tyro
 
 from robocas_ms3 import __version__
+from robocas_ms3.cli.interrupts import INTERRUPTED, heed_ctrl_c, leave
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import FULL
 from robocas_ms3.paths import is_writable, temporary_cache, variable_of
@@ -51,7 +52,6 @@ DESCRIPTION = (
     "`robocas COMMAND --help` explains a command; --debug with any of them shows tracebacks."
 )
 CLI_STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.DisallowNone)
-INTERRUPTED = 130  # what a shell reports of a program that Ctrl-C ended
 _ENVIRONMENT = {*FULL, errno.EACCES, errno.EPERM, errno.EROFS}
 
 
@@ -61,7 +61,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     Args:
         argv: arguments after the program's name; default: the process's own.
     """
-    sys.exit(run(sys.argv[1:] if argv is None else argv))
+    heed_ctrl_c()
+    leave(run(sys.argv[1:] if argv is None else argv))
 
 
 def run(argv: Sequence[str]) -> int:

@@ -15,13 +15,14 @@ from robocas_ms3.config import load_config_of
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.documents import load_json
 from robocas_ms3.errors import RobocasError
+from robocas_ms3.outputs import check_same
 from robocas_ms3.planning.backends import BACKENDS
 from robocas_ms3.recordings.seeds import GREATEST_SEED
 from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.model import SceneModel
 
 
-def check_number(name: str, value: float, least: int, greatest: int | None = None) -> None:
+def check_number(name: str, value: float, least: float, greatest: int | None = None) -> None:
     """Check the range of a number.
 
     Raises:
@@ -30,6 +31,16 @@ def check_number(name: str, value: float, least: int, greatest: int | None = Non
     if not least <= value < math.inf or (greatest is not None and value > greatest):
         expected = f"at least {least}" if greatest is None else f"{least} to {greatest}"
         raise RobocasError("this number is out of range", where=name, expected=expected, found=value)
+
+
+def check_limits(episode_seconds: float, memory_gb: float) -> None:
+    """Check what an episode may take.
+
+    Raises:
+        RobocasError: it is nothing.
+    """
+    check_number("episode_seconds", episode_seconds, 1)
+    check_number("memory_gb", memory_gb, 0.1)
 
 
 def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int, jobs: int) -> None:
@@ -70,7 +81,7 @@ def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int
 
 
 def check_same_run(path: Path, run: dict[str, Any]) -> None:
-    """Check that an output was begun with the same settings.
+    """Check that an output was begun with the same settings and versions.
 
     Args:
         path: ``run.json`` of the output, which may not be there.
@@ -85,8 +96,12 @@ def check_same_run(path: Path, run: dict[str, Any]) -> None:
     if isinstance(before.get("settings"), dict):  # a setting that is newer than the output had its default then
         defaults = {one.name: one.default for one in fields(EpisodeSettings) if one.default is not MISSING}
         before["settings"] = {**defaults, **before["settings"]}
+    if isinstance(before.get("versions"), dict):  # outputs that are older have none
+        now, fix = run.get("versions", {}), "Install those, or choose another --out."
+        what = "this machine has other versions than this output was begun with"
+        check_same(before["versions"], now, what, where=path, fix=fix, error=RobocasError)
     for key, value in json.loads(json.dumps(run)).items():
-        if before.get(key) != value:
+        if key != "versions" and before.get(key) != value:
             raise RobocasError(
                 f"{key} differ from those this output was begun with",
                 where=path,

@@ -11,7 +11,7 @@ from robocas_ms3.config import TaskConfig
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.backends import DEFAULT
-from robocas_ms3.planning.executor import Seconds
+from robocas_ms3.planning.seconds import Seconds
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
 
 NOISY = "noisy_"  # begins the reasons of attempts that failed for noise alone

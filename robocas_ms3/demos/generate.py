@@ -17,11 +17,13 @@ from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_st
 from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import check_overwrite, check_run, claim_output, locked_folder
-from robocas_ms3.planning.executor import Seconds
+from robocas_ms3.outputs import check_overwrite, check_run, check_there, claim_output, locked_folder, while_there
+from robocas_ms3.planning.seconds import Seconds
+from robocas_ms3.processes import Limits
 from robocas_ms3.recordings.entries import read_json
+from robocas_ms3.recordings.merging import merge
 from robocas_ms3.recordings.reading import open_trajectory
-from robocas_ms3.recordings.writing import merge
+from robocas_ms3.recordings.versions import versions
 
 RUN = "run.json"
 _BEGINNINGS = {RUN, FAILURES_FILE, "episodes"}  # of a run that has not finished a seed yet
@@ -63,6 +65,7 @@ def generate(
     first_seed: int = 0,
     jobs: int = 1,
     fork: bool = True,
+    limits: Limits | None = None,
     resume: bool = False,
     overwrite: bool = False,
     on_start: Callable[[], None] = lambda: None,
@@ -82,6 +85,8 @@ def generate(
         first_seed: seeds are counted from here.
         jobs: worker processes.
         fork: undo what fails by forking where that is safe.
+        limits: of each seed. With them one job is a process of its own too; a seed that goes beyond them, or takes its
+            process down, is begun again once, and then given up. None: with one job this process does it.
         resume: go on with what is in ``out``.
         overwrite: replace what is in ``out``.
         on_start: called once arguments, configuration, pack and output turned out right.
@@ -89,8 +94,8 @@ def generate(
 
     Raises:
         OutputExistsError: ``out`` has content and neither flag is set, or what was made by another command.
-        RobocasError: an argument is wrong, which leaves no trace; ``out`` was made with other settings, or another
-            process writes there; far too many seeds fail.
+        RobocasError: an argument is wrong, which leaves no trace; ``out`` was made with other settings or versions, or
+            another process writes there; far too many seeds fail.
     """
     check_arguments(settings, episodes=episodes, first_seed=first_seed, jobs=jobs)
     if overwrite:
@@ -98,12 +103,13 @@ def generate(
     check_run(out / RUN, "settings", "generate")
     with locked_folder(out):
         claim_output(out, overwrite=overwrite or _only_begun(out), resume=resume)
-        run = {"settings": asdict(settings), "first_seed": first_seed}
+        run = {"settings": asdict(settings), "first_seed": first_seed, "versions": versions()}
         check_same_run(out / RUN, run)
         make_folder(out)
         write_json(out / RUN, run)
         on_start()
-        return _generate_in(out, settings, episodes, first_seed, jobs, fork, on_result)
+        with while_there(out / RUN):
+            return _generate_in(out, settings, episodes, first_seed, jobs, fork, limits, on_result)
 
 
 def _only_begun(out: Path) -> bool:
@@ -120,6 +126,7 @@ def _generate_in(
     first_seed: int,
     jobs: int,
     fork: bool,
+    limits: Limits | None,
     on_result: Callable[[EpisodeResult], None],
 ) -> Summary:
     shards, ledger = make_folder(out / "episodes"), Ledger(out / FAILURES_FILE)
@@ -129,7 +136,7 @@ def _generate_in(
     results: list[EpisodeResult] = []
     good = 0
     try:
-        with closing(generate_seeds(settings, missing, shards, jobs, fork=fork)) as new:
+        with closing(generate_seeds(settings, missing, shards, jobs, fork=fork, limits=limits)) as new:
             for seed in count(first_seed):
                 if good >= episodes:
                     break
@@ -138,6 +145,7 @@ def _generate_in(
                     good += earlier[seed].success
                     continue
                 result = next(new)
+                check_there(out / RUN)
                 lines = list(result.failures)
                 if not result.success:
                     lines.append(Failure(seed, -1, "episode", "gave_up", 0.0))

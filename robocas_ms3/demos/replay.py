@@ -22,8 +22,9 @@ from robocas_ms3.files import make_folder
 from robocas_ms3.outputs import claim_output
 from robocas_ms3.recordings.entries import read_json, read_reset
 from robocas_ms3.recordings.environment import RecordedEnv, read_env
+from robocas_ms3.recordings.merging import merge
 from robocas_ms3.recordings.reading import open_trajectory, readable
-from robocas_ms3.recordings.writing import EpisodeRecorder, merge
+from robocas_ms3.recordings.writing import EpisodeRecorder
 from robocas_ms3.tasks.base import RoboCASEnv
 
 

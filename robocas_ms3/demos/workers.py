@@ -7,11 +7,14 @@ from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
-from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.ledger import Failure
-from robocas_ms3.processes import Pool, use_one_torch_thread
+from robocas_ms3.processes import NO_LIMITS, Limits, Pool, use_one_torch_thread
+
+if TYPE_CHECKING:
+    from robocas_ms3.demos.generator import EpisodeGenerator
 
 
 def shard_name(seed: int) -> str:
@@ -20,10 +23,17 @@ def shard_name(seed: int) -> str:
 
 
 def generate_seeds(
-    settings: EpisodeSettings, seeds: Iterator[int], folder: Path, jobs: int, *, fork: bool = True
+    settings: EpisodeSettings,
+    seeds: Iterator[int],
+    folder: Path,
+    jobs: int,
+    *,
+    fork: bool = True,
+    limits: Limits | None = None,
 ) -> Generator[EpisodeResult, None, None]:
-    """Results in the order of the seeds, which never end."""
-    with Pool(partial(_open, settings, folder, fork), jobs, died=_died) as pool:
+    """Results in the order of the seeds, which never end; without limits one job is this process."""
+    opened, here = partial(_open, settings, folder, fork), jobs <= 1 and limits is None
+    with Pool(opened, jobs, died=_died, here=here, limits=limits or NO_LIMITS) as pool:
         yield from pool.do(seeds, in_order=True)
 
 
@@ -42,11 +52,13 @@ class _Generates:
 
 
 def _open(settings: EpisodeSettings, folder: Path, fork: bool) -> _Generates:
+    from robocas_ms3.demos.generator import EpisodeGenerator  # seconds, which a process that only waits can save
+
     if multiprocessing.parent_process():  # one of ours; the user's own keeps its threads
         use_one_torch_thread()
     return _Generates(EpisodeGenerator(settings, fork=fork), folder)
 
 
-def _died(seed: int) -> EpisodeResult:
+def _died(seed: int, why: str) -> EpisodeResult:
     """What a seed comes to that takes its process down, as mplib's C++ can."""
-    return EpisodeResult(seed, success=False, attempts=1, failures=[Failure(seed, 0, "worker", "crashed", 0.0)])
+    return EpisodeResult(seed, success=False, attempts=1, failures=[Failure(seed, 0, "worker", why, 0.0)])

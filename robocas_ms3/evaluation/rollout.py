@@ -99,17 +99,26 @@ class Rollouts:
                 self._begin([(env, waiting.pop()) for env in free[: len(waiting)]])
             yield from self._step()
 
+    def lost(self, envs: Sequence[int], why: str) -> Iterator[Rollout]:
+        """Episodes under way in some envs that are no more: nothing is known of what happened in them."""
+        for env in envs:
+            if env in self._playing:
+                played = Rollout(self._playing[env].start, error=why)
+                played.flags = played.flag_seconds = dict.fromkeys(self._flags)
+                played.measures = dict.fromkeys((*MEASURES, *([_WELDS] if _WELDS in self._info else [])), 0.0)
+                yield played
+
     def _begin(self, pairs: list[tuple[int, Start]]) -> None:
         envs = [env for env, _ in pairs]
         seeds = [start.seed for _, start in pairs]
+        starts = [Start(**{**vars(start), "env": env}) for env, start in pairs]
+        for start in starts:
+            self._playing[start.env], self._chunks[start.env] = Rollout(start), []
         if self._refill:
             self._obs, info = self._env.reset(seed=seeds, options={"env_idx": np.array(envs)})
         else:  # a batch is reset as a whole, with the objects of these seeds
             rest = [seeds[0]] * (self._count - len(seeds))
             self._obs, info = self._env.reset(seed=seeds + rest, options={"reconfigure": True})
-        starts = [Start(**{**vars(start), "env": env}) for env, start in pairs]
-        for start in starts:
-            self._playing[start.env], self._chunks[start.env] = Rollout(start), []
         self._info = info
         if not self._flags:
             self._flags = [name for name, value in info.items() if _is_flag(value)]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import platform
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,16 +12,22 @@ from typing import Any
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.datasets.writing.render import require_renderer
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.errors import EvaluationError, WorkerDied
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Policy, describe
 from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
-from robocas_ms3.evaluation.rollout import Rollouts, Rules
+from robocas_ms3.evaluation.rollout import Rollout, Rollouts, Rules
 from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
 from robocas_ms3.evaluation.weld import refuse
+from robocas_ms3.outputs import locked_folder, while_there
+from robocas_ms3.processes import NO_LIMITS, Limits
 from robocas_ms3.strict import nearest
 from robocas_ms3.tasks.vector.backend import Backend, choose_backend
+
+TRIES = 2
+"""How often an episode is begun whose process died, counting the first time."""
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -35,6 +43,8 @@ class Settings:
         episodes: only the first so many of each configuration.
         split: only the episodes of this split; empty: of all.
         weld: whether what is lifted is welded to the hand, as upstream does (`weld`).
+        limits: of what a process of envs may take for a step or a reset. An episode that goes beyond them, or takes its
+            process down, is played again once; then it is broken off, which is a failure.
     """
 
     num_envs: int = 2
@@ -45,6 +55,7 @@ class Settings:
     episodes: int | None = None
     split: str = ""
     weld: bool = False
+    limits: Limits = NO_LIMITS
 
 
 def evaluate(
@@ -75,6 +86,7 @@ def evaluate(
         DatasetError: the policy wants to see, and there is no render device.
         EvaluationError: the policy or the weld does not fit the protocol, the pack is another, or the result is of
             another run.
+        RobocasError: another process writes there.
     """
     protocol.rules.refuse(policy.wants)
     rate_of(protocol, policy.wants)
@@ -86,15 +98,17 @@ def evaluate(
         raise EvaluationError("no episodes in this part", where=protocol.rules.name, found=f"shard {number}/{of}")
     if policy.wants.cameras:
         require_renderer()
-    done = results.begin(folder, about(protocol, policy, name, settings), resume=resume, again=again)
-    left = [episode for episode in wanted if episode.episode not in done]
-    count = len(left)
-    for config in dict.fromkeys(episode.config for episode in left):
-        of_config = [episode for episode in left if episode.config == config]
-        for outcome in _play(protocol, policy, of_config, settings):
-            results.append(folder, outcome)
-            count -= 1
-            yield outcome, count
+    with locked_folder(folder):
+        done = results.begin(folder, about(protocol, policy, name, settings), resume=resume, again=again)
+        left = [episode for episode in wanted if episode.episode not in done]
+        count = len(left)
+        for config in dict.fromkeys(episode.config for episode in left):
+            of_config = [episode for episode in left if episode.config == config]
+            for outcome in _play(protocol, policy, of_config, settings):
+                with while_there(folder / results.RUN, EvaluationError):
+                    results.append(folder, outcome)
+                count -= 1
+                yield outcome, count
 
 
 def chosen(episodes: Sequence[Episode], settings: Settings) -> list[Episode]:
@@ -153,17 +167,32 @@ def _play(protocol: LoadedProtocol, policy: Policy, episodes: list[Episode], set
     rules, first = protocol.rules, episodes[0]
     rate, gpu = rate_of(protocol, policy.wants), choose_backend(settings.backend) == "gpu"
     count = min(settings.num_envs, len(episodes))
-    runs = {"backend": settings.backend, "workers": settings.workers, "weld": settings.weld}
-    env = make_env(protocol, policy.wants, first, count, **runs)
-    try:
-        steps = rules.steps(first.task, rate)
-        assert steps is not None  # `load_protocol` saw to it
-        ends = Rules(steps, tuple(rules.ends_on), rules.max_v0_steps)
-        known = {one.episode: one for one in episodes}
-        for played in Rollouts(env, policy, ends, 1 / rate, refill=not gpu).play(
-            [start_of(protocol, one) for one in episodes]
-        ):
-            one = known[played.start.episode]
-            yield Outcome.of(played, one, object_ids(protocol, one))
-    finally:
-        env.close()
+    runs = {name: getattr(settings, name) for name in ("backend", "workers", "weld", "limits")}
+    steps = rules.steps(first.task, rate)
+    assert steps is not None  # `load_protocol` saw to it
+    ends = Rules(steps, tuple(rules.ends_on), rules.max_v0_steps)
+    left = {one.episode: one for one in episodes}
+    died: Counter[int] = Counter()  # by episode, how often its process did
+
+    def came_of(played: Rollout) -> Outcome:
+        one = left.pop(played.start.episode)
+        return Outcome.of(played, one, object_ids(protocol, one))
+
+    while left:
+        env = make_env(protocol, policy.wants, first, min(count, len(left)), **runs)
+        rollouts = Rollouts(env, policy, ends, 1 / rate, refill=not gpu)
+        try:
+            yield from map(came_of, rollouts.play([start_of(protocol, one) for one in left.values()]))
+        except WorkerDied as error:
+            lost = list(rollouts.lost(error.envs, f"its process died: {error.found}"))
+            if not lost:
+                raise
+            for played in lost:
+                number = played.start.episode
+                died[number] += 1
+                if died[number] < TRIES:
+                    _log.warning("episode %d: %s; it is played again", number, played.error)
+                else:
+                    yield came_of(played)
+        finally:
+            env.close()

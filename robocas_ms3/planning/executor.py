@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from robocas_ms3.planning.protocol import Array, Trajectory
+from robocas_ms3.planning.seconds import Seconds
 from robocas_ms3.tasks.transfer import TransferEnv
 
 OPEN, CLOSED = 1.0, -1.0
@@ -30,25 +29,6 @@ class Segment:
     goal_type: str
     goal_description: str
     first: int
-
-
-@dataclass
-class Seconds:
-    """Where an episode's time went: CPU seconds of this process and of all its branches that could be played."""
-
-    reset: float = 0.0
-    planning: float = 0.0
-    simulation: float = 0.0
-    trial: float = 0.0
-
-    @contextmanager
-    def spent_on(self, part: str) -> Iterator[None]:
-        """Add the time spent inside to a part."""
-        start = time.process_time()
-        try:
-            yield
-        finally:
-            setattr(self, part, getattr(self, part) + time.process_time() - start)
 
 
 @dataclass

@@ -19,6 +19,7 @@ from robocas_ms3.files import make_folder, replacing, write_json
 from robocas_ms3.outputs import sweep
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import EPISODES, REPORT, UNITS, Outcome, Task, Unit
+from robocas_ms3.recordings.merging import merge
 from robocas_ms3.recordings.reading import TrajectoryFile
 
 DEMOS, DATASETS, STATISTICS = "demos", "datasets", "statistics"
@@ -54,7 +55,7 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Callable[[str
             sweep(path.parent)
             if not path.is_file():
                 say(f"demonstrations, {plan.parts[number].name}")
-                _merge([task.recording for task in recorded], path)
+                merge([task.recording for task in recorded], path)
         if plan.makes_datasets and "lerobot" in plan.formats:
             say("the LeRobot dataset")
             _convert_lerobot(robocas, out / DATASETS / "lerobot", jobs)
@@ -86,12 +87,6 @@ def _join_episodes(plan: Plan, out: Path, tasks: Mapping[int, Sequence[Task]]) -
     settings = dataset_settings(plan.rate, plan.pictures.chosen(), plan.embeddings)
     write_json(out / schema.CONVERSION_FILE, {**header(settings), "episodes": entries})
     write_info(out)
-
-
-def _merge(recordings: list[Path], path: Path) -> None:
-    from robocas_ms3.recordings.writing import merge  # the simulator comes with it
-
-    merge(recordings, path)
 
 
 def _say_source(path: Path, source: dict[str, Any]) -> None:

@@ -11,7 +11,16 @@ from typing import Any
 
 from robocas_ms3.errors import PlanError
 from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import check_overwrite, check_run, claim_output, is_taken, locked_folder, sweep
+from robocas_ms3.outputs import (
+    check_overwrite,
+    check_run,
+    check_there,
+    claim_output,
+    is_taken,
+    locked_folder,
+    sweep,
+    while_there,
+)
 from robocas_ms3.plans.begun import check_plan_of, content_of
 from robocas_ms3.plans.checks import check_plan
 from robocas_ms3.plans.engines import Engine
@@ -73,11 +82,12 @@ def run_plan(
         on_start()
         parts = [_Part(plan, number) for number in range(len(plan.parts))]
         engine = open_engine(plan, out)
-        try:
-            _do_units(plan, out, engine, parts, on_progress)
-        finally:
-            engine.close()
-        return join(plan, out, {part.number: list(part.chosen()) for part in parts}, jobs=jobs, say=on_stage)
+        with while_there(out / PLAN, PlanError):
+            try:
+                _do_units(plan, out, engine, parts, on_progress)
+            finally:
+                engine.close()
+            return join(plan, out, {part.number: list(part.chosen()) for part in parts}, jobs=jobs, say=on_stage)
 
 
 @dataclass
@@ -157,6 +167,7 @@ def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_
                 else:
                     under_way[engine.submit(unit)] = unit
         if not under_way or time.monotonic() > said + _LOOK:  # it reads as many files as there are units under way
+            check_there(out / PLAN, PlanError)
             for part in parts:
                 part.write_tally(out)
             on_progress(_counts(plan, out, parts, under_way))

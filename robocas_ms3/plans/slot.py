@@ -13,10 +13,10 @@ from robocas_ms3.errors import MissingExtraError, PlanError
 from robocas_ms3.files import flush_to_disk, make_folder, write_json
 from robocas_ms3.outputs import sweep
 from robocas_ms3.plans.begun import check_versions
-from robocas_ms3.plans.child import Child, ChildDied, Stopped
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import DONE, EPISODES, Death, Outcome, Task, Unit, deaths, ledger, outcomes
 from robocas_ms3.processes import Worker
+from robocas_ms3.processes.child import Child, ChildDied, NotBegun, Stopped
 from robocas_ms3.recordings.versions import versions
 
 TRIES = 2
@@ -113,6 +113,8 @@ class Slot:
                 return child.do(task, seconds)
             except (Stopped, PlanError, MissingExtraError, OSError):
                 raise  # it would befall every seed
+            except NotBegun as failed:  # so would this
+                raise PlanError("a process could not begin", found=failed.said()) from failed.error
             except ChildDied as death:
                 why = str(death)
             except Exception as error:  # a bug that this seed has found, or some memory that was missing

@@ -1,4 +1,4 @@
-"""Record episodes in ManiSkill's trajectory format: one file an episode while generating, merged at the end."""
+"""Record episodes in ManiSkill's trajectory format, one file an episode; `merging` makes one of them."""
 
 from __future__ import annotations
 
@@ -16,16 +16,13 @@ from mani_skill.utils.wrappers.record import parse_env_info
 from numpy.typing import NDArray
 
 from robocas_ms3.files import replacing, write_json
-from robocas_ms3.recordings.entries import read_json
 from robocas_ms3.recordings.environment import recorded_id
-from robocas_ms3.recordings.reading import open_trajectory
 from robocas_ms3.recordings.versions import versions
-from robocas_ms3.recordings.whole import reserved, write_whole
+from robocas_ms3.recordings.whole import write_whole
 from robocas_ms3.tasks.base import RoboCASEnv
 
 # Settings of one machine or one run; a trajectory has to replay without them.
 _LOCAL_KWARGS = ("layouts", "render_backend", "render_mode", "sim_backend", "reward_mode")
-_MARGIN = 4096  # bytes an episode may need in a file of many beyond those of its own
 _PICTURES = ("rgb", "depth", "seg")
 
 
@@ -168,30 +165,3 @@ def _write(group: h5py.Group, key: str, data: Any) -> None:
         return
     packing = {"compression": "gzip", "compression_opts": 5} if key in _PICTURES else {}
     group.create_dataset(key, data=data, dtype=data.dtype, **packing)
-
-
-def merge(shards: list[Path], out: Path) -> None:
-    """Merge trajectory files into one, episodes numbered in the order given; unknown keys of the JSON are kept.
-
-    Args:
-        shards: HDF5 files, each with its JSON beside it.
-        out: HDF5 file to write; its JSON is written beside it.
-
-    Raises:
-        DatasetError: a file can't be read.
-    """
-    merged: dict[str, Any] = {}
-    episodes: list[dict[str, Any]] = []
-    sizes = [shard.stat().st_size for shard in shards]
-    with replacing(out) as tmp:
-        with reserved(tmp, sum(sizes) + _MARGIN * (1 + len(sizes))) as target:
-            for shard in shards:
-                data = read_json(shard)
-                merged = merged or {key: value for key, value in data.items() if key != "episodes"}
-                with open_trajectory(shard) as source:
-                    for episode in data["episodes"]:
-                        number = len(episodes)
-                        source.copy(f"traj_{episode['episode_id']}", target, name=f"traj_{number}")
-                        episodes.append({**episode, "episode_id": number})
-        # the JSON first: an HDF5 file that is there always has its JSON
-        write_json(out.with_suffix(".json"), {**merged, "episodes": episodes})

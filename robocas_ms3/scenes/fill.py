@@ -57,5 +57,5 @@ def _make(bank: LayoutBank, pair: Pair) -> tuple[Pair, str]:
     return pair, ""
 
 
-def _died(pair: Pair) -> tuple[Pair, str]:
-    return pair, "the process that made it died; is memory short?"
+def _died(pair: Pair, why: str) -> tuple[Pair, str]:
+    return pair, f"the process that made it died ({why}); is memory short?"

@@ -12,6 +12,7 @@ from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.workers import generate_seeds, shard_name
+from robocas_ms3.errors import RobocasError
 from robocas_ms3.processes import Pool
 from robocas_ms3.recordings.entries import read_json
 
@@ -37,7 +38,7 @@ def made(monkeypatch):
     """Seeds that were generated, in the order in which they were."""
     seeds_made = []
 
-    def make(settings, seeds, folder, jobs, *, fork):
+    def make(settings, seeds, folder, jobs, *, fork, limits):
         for seed in seeds:
             seeds_made.append(seed)
             if seed == HOPELESS:
@@ -121,8 +122,15 @@ def test_fewer_than_there_are(tmp_path, made):
 
 
 def test_a_seed_that_takes_its_process_down_is_a_failure_of_its_own(monkeypatch):
-    """Whose fault it was is the pool's to find out: tests/test_processes.py."""
-    monkeypatch.setattr(Pool, "do", lambda pool, seeds, in_order: (pool._died(seed) for seed in seeds))
+    """Whose fault it was is the pool's to find out: tests/test_process_pool.py."""
+    monkeypatch.setattr(Pool, "do", lambda pool, seeds, in_order: (pool._died(seed, "SIGSEGV") for seed in seeds))
     (result,) = generate_seeds(SETTINGS, iter([5]), Path(), 2)
     assert (result.seed, result.success, result.attempts) == (5, False, 1)
-    assert [(one.stage, one.reason) for one in result.failures] == [("worker", "crashed")]
+    assert [(one.stage, one.reason) for one in result.failures] == [("worker", "SIGSEGV")]
+
+
+def test_an_output_folder_that_vanishes_is_one_clear_line(tmp_path, made):
+    out = tmp_path / "out"
+    with pytest.raises(RobocasError, match=r"out: the output folder is gone.*\(expected run.json\)"):
+        generate(SETTINGS, out, episodes=5, on_result=lambda result: shutil.rmtree(out))
+    assert made == [0, 1]

@@ -33,6 +33,8 @@ SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
         (["-n", "0"], "episodes: this number is out of range (expected at least 1, found 0)"),
         (["-n", "-3"], "found -3)"),
         (["--jobs", "0"], "jobs: this number is out of range (expected at least 1, found 0)"),
+        (["--episode-seconds", "0"], "episode_seconds: this number is out of range (expected at least 1, found 0.0)"),
+        (["--memory-gb", "nan"], "memory_gb: this number is out of range (expected at least 0.1, found nan)"),
         (["--pack", "nothing"], "nothing: no such asset pack"),
         (["--config", "pick_table_scatered"], "Did you mean pick_table_scattered"),
         (
@@ -71,7 +73,7 @@ def begun(out, *, ledger=""):
 def hopeless(monkeypatch):
     """Every seed is given up."""
 
-    def give_up(settings, seeds, folder, jobs, *, fork):
+    def give_up(settings, seeds, folder, jobs, *, fork, limits):
         for seed in seeds:
             yield EpisodeResult(seed, success=False, failures=[Failure(seed, 0, "reach", "far", 0.0)])
 
@@ -176,3 +178,12 @@ def test_a_setting_that_is_newer_than_the_output_had_its_default(tmp_path):
     check_same_run(tmp_path / "run.json", {"settings": settings})
     with pytest.raises(RobocasError, match="settings differ"):
         check_same_run(tmp_path / "run.json", {"settings": {**settings, "planner": "straight"}})
+
+
+def test_other_versions_do_not_go_on_with_an_output(tmp_path):
+    made = {"settings": asdict(SETTINGS), "versions": {"sapien": "3.0.3", "numpy": "1.26.4"}}
+    (tmp_path / "run.json").write_text(json.dumps({**made, "versions": {"sapien": "2.2.2", "numpy": "1.26.4"}}))
+    with pytest.raises(RobocasError, match=r"other versions than .*\(expected sapien 2\.2\.2, found sapien 3\.0\.3\)"):
+        check_same_run(tmp_path / "run.json", made)
+    (tmp_path / "run.json").write_text(json.dumps({"settings": made["settings"]}))  # before they were noted
+    check_same_run(tmp_path / "run.json", made)

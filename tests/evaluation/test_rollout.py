@@ -2,45 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
+from counting import Counting
 
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
-from robocas_ms3.evaluation.tracking import SUMS
-
-
-class Counting:
-    """N envs of which each succeeds once the sum of its first action numbers has come to its seed."""
-
-    def __init__(self, num_envs: int) -> None:
-        self.num_envs, self.resets = num_envs, []
-        self.seeds, self.sums = np.zeros(num_envs, int), np.zeros(num_envs)
-        self.elapsed = np.zeros(num_envs, np.int32)
-
-    def reset(self, *, seed: list[int], options: dict[str, Any]) -> tuple[Any, dict]:
-        envs = options.get("env_idx", np.arange(self.num_envs))
-        self.resets.append(list(envs))
-        self.seeds[envs], self.sums[envs], self.elapsed[envs] = seed, 0, 0
-        return self._seen(), self._info()
-
-    def step(self, actions: np.ndarray) -> tuple:
-        self.sums += actions[:, 0]
-        self.elapsed += 1
-        return self._seen(), None, None, None, self._info()
-
-    def _seen(self) -> dict[str, Any]:
-        column = self.sums[:, None].astype(np.float32)
-        agent = {"qpos": np.tile(column, 12), "tcp_in_arm_base": np.tile(column, 7), "gripper_width": column}
-        return {"agent": agent, "extra": {"seed": self.seeds[:, None].astype(np.float32), "tcp_pose": column}}
-
-    def _info(self) -> dict[str, Any]:
-        tracked = {"sums": np.zeros((self.num_envs, len(SUMS)), np.float32)}
-        done = self.sums >= self.seeds
-        return {**tracked, "success": done, "fail": ~done & False, "elapsed_steps": self.elapsed.copy()}
 
 
 class Obedient:

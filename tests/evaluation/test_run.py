@@ -6,14 +6,17 @@ import shutil
 from pathlib import Path
 
 import pytest
+from counting import Dying
 
 from robocas_ms3.cli.main import run as cli
-from robocas_ms3.errors import DatasetError, EvaluationError
+from robocas_ms3.errors import DatasetError, EvaluationError, RobocasError, WorkerDied
 from robocas_ms3.evaluation import results, run
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.run import Settings, chosen, evaluate
+from robocas_ms3.evaluation.verify import problems
+from robocas_ms3.outputs import locked_folder
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +130,43 @@ def test_who_wants_to_see_needs_a_renderer(tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("times", [1, 2])
+def test_an_episode_that_ends_its_process_is_played_again_and_then_counts_as_failed(
+    short, tmp_path, monkeypatch, caplog, times
+):
+    protocol, made, deaths = load_protocol(short), [], [times]
+
+    def make_env(protocol, wants, first, count, **_):
+        made.append(Dying(count, protocol.episodes[1].seed, deaths))
+        return made[-1]
+
+    monkeypatch.setattr(run, "make_env", make_env)
+    found = play(tmp_path / "out", "still", protocol=short)
+    assert sorted(found) == [0, 1, 2, 3]  # none is left out
+    assert [number for number, one in found.items() if one["error"]] == ([1] if times == 2 else [])
+    assert found[1]["error"] == ("its process died: SIGSEGV" if times == 2 else "")
+    assert (found[1]["failure_stage"] == "error") == (times == 2)
+    assert found[0]["steps"] == 20  # from its beginning, whatever befell the other
+    assert [record.getMessage() for record in caplog.records] == [
+        "episode 1: its process died: SIGSEGV; it is played again"
+    ]
+    assert all(env.closed for env in made)
+    said = problems(results.read(tmp_path / "out"), protocol)
+    assert not [one for one in said if one.startswith("episode 1:") and times == 2]
+    if times == 2:
+        play(tmp_path / "out", "still", protocol=short, resume=True)  # it stays as it is
+        assert results.read(tmp_path / "out").broken_off() == 1
+
+
+def test_a_process_that_dies_at_no_episode_ends_the_run(short, tmp_path, monkeypatch):
+    def make_env(protocol, wants, first, count, **_):
+        raise WorkerDied("its process died", where="env 0", found="SIGSEGV")
+
+    monkeypatch.setattr(run, "make_env", make_env)
+    with pytest.raises(WorkerDied, match="env 0: its process died"):
+        play(tmp_path / "out", "still", protocol=short)
+
+
 def test_an_interrupted_run_says_how_it_goes_on(tmp_path, monkeypatch, capsys):
     def interrupted(*args, **kwargs):
         raise KeyboardInterrupt
@@ -158,3 +198,8 @@ def test_policies_by_name():
         with pytest.raises(EvaluationError, match="no such policy"):
             make_policy(name)
     assert make_policy("robocas_ms3.evaluation.policies.plain:StillPolicy").wants.convention == "robocas"
+
+
+def test_two_runs_into_one_folder_are_refused(tmp_path):
+    with locked_folder(tmp_path / "out"), pytest.raises(RobocasError, match="out: another process is writing here"):
+        play(tmp_path / "out", "still")

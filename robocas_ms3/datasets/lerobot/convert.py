@@ -24,7 +24,17 @@ from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, naming, write_json
-from robocas_ms3.outputs import check_same, claim_output, is_taken, kept_if_begun, locked_folder, sweep
+from robocas_ms3.outputs import (
+    check_same,
+    check_there,
+    claim_output,
+    is_taken,
+    kept_if_begun,
+    locked_folder,
+    sweep,
+    while_there,
+)
+from robocas_ms3.processes import Limits as EpisodeLimits
 from robocas_ms3.words import count_of
 
 Codec = Literal["h264", "av1"]
@@ -48,6 +58,7 @@ def convert_lerobot(
     jobs: int = 1,
     pack: str | Path | None = None,
     limits: Limits | None = None,
+    episode_limits: EpisodeLimits | None = None,
     on_start: Callable[[int], None] | None = None,
     on_episode: Callable[[WrittenEpisode], None] | None = None,
     open_source: OpenSource = open_env,
@@ -69,6 +80,7 @@ def convert_lerobot(
         jobs: worker processes.
         pack: name or folder of the objects' pack, instead of what a trajectory names.
         limits: sizes of files; default: LeRobot's.
+        episode_limits: what an episode may take, as in `writing.convert.convert`.
         on_start: called with the number of episodes to write.
         on_episode: called after each.
         open_source: what shows a trajectory's states; must be importable by workers.
@@ -100,11 +112,11 @@ def convert_lerobot(
             written, joining = [], 0.0
             if not (out / INFO_FILE).is_file():
                 parts = make_folder(out / PARTS)
-                with kept_if_begun(out, parts):
+                with while_there(parts / _PLAN, DatasetError), kept_if_begun(out, parts):
                     _sweep(out)
                     if not (parts / _PLAN).is_file():
                         write_json(parts / _PLAN, plan)
-                    written = _stage(request, parts, plan, jobs, on_start, on_episode)
+                    written = _stage(request, parts, plan, jobs, episode_limits, on_start, on_episode)
                     staged = time.perf_counter()
                     _join(out, plan, fps, limits)
                     joining = time.perf_counter() - staged
@@ -145,6 +157,7 @@ def _stage(
     parts: Path,
     plan: dict[str, Any],
     jobs: int,
+    limits: EpisodeLimits | None,
     on_start: Callable[[int], None] | None,
     on_episode: Callable[[WrittenEpisode], None] | None,
 ) -> list[WrittenEpisode]:
@@ -155,8 +168,9 @@ def _stage(
     if on_start:
         on_start(len(missing))
     written: list[WrittenEpisode] = []
-    with closing(stage_all(StageJob(request, parts, plan["settings"]["codec"], missing), jobs)) as episodes:
+    with closing(stage_all(StageJob(request, parts, plan["settings"]["codec"], missing, limits), jobs)) as episodes:
         for episode in episodes:
+            check_there(parts / _PLAN, DatasetError)
             written.append(episode)
             if on_episode:
                 on_episode(episode)

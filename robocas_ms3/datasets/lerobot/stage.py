@@ -29,6 +29,7 @@ from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder
+from robocas_ms3.processes import Limits
 
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
 SUBGOAL = "subgoal"  # column of texts, which become numbers when parts are joined
@@ -43,12 +44,14 @@ class StageJob:
         parts: folder of the parts.
         codec: of RGB.
         tasks: (episode index, number in the source) of those to write.
+        limits: of an episode; None: there are none, and one process is this one.
     """
 
     request: Request
     parts: Path
     codec: str
     tasks: list[tuple[int, int]]
+    limits: Limits | None = None
 
 
 def part_folder(parts: Path, index: int) -> Path:
@@ -65,9 +68,18 @@ def stage_all(job: StageJob, processes: int) -> Generator[WrittenEpisode, None, 
     """Write parts; gives each episode when it is done, in any order.
 
     Raises:
-        DatasetError: an episode can't be written, or a process died.
+        DatasetError: an episode can't be written, or ended its process twice.
     """
-    return do_all(partial(_Stager, job), job.tasks, processes, job.parts, renders=job.request.is_trajectory)
+    return do_all(
+        partial(_Stager, job),
+        job.tasks,
+        processes,
+        job.parts,
+        renders=job.request.is_trajectory,
+        limits=job.limits,
+        apart=job.limits is not None and job.request.renders,
+        name=lambda task: episode_folder(task[0]),
+    )
 
 
 class _Stager:

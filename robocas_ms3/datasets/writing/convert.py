@@ -33,8 +33,10 @@ from robocas_ms3.datasets.writing.players import Player, RecordingPlayer, Reques
 from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.datasets.writing.workers import Job, write_all
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
+from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import claim_output, kept_if_begun, locked_folder, sweep
+from robocas_ms3.outputs import check_there, claim_output, kept_if_begun, locked_folder, sweep, while_there
+from robocas_ms3.processes import Limits
 
 _log = logging.getLogger(__name__)
 
@@ -77,6 +79,7 @@ def convert(
     previews: bool | None = False,
     jobs: int = 1,
     pack: str | Path | None = None,
+    episode_limits: Limits | None = None,
     on_start: Callable[[int], None] | None = None,
     on_episode: Callable[[WrittenEpisode], None] | None = None,
     open_source: OpenSource = open_env,
@@ -100,6 +103,9 @@ def convert(
         previews: whether to write a video of each new episode, and a contact sheet; None: where they are at most 20.
         jobs: worker processes.
         pack: name or folder of the objects' pack, instead of what the file names.
+        episode_limits: what an episode may take. With them one job is a process of its own too, where it renders; an
+            episode that goes beyond them, or takes its process down, is begun again once, and then left out, which is
+            an error in the end. None: with one job this process does it.
         on_start: called with the number of episodes to write.
         on_episode: called after each.
         open_source: what shows the states; must be importable by workers.
@@ -141,7 +147,9 @@ def convert(
             sheet = None
             if previews or (previews is None and len(plan.tasks) <= FEW):
                 sheet = on_sheet(map(int, plan.content["episodes"]))
-            written = _write(Job(request, out, vectors, sheet, missing), player.file.env_info, plan, jobs, on_episode)
+            job = Job(request, out, vectors, sheet, missing, episode_limits)
+            with while_there(out / schema.CONVERSION_FILE, DatasetError):
+                written = _write(job, player.file.env_info, plan, jobs, on_episode)
             if left := still_missing(out, plan.content):
                 _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))
     written.sort(key=lambda episode: episode.number)
@@ -160,13 +168,16 @@ def _write(
     before = _split_before(job.out)
     with kept_if_begun(job.out):
         write_json(job.out / schema.CONVERSION_FILE, plan.content)
-        with closing(write_all(job, jobs)) as episodes:
-            for episode in episodes:
-                written.append(episode)
-                if on_episode:
-                    on_episode(episode)
-        for folder in (job.out, job.out / schema.PREVIEW_FOLDER):
-            sweep(folder)  # what processes that died left; others did it again
+        try:
+            with closing(write_all(job, jobs)) as episodes:
+                for episode in episodes:
+                    check_there(job.out / schema.CONVERSION_FILE, DatasetError)
+                    written.append(episode)
+                    if on_episode:
+                        on_episode(episode)
+        finally:
+            for folder in (job.out, job.out / schema.PREVIEW_FOLDER):
+                sweep(folder)  # what processes that died left; others did it again
         add_failures(job.request.path.parent, job.out, env_info)
         write_info(job.out, before)
     if job.sheet is not None:

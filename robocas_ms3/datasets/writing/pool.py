@@ -7,10 +7,10 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import NoReturn, TypeVar
+from typing import TypeVar
 
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.processes import Pool, Worker, use_one_torch_thread
+from robocas_ms3.processes import NO_LIMITS, Limits, Pool, Worker, use_one_torch_thread
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -23,6 +23,9 @@ def do_all(
     where: Path,
     *,
     renders: bool = True,
+    limits: Limits | None = None,
+    apart: bool = False,
+    name: Callable[[Task], str] = str,
 ) -> Generator[Result, None, None]:
     """Do tasks; gives each result when it is there, in any order.
 
@@ -32,20 +35,31 @@ def do_all(
         processes: how many work; with one it is this one.
         where: what is written, for the error.
         renders: whether they render; then torch has one thread in each process.
+        limits: of each task.
+        apart: whether even one process is not this one, so that limits hold and a crash of a library does not end it.
+        name: of a task, for the error.
 
     Raises:
-        DatasetError: a process died; else whatever a task raises.
+        DatasetError: a process died twice at a task; the others are done before. Else whatever a task raises.
     """
+    lost: dict[str, str] = {}
 
-    def died(task: Task) -> NoReturn:
-        fix = "Is memory short? Pass --resume and fewer --jobs."
-        raise DatasetError("a worker process died", where=where, fix=fix)
+    def died(task: Task, why: str) -> None:
+        lost[name(task)] = why
 
     processes = min(processes, len(tasks))
-    here = one_torch_thread() if renders and processes <= 1 else nullcontext()
-    opened = partial(_open_renderer, open_worker) if renders and processes > 1 else open_worker
-    with here, Pool(opened, processes, died=died) as pool:
-        yield from pool.do(tasks)
+    here = processes <= 1 and not apart
+    threads = one_torch_thread() if renders and here else nullcontext()
+    opened = partial(_open_renderer, open_worker, processes) if renders and not here else open_worker
+    pool: Pool[Task, Result | None] = Pool(opened, processes, died=died, here=here, limits=limits or NO_LIMITS)
+    with threads, pool:
+        for result in pool.do(tasks):
+            if result is not None:
+                yield result
+    if lost:
+        said = ", ".join(f"{one}: {why}" for one, why in sorted(lost.items()))
+        fix = "Everything else is written. Is memory short? --resume tries again, maybe with fewer --jobs."
+        raise DatasetError("these ended the process that wrote them, twice", where=where, found=said, fix=fix)
 
 
 @contextmanager
@@ -61,9 +75,9 @@ def one_torch_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _open_renderer(open_worker: Callable[[], Worker[Task, Result]]) -> Worker[Task, Result]:
-    """In one of several processes."""
-    # One thread a process: several that render in software on all cores get in each other's way.
-    os.environ.setdefault("LP_NUM_THREADS", "1")
+def _open_renderer(open_worker: Callable[[], Worker[Task, Result]], processes: int) -> Worker[Task, Result]:
+    """In a process of its own, of so many."""
+    if processes > 1:  # that render in software on all cores get in each other's way
+        os.environ.setdefault("LP_NUM_THREADS", "1")
     use_one_torch_thread()
     return open_worker()

@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.preview import Preview
 from robocas_ms3.datasets.writing.players import RecordingPlayer, Request
 from robocas_ms3.datasets.writing.pool import do_all
 from robocas_ms3.datasets.writing.writer import WrittenEpisode, write_episode
+from robocas_ms3.processes import Limits
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class Job:
         vectors: embedding (384,) of every text; None: no embeddings.
         sheet: episodes on the contact sheet; None: no previews are made.
         tasks: (number in the dataset, number in the source) of each episode to write.
+        limits: of an episode; None: there are none, and one process is this one.
     """
 
     request: Request
@@ -33,15 +36,24 @@ class Job:
     vectors: dict[str, NDArray[np.float32]] | None
     sheet: tuple[int, ...] | None
     tasks: list[tuple[int, int]]
+    limits: Limits | None = None
 
 
 def write_all(job: Job, processes: int) -> Generator[WrittenEpisode, None, None]:
     """Write the job's episodes; gives each when it is done, in any order.
 
     Raises:
-        DatasetError: an episode can't be written, or a process died.
+        DatasetError: an episode can't be written, or ended its process twice.
     """
-    return do_all(partial(_Writer, job), job.tasks, processes, job.out)
+    return do_all(
+        partial(_Writer, job),
+        job.tasks,
+        processes,
+        job.out,
+        limits=job.limits,
+        apart=job.limits is not None and job.request.renders,
+        name=lambda task: schema.episode_folder(task[0]),
+    )
 
 
 class _Writer:

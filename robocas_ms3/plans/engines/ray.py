@@ -12,7 +12,6 @@ from queue import Empty, PriorityQueue
 from typing import Any
 
 from robocas_ms3.errors import PlanError
-from robocas_ms3.plans.child import Stopped
 from robocas_ms3.plans.engines.pieces import Arriving
 from robocas_ms3.plans.engines.ray_actor import RaySlot, Terms
 from robocas_ms3.plans.engines.ray_cluster import connect, read_options, require_ray
@@ -20,6 +19,7 @@ from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.slot import Stages
 from robocas_ms3.plans.units import DEATHS, LEDGER, Outcome, Unit, outcomes
 from robocas_ms3.processes import SentError
+from robocas_ms3.processes.child import Stopped
 from robocas_ms3.recordings.versions import versions
 
 TRIES = 3

@@ -12,6 +12,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 
 from robocas_ms3.benchmark import TASKS
 from robocas_ms3.errors import VectorEnvError
+from robocas_ms3.processes import NO_LIMITS, Limits
 from robocas_ms3.tasks.vector.backend import Backend, choose_backend
 from robocas_ms3.tasks.vector.environment import NumpyVectorEnv, RoboCASVectorEnv
 from robocas_ms3.tasks.vector.processes import ProcessEnv
@@ -30,6 +31,7 @@ def make_vec(
     ignore_terminations: bool = False,
     record_metrics: bool = True,
     wrappers: Sequence[Callable[[gym.Env], gym.Env]] = (),
+    limits: Limits = NO_LIMITS,
     **kwargs: Any,
 ) -> VectorEnv:
     """Several environments as one vector environment, with ManiSkill's conventions.
@@ -53,6 +55,7 @@ def make_vec(
         ignore_terminations: whether an env goes on after success, until its time is up.
         record_metrics: whether infos have ``episode``.
         wrappers: put around each env, the first one first; on a GPU around the batch.
+        limits: of what a process may take for a step or a reset of its envs; it dies where it takes more.
         kwargs: for ``gym.make``, such as ``obs_mode``, ``control_mode``, ``config``, ``max_episode_steps``.
 
     Raises:
@@ -72,7 +75,7 @@ def make_vec(
             env = wrap(env)
     else:
         workers = min(num_envs, workers or len(os.sched_getaffinity(0)))
-        env = ProcessEnv(env_id, num_envs, workers, kwargs, wrappers)
+        env = ProcessEnv(env_id, num_envs, workers, kwargs, wrappers, limits)
     vector = RoboCASVectorEnv(
         env, auto_reset=auto_reset, ignore_terminations=ignore_terminations, record_metrics=record_metrics
     )

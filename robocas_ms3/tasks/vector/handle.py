@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import signal
@@ -17,10 +18,12 @@ from typing import Any
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import VectorEnvError, WorkerDied
+from robocas_ms3.processes import NO_LIMITS, is_too_large, uninterrupted
 
 STEP, LEAVE = b"s", b"q"  # messages; all others are pickled
 NUMBER = 8  # bytes before each message, its number, which the answer repeats
 _GRACE, _GRACE_AT_WORK = 10.0, 1.0  # s to leave in
+_LOOK = 1.0  # s between two looks at what it takes
 # Neither fork nor multiprocessing's spawn: a process with a renderer or CUDA can't be forked, and spawn runs the user's
 # program again, which a program without `if __name__ == "__main__"`, a notebook and a program from a pipe don't stand.
 _PROGRAM = """\
@@ -44,23 +47,26 @@ class WorkerHandle:
 
     Attributes:
         at_work: (num_envs,) bool, shared, which envs are resetting or stepping; None: not known yet.
+        limits: of what it is asked for.
     """
 
     def __init__(self, envs: range, memory: int) -> None:
         self.envs = envs
         self._asked = self._answered = 0  # messages have numbers: an interrupted call leaves an answer behind
         self.at_work: NDArray[Any] | None = None
+        self.limits, self._looked = NO_LIMITS, time.monotonic()
         here, there = socket.socketpair()
         with there:
             program = _PROGRAM.format(path=sys.path, connection=there.fileno(), memory=memory, parent=os.getpid())
             try:
-                self.process = subprocess.Popen(
-                    [sys.executable, "-c", program],
-                    pass_fds=(there.fileno(), memory),
-                    stdin=subprocess.DEVNULL,
-                    # one thread each, also of the software renderer: those of several processes get in each other's way
-                    env={"OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1", **os.environ},
-                )
+                with uninterrupted():  # which the process inherits, until it ignores Ctrl-C
+                    self.process = subprocess.Popen(
+                        [sys.executable, "-c", program],
+                        pass_fds=(there.fileno(), memory),
+                        stdin=subprocess.DEVNULL,
+                        # one thread each, also of the software renderer: those of several get in each other's way
+                        env={"OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1", **os.environ},
+                    )
             except OSError as error:
                 raise VectorEnvError(
                     "can't start a process",
@@ -95,13 +101,33 @@ class WorkerHandle:
         """
         while self.busy:
             try:
+                self._wait()
                 answer = self.connection.recv_bytes()
             except (EOFError, OSError) as error:
                 raise self._died() from error
             self._answered = int.from_bytes(answer[:NUMBER], "little")
         return pickle.loads(answer[NUMBER:]) if len(answer) > NUMBER else None
 
-    def _died(self) -> WorkerDied:
+    def _wait(self) -> None:
+        """Wait for an answer.
+
+        Raises:
+            WorkerDied: the process took more than it may, and was ended.
+        """
+        begun = time.monotonic()
+        while True:
+            now = time.monotonic()
+            why = "too slow" if now - begun > self.limits.seconds else ""
+            if now - self._looked > _LOOK and self.limits.memory_gb < math.inf:
+                self._looked = now
+                why = "too much memory" if is_too_large(self.process.pid, self.limits.memory_gb, forks=False) else why
+            if why:
+                self.process.kill()
+                raise self._died(why)
+            if self.connection.poll(_LOOK):
+                return
+
+    def _died(self, why: str = "") -> WorkerDied:
         try:
             code = self.process.wait(_GRACE_AT_WORK)
         except subprocess.TimeoutExpired:
@@ -110,8 +136,11 @@ class WorkerHandle:
         if code is not None and code < 0:
             how = f"{signal.Signals(-code).name}{', is memory short?' if code == -signal.SIGKILL else ''}"
         at_work = [] if self.at_work is None else [env for env in self.envs if self.at_work[env]]
-        where = name_envs(at_work or self.envs)
-        return WorkerDied("its process died", where=where, found=how, fix="Make the environments again.")
+        envs = at_work or list(self.envs)
+        what, fix = "its process died", "Make the environments again."
+        died = WorkerDied(what, where=name_envs(envs), found=why or how, fix=fix)
+        died.envs = tuple(envs)
+        return died
 
 
 def name_envs(envs: Sequence[int]) -> str:

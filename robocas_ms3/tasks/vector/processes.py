@@ -17,7 +17,7 @@ from mani_skill.utils.common import torch_clone_dict
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from robocas_ms3.errors import VectorEnvError, WorkerDied
-from robocas_ms3.processes import SentError
+from robocas_ms3.processes import NO_LIMITS, Limits, SentError
 from robocas_ms3.tasks.seeds import following_seeds
 from robocas_ms3.tasks.vector.block import Block, nest, open_memory
 from robocas_ms3.tasks.vector.handle import STEP, WorkerHandle, close_all, name_envs
@@ -39,6 +39,7 @@ class ProcessEnv(gym.Env):
         workers: processes, each with as many envs as the others, or one more.
         kwargs: for ``gym.make``; pickled, with what the main program defines.
         wrappers: put around each env, the first one first; pickled the same way.
+        limits: of what a process may take for a step or a reset of its envs; it is ended where it takes more.
 
     Raises:
         VectorEnvError: they can't be sent to processes.
@@ -53,12 +54,14 @@ class ProcessEnv(gym.Env):
         workers: int,
         kwargs: dict[str, Any],
         wrappers: Sequence[Callable[[gym.Env], gym.Env]] = (),
+        limits: Limits = NO_LIMITS,
     ) -> None:
         self.num_envs, self.device = num_envs, torch.device("cpu")
         self.reconfiguration_freq = 0  # of the batch; what a reset builds anew is each env's own affair
         self.spec = copy(gym.spec(env_id))
         if kwargs.get("max_episode_steps") is not None:  # which ManiSkill's helpers read here
             self.spec.max_episode_steps = kwargs["max_episode_steps"]
+        self._limits = limits
         self._seed_range: tuple[int, int] | None = kwargs.get("seeds")
         self._must_reset: set[int] = set()  # envs that an interrupted or failed call left in who knows what state
         cuts = [num_envs * worker // workers for worker in range(workers + 1)]
@@ -96,6 +99,7 @@ class ProcessEnv(gym.Env):
         self._obs, self._info = views.get("obs", {}), views["info"]
         for worker in self._workers:
             worker.at_work = block.arrays["at_work",]
+            worker.limits = self._limits
 
     @property
     def pids(self) -> list[int]:

@@ -213,6 +213,12 @@ def test_a_folder_that_is_not_writable(trajectory, tmp_path):
         run(trajectory, tmp_path / "out")
 
 
+def test_a_folder_that_vanishes(trajectory, tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(DatasetError, match=r"out: the output folder is gone.*\(expected conversion.json\)"):
+        run(trajectory, out, on_episode=lambda episode: shutil.rmtree(out))
+
+
 def test_a_file_where_a_folder_should_be(trajectory, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(RobocasError, match="can't make this folder"):

@@ -48,11 +48,12 @@ class Deadly(Looking):
         return os._exit(9) if task == 2 else task
 
 
-def test_a_process_that_dies_is_one_clear_line():
-    results = do_all(Deadly, [1, 2, 3], 2, Path("out"), renders=False)
-    assert next(results) == 1
-    with pytest.raises(DatasetError, match="out: a worker process died.*--resume and fewer --jobs"):
-        list(results)
+def test_a_task_that_ends_its_process_is_one_clear_line_after_all_others():
+    done, names = [], {2: "two"}
+    with pytest.raises(DatasetError, match="out: these ended the process.*found two: exit code 9.*--resume"):
+        for one in do_all(Deadly, [1, 2, 3], 1, Path("out"), renders=False, apart=True, name=names.__getitem__):
+            done.append(one)
+    assert done == [1, 3]
 
 
 def test_elsewhere_torch_is_left_alone():

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import atexit
+import math
 import multiprocessing
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, Generic, TypeVar
 
 import psutil
 
-from robocas_ms3.errors import PlanError
-from robocas_ms3.processes import SentError, Worker, leave_with, uninterrupted
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.processes.lives import is_too_large, leave_with, uninterrupted
+from robocas_ms3.processes.sent import SentError
+from robocas_ms3.processes.worker import Worker
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -27,8 +32,41 @@ _LOOK = 1.0  # s between two looks at a process's memory
 _KILLED_TOO = 2.0  # s until this process hears of it as well, where somebody ends all of them at once
 
 
+@dataclass(frozen=True)
+class Limits:
+    """What a task may take.
+
+    Attributes:
+        seconds: of wall-clock time.
+        memory_gb: a process may use, each that it forked likewise.
+    """
+
+    seconds: float = math.inf
+    memory_gb: float = math.inf
+
+
+NO_LIMITS = Limits()
+
+
 class ChildDied(Exception):
     """The process ended, or was ended; the message says why, in words that can be counted."""
+
+
+class NotBegun(Exception):
+    """The process failed, or died, before it could begin with its first task.
+
+    Attributes:
+        error: what it raised; None: it died.
+    """
+
+    def __init__(self, error: BaseException | None = None, why: str = "") -> None:
+        super().__init__(str(error or why))
+        self.error, self._why = error, why
+
+    def said(self) -> BaseException:
+        """The error for who asked."""
+        what, fix = "a process ended before it could begin", "See what it said above; robocas doctor says what works."
+        return self.error or RobocasError(what, found=self._why, fix=fix)
 
 
 class Stopped(Exception):  # noqa: N818  (nothing is wrong)
@@ -44,7 +82,7 @@ class Child(Generic[Task, Result]):
     """
 
     def __init__(self, open_worker: Callable[[], Worker[Task, Result]], memory_gb: float) -> None:
-        self._open_worker, self._memory = open_worker, memory_gb * 2**30
+        self._open_worker, self._memory = open_worker, memory_gb
         self._guard = threading.Lock()  # of the process: begun, and ended by whoever comes first
         self._process: Any = None
         self._pipe: Any = None  # a Connection
@@ -59,7 +97,7 @@ class Child(Generic[Task, Result]):
 
         Raises:
             ChildDied: the process died, or was ended for time or memory.
-            PlanError: it died, or failed, before it could begin: not for the task.
+            NotBegun: it died, or failed, before it could begin: not for the task.
             Stopped: `stop` was called.
             Exception: whatever the task raises.
         """
@@ -79,35 +117,29 @@ class Child(Generic[Task, Result]):
             if self._closed:
                 raise Stopped from error
             if not self._open:
-                fix = "See what it said above; robocas doctor says what of this machine works."
-                raise PlanError("a process ended before it could begin", found=why, fix=fix) from error
+                raise NotBegun(why=why) from error
             raise ChildDied(why) from error
         finally:
             self._busy = False
         if isinstance(answer, SentError):
             if not self._open:
-                raise PlanError("a process could not begin", found=answer.error) from answer.error
+                raise NotBegun(answer.with_traceback())
             answer.reraise()
         return answer
 
     def _wait(self, pipe: Any, seconds: float) -> Any:
         until = time.monotonic() + seconds
         while not pipe.poll(_LOOK):
-            why = "too slow" if time.monotonic() > until else "too much memory" if self._too_large() else ""
+            why = "too slow" if time.monotonic() > until else "too much memory" if self._is_too_large() else ""
             if why:
                 self.end()
                 if self._closed:
                     raise Stopped
-                raise ChildDied(why)
+                raise ChildDied(why) if self._open else NotBegun(why=why)
         return pipe.recv()
 
-    def _too_large(self) -> bool:
-        """Whether the process and what it forked use more than they may."""
-        try:
-            process = psutil.Process(self._process.pid)
-            return any(one.memory_info().rss > self._memory for one in (process, *process.children(recursive=True)))
-        except psutil.Error:
-            return False  # it has just died
+    def _is_too_large(self) -> bool:
+        return self._memory < math.inf and is_too_large(self._process.pid, self._memory)
 
     def _cause(self) -> str:
         """Why the process died."""
@@ -137,7 +169,7 @@ class Child(Generic[Task, Result]):
             self._closed = True
             if self._process is not None:
                 if self._busy:
-                    self._process.kill()
+                    _kill(self._process)
                 else:
                     self._pipe.close()  # it leaves by itself
 
@@ -146,7 +178,7 @@ class Child(Generic[Task, Result]):
         process = self._process
         if process is not None:
             process.join(seconds)
-            process.kill()
+            _kill(process)
 
     def end(self) -> None:
         """End the process, whatever it is at; the next task gets another."""
@@ -155,12 +187,20 @@ class Child(Generic[Task, Result]):
 
     def _end(self) -> None:
         if self._process is not None:
-            self._process.kill()
+            _kill(self._process)
             self._process.join()
             self._process = None
         if self._pipe is not None:
             self._pipe.close()
             self._pipe = None
+
+
+def _kill(process: Any) -> None:
+    """Kill a process and what it forked, which must not write on."""
+    with suppress(psutil.Error):
+        for forked in psutil.Process(process.pid).children(recursive=True):
+            forked.kill()
+    process.kill()
 
 
 def _serve(open_worker: Callable[[], Worker[Any, Any]], pipe: Connection, parent: int) -> None:
@@ -178,8 +218,11 @@ def _serve(open_worker: Callable[[], Worker[Any, Any]], pipe: Connection, parent
                 worker = open_worker()
                 pipe.send(None)
             answer = worker.do(task)
-        except BaseException as error:
+        except BaseException as error:  # noqa: BLE001  (it is raised again where it can be dealt with)
             answer = SentError.of(error, "a worker")
-        pipe.send(answer)
+        try:
+            pipe.send(answer)
+        except Exception as error:  # the result can't be sent
+            pipe.send(SentError.of(error, "a worker"))
     atexit._run_exitfuncs()
     os._exit(0)  # without what torch and SAPIEN do in the end: a second, while one waits who pressed Ctrl-C
