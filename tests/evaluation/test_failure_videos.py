@@ -59,4 +59,4 @@ def test_a_failure_is_filmed_and_linked(tmp_path, needs_renderer, capsys):
     assert frames.shape == (3, SIZE[1], SIZE[0], 3)  # at the reset, after 4 of 10 steps, after 8
     assert frames.std() > 10
     page = (out / "report.html").read_text()
-    assert 'href="videos/episode_00000.mp4"' in page and "1 of 1 episodes" in page
+    assert 'href="videos/episode_00000.mp4"' in page and "1 of 1 episode, protocol" in page

@@ -248,7 +248,7 @@ def test_a_machine_with_other_versions_does_no_unit(tmp_path):
 
 def test_killed_at_any_moment_it_goes_on_and_ends_the_same(undisturbed, tmp_path):
     out = tmp_path / "out"
-    for seeds in (0, 1, 4):
+    for seeds in (1, 4):
         with in_a_process(out) as process:
             wait_until(lambda seeds=seeds: (out / "plan.json").is_file() and seeds_done(out) >= seeds, process)
             os.killpg(process.pid, signal.SIGKILL)
