@@ -75,9 +75,9 @@ def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int
             found=settings.replay_rate,
         )
     BACKENDS.find(settings.planner, where="planner")
-    find_robot(settings.robot)
+    robot = find_robot(settings.robot)
     config = load_config_of(TASKS[settings.task], settings.config)
-    SceneModel.load(config, load_pack(settings.pack), load_pack("builtin"))
+    SceneModel.load(config, load_pack(settings.pack), load_pack("builtin"), robot=robot.description)
 
 
 def check_same_run(path: Path, run: dict[str, Any]) -> None:

@@ -5,6 +5,7 @@ Metres, radians, seconds. Another arm is another description, beside its URDF an
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import pi
 from typing import ClassVar
@@ -13,6 +14,24 @@ from robocas_ms3.errors import RobocasError
 
 Limits = tuple[tuple[float, float], ...]
 _OF_EACH_JOINT = ("joints", "limits")
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """The room that a robot takes as it starts, and how far it gets: what scenes are checked for, without a simulator.
+
+    Attributes:
+        body_boxes: what turns with the base, the arm's lowest link included: half sizes in x and y, and height up to
+            which it goes from the floor, of each box, m, with room to spare.
+        arm_at_start: start -> points along the arm's links from its base to the TCP, in the robot's root frame, m.
+        shoulder: height above the arm's base of the joint that reach is counted from, m.
+        reach: from there to the TCP of the stretched arm, m.
+    """
+
+    body_boxes: tuple[tuple[float, float, float], ...]
+    arm_at_start: Mapping[str, tuple[tuple[float, float, float], ...]]
+    shoulder: float
+    reach: float
 
 
 @dataclass(frozen=True)
@@ -42,6 +61,7 @@ class RobotDescription:
         finger_extension: how much longer the fingers are, m.
         finger_friction: of the finger tips.
         inverse_kinematics: import path of the arm's closed form (`planning.analytic`).
+        envelope: the room it takes; None: scenes are not checked for it.
 
     Raises:
         RobocasError: it has another number of joints.
@@ -79,6 +99,7 @@ class RobotDescription:
     finger_extension: float
     finger_friction: float
     inverse_kinematics: str = "robocas_ms3.planning.analytic:PandaGeometry"
+    envelope: Envelope | None = None
 
     def __post_init__(self) -> None:
         parts = {"base": self.base_slice, "arm": self.arm_slice, "finger": self.finger_slice}
@@ -105,6 +126,21 @@ class RobotDescription:
         return 2 * self.open_finger
 
 
+PANDA_ENVELOPE = Envelope(
+    body_boxes=((0.28, 0.23, 0.30), (0.15, 0.13, 0.64)),
+    arm_at_start={
+        "rest": (
+            *((0, 0, 0.49), (0, 0, 0.823), (-0.269, 0, 0.988), (-0.226, 0, 1.059), (0.15, 0, 1.172)),
+            *((0.237, 0, 1.16), (0.204, 0, 0.922)),
+        ),
+        "evaluation": (
+            *((0, 0, 0.49), (0, 0, 0.823), (0.05, -0.001, 1.135), (0.131, -0.004, 1.122), (0.51, -0.014, 1.019)),
+            *((0.576, -0.01, 1.077), (0.735, -0.021, 0.897)),
+        ),
+    },
+    shoulder=0.333,
+    reach=0.98,
+)
 MOBILE_PANDA = RobotDescription(
     uid="robocas_mobile_panda",
     base_joints=("base_x_joint", "base_y_joint", "base_yaw_joint"),
@@ -144,4 +180,5 @@ MOBILE_PANDA = RobotDescription(
     stock_tcp_in_hand=0.1034,
     finger_extension=0.03,  # moves the TCP to 0.1334 m from the hand
     finger_friction=0.99,
+    envelope=PANDA_ENVELOPE,
 )

@@ -15,24 +15,9 @@ from robocas_ms3.assets.pack import LoadedFurniture
 from robocas_ms3.config.task import TaskConfig
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.poses import transform
-from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.description import Envelope, RobotDescription
 from robocas_ms3.scenes.placement import Array, Region
 
-# What turns with the robot's base, the lowest link included: half sizes in x and y, height up to which it goes, m, with
-# room to spare
-BODY_BOXES = ((0.28, 0.23, 0.30), (0.15, 0.13, 0.64))
-# Along the arm's links from its base to the TCP as it starts, in the robot's root frame, m
-ARM_AT_START: dict[str, Array] = {
-    "rest": np.array(
-        [(0, 0, 0.49), (0, 0, 0.823), (-0.269, 0, 0.988), (-0.226, 0, 1.059), (0.15, 0, 1.172), (0.237, 0, 1.16)]
-        + [(0.204, 0, 0.922)]
-    ),
-    "evaluation": np.array(
-        [(0, 0, 0.49), (0, 0, 0.823), (0.05, -0.001, 1.135), (0.131, -0.004, 1.122), (0.51, -0.014, 1.019)]
-        + [(0.576, -0.01, 1.077), (0.735, -0.021, 0.897)]
-    ),
-}
-SHOULDER, REACH = 0.333, 0.98  # m: above the arm's base; from there to the TCP of an arm that is stretched
 _TOUCHING = 0.005  # m by which hulls may overlap: they are coarser than what is shown
 _STEP, _ALONG = 0.05, 0.01  # m between places of the base that are tried, and along the arm
 
@@ -64,6 +49,7 @@ def check_clearance(
     basket: tuple[LoadedFurniture, Array] | None,
     robot_pose: Array,
     region: tuple[Region, Array],
+    robot: RobotDescription,
 ) -> None:
     """Check that furniture, basket and robot don't overlap, and that basket and objects are within the arm's reach.
 
@@ -77,6 +63,7 @@ def check_clearance(
         basket: and its pose 4x4 in the world; None: there is none.
         robot_pose: 4x4 in the world, of the robot's root.
         region: for objects, and 4x4 of its frame in the world, with what has to be opened open.
+        robot: that is to work there; one without an envelope is not looked at.
 
     Raises:
         ConfigError: naming the two, and by how much.
@@ -91,16 +78,19 @@ def check_clearance(
         standing = Standing("basket", _world_hulls(*basket, {}))
         pairs += [(standing, other) for other in (*fixed, around)]
         fixed.append(standing)
-    if config.randomisation.robot is None:
-        pairs += [(_body(robot_pose), other) for other in (*fixed, around)]
+    envelope = robot.envelope
+    if envelope is not None and config.randomisation.robot is None:
+        pairs += [(_body(envelope, robot_pose), other) for other in (*fixed, around)]
     for one, other in pairs:
         deep = max((overlap(a, b) for a, b in _near(one, other)), default=0.0)
         if deep > _TOUCHING:
             fix = f"Move one of them by more than {deep:.2f} m" + ("." if other is around else ", or leave one out.")
             raise ConfigError(f"{one.key} and {other.key} overlap", expected="apart", found=f"{deep:.3f} m", fix=fix)
-    if config.randomisation.robot is None:
-        _check_arm(transform(robot_pose, _densely(ARM_AT_START[config.robot_start])), [*fixed, around])
-    _check_reach(config, basket, robot_pose, region)
+    if envelope is not None:
+        if config.randomisation.robot is None:
+            arm = np.array(envelope.arm_at_start[config.robot_start])
+            _check_arm(transform(robot_pose, _densely(arm)), [*fixed, around])
+        _check_reach(config, basket, robot_pose, region, robot, envelope)
 
 
 def overlap(one: Hull, other: Hull) -> float:
@@ -149,10 +139,10 @@ def _world_hulls(part: LoadedFurniture, pose: Array, joints: Mapping[str, float]
     return hulls
 
 
-def _body(robot_pose: Array) -> Standing:
+def _body(envelope: Envelope, robot_pose: Array) -> Standing:
     corners = np.array(list(product((-1.0, 1.0), (-1.0, 1.0), (0.0, 1.0))))
     sides = np.array([(0, 1, 2), (0, 1, 4), (0, 2, 4)])  # one along x, y and z each: those opposite add no axes
-    hulls = [Hull(transform(robot_pose, corners * box), sides) for box in BODY_BOXES]
+    hulls = [Hull(transform(robot_pose, corners * box), sides) for box in envelope.body_boxes]
     return Standing("robot", hulls)
 
 
@@ -180,24 +170,26 @@ def _check_reach(
     basket: tuple[LoadedFurniture, Array] | None,
     robot_pose: Array,
     region: tuple[Region, Array],
+    robot: RobotDescription,
+    envelope: Envelope,
 ) -> None:
     """Check that the nearest points of region and basket are where a stretched arm gets, or the base brings it."""
     moved = config.randomisation.robot
     slack = _STEP + (np.sqrt(2) * moved.position if moved else 0.0)
-    ranges = MOBILE_PANDA.base_limits[:2] if config.base_motion else ((0.0, 0.0),) * 2
+    ranges = robot.base_limits[:2] if config.base_motion else ((0.0, 0.0),) * 2
     spans = [np.arange(low, high + _STEP, _STEP) for low, high in ranges]
     x, y = (grid.ravel() for grid in np.meshgrid(*spans))
-    height = np.full(len(x), MOBILE_PANDA.arm_base_height + SHOULDER)
+    height = np.full(len(x), robot.arm_base_height + envelope.shoulder)
     shoulders = transform(robot_pose, np.stack([x, y, height], axis=1))
     area, frame = region
     low, high = np.array([*area.min_xy, area.z]), np.array([*area.max_xy, area.z])
     fix = "Move it or the robot" if config.base_motion else "Move it or the robot, or set base_motion"
-    _within(_distance(shoulders, frame, low, high), REACH + slack, f"surface {config.surface.name!r}", fix)
+    _within(_distance(shoulders, frame, low, high), envelope.reach + slack, f"surface {config.surface.name!r}", fix)
     if basket is not None:
         by = config.randomisation.basket
         corners = np.concatenate(basket[0].hulls)
         far = _distance(shoulders, basket[1], corners.min(axis=0), corners.max(axis=0))
-        _within(far, REACH + slack + (np.sqrt(2) * by.position if by else 0.0), "the basket", fix)
+        _within(far, envelope.reach + slack + (np.sqrt(2) * by.position if by else 0.0), "the basket", fix)
 
 
 def _within(distance: float, limit: float, what: str, fix: str) -> None:

@@ -12,6 +12,7 @@ from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, Pack
 from robocas_ms3.config.task import TaskConfig
 from robocas_ms3.poses import transform
+from robocas_ms3.robots.description import MOBILE_PANDA, RobotDescription
 from robocas_ms3.scenes.clearance import check_clearance
 from robocas_ms3.scenes.lookup import (
     check_joints,
@@ -56,8 +57,21 @@ class SceneModel:
     region: Region
 
     @classmethod
-    def load(cls, config: TaskConfig, object_pack: Pack, furniture_pack: Pack) -> SceneModel:
+    def load(
+        cls,
+        config: TaskConfig,
+        object_pack: Pack,
+        furniture_pack: Pack,
+        *,
+        robot: RobotDescription = MOBILE_PANDA,
+    ) -> SceneModel:
         """Look up all assets of a configuration.
+
+        Args:
+            config: the configuration.
+            object_pack: of its objects.
+            furniture_pack: of everything else.
+            robot: that is to work there.
 
         Raises:
             ConfigError: an asset is unknown or can't play its part, or where it stands it can't (`check_clearance`).
@@ -88,6 +102,7 @@ class SceneModel:
             (basket, model.basket_pose) if basket and model.basket_pose is not None else None,
             model.robot_pose,
             (model.region, model.support_pose @ model.support_motion(opened=True)),
+            robot,
         )
         return model
 

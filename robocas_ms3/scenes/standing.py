@@ -11,7 +11,7 @@ from robocas_ms3.assets.physics import TIME_STEP, Solid, add_body, add_fixed, en
 from robocas_ms3.config.randomisation import PoseRandomisation
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.poses import planar, transform
-from robocas_ms3.scenes.clearance import BODY_BOXES
+from robocas_ms3.robots.description import PANDA_ENVELOPE
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.settle import add_furniture
@@ -20,6 +20,7 @@ STAND_SECONDS = 1.0
 MAX_SHIFT, MAX_TURN_DEG = 0.005, 2.0  # meanwhile, of a basket that stands
 LOAD = 0.5  # kg, of something in it
 _TRIES = 50
+_BODY_BOXES = PANDA_ENVELOPE.body_boxes  # whatever robot: a layout follows from its configuration and seeds alone
 
 
 def place_robot(model: SceneModel, rng: np.random.Generator) -> Array:
@@ -85,7 +86,7 @@ def body_is_free(base_in_world: Array, cloud: Array) -> bool:
     """
     local = transform(np.linalg.inv(base_in_world), cloud)
     x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
-    inside = [(x <= half_x) & (y <= half_y) & (z <= height) for half_x, half_y, height in BODY_BOXES]
+    inside = [(x <= half_x) & (y <= half_y) & (z <= height) for half_x, half_y, height in _BODY_BOXES]
     return not ((z > 0) & np.logical_or.reduce(inside)).any()
 
 

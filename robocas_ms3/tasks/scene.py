@@ -99,7 +99,9 @@ class SceneEnv(SeededEnv):
                 found=f'"none", with obs_mode={kwargs["obs_mode"]!r}',
                 fix="Leave render_backend out.",
             )
-        self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack))
+        self.model = SceneModel.load(
+            self.task_config, load_pack(pack), load_pack(furniture_pack), robot=self.robot_spec.description
+        )
         self._visual_level: VisualLevel = visual_level
         self._resets = 0
         self._engine_errors: EngineErrors | None = None

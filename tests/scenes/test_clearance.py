@@ -1,6 +1,7 @@
 """Scenes that can't be are refused when they are loaded, saying which two things, by how much, and what to change."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from robocas_ms3.errors import ConfigError
 from robocas_ms3.paths import protocols_dir
 from robocas_ms3.robots.forward import chain
 from robocas_ms3.robots.table import PANDA
-from robocas_ms3.scenes.clearance import ARM_AT_START, REACH, SHOULDER, overlap
+from robocas_ms3.scenes.clearance import overlap
 from robocas_ms3.scenes.model import SceneModel
 
 
@@ -107,6 +108,16 @@ def test_overlaps_by_numbers_worked_out_by_hand():
         assert overlap(hull(one), hull(moved)) == pytest.approx(max(-gap, 0))
 
 
+def test_another_robot_is_judged_by_its_own_reach_and_one_of_which_nothing_is_known_is_not():
+    far = load_task_config("pick_table_scattered").model_dump(mode="json") | {"robot": at(0.7, -1.2, yaw=90)}
+    config, pack, panda = load_task_config(far), load_pack("builtin"), PANDA.description
+    longer = replace(panda, envelope=replace(panda.envelope, reach=2.0))
+    with pytest.raises(ConfigError, match="out of the arm's reach"):
+        SceneModel.load(config, pack, pack, robot=replace(panda, envelope=replace(panda.envelope, reach=1.0)))
+    for robot in (longer, replace(panda, envelope=None)):
+        SceneModel.load(config, pack, pack, robot=robot)
+
+
 def test_what_is_known_of_the_arm_is_so():
     urdf, robot = PANDA.files().urdf, PANDA.description
     base = chain(urdf, robot.root_link, robot.arm_base_link, np.zeros((1, 3)))[0]
@@ -118,9 +129,9 @@ def test_what_is_known_of_the_arm_is_so():
         tcp = base @ chain(urdf, robot.arm_base_link, robot.tcp_link, arm)[0]
         # the second link turns where the first does, the sixth where the fifth
         origins = np.array([base[:3, 3], *(links[i][:3, 3] for i in (0, 2, 3, 4, 6)), tcp[:3, 3]])
-        np.testing.assert_allclose(ARM_AT_START[start], origins, atol=1e-3)
+        np.testing.assert_allclose(robot.envelope.arm_at_start[start], origins, atol=1e-3)
     shoulder = chain(urdf, robot.arm_base_link, robot.arm_links[0], np.zeros((1, 1)))[0][:3, 3]
-    assert shoulder[2] == pytest.approx(SHOULDER)
+    assert shoulder[2] == pytest.approx(robot.envelope.shoulder)
     many = np.random.default_rng(0).uniform(*np.array(robot.arm_limits).T, (20_000, 7))
     far = np.linalg.norm(chain(urdf, robot.arm_base_link, robot.tcp_link, many)[:, :3, 3] - shoulder, axis=1).max()
-    assert REACH - 0.08 < far < REACH
+    assert robot.envelope.reach - 0.08 < far < robot.envelope.reach
