@@ -346,13 +346,14 @@ from asset_tools.visual import to_display
 from pathlib import Path
 start = time.process_time()
 scan = prepare(Path({str(path)!r}))
-to_display(scan.mesh, triangles=12000, texture_size=256)  # more texels cost as much whatever the faces are
+to_display(scan.mesh, triangles=1000)
+to_display(scan.mesh, triangles=12000, texture_size=1024)
 peak = re.search(r"VmHWM:\\s*(\\d+) kB", Path("/proc/self/status").read_text())[1]  # rusage has the parent's in it
 print(time.process_time() - start, int(peak) / 1024**2)
 pickle.dump(scan, open({str(tmp_path / "scan.pickle")!r}, "wb"))
 """
     seconds, gibibytes = map(float, subprocess.check_output([sys.executable, "-c", code]).split())
-    assert seconds < 30
+    assert seconds < 60
     assert gibibytes < 2
     import pickle
 

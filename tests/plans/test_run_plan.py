@@ -3,14 +3,14 @@
 import json
 import os
 import signal
-import subprocess
 import sys
 import time
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
 import pytest
+from faults import running
 from plan_stages import PLAN, MadeUp, assert_same, plan_faults, stages
 
 from robocas_ms3.datasets.checks.dataset import validate
@@ -25,7 +25,6 @@ from robocas_ms3.recordings.reading import TrajectoryFile
 from robocas_ms3.recordings.versions import versions
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
-SOON = 10  # s; on a machine that does nothing else it is 1.4, which is not for a test beside others to measure
 
 
 def run(out, plan=PLAN, jobs=1, stop_before_join=False, **more):
@@ -148,23 +147,9 @@ def test_a_folder_of_something_else_is_not_gone_on_with(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {".bashrc.old", "plan.json"}
 
 
-@contextmanager
 def in_a_process(out):
     """A run of two slots, in a process of its own and a group of processes of their own."""
-    path = os.pathsep.join(map(str, (SUPPORT, *sys.path)))
-    process = subprocess.Popen(
-        [sys.executable, SUPPORT / "plan_runner.py", out],
-        env={**os.environ, "PYTHONPATH": path},
-        start_new_session=True,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield process
-    finally:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.communicate()
+    return running([sys.executable, SUPPORT / "plan_runner.py", out])
 
 
 def wait_until(what, process):
@@ -196,22 +181,28 @@ def of_group(process, group):
         return False
 
 
-@pytest.mark.parametrize("seeds", [0, 2])
-def test_ctrl_c_ends_all_processes_soon_and_blames_no_seed(tmp_path, seeds):
-    out = tmp_path / "out"
+def interrupt(out, seeds):
+    """Press Ctrl-C once so many seeds are done; seconds until all processes are gone."""
     with in_a_process(out) as process:
         wait_until(lambda: (out / "plan.json").is_file() and seeds_done(out) >= seeds, process)
         time.sleep(0.3)  # processes that record or render are starting
         begun = time.monotonic()
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=30)
-        assert time.monotonic() - begun < SOON
         assert process.returncode != 0
         assert said.count("Traceback") <= 1  # the runner's own
         assert "KeyboardInterrupt" in said
         while alive(process.pid):  # an ending one of Python's own, which keeps track of semaphores, is the last
-            assert time.monotonic() - begun < SOON, alive(process.pid)
+            assert time.monotonic() - begun < 30, alive(process.pid)
+        took = time.monotonic() - begun
     assert not list(out.rglob("deaths.jsonl"))
+    return took
+
+
+@pytest.mark.parametrize("seeds", [0, 2])
+def test_ctrl_c_ends_all_processes_soon_and_blames_no_seed(tmp_path, seeds):
+    # alone it takes 1.4 s; a machine that is busy for a moment has two more goes
+    assert any(interrupt(tmp_path / f"{attempt}", seeds) < 3 for attempt in range(3))
 
 
 def cannot_begin(plan):
@@ -248,7 +239,7 @@ def test_a_machine_with_other_versions_does_no_unit(tmp_path):
 
 def test_killed_at_any_moment_it_goes_on_and_ends_the_same(undisturbed, tmp_path):
     out = tmp_path / "out"
-    for seeds in (1, 4):
+    for seeds in (0, 1, 4):
         with in_a_process(out) as process:
             wait_until(lambda seeds=seeds: (out / "plan.json").is_file() and seeds_done(out) >= seeds, process)
             os.killpg(process.pid, signal.SIGKILL)

@@ -25,14 +25,15 @@ def model(**changes) -> SceneModel:
     return SceneModel.load(load_task_config(data), pack, pack)
 
 
-def test_it_makes_the_same_layouts_and_ends_with_its_object():
+def test_it_makes_the_same_layouts_and_ends_with_its_object(monkeypatch):
+    monkeypatch.setattr("robocas_ms3.scenes.source._GRACE", 30)  # it leaves by itself, on a busy machine too
     scene = model()
     other = OtherProcess(scene)
     process = other._process
     for seed in (3, 4):
         np.testing.assert_array_equal(other.layout(3, seed).object_poses, sample_layout(scene, 3, seed).object_poses)
     del other
-    assert process.poll() is not None
+    assert process.poll() == 0
 
 
 def test_what_it_can_not_make_is_an_error_as_here_and_it_goes_on():

@@ -188,12 +188,19 @@ def test_a_real_dataset_is_valid(recorded, tmp_path, capsys):
 
 
 def test_the_benchmark_runs(recorded, monkeypatch, capsys):
-    """Every case; of pictures this small everything but rendering is what takes time."""
+    """Every case, and jobs; of pictures this small everything but rendering is what takes time."""
     pytest.importorskip("av", reason="needs the extra 'lerobot'")
     pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
     monkeypatch.syspath_prepend(Path(__file__).resolve().parents[3] / "benchmarks")
-    benchmark = importlib.import_module("convert")
-    benchmark.main(benchmark.Benchmark(recorded[0], episodes=2, turns=1, size=(32, 24)))
+    benchmark, used = importlib.import_module("convert"), []
+    converts = benchmark.convert_one
+
+    def convert_one(*args):  # whether more processes do it is tested elsewhere: each takes 10 s to begin
+        used.append(args[5] if len(args) > 5 else 1)
+        converts(*args[:5])
+
+    monkeypatch.setattr(benchmark, "convert_one", convert_one)
+    benchmark.main(benchmark.Benchmark(recorded[0], episodes=2, turns=1, size=(32, 24), jobs=2, jobs_episodes=2))
     report = json.loads(capsys.readouterr().out)
     assert report["steps"] == 2 * 4
     for name in benchmark.CASES:
@@ -202,6 +209,9 @@ def test_the_benchmark_runs(recorded, monkeypatch, capsys):
         bare = report["bare, depth" if "depth" in name else "bare"]
         assert case["over bare"] > 1
         assert 0 < bare["cpu ms a step"] < case["cpu ms a step"]
+    assert set(report["jobs"]["wall s"]) == {"1", "2"}
+    assert report["jobs"]["times as fast"] > 0
+    assert used[-2:] == [1, 2]
 
 
 def test_torch_has_one_thread_while_it_converts(recorded, tmp_path, monkeypatch):
