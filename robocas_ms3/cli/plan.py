@@ -84,10 +84,8 @@ def run(command: Run) -> int:
     """Run ``run``."""
     import os
 
-    from rich.console import Console
-    from rich.progress import Progress
-
-    from robocas_ms3.cli.bars import Log, columns, say
+    from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.plan_progress import PlanProgress
     from robocas_ms3.demos.checks import check_number
     from robocas_ms3.plans.engines import open_engine
     from robocas_ms3.plans.plan import load_plan
@@ -101,21 +99,7 @@ def run(command: Run) -> int:
         from robocas_ms3.datasets.writing.render import require_renderer
 
         require_renderer()
-    console = Console(stderr=True)
-    log = Log()
-    with Progress(*columns(), console=console, disable=not console.is_interactive) as progress:
-        bars = [progress.add_task(f"{part.name}", total=part.episodes) for part in plan.parts]
-
-        def on_progress(counts) -> None:
-            for bar, count in zip(bars, counts, strict=True):
-                progress.update(bar, completed=count)
-            if not console.is_interactive:
-                named = zip(plan.parts, counts, strict=True)
-                log.tell("; ".join(f"{part.name}: {count} of {part.episodes}" for part, count in named))
-
-        def on_stage(text: str) -> None:
-            progress.console.print(f"joining {text}", highlight=False)
-
+    with PlanProgress(plan, command.out) as progress:
         report = run_plan(
             plan,
             command.out,
@@ -123,8 +107,9 @@ def run(command: Run) -> int:
             resume=command.resume,
             overwrite=command.overwrite,
             jobs=jobs,
-            on_progress=on_progress,
-            on_stage=on_stage,
+            on_start=progress.begin,
+            on_progress=progress.at,
+            on_stage=progress.stage,
         )
     say(f"{command.out}: {count_of(report['episodes'], 'episode')}; report.json")
     return 0

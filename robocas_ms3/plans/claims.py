@@ -75,6 +75,43 @@ def refuse_claimed(folder: Path, within: float = 2 * LEASE) -> None:
                 raise PlanError("jobs of Slurm are at this plan", where=claim, found=found, fix=fix)
 
 
+@contextmanager
+def sole(path: Path, lease: float = LEASE) -> Iterator[None]:
+    """Hold the claim on what only one machine may do, and end this process if it is lost; see `claimed`.
+
+    On this machine a lock tells already that nobody else is there, so a claim of its own is one that was killed.
+
+    Raises:
+        PlanError: another machine holds it.
+    """
+    refuse_other(path, lease)
+    for old in _claims(path).values():  # those of this machine's dead, and what was given back
+        old.unlink(missing_ok=True)
+    try:
+        with claimed(path, lease):
+            yield
+    finally:
+        for old in _claims(path).values():
+            old.unlink(missing_ok=True)
+
+
+def refuse_other(path: Path, lease: float = LEASE) -> None:
+    """See that no other machine holds a claim.
+
+    Raises:
+        PlanError: one does.
+    """
+    claims = _claims(path)
+    if not claims:
+        return
+    claim = claims[max(claims)]
+    with suppress(FileNotFoundError):
+        host = claim.read_text(encoding="utf-8").split(" ")[0]
+        if host != socket.gethostname() and claim.stat().st_mtime > 0 and (age := _age(claim)) < lease:
+            found, fix = f"{host}, {age:.0f} s ago", f"Wait until it is done, or was dead for {lease:.0f} s."
+            raise PlanError("another machine runs this plan", where=path.parent, found=found, fix=fix)
+
+
 class _Keeper:
     """Renews a claim, and says when it is lost; two threads, as a file server that hangs holds one up."""
 
@@ -123,7 +160,7 @@ def _take(path: Path, token: str, lease: float) -> Path:
     make_folder(path.parent)
     said = False
     while True:
-        last = max((int(name.suffix[1:]) for name in path.parent.glob(f"{path.name}.[0-9]*")), default=0)
+        last = max(_claims(path), default=0)
         if not last or _age(_numbered(path, last)) >= lease:
             claim = _numbered(path, last + 1)
             with suppress(FileExistsError), claim.open("x", encoding="utf-8") as file:
@@ -133,6 +170,11 @@ def _take(path: Path, token: str, lease: float) -> Path:
             said = True
             _log.warning("waiting: another process is at %s", path)
         time.sleep(min(2.0, lease / 10))
+
+
+def _claims(path: Path) -> dict[int, Path]:
+    """Number -> file of the claims on something."""
+    return {int(name.suffix[1:]): name for name in path.parent.glob(f"{path.name}.[0-9]*")}
 
 
 def _numbered(path: Path, number: int) -> Path:

@@ -1,4 +1,4 @@
-"""Joins what the units made: demonstrations part by part, and datasets of all of them."""
+"""Joins what the units made: layouts and demonstrations part by part, and datasets of all of them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from robocas_ms3.datasets.sources.provenance import recording_entry
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings, header
 from robocas_ms3.documents import load_json
-from robocas_ms3.files import make_folder, replacing, write_json
+from robocas_ms3.files import flush_to_disk, make_folder, replacing, write_json
 from robocas_ms3.outputs import sweep
 from robocas_ms3.plans.plan import Plan
+from robocas_ms3.plans.sides import rule_of, sides_of
 from robocas_ms3.plans.units import EPISODES, REPORT, UNITS, Outcome, Task, Unit
 from robocas_ms3.recordings.merging import merge
 from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.scenes.frozen import join_frozen
 
-DEMOS, DATASETS, STATISTICS = "demos", "datasets", "statistics"
+LAYOUTS, DEMOS, DATASETS, STATISTICS = "layouts", "demos", "datasets", "statistics"
 TRAJECTORY = "trajectory.h5"
 Chosen = Mapping[int, Sequence[tuple[Unit, Outcome]]]
 """Part -> its episodes, in the order of their seeds."""
@@ -36,7 +38,7 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Callable[[str
         out: its folder.
         chosen: the episodes.
         jobs: processes.
-        say: called with what is joined.
+        say: called with what is done.
 
     Returns:
         The report.
@@ -46,26 +48,42 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Callable[[str
             number: [Task(number, outcome.seed, unit.folder(plan, out)) for unit, outcome in episodes]
             for number, episodes in chosen.items()
         }
+        if plan.makes_layouts:
+            say("joining layouts")
+            _join_layouts(plan, out / LAYOUTS, tasks)
         robocas = out / DATASETS / "robocas"
         if plan.makes_datasets and not (robocas / schema.DATA_INFO_FILE).is_file():
-            say("the dataset")
+            say("joining the dataset")
             _join_episodes(plan, robocas, tasks)
-        for number, recorded in tasks.items():
+        for number, recorded in tasks.items() if plan.makes_demonstrations else ():
             path = make_folder(out / DEMOS / f"{plan.parts[number].name}") / TRAJECTORY
             sweep(path.parent)
             if not path.is_file():
-                say(f"demonstrations, {plan.parts[number].name}")
+                say(f"joining demonstrations, {plan.parts[number].name}")
                 merge([task.recording for task in recorded], path)
         if plan.makes_datasets and "lerobot" in plan.formats:
-            say("the LeRobot dataset")
+            say("making the LeRobot dataset")
             _convert_lerobot(robocas, out / DATASETS / "lerobot", jobs)
         if "statistics" in plan.stages:
-            say("statistics")
+            say("drawing statistics")
             _write_statistics(robocas, out / STATISTICS)
         write_json(out / REPORT, _report(plan, chosen))
+    flush_to_disk(out)
     for path in [*(out / UNITS).glob("*/*/seed_*"), *(out / UNITS).glob(f"*/*/{EPISODES}")]:
         shutil.rmtree(path) if path.is_dir() else path.unlink()  # they are joined, or more than were asked for
     return load_json(out / REPORT)
+
+
+def has_begun(out: Path) -> bool:
+    """Whether files of units have been moved already."""
+    return (out / DATASETS).exists() or (out / DEMOS).exists() or (out / REPORT).is_file()
+
+
+def _join_layouts(plan: Plan, out: Path, tasks: Mapping[int, Sequence[Task]]) -> None:
+    make_folder(out)
+    sweep(out)
+    for number, made in tasks.items():
+        join_frozen(out / f"{plan.parts[number].name}.npy", [task.layout for task in made])
 
 
 def _join_episodes(plan: Plan, out: Path, tasks: Mapping[int, Sequence[Task]]) -> None:
@@ -85,8 +103,8 @@ def _join_episodes(plan: Plan, out: Path, tasks: Mapping[int, Sequence[Task]]) -
                 entry = recording_entry(file, 0)
             entries[str(number)] = {**entry, **joined, "trajectory_episode": place}
     settings = dataset_settings(plan.rate, plan.pictures.chosen(), plan.embeddings)
-    write_json(out / schema.CONVERSION_FILE, {**header(settings), "episodes": entries})
-    write_info(out)
+    write_json(out / schema.CONVERSION_FILE, {**header(settings, rule_of(plan)), "episodes": entries})
+    write_info(out, sides_of(plan, out))
 
 
 def _say_source(path: Path, source: dict[str, Any]) -> None:

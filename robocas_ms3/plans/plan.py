@@ -12,50 +12,15 @@ from pydantic import Field, field_validator, model_validator
 from robocas_ms3.assets.pack import pack_folders
 from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config import load_config_of
-from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import PlanError, RobocasError
 from robocas_ms3.paths import plans_dir
+from robocas_ms3.plans.settings import LimitsConfig, PartConfig, PicturesConfig, RecordingConfig, SplitConfig
 from robocas_ms3.recordings.seeds import GREATEST_SEED
 from robocas_ms3.strict import StrictModel, nearest, parse
 
-
-class PartConfig(StrictModel):
-    """Episodes of one configuration."""
-
-    task: str
-    config: str | dict[str, Any] | None = Field(
-        default=None, description="a shipped configuration, a YAML file beside the plan, or the whole of one"
-    )
-    pack: str = "builtin"
-    episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(description="successful ones")
-    seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)] = Field(default=0, description="the first; others follow")
-    name: Annotated[str, Field(pattern=r"^[\w-]+$")] | None = Field(default=None, description="of its folders")
-
-
-class PicturesConfig(StrictModel):
-    """What is rendered."""
-
-    size: tuple[Annotated[int, Field(ge=16)], Annotated[int, Field(ge=16)]] = (640, 480)
-    depth: bool = True
-    image_format: Literal["png", "jpg", "webp"] = "png"
-    cameras: list[str] | None = None
-
-    def chosen(self) -> Pictures:
-        """For writers of datasets."""
-        cameras = {} if self.cameras is None else {"cameras": tuple(self.cameras)}
-        return Pictures(size=self.size, depth=self.depth, image_format=self.image_format, **cameras)
-
-
-class LimitsConfig(StrictModel):
-    """What an episode may take; beyond it, its process is ended, and it is tried once more."""
-
-    record_seconds: Annotated[float, Field(gt=0)] = 1800.0
-    render_seconds: Annotated[float, Field(gt=0)] = 3600.0
-    memory_gb: Annotated[float, Field(gt=0)] = Field(default=8.0, description="of each process")
-
-
-Stage = Literal["demonstrations", "datasets", "statistics"]
+Stage = Literal["layouts", "demonstrations", "datasets", "statistics"]
+_NEEDS = {"datasets": "demonstrations", "statistics": "datasets"}
 
 
 class Plan(StrictModel):
@@ -65,10 +30,12 @@ class Plan(StrictModel):
     parts: Annotated[list[PartConfig], Field(min_length=1)]
     stages: Annotated[list[Stage], Field(min_length=1)] = ["demonstrations", "datasets", "statistics"]
     formats: list[Literal["robocas", "lerobot"]] = ["robocas"]
+    recording: RecordingConfig = RecordingConfig()
     pictures: PicturesConfig = PicturesConfig()
     rate: Annotated[float, Field(gt=0)] = Field(default=5.0, description="steps of a dataset a second")
     control_freq: int = 20
     embeddings: bool = True
+    split: SplitConfig | None = Field(default=None, description="default: as `robocas convert` has it, 90 : 10 by seed")
     block: Annotated[int, Field(ge=1, le=1000)] = Field(default=10, description="seeds of a unit of work")
     limits: LimitsConfig = LimitsConfig()
 
@@ -81,13 +48,25 @@ class Plan(StrictModel):
 
     @model_validator(mode="after")
     def _stages_fit(self) -> Plan:
-        missing = {"datasets": "demonstrations", "statistics": "datasets"}
         for stage in self.stages:
-            if stage in missing and missing[stage] not in self.stages:
-                raise ValueError(f"stages: {stage} needs {missing[stage]}")
+            if _NEEDS.get(stage, stage) not in self.stages:
+                raise ValueError(f"stages: {stage} needs {_NEEDS[stage]}")
         if "lerobot" in self.formats and not self.makes_datasets:
             raise ValueError("formats: lerobot needs the stage datasets")
+        free = {part.task for part in self.parts if part.split is None}
+        if self.split and self.split.by == "task" and len(free) < 2:
+            raise ValueError("split: by task needs parts of two tasks that name no side")
         return self
+
+    @property
+    def makes_layouts(self) -> bool:
+        """Whether layouts are kept."""
+        return "layouts" in self.stages
+
+    @property
+    def makes_demonstrations(self) -> bool:
+        """Whether episodes are recorded."""
+        return "demonstrations" in self.stages
 
     @property
     def makes_datasets(self) -> bool:

@@ -1,4 +1,4 @@
-"""Records the episode of a seed, in a process of a slot."""
+"""Makes the layout of a seed and records its episode, in a process of a slot."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Any
 
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import write_json
+from robocas_ms3.plans.layouts import LayoutMaker
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import Task
 from robocas_ms3.processes import use_one_torch_thread
@@ -20,7 +22,8 @@ def settings_of(plan: Plan, part: int) -> EpisodeSettings:
     one = plan.parts[part]
     assert one.config is not None  # a loaded plan names all
     rate = int(plan.rate) if plan.rate == int(plan.rate) else 5  # actions are tried as the dataset will hold them
-    return EpisodeSettings(one.task, one.config, one.pack, plan.control_freq, replay_rate=rate)
+    chosen = {"control_freq": plan.control_freq, "replay_rate": rate, **plan.recording.chosen()}
+    return EpisodeSettings(one.task, one.config, one.pack, **chosen)
 
 
 class Records:
@@ -31,16 +34,33 @@ class Records:
         self._plan = plan
         self._settings: EpisodeSettings | None = None
         self._generator: EpisodeGenerator | None = None
+        self._layouts: LayoutMaker | None = None
 
     def do(self, task: Task) -> dict[str, Any]:
-        """Record a seed's episode, and say what came of it."""
+        """Make a seed's layout and record its episode, whatever is asked for, and say what came of it."""
         begun = _cpu_seconds()
-        if not task.recording.is_file():  # else it was killed between this and the ledger's line
+        self._turn_to(settings_of(self._plan, task.part))
+        found = self._make_layout(task)
+        if found["success"] and self._plan.makes_demonstrations:
+            found = self._record(task)
+        return {**found, "record_seconds": round(_cpu_seconds() - begun, 2)}
+
+    def _make_layout(self, task: Task) -> dict[str, Any]:
+        if self._layouts is not None:
+            try:
+                self._layouts.write(task)
+            except LayoutError as error:
+                return {"success": False, "failures": [f"layout: {error.what}"]}
+        return {"success": True}
+
+    def _record(self, task: Task) -> dict[str, Any]:
+        assert self._generator is not None
+        if not task.recording.is_file():  # else its process died after it was there
             made = task.recording.with_name(f".{task.recording.stem}.tmp.h5")
-            result = self._of(task).generate(task.seed, task.folder, made.stem)
+            result = self._generator.generate(task.seed, task.folder, made.stem)
             failures = [f"{failure.stage}: {failure.reason}" for failure in result.failures]
             if not result.success:
-                return {"failures": failures, "record_seconds": round(_cpu_seconds() - begun, 2)}
+                return {"success": False, "failures": failures}
             _forget_clock(made, failures)
             os.replace(made.with_suffix(".json"), task.recording.with_suffix(".json"))
             os.replace(made, task.recording)
@@ -49,21 +69,21 @@ class Records:
             "success": True,
             "steps": said["elapsed_steps"],
             "failures": said["robocas"]["failed_attempts"],
-            "record_seconds": round(_cpu_seconds() - begun, 2),
         }
 
-    def _of(self, task: Task) -> EpisodeGenerator:
-        settings = settings_of(self._plan, task.part)
-        if self._generator is None or settings != self._settings:
-            self.close()
-            self._settings, self._generator = settings, EpisodeGenerator(settings)
-        return self._generator
+    def _turn_to(self, settings: EpisodeSettings) -> None:
+        if settings == self._settings:
+            return
+        self.close()
+        self._layouts = LayoutMaker(settings) if self._plan.makes_layouts else None
+        self._generator = EpisodeGenerator(settings) if self._plan.makes_demonstrations else None
+        self._settings = settings
 
     def close(self) -> None:
         """Close the environments."""
         if self._generator is not None:
             self._generator.close()
-            self._generator = None
+        self._settings = self._generator = None
 
 
 def _forget_clock(recording: Path, failures: list[str]) -> None:

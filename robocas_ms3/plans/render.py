@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,12 +35,11 @@ class Renders:
     def do(self, task: Task) -> dict[str, Any]:
         """Render a seed's episode, and say what it takes."""
         begun = time.process_time()
-        size = 0
-        if not task.episode.is_dir():
+        if not task.episode.is_dir():  # else its process died after it was there
             player = self._showing(task)
             embed = self._embed if self._plan.embeddings else None
-            size = write_episode(task.episode.parent, 0, player, 0, embed=embed).size
-        return {"render_seconds": round(time.process_time() - begun, 2), "size": size or _size(task.episode)}
+            write_episode(task.episode.parent, 0, player, 0, embed=embed)
+        return {"render_seconds": round(time.process_time() - begun, 2)}
 
     def _showing(self, task: Task) -> RecordingPlayer:
         if self._player is None or self._part != task.part:
@@ -65,7 +63,3 @@ class Renders:
         if self._player is not None:
             self._player.close()
             self._player = None
-
-
-def _size(folder: Path) -> int:
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

@@ -23,11 +23,13 @@ from robocas_ms3.outputs import (
 )
 from robocas_ms3.plans.begun import check_plan_of, content_of
 from robocas_ms3.plans.checks import check_plan
+from robocas_ms3.plans.claims import refuse_other, sole
 from robocas_ms3.plans.engines import Engine
-from robocas_ms3.plans.join import join
+from robocas_ms3.plans.join import has_begun, join
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.tally import Tally, tally_path
-from robocas_ms3.plans.units import PLAN, Outcome, Unit, outcomes
+from robocas_ms3.plans.units import DRIVER, PLAN, Outcome, Task, Unit, outcomes
+from robocas_ms3.words import count_of
 
 _AHEAD = 2  # units a slot that are under way, so that none waits for the next
 _LOOK = 1.0  # s between two looks at what is under way
@@ -59,7 +61,7 @@ def run_plan(
         jobs: processes that join.
         on_start: called once plan and output turned out right.
         on_progress: called now and then.
-        on_stage: called with what is joined.
+        on_stage: called with what is done now, when that changes.
 
     Returns:
         The report: what is in ``report.json``.
@@ -74,17 +76,17 @@ def run_plan(
         check_overwrite(out, (PLAN,), "made by `robocas plan run`", PlanError)
         check_run(out / PLAN, "versions", "plan run", PlanError)
     with locked_folder(out):
+        refuse_other(out / DRIVER)
         claim_output(out, overwrite=overwrite, resume=resume)
         if is_taken(out):
             check_plan_of(out, plan)
         sweep(make_folder(out))
-        write_json(out / PLAN, content_of(plan))
-        on_start()
-        parts = [_Part(plan, number) for number in range(len(plan.parts))]
-        engine = open_engine(plan, out)
-        with while_there(out / PLAN, PlanError):
+        with while_there(out / PLAN, PlanError), sole(out / DRIVER):
+            write_json(out / PLAN, content_of(plan))
+            on_start()
+            engine = open_engine(plan, out)
             try:
-                _do_units(plan, out, engine, parts, on_progress)
+                parts = _do_all(plan, out, engine, on_progress, on_stage)
             finally:
                 engine.close()
             return join(plan, out, {part.number: list(part.chosen()) for part in parts}, jobs=jobs, say=on_stage)
@@ -153,6 +155,32 @@ class _Part:
                 if outcome.success and left:
                     left -= 1
                     yield Unit(self.number, block), outcome
+
+
+def _do_all(
+    plan: Plan, out: Path, engine: Engine, on_progress: OnProgress, on_stage: Callable[[str], None]
+) -> list[_Part]:
+    """Do units until there are enough episodes, all of whose files are as they were written."""
+    while True:
+        parts = [_Part(plan, number) for number in range(len(plan.parts))]
+        _do_units(plan, out, engine, parts, on_progress)
+        damaged = {} if has_begun(out) else _damaged(plan, out, parts)
+        if not damaged:
+            return parts
+        count = sum(map(len, damaged.values()))
+        on_stage(f"{count_of(count, 'episode')} again: their files are not what was written")
+        for unit, seeds in damaged.items():
+            unit.forget(plan, out, seeds)
+
+
+def _damaged(plan: Plan, out: Path, parts: Sequence[_Part]) -> dict[Unit, list[int]]:
+    """Seeds of units whose files have other sizes than they had, as those of a disk with errors may."""
+    found: dict[Unit, list[int]] = {}
+    for part in parts:
+        for unit, outcome in part.chosen():
+            if Task(unit.part, outcome.seed, unit.folder(plan, out)).size() != outcome.size:
+                found.setdefault(unit, []).append(outcome.seed)
+    return found
 
 
 def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_progress: OnProgress) -> None:

@@ -95,12 +95,14 @@ class Slot:
 
     def _seed(self, task: Task) -> Outcome:
         limits = self._plan.limits
+        task.clear()
         recorded = self._survive(self._record, "record", task, limits.record_seconds)
         known: dict[str, Any] = {"success": False} | recorded
         if known["success"] and self._plan.makes_datasets:
             known |= self._survive(self._render, "render", task, limits.render_seconds)
             known["success"] = known["success"] and task.episode.is_dir()
-        return Outcome(seed=task.seed, at=time.time(), **known)
+        size = task.size() if known["success"] else 0
+        return Outcome(seed=task.seed, at=time.time(), size=size, **known)
 
     def _survive(self, child: Child[Task, dict[str, Any]], stage: str, task: Task, seconds: float) -> dict[str, Any]:
         """A stage of an episode; a seed whose process died is begun again, and left out if it dies again."""

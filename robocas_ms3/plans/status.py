@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ class PartStatus:
         tried: seeds.
         failed: ``stage: reason`` -> how many seeds failed for it in the end.
         record_seconds, render_seconds: CPU time an episode, s.
-        bytes: of pictures and arrays.
+        bytes: of their files.
     """
 
     name: str
@@ -43,7 +44,8 @@ class Status:
     Attributes:
         parts: of it.
         episodes_an_hour: of the last ten minutes before the last episode.
-        seconds_left: until all episodes are there, at that rate; None: not known.
+        seconds_left: until all episodes are there, if they take the CPU time that those of their part took; None: not
+            known.
         idle_seconds: since the last episode; None: there is none.
         finished: whether everything is joined.
     """
@@ -66,21 +68,22 @@ def status(out: Path) -> Status:
         PlanError: no plan was begun there.
     """
     plan = read_plan(out)
-    parts, times = [], []
+    parts: list[PartStatus] = []
+    times: list[tuple[float, int]] = []  # when an episode was done, of which part
     for number, part in enumerate(plan.parts):
         tally = Tally.read(tally_path(out, f"{part.name}"))
         for unit in begun(plan, out, number):  # those under way, and those that were done just now
             if unit.block not in tally.blocks:
                 tally.add(unit.block, outcomes(unit.folder(plan, out)).values())
-        times += tally.times
+        times += [(at, number) for at in tally.times]
         parts.append(_part(f"{part.name}", part.episodes, tally))
-    rate = _rate(sorted(times))
-    left = sum(part.wanted - part.done for part in parts)
+    lately, seconds = _lately(sorted(times))
+    left = _seconds_left(parts, lately, seconds)
     return Status(
         parts,
-        round(3600 * rate, 1),
-        round(left / rate, 1) if rate else None,
-        round(max(0.0, time.time() - max(times)), 1) if times else None,
+        round(3600 * len(lately) / seconds, 1) if seconds else 0.0,
+        None if left is None else round(left, 1),
+        round(max(0.0, time.time() - max(times)[0]), 1) if times else None,
         (out / REPORT).is_file(),
     )
 
@@ -99,7 +102,23 @@ def _part(name: str, wanted: int, tally: Tally) -> PartStatus:
     )
 
 
-def _rate(times: list[float]) -> float:
-    """Episodes a second, by when they were done; 0 where that is not known."""
-    recent = [at for at in times if at > times[-1] - RECENT]
-    return (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 and recent[-1] > recent[0] else 0.0
+def _lately(times: list[tuple[float, int]]) -> tuple[list[int], float]:
+    """Parts of the episodes that were done of late, and the seconds they took; 0 s where that is not known."""
+    recent = [(at, part) for at, part in times if at > times[-1][0] - RECENT]
+    if len(recent) < 2 or recent[-1][0] <= recent[0][0]:
+        return [], 0.0
+    return [part for _, part in recent[1:]], recent[-1][0] - recent[0][0]
+
+
+def _seconds_left(parts: Sequence[PartStatus], lately: Sequence[int], seconds: float) -> float | None:
+    """Time until all is done: what is left costs what episodes of its part cost, or those of all where it has none."""
+    if not lately:
+        return None
+    done = sum(part.done for part in parts)
+    spent = [(part.record_seconds + part.render_seconds) * part.done for part in parts]
+    mean = sum(spent) / max(1, done)
+    cost = [each / part.done if part.done else mean for each, part in zip(spent, parts, strict=True)]
+    if not mean:  # nothing says what they cost
+        cost = [1.0] * len(parts)
+    left = sum(each * (part.wanted - part.done) for each, part in zip(cost, parts, strict=True))
+    return left * seconds / max(1e-9, sum(cost[part] for part in lately))

@@ -23,7 +23,7 @@ class Tally:
         tried, good: seeds, and those of them with an episode.
         failed: ``stage: reason`` -> how many seeds failed for it in the end.
         record_seconds, render_seconds: CPU time of all, s.
-        size: bytes of pictures and arrays.
+        size: bytes of the files of episodes.
         times: when episodes were done, s since 1970; written of the last `RECENT` before the last one.
     """
 

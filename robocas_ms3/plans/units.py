@@ -6,7 +6,8 @@ other files are episodes that wait to be joined. A unit that is done says so in 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shutil
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +19,8 @@ PLAN, REPORT = "plan.json", "report.json"
 UNITS, LEDGER, DEATHS, DONE = "units", "seeds.jsonl", "deaths.jsonl", "done.json"
 CLAIMS = Path("slurm", "claims")
 """Folder in the plan's, of the claims that jobs of Slurm have on units."""
+DRIVER = ".driver"
+"""Claim in the plan's folder, of who runs it."""
 EPISODES = "episodes"
 """Folder of a unit with its rendered episodes."""
 
@@ -48,6 +51,13 @@ class Unit:
         """Where its files lie."""
         return out / UNITS / f"{plan.parts[self.part].name}" / f"{self.block:05d}"
 
+    def forget(self, plan: Plan, out: Path, seeds: Collection[int]) -> None:
+        """Forget what came of some seeds, which are then done again; nobody may be at the unit."""
+        folder = self.folder(plan, out)
+        (folder / DONE).unlink(missing_ok=True)
+        lines = ledger(folder)
+        lines.rewrite(outcome for outcome in lines.read() if outcome.seed not in seeds)
+
 
 @dataclass(frozen=True)
 class Task:
@@ -58,6 +68,11 @@ class Task:
     folder: Path
 
     @property
+    def layout(self) -> Path:
+        """Its layout."""
+        return self.folder / f"seed_{self.seed:010d}.npy"
+
+    @property
     def recording(self) -> Path:
         """Its recorded episode."""
         return self.folder / f"seed_{self.seed:010d}.h5"
@@ -66,6 +81,17 @@ class Task:
     def episode(self) -> Path:
         """Its rendered episode."""
         return self.folder / EPISODES / f"{self.seed:010d}" / episode_folder(0)
+
+    def size(self) -> int:
+        """Bytes of all its files."""
+        files = [*self.folder.glob(f"seed_{self.seed:010d}.*"), *self.episode.rglob("*")]
+        return sum(path.stat().st_size for path in files if path.is_file())
+
+    def clear(self) -> None:
+        """Delete its files: of a seed without a line in the ledger they may not be whole, after a power cut."""
+        for path in self.folder.glob(f"seed_{self.seed:010d}.*"):
+            path.unlink()
+        shutil.rmtree(self.episode.parent, ignore_errors=True)
 
 
 @dataclass(frozen=True)
@@ -78,7 +104,7 @@ class Outcome:
         steps: its length in control steps.
         failures: ``stage: reason`` of each attempt that failed.
         record_seconds, render_seconds: CPU time, of the processes that did it.
-        size: bytes in the dataset.
+        size: bytes of its files.
         at: when it was done, s since 1970, of the machine that did it.
     """
 

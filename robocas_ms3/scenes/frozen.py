@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.documents import DAMAGED
 from robocas_ms3.errors import LayoutError
@@ -59,3 +60,20 @@ def write_frozen(path: Path, names: Collection[str], layouts: Mapping[int, Layou
     records = as_records(sorted(names), {(seed, seed): layout for seed, layout in layouts.items()})
     with replacing(path) as tmp, tmp.open("wb") as file:
         np.save(file, records)
+
+
+def join_frozen(path: Path, parts: Sequence[Path]) -> None:
+    """Join files of one configuration's layouts, in the order given; see `FrozenLayouts`.
+
+    Raises:
+        LayoutError: one of them is damaged, or of another configuration.
+    """
+    pieces: list[NDArray[np.void]] = []
+    for part in parts:
+        try:
+            pieces.append(np.load(part, allow_pickle=False))
+            check_record(np.concatenate([pieces[0][:0], pieces[-1][:0]]).dtype)  # texts may be of other lengths
+        except (*DAMAGED, IndexError, KeyError, TypeError) as error:
+            raise LayoutError("no frozen layouts", where=part, found=error) from error
+    with replacing(path) as tmp, tmp.open("wb") as file:
+        np.save(file, np.concatenate(pieces))
