@@ -5,4 +5,5 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bin=${ROBOCAS_VENV:-.venv}/bin
 export OMP_NUM_THREADS=1
-exec "$bin/python" -W ignore benchmarks/soak.py --jobs "$(nproc)" "$@"
+jobs=$(env -u OMP_NUM_THREADS nproc)  # which would count those
+exec "$bin/python" -W ignore benchmarks/soak.py --jobs "$jobs" "$@"

@@ -1,13 +1,15 @@
 """Plans as files: what is wrong with one is a line; the shipped ones are whole."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pytest
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.errors import ConfigError, PlanError
+from robocas_ms3.errors import ConfigError, ExtensionError, PlanError, RobocasError
+from robocas_ms3.plans.checks import check_plan
 from robocas_ms3.plans.plan import load_plan, most_seeds, shipped_plans
-from robocas_ms3.plans.status import status
+from robocas_ms3.plans.record import settings_of
+from robocas_ms3.plans.status import PartStatus, _seconds_left, status
 from robocas_ms3.plans.tally import Tally, tally_path
 from robocas_ms3.plans.units import LEDGER, PLAN, Outcome, Unit, ledger
 
@@ -77,6 +79,10 @@ def test_a_configuration_beside_the_plan_is_taken_whole(written, tmp_path):
             "one name",
         ),
         (GOOD + "pictures: {cameras: [nose]}\n", "no such camera"),
+        (GOOD + "split: {val_share: 1.5}\n", "split.val_share"),
+        (GOOD + "split: {by: task}\n", "by task needs parts of two tasks"),
+        (GOOD + "recording: {noise: 3}\n", "unknown key 'recording.noise'.*Did you mean noise_mm"),
+        ("parts:\n  - {task: pick, episodes: 1, split: both}\n", "parts.0.split"),
         ("parts:\n  - {task: pick, episodes: 1, name: ../up}\n", "parts.0.name"),
         (
             "parts:\n  - {task: pick, episodes: 1, name: a}\n  - {task: pick, episodes: 1, name: a}\n",
@@ -136,6 +142,33 @@ def test_status_is_read_from_the_folder_alone(written, tmp_path, capsys):
     assert asdict(status(out)) | {"idle_seconds": 0} == asdict(found) | {"idle_seconds": 0}
     tally_path(out, "a").write_text('{"blocks": [0], "tried": "x"}')
     assert status(out).parts[0].tried == 1  # a damaged one is none
+
+
+def test_what_is_left_costs_what_its_part_costs():
+    def part(name, wanted, done, seconds):
+        return PartStatus(name, wanted, done, done, {}, seconds, 0.0, 0)
+
+    parts = [part("pick", 10, 10, 2.0), part("search", 5, 1, 20.0), part("select", 3, 0, 0.0)]
+    # of late: ten picks and a search, 40 CPU s in 20 s; left: four searches, and three of a mean of 40 / 11
+    left = 4 * 20.0 + 3 * 40.0 / 11
+    assert _seconds_left(parts, [0] * 10 + [1], 20.0) == pytest.approx(left / 2)
+    assert _seconds_left(parts, [], 0.0) is None
+    free = [part("a", 10, 4, 0.0)]  # nothing says what they cost
+    assert _seconds_left(free, [0, 0], 4.0) == pytest.approx(12.0)
+
+
+def test_a_recording_s_settings_are_the_plan_s(written):
+    text = "rate: 10\ncontrol_freq: 20\nrecording: {noisy_trials: 0, max_attempts: 3}\n"
+    settings = settings_of(load_plan(written(GOOD + text)), 0)
+    assert (settings.replay_rate, settings.noisy_trials, settings.max_attempts) == (10, 0, 3)
+    assert settings == replace(settings_of(load_plan(written(GOOD)), 0), replay_rate=10, noisy_trials=0, max_attempts=3)
+
+
+def test_a_recording_s_settings_are_checked_before_it_begins(written):
+    with pytest.raises(ExtensionError, match="no such planner"):
+        check_plan(load_plan(written(GOOD + "recording: {planner: mplip}\nembeddings: false\n")))
+    with pytest.raises(RobocasError, match="max_attempts: this number is out of range"):
+        check_plan(load_plan(written(GOOD + "recording: {max_attempts: 0}\nembeddings: false\n")))
 
 
 def test_a_tally_keeps_the_times_of_ten_minutes(tmp_path):

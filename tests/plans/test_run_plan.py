@@ -16,6 +16,8 @@ from plan_stages import PLAN, MadeUp, assert_same, plan_faults, stages
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.errors import MissingExtraError, OutputExistsError, PlanError
+from robocas_ms3.files import write_json
+from robocas_ms3.plans.begun import content_of
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.run import _Part, run_plan
 from robocas_ms3.plans.slot import Slot, Stages
@@ -135,6 +137,36 @@ def test_a_line_of_a_ledger_that_was_damaged_is_done_again(undisturbed, tmp_path
     path.write_text(f"{first}\n{{garbage\n{third}\n")
     run(out, resume=True)
     assert_same(undisturbed, out)
+
+
+def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    run(out, stop_before_join=True)
+    files = Unit(0, 0).folder(PLAN, out)
+    picture = sorted((files / "episodes").glob("*11/episode_*/**/*.png"))[0]
+    cut = [*files.glob("seed_*10.h5"), picture, *files.glob("seed_*12.json")]
+    for path, length in zip(cut, (1000, 50, 0), strict=True):
+        os.truncate(path, length)
+    said = []
+    run(out, resume=True, on_stage=said.append)
+    assert said[0] == "3 episodes again: their files are not what was written"
+    assert_same(undisturbed, out)
+
+
+def test_a_plan_on_another_machine_is_left_alone(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    write_json(out / "plan.json", content_of(PLAN))
+    claim = out / ".driver.3"
+    claim.write_text("node7 4242 abc")
+    for flag in ("resume", "overwrite"):
+        with pytest.raises(PlanError, match=r"another machine runs this plan .found node7, \d s ago"):
+            run(out, **{flag: True})
+    assert {path.name for path in out.iterdir()} == {".driver.3", "plan.json"}
+    os.utime(claim, (0, 0))  # it was given back
+    run(out, resume=True)
+    assert_same(undisturbed, out)
+    assert not list(out.glob(".driver*"))
 
 
 def test_a_folder_of_something_else_is_not_gone_on_with(tmp_path):

@@ -1,0 +1,86 @@
+"""What a plan costs, by a few episodes of each part: CPU hours, hours on some cores, gigabytes; prints JSON.
+
+python benchmarks/plan_cost.py paper --episodes 4 --seed 0
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+import yaml
+
+from robocas_ms3.plans.plan import Plan, load_plan
+from robocas_ms3.plans.status import PartStatus, status
+
+
+@dataclass
+class Benchmark:
+    """Run a plan of fewer episodes, part by part as many, and multiply."""
+
+    plan: Annotated[str, tyro.conf.Positional] = "paper"
+    """Name of a shipped plan, or a YAML file."""
+    episodes: int = 4
+    """Of each part."""
+    seed: int = 0
+    """The first of all parts; take ones that were never used."""
+    jobs: int = os.cpu_count() or 1
+    """Episodes at once: one a core, as the plan itself is run."""
+    cores: tuple[int, ...] = (2, 64)
+    """Machines to say the hours of."""
+
+
+def main(cfg: Benchmark) -> None:
+    """Run it."""
+    plan = load_plan(cfg.plan)
+    with tempfile.TemporaryDirectory() as folder:
+        path, out = Path(folder) / "sample.yaml", Path(folder) / "out"
+        path.write_text(yaml.safe_dump(sample_of(plan, cfg)), encoding="utf-8")
+        command = [sys.executable, "-W", "ignore", "robocas_cli.py", "plan", "run", str(path), "--out", str(out)]
+        begun = time.monotonic()
+        subprocess.run([*command, "--jobs", str(cfg.jobs)], check=True, stdout=subprocess.DEVNULL)
+        print(json.dumps(report(plan, cfg, status(out).parts, time.monotonic() - begun), indent=2))
+
+
+def sample_of(plan: Plan, cfg: Benchmark) -> dict[str, Any]:
+    """The plan with fewer episodes, in units of one; texts are not embedded, which costs next to nothing."""
+    sample = plan.model_dump(mode="json", exclude_none=True)
+    for number, part in enumerate(sample["parts"]):
+        part |= {"episodes": cfg.episodes, "seed": cfg.seed + 1000 * number}
+    return {**sample, "stages": ["demonstrations", "datasets"], "formats": ["robocas"], "embeddings": False, "block": 1}
+
+
+def report(plan: Plan, cfg: Benchmark, parts: list[PartStatus], wall: float) -> dict[str, Any]:
+    """The figures, with the sum that leads to them."""
+    rows = {}
+    for part, measured in zip(plan.parts, parts, strict=True):
+        each = measured.record_seconds + measured.render_seconds
+        rows[f"{part.name}"] = {
+            "record_cpu_seconds": measured.record_seconds,
+            "render_cpu_seconds": measured.render_seconds,
+            "megabytes": round(measured.bytes / 1e6 / cfg.episodes, 1),
+            "episodes": part.episodes,
+            "cpu_hours": round(part.episodes * each / 3600, 2),
+        }
+    hours = sum(row["cpu_hours"] for row in rows.values())
+    return {
+        "plan": cfg.plan,
+        "measured_episodes_a_part": cfg.episodes,
+        "measured_minutes": round(wall / 60, 1),
+        "parts": rows,
+        "cpu_hours": round(hours, 1),
+        "gigabytes": round(sum(row["megabytes"] * row["episodes"] for row in rows.values()) / 1000),
+        "hours": {f"{cores} cores": round(hours / cores, 2) for cores in cfg.cores},
+    }
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Benchmark))

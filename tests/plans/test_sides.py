@@ -1,0 +1,70 @@
+"""A plan says which episodes validate: of a part as a whole, by a rule, or as conversions do."""
+
+import json
+
+import pytest
+from plan_stages import PLAN
+
+from robocas_ms3.datasets.manage import splitting
+from robocas_ms3.datasets.sources.split import SPLIT_RULE
+from robocas_ms3.plans import sides
+from robocas_ms3.plans.plan import Plan
+
+COUNTS = (20, 5, 10)
+
+
+def plan_of(*splits, split=None):
+    parts = [
+        {"task": task, "episodes": count, "seed": 100 * number, "name": name, "split": side}
+        for number, (task, count, name, side) in enumerate(
+            zip(("pick", "select", "pick"), COUNTS, "abc", splits, strict=True)
+        )
+    ]
+    return Plan.model_validate({**json.loads(PLAN.model_dump_json()), "parts": parts, "split": split}, strict=False)
+
+
+@pytest.fixture
+def of(monkeypatch):
+    """Sides of a plan whose dataset says what its episodes' seeds, targets and tasks are."""
+
+    def groups(root, by):
+        numbers = range(sum(COUNTS))
+        task = {n: "select" if 20 <= n < 25 else "pick" for n in numbers}
+        return {"seed": {n: str(7 * n) for n in numbers}, "target": {n: str(n % 4) for n in numbers}, "task": task}[by]
+
+    monkeypatch.setattr(sides, "groups_of", groups)
+    monkeypatch.setattr(sides, "Dataset", lambda root: root)
+    return lambda plan: sides.sides_of(plan, "somewhere")
+
+
+def test_without_a_word_it_is_what_conversions_do(of):
+    plan = plan_of(None, None, None)
+    assert of(plan) == sides.split_by_seed({n: 7 * n for n in range(35)})
+    assert len(of(plan)[1]) == 4  # round(3.5)
+    assert sides.rule_of(plan) == SPLIT_RULE
+
+
+def test_a_part_may_validate_as_a_whole(of):
+    plan = plan_of("train", "val", "train")
+    assert of(plan) == ([*range(20), *range(25, 35)], [*range(20, 25)])
+    assert sides.rule_of(plan) == "a: train; b: val; c: train"
+
+
+def test_other_parts_go_by_the_rule(of):
+    plan = plan_of(None, "val", None, split={"val_share": 0.2, "by": "target"})
+    train, val = of(plan)
+    assert sorted(train + val) == [*range(35)]
+    assert set(range(20, 25)) < set(val)
+    free = set(val) - set(range(20, 25))
+    assert {n % 4 for n in free}.isdisjoint({n % 4 for n in train})  # a target is on one side
+    assert sides.rule_of(plan) == f"b: val; {splitting.Share(0.2, 'target').rule}"
+
+
+def test_all_of_one_kind_train(of, caplog):
+    plan = plan_of(None, "val", None, split={"by": "seed"})
+    plan = plan.model_copy(
+        update={"split": plan.split.model_copy(update={"by": "task"})}
+    )  # parts of pick alone are free
+    train, val = of(plan)
+    assert (len(train), val) == (30, [*range(20, 25)])
+    assert "all episodes are of one task, and train" in caplog.text
