@@ -38,10 +38,10 @@ def claimed(path: Path, lease: float = LEASE, on_lost: Callable[[], object] = la
 
     Args:
         path: of the claims, without their number.
-        lease: s; the same for all that ask.
+        lease: s; whoever asks goes by the one that the claim it finds was made with.
         on_lost: ends at once what is done inside, from another thread; by default this process.
     """
-    token = f"{socket.gethostname()} {os.getpid()} {uuid.uuid4().hex}"
+    token = f"{socket.gethostname()} {os.getpid()} {uuid.uuid4().hex} {lease}"
     claim = _take(path, token, lease)
     keeper = _Keeper(claim, token, lease, on_lost)
     try:
@@ -53,12 +53,11 @@ def claimed(path: Path, lease: float = LEASE, on_lost: Callable[[], object] = la
                 os.utime(claim, (0, 0))
 
 
-def refuse_claimed(folder: Path, within: float = 2 * LEASE) -> None:
+def refuse_claimed(folder: Path) -> None:
     """See that nobody is at anything that is claimed in a folder; whoever claims nothing could be there too.
 
     Args:
         folder: of all claims; need not exist.
-        within: s in which a claim that somebody holds is renewed, with room to spare.
 
     Raises:
         PlanError: somebody is.
@@ -69,7 +68,7 @@ def refuse_claimed(folder: Path, within: float = 2 * LEASE) -> None:
     for path, number in last.items():
         claim = _numbered(path, number)
         with suppress(FileNotFoundError):
-            if claim.stat().st_mtime > 0 and (age := _age(claim)) < within:
+            if claim.stat().st_mtime > 0 and (age := _age(claim)) < 2 * _lease_of(claim):  # with room to spare
                 fix = "Go on with --on slurm, or cancel its jobs and wait until the claim is not renewed any more."
                 found = f"{claim.read_text(encoding='utf-8').split(' ')[0]}, {age:.0f} s ago"
                 raise PlanError("jobs of Slurm are at this plan", where=claim, found=found, fix=fix)
@@ -84,7 +83,7 @@ def sole(path: Path, lease: float = LEASE) -> Iterator[None]:
     Raises:
         PlanError: another machine holds it.
     """
-    refuse_other(path, lease)
+    refuse_other(path)
     for old in _claims(path).values():  # those of this machine's dead, and what was given back
         old.unlink(missing_ok=True)
     try:
@@ -95,7 +94,7 @@ def sole(path: Path, lease: float = LEASE) -> Iterator[None]:
             old.unlink(missing_ok=True)
 
 
-def refuse_other(path: Path, lease: float = LEASE) -> None:
+def refuse_other(path: Path) -> None:
     """See that no other machine holds a claim.
 
     Raises:
@@ -107,6 +106,7 @@ def refuse_other(path: Path, lease: float = LEASE) -> None:
     claim = claims[max(claims)]
     with suppress(FileNotFoundError):
         host = claim.read_text(encoding="utf-8").split(" ")[0]
+        lease = _lease_of(claim)
         if host != socket.gethostname() and claim.stat().st_mtime > 0 and (age := _age(claim)) < lease:
             found, fix = f"{host}, {age:.0f} s ago", f"Wait until it is done, or was dead for {lease:.0f} s."
             raise PlanError("another machine runs this plan", where=path.parent, found=found, fix=fix)
@@ -161,7 +161,7 @@ def _take(path: Path, token: str, lease: float) -> Path:
     said = False
     while True:
         last = max(_claims(path), default=0)
-        if not last or _age(_numbered(path, last)) >= lease:
+        if not last or _age(before := _numbered(path, last)) >= _lease_of(before, lease):
             claim = _numbered(path, last + 1)
             with suppress(FileExistsError), claim.open("x", encoding="utf-8") as file:
                 file.write(token)
@@ -179,6 +179,14 @@ def _claims(path: Path) -> dict[int, Path]:
 
 def _numbered(path: Path, number: int) -> Path:
     return path.with_name(f"{path.name}.{number}")
+
+
+def _lease_of(claim: Path, default: float = LEASE) -> float:
+    """Seconds, as whoever made a claim said; one that was killed at that moment said nothing."""
+    try:
+        return float(claim.read_text(encoding="utf-8").split(" ")[3])
+    except (OSError, ValueError, IndexError):
+        return default
 
 
 def _age(claim: Path) -> float:

@@ -134,3 +134,23 @@ def test_what_claims_nothing_is_refused_where_somebody_is(tmp_path):
     with claimed(path, LEASE):
         os.utime(path.with_name("00003.2"), (time.time() - 200,) * 2)
         refuse_claimed(folder)  # its holder is long dead
+
+
+def take_and_give_back(path, lease):
+    with claimed(path, lease):
+        pass
+
+
+def test_a_claim_is_judged_by_the_lease_that_it_was_made_with(tmp_path):
+    path = tmp_path / CLAIMS / "a" / "00003"
+    with claimed(path, 600.0):
+        claim = path.with_name("00003.1")
+        os.utime(claim, (time.time() - 500,) * 2)  # renewed every 60 s, and a bad minute now and then
+        with pytest.raises(PlanError, match="jobs of Slurm are at this plan"):
+            refuse_claimed(tmp_path / CLAIMS)
+        waiting = threading.Thread(target=take_and_give_back, args=(path, 0.1), daemon=True)
+        waiting.start()
+        waiting.join(1.0)
+        assert waiting.is_alive()
+    waiting.join(10)
+    assert not waiting.is_alive()
