@@ -20,6 +20,7 @@ from robocas_ms3.outputs import sweep
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.sides import rule_of, sides_of
 from robocas_ms3.plans.units import EPISODES, REPORT, UNITS, Outcome, Task, Unit
+from robocas_ms3.processes.child import Limits
 from robocas_ms3.recordings.merging import merge
 from robocas_ms3.recordings.reading import TrajectoryFile
 from robocas_ms3.scenes.frozen import join_frozen
@@ -37,7 +38,7 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Callable[[str
         plan: it.
         out: its folder.
         chosen: the episodes.
-        jobs: processes.
+        jobs: processes, of this machine no more than it has cores.
         say: called with what is done.
 
     Returns:
@@ -63,7 +64,7 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Callable[[str
                 merge([task.recording for task in recorded], path)
         if plan.makes_datasets and "lerobot" in plan.formats:
             say("making the LeRobot dataset")
-            _convert_lerobot(robocas, out / DATASETS / "lerobot", jobs)
+            _convert_lerobot(plan, robocas, out / DATASETS / "lerobot", jobs)
         if "statistics" in plan.stages:
             say("drawing statistics")
             _write_statistics(robocas, out / STATISTICS)
@@ -115,10 +116,12 @@ def _say_source(path: Path, source: dict[str, Any]) -> None:
         tmp.write_text(text + "\n", encoding="utf-8")
 
 
-def _convert_lerobot(robocas: Path, out: Path, jobs: int) -> None:
+def _convert_lerobot(plan: Plan, robocas: Path, out: Path, jobs: int) -> None:
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 
-    convert_lerobot(robocas, out, resume=True, jobs=jobs)
+    limits = Limits(plan.limits.render_seconds, plan.limits.memory_gb)
+    jobs = min(jobs, os.cpu_count() or 1)  # those of a plan may be a cluster's
+    convert_lerobot(robocas, out, resume=True, jobs=jobs, episode_limits=limits)
 
 
 def _write_statistics(robocas: Path, out: Path) -> None:
