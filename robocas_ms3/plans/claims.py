@@ -33,8 +33,8 @@ _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def claimed(path: Path, lease: float = LEASE, on_lost: Callable[[], object] = lambda: os._exit(75)) -> Iterator[None]:
-    """Hold the claim on something; waits as long as somebody else does.
+def claimed(path: Path, lease: float = LEASE, on_lost: Callable[[], object] = lambda: os._exit(75)) -> Iterator[Path]:
+    """Hold the claim on something, and yield its file; waits as long as somebody else holds it.
 
     Args:
         path: of the claims, without their number.
@@ -45,7 +45,7 @@ def claimed(path: Path, lease: float = LEASE, on_lost: Callable[[], object] = la
     claim = _take(path, token, lease)
     keeper = _Keeper(claim, token, lease, on_lost)
     try:
-        yield
+        yield claim
     finally:
         keeper.end()
         with suppress(OSError):  # then it ends with its lease
@@ -83,15 +83,16 @@ def sole(path: Path, lease: float = LEASE) -> Iterator[None]:
     Raises:
         PlanError: another machine holds it.
     """
+    known = _claims(path)
     refuse_other(path)
-    for old in _claims(path).values():  # those of this machine's dead, and what was given back
-        old.unlink(missing_ok=True)
-    try:
-        with claimed(path, lease):
-            yield
-    finally:
-        for old in _claims(path).values():
+    for old in known.values():
+        with suppress(FileNotFoundError):
+            os.utime(old, (0, 0))
+    with claimed(path, lease) as claim:
+        for old in known.values():
             old.unlink(missing_ok=True)
+        yield
+    claim.unlink(missing_ok=True)
 
 
 def refuse_other(path: Path) -> None:
@@ -161,7 +162,11 @@ def _take(path: Path, token: str, lease: float) -> Path:
     said = False
     while True:
         last = max(_claims(path), default=0)
-        if not last or _age(before := _numbered(path, last)) >= _lease_of(before, lease):
+        try:
+            free = not last or _age(before := _numbered(path, last)) >= _lease_of(before, lease)
+        except FileNotFoundError:  # it went just now
+            continue
+        if free:
             claim = _numbered(path, last + 1)
             with suppress(FileExistsError), claim.open("x", encoding="utf-8") as file:
                 file.write(token)
