@@ -8,7 +8,8 @@ bin=$(cd "${ROBOCAS_VENV:-.venv}" && pwd)/bin
 "$bin/ruff" check .
 "$bin/ruff" format --check .
 "$bin/basedpyright" --pythonpath "$bin/python"
+unset PYTHONDONTWRITEBYTECODE  # else each of the hundreds of processes that tests start compiles the package anew
 # A process a core, with one thread each: the tensors are small, and threads of several processes get in each other's way.
-# Files in order: else those with few tests, which are the slow ones, come last, and one process waits for the other.
+# Files in our order (tests/conftest.py, the longest first): else a long one comes last, and one process waits for it.
 export OMP_NUM_THREADS=1
 "$bin/python" -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder "$@"

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import NoReturn
@@ -18,11 +19,33 @@ settings.register_profile("untimed", deadline=None)  # a busy machine is no fail
 settings.load_profile("untimed")
 ROOT = Path(__file__).resolve().parents[1]
 PROBES = ROOT / "robocas_ms3" / "doctor" / "probes.py"
+LONGEST = {
+    "tests/asset_tools/test_bad_scans.py",
+    "tests/asset_tools/test_builtin_furniture.py",
+    "tests/asset_tools/test_builtin_toys.py",
+    "tests/datasets/writing/test_render.py",
+    "tests/demos/test_generate.py",
+    "tests/evaluation/test_run.py",
+    "tests/evaluation/test_weld.py",
+    "tests/examples/test_examples.py",
+    "tests/plans/test_run_plan.py",
+    "tests/tasks/test_registry.py",
+    "tests/tasks/vector/test_processes.py",
+    "tests/tasks/vector/test_same_episodes.py",
+    "tests/test_registration_of_strangers.py",
+    "tests/viewer/test_page.py",
+}
+"""Files of half a minute and more."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[_DATA] = tempfile.mkdtemp(prefix="robocas-test-data-")
     os.environ["ROBOCAS_DATA"] = config.stash[_DATA]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files: whoever has one at the end is waited for by the other processes."""
+    items.sort(key=lambda item: item.nodeid.partition("::")[0] not in LONGEST)  # a stable sort
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
@@ -42,10 +65,22 @@ def shared_dir() -> Path:
 
 
 @pytest.fixture(scope="session")
-def needs_renderer() -> str:
-    """The render device. Without one: a skip, on CI a failure, as setup installs one there."""
+def needs_renderer() -> Iterator[str]:
+    """The render device. Without one: a skip, on CI a failure, as setup installs one there.
+
+    One render system stays until the end: with the last one SAPIEN forgets the tables of its light, and the next one
+    makes them anew, which takes a renderer in software 7 s.
+    """
     device, problem = _render_device()
-    return device or without_renderer(problem)
+    if device is None:
+        without_renderer(problem)
+    kept = None
+    if "llvmpipe" in device:
+        import sapien
+
+        kept = sapien.render.RenderSystem(sapien.Device("cpu"))
+    yield device
+    del kept
 
 
 def without_renderer(problem: str) -> NoReturn:

@@ -22,11 +22,11 @@ class Renders:
 
     def __init__(self, plan: Plan, open_source: OpenSource = open_env) -> None:
         os.environ.setdefault("LP_NUM_THREADS", "1")  # as many processes render as there are cores
-        use_one_torch_thread()
-        if open_source is open_env:  # where it is missing, it is for all episodes
+        if open_source is open_env:
             from robocas_ms3.datasets.writing.render import require_renderer
 
-            require_renderer()
+            use_one_torch_thread()
+            require_renderer()  # where it is missing, it is for all episodes
         self._plan, self._open_source = plan, open_source
         self._part: int | None = None
         self._player: RecordingPlayer | None = None

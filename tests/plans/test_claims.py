@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack
 
 import pytest
 
@@ -14,7 +15,7 @@ from robocas_ms3.plans.claims import claimed, refuse_claimed
 from robocas_ms3.plans.engines import open_engine
 from robocas_ms3.plans.units import CLAIMS
 
-LEASE = 3.0
+LEASE = 2.0
 HOLD = """
 import json, sys, time
 from pathlib import Path
@@ -55,7 +56,7 @@ def test_one_after_the_other(tmp_path):
 
 def test_one_who_holds_it_for_longer_than_a_lease_is_waited_for(tmp_path):
     path, notes = tmp_path / "00000", tmp_path / "notes"
-    process = holding(path, notes, 2.5 * LEASE)
+    process = holding(path, notes, 1.5 * LEASE)
     wait_for(lambda: read(notes) == ["in"])
     with claimed(path, LEASE):
         assert read(notes) == ["in", "out"]
@@ -88,35 +89,33 @@ def test_a_holder_that_wakes_after_its_lease_leaves_at_once(tmp_path):
         assert time.time() - mine.stat().st_mtime < LEASE  # it did not give back what is not its own
 
 
-@pytest.mark.parametrize("how", ["taken", "gone", "not its own"])
-def test_a_lost_claim_is_noticed(tmp_path, how):
-    lost = threading.Event()
-    with claimed(tmp_path / "claims" / "00000", LEASE, lost.set):
-        claim = tmp_path / "claims" / "00000.1"
-        assert not lost.wait(LEASE)  # nothing is wrong yet
-        if how == "taken":
-            claim.with_suffix(".2").touch()
-        elif how == "gone":
-            os.rename(tmp_path / "claims", tmp_path / "away")
-        else:
-            claim.write_text("another's")
-        assert lost.wait(LEASE)
+def test_a_lost_claim_is_noticed(tmp_path):
+    with ExitStack() as held:
+        lost = {how: threading.Event() for how in ("taken", "gone", "not its own")}
+        for how, event in lost.items():
+            held.enter_context(claimed(tmp_path / how / "00000", LEASE, event.set))
+        time.sleep(LEASE)
+        assert not [how for how, event in lost.items() if event.is_set()]  # nothing is wrong yet
+        (tmp_path / "taken" / "00000.2").touch()
+        os.rename(tmp_path / "gone", tmp_path / "away")
+        (tmp_path / "not its own" / "00000.1").write_text("another's")
+        assert [how for how, event in lost.items() if not event.wait(LEASE)] == []
 
 
 def test_a_claim_that_cannot_be_renewed_is_given_up_before_others_may_take_it(tmp_path, monkeypatch):
-    lost, real = threading.Event(), os.utime
+    lost, over, real = threading.Event(), threading.Event(), os.utime
 
     def hang(path, *more):
         if "00000.1" in str(path) and not more:
-            time.sleep(10 * LEASE)  # as a file server does that is gone
+            over.wait()  # as a file server does that is gone
         real(path, *more)
 
     monkeypatch.setattr(os, "utime", hang)
     begun = time.monotonic()
-    keeper = claimed(tmp_path / "00000", LEASE, lost.set)
-    keeper.__enter__()
-    assert lost.wait(LEASE)
-    assert time.monotonic() - begun < LEASE
+    with claimed(tmp_path / "00000", LEASE, lost.set):
+        assert lost.wait(LEASE)
+        assert time.monotonic() - begun < LEASE
+        over.set()
 
 
 def test_what_claims_nothing_is_refused_where_somebody_is(tmp_path):

@@ -1,15 +1,44 @@
-"""Commands without the seconds that imports take: a process that has imported the package forks for each."""
+"""Commands without the seconds that imports take: a process that has imported the package forks for each.
+
+It is itself the fork of one that has imported the libraries, whatever folders of packages there are.
+"""
 
 from __future__ import annotations
 
 import os
 import pickle
+import socket
 import subprocess
 import sys
 import tempfile
 import weakref
+from functools import cache
 from pathlib import Path
 from typing import Any
+
+_LIBRARIES = """
+import os, pickle, signal, socket, sys
+import torch, mani_skill.envs
+link = socket.socket(fileno=int(sys.argv.pop()))
+signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for its forks
+while True:
+    order, ends, *_ = socket.recv_fds(link, 2**20, 2)
+    if not order:
+        break
+    if os.fork() == 0:
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        link.close()
+        for number, end in enumerate(ends):
+            os.dup2(end, number)
+            os.close(end)
+        program, path, environment = pickle.loads(order)
+        os.environ.clear()
+        os.environ.update(environment)
+        sys.path[1:1] = path
+        exec(program)
+    for end in ends:
+        os.close(end)
+"""
 
 _PROGRAM = """
 import os, pickle, runpy, sys, types
@@ -55,6 +84,16 @@ os._exit(0)
 """
 
 
+@cache
+def _libraries() -> socket.socket:
+    """The link to the process that has imported the libraries; it ends with this one."""
+    here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with there:
+        command = [sys.executable, "-W", "ignore", "-c", _LIBRARIES, str(there.fileno())]
+        subprocess.Popen(command, pass_fds=[there.fileno()], stdin=subprocess.DEVNULL)
+    return here
+
+
 class ForkServer:
     """Python with the package imported, ready for commands.
 
@@ -63,19 +102,25 @@ class ForkServer:
     """
 
     def __init__(self, *path: Path) -> None:
-        env = os.environ | {"PYTHONPATH": os.pathsep.join([*map(str, path), os.environ.get("PYTHONPATH", "")])}
-        self._process = subprocess.Popen(
-            [sys.executable, "-W", "ignore", "-c", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=env
-        )
-        weakref.finalize(self, self._process.kill)
+        folders = [str(folder) for folder in path]
+        env = os.environ | {"PYTHONPATH": os.pathsep.join([*folders, os.environ.get("PYTHONPATH", "")])}
+        (orders, self._orders), (self._answers, answers) = _pipe(), _pipe()
+        with orders, answers:
+            order = pickle.dumps((_PROGRAM, folders, dict(env)))
+            socket.send_fds(_libraries(), [order], [orders.fileno(), answers.fileno()])
+        weakref.finalize(self, self._orders.close)  # then it ends
 
     def run(self, *words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
         """Do as ``python WORDS`` would: a script or ``-c CODE``, and arguments."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
         with tempfile.NamedTemporaryFile("r") as out, tempfile.NamedTemporaryFile("r") as err:
             command = tuple(map(str, words))
-            pickle.dump((command, str(cwd or Path.cwd()), (out.name, err.name)), self._process.stdin)
-            self._process.stdin.flush()
-            code: Any = pickle.load(self._process.stdout)
+            pickle.dump((command, str(cwd or Path.cwd()), (out.name, err.name)), self._orders)
+            self._orders.flush()
+            code: Any = pickle.load(self._answers)
             return subprocess.CompletedProcess(command, code, out.read(), err.read())
+
+
+def _pipe() -> tuple[Any, Any]:
+    """What is read from, and what is written to."""
+    ends = os.pipe()
+    return os.fdopen(ends[0], "rb"), os.fdopen(ends[1], "wb")

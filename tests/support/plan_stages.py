@@ -72,6 +72,10 @@ def render(plan):
     return Renders(plan, RayCaster)
 
 
+def cannot_begin(plan):
+    raise OSError("no such device\nat all")
+
+
 def stages():
     return Stages(MadeUp, render)
 

@@ -101,7 +101,7 @@ def test_a_busy_process_is_not_waited_for():
 def test_errors_of_making_arrive_as_themselves():
 
     with pytest.raises(ConfigError, match="no_such_config") as error:
-        make(2, 2, config="no_such_config")
+        make(2, 1, config="no_such_config")
     assert "env 0" in str(error.value.__cause__)
     with pytest.raises(VectorEnvError, match="can't be sent"):
         make(1, 1, config={"lock": threading.Lock()})
