@@ -1,4 +1,4 @@
-"""Data of others read strictly: the base of all declared forms, and what pydantic complains of in our words.
+"""Data and numbers of others read strictly: the base of all declared forms, and pydantic's complaints in our words.
 
 A message names the key, what was expected and what was found; of a mistyped key or word also the nearest known ones.
 """
@@ -6,6 +6,7 @@ A message names the key, what was expected and what was found; of a mistyped key
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -142,6 +143,17 @@ def mistakes(
         found.setdefault(".".join(keys), []).append((details, node))
     said = [_mistake(key, same, schema, {**_EXPECTED, **(words or {})}) for key, same in found.items()]
     return sorted(said, key=lambda mistake: mistake.kind != "extra_forbidden")  # it may be why another is missing
+
+
+def check_number(name: str, value: float, least: float, greatest: int | None = None) -> None:
+    """Check the range of a number.
+
+    Raises:
+        RobocasError: it is outside.
+    """
+    if not least <= value < math.inf or (greatest is not None and value > greatest):
+        expected = f"at least {least}" if greatest is None else f"{least} to {greatest}"
+        raise RobocasError("this number is out of range", where=name, expected=expected, found=value)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

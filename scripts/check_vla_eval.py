@@ -130,7 +130,7 @@ def remember(out: Path, kept: Path) -> results.Result:
     """What comes of the episodes in an evaluation of ours; what was seen and done there is kept in a file."""
     policy, protocol, arrays = Remembering(), load_protocol("smoke"), {}
     settings = Settings(num_envs=1, backend="processes", tasks=tuple(TASKS))
-    for outcome, _ in evaluate(protocol, policy, "scripted-motions", out, settings):
+    for outcome in evaluate(protocol, policy, "scripted-motions", out, settings):
         steps, episode = policy.kept[outcome.episode], protocol.episodes[outcome.episode]
         number = sum(one.config == episode.config for one in protocol.episodes[: episode.episode])
         for key in steps[0]:

@@ -11,6 +11,7 @@ import tyro
 
 from robocas_ms3.cli.assets_show import mesh_tools
 from robocas_ms3.cli.options import Maybe, Several
+from robocas_ms3.words import count_of
 
 # `asset_tools.pipeline.Job`, which only loads when a command runs
 Job = Any
@@ -110,21 +111,21 @@ def import_scans(command: ImportScans) -> int:
         from asset_tools.import_scans import ImportSettings, scan_jobs
     masses = _masses(command.masses)
     settings = ImportSettings(command.units, command.up, masses, command.licence, command.attribution)
-    return _make(scan_jobs(command.source, settings), command, command.pack, "scans")
+    return _make(scan_jobs(command.source, settings), command, command.pack, "scan")
 
 
 def import_graspnet(command: ImportGraspNet) -> int:
     """Run ``import-graspnet``."""
     with mesh_tools():
         from asset_tools.graspnet.importer import graspnet_jobs
-    return _make(graspnet_jobs(command.root, command.ids), command, command.pack, "GraspNet objects")
+    return _make(graspnet_jobs(command.root, command.ids), command, command.pack, "GraspNet object")
 
 
 def import_ycb(command: ImportYCB) -> int:
     """Run ``import-ycb``."""
     with mesh_tools():
         from asset_tools.import_ycb import ycb_jobs
-    return _make(ycb_jobs(command.root, command.ids), command, command.pack, "YCB objects")
+    return _make(ycb_jobs(command.root, command.ids), command, command.pack, "YCB object")
 
 
 def import_partnet(command: ImportPartNet) -> int:
@@ -135,7 +136,7 @@ def import_partnet(command: ImportPartNet) -> int:
     if command.template:
         print(template(command.models[0]))
         return 0
-    return _make(partnet_jobs(command.models, command.annotations), command, command.pack, "PartNet models")
+    return _make(partnet_jobs(command.models, command.annotations), command, command.pack, "PartNet model")
 
 
 def build(command: Build) -> int:
@@ -186,26 +187,22 @@ def _make(jobs: list[Job], command: _Making, name: str, what: str) -> int:
     elif out.exists() and not command.overwrite:
         fix = "Pass --overwrite to replace it, or choose another name with --pack."
         raise OutputExistsError("there is such a pack already, made from something else", where=out, fix=fix)
-    return _write(jobs, command, out, f"{len(jobs)} {what}")
+    return _write(jobs, command, out, count_of(len(jobs), what))
 
 
 def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, record: bool = True) -> int:
-    from rich.console import Console
-    from rich.progress import Progress
-
     from asset_tools.pipeline import JobResult, write_pack
     from robocas_ms3.cli.assets_show import Info, info
-    from robocas_ms3.cli.bars import columns
+    from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.paths import cache_dir
 
-    console = Console(highlight=False, soft_wrap=True)
-    with Progress(*columns(), console=Console(stderr=True)) as progress:
-        bar = progress.add_task(out.name, total=len(jobs))
+    with bar(f"assets of {out.name} made") as shown:
+        shown.start(len(jobs))
 
         def on_made(made: JobResult) -> None:
-            progress.advance(bar)
+            shown.advance()
             if made.asset is None:
-                progress.console.print(f"left out: {made.error}", highlight=False, soft_wrap=True)
+                shown.note(f"left out: {made.error}")
 
         write_pack(
             jobs,
@@ -218,7 +215,7 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
             on_made=on_made,
         )
     info(Info(pack=str(out)))
-    console.print(f"wrote {out}")
+    say(f"wrote {out}")
     return 0
 
 

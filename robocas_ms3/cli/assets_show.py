@@ -142,20 +142,19 @@ def verify(command: Verify) -> int:
 
 def sheet(command: Sheet) -> int:
     """Run ``sheet``."""
-    from rich.console import Console
-
     with mesh_tools():
         from asset_tools.sheet import contact_sheet
     from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.cli.bars import say, working
     from robocas_ms3.errors import AssetError
 
     pack = load_pack(command.pack)
     out = command.out or Path(f"{pack.name}.png")
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise AssetError("a sheet is a PNG or JPEG", where=out, expected=".png, .jpg", found=out.suffix or "no suffix")
-    with Console(stderr=True).status(f"drawing {count_of(len(command.ids) or len(pack.manifest.assets), 'asset')}"):
+    with working(f"drawing {count_of(len(command.ids) or len(pack.manifest.assets), 'asset')}"):
         contact_sheet(pack, out, ids=command.ids or None)
-    Console(highlight=False, soft_wrap=True).print(f"wrote {out}")
+    say(f"wrote {out}")
     return 0
 
 
@@ -168,17 +167,21 @@ def _console() -> Console:
 
 
 def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
-    from rich.console import Console
-    from rich.progress import track
     from rich.table import Table
 
     with mesh_tools():
         from asset_tools.quality.measure import HEADER, differences, judge, rows
         from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
+    from robocas_ms3.cli.bars import bar
     from robocas_ms3.files import write_json
 
     total = len(pack.manifest.assets)
-    measured: dict[str, Any] = dict(track(remeasure_pack(pack, jobs), "measuring", total, console=Console(stderr=True)))
+    measured: dict[str, Any] = {}
+    with bar("assets measured") as shown:
+        shown.start(total)
+        for name, found in remeasure_pack(pack, jobs):
+            measured[name] = found
+            shown.advance()
     objects = {name: measured[name] for name in pack.objects}
     furniture = {name: measured[name] for name in pack.furniture}
     console = _console()

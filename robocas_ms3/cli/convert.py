@@ -129,7 +129,7 @@ def _convert(cfg: Convert) -> int:
     from robocas_ms3.words import count_of
 
     chosen = _format(cfg)
-    with bar("episodes") as shown:
+    with bar("episodes written") as shown:
         options: dict[str, Any] = {
             "append": cfg.append,
             "embeddings": cfg.embeddings,

@@ -21,18 +21,17 @@ class Doctor:
 
 def main(cfg: Doctor) -> int:
     """Run the command."""
-    from rich.console import Console
-
+    from robocas_ms3.cli.bars import say, working
     from robocas_ms3.doctor.checks import examine
 
-    with Console(stderr=True).status("examining"):
+    with working("examining"):
         findings = examine()
     failed = sum(finding.status == "fail" for finding in findings)
     if cfg.json:
         import json
 
         report = {"ok": not failed, "findings": [asdict(finding) for finding in findings]}
-        Console(soft_wrap=True, highlight=False, markup=False).print(json.dumps(report, indent=2))
+        say(json.dumps(report, indent=2))
         return 1 if failed else 0
     _print(findings, failed)
     return 1 if failed else 0

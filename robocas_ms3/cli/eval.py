@@ -106,13 +106,12 @@ def run(cfg: Eval) -> int:
             raise EvaluationError("no such task", where=word, expected=expected, fix=nearest(word, [*TASKS, *WORDS]))
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.cli.eval_results import write_pages
-    from robocas_ms3.demos.checks import check_number
-    from robocas_ms3.evaluation.policies import open_policy
+    from robocas_ms3.evaluation.policies import check_policy, open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.results import read
-    from robocas_ms3.evaluation.run import Settings, evaluate
     from robocas_ms3.evaluation.tables import markdown
     from robocas_ms3.processes import Limits, use_one_torch_thread
+    from robocas_ms3.strict import check_number
     from robocas_ms3.words import count_of
 
     for name, number in (("envs", cfg.envs), ("episodes", cfg.episodes), ("workers", cfg.workers)):
@@ -122,15 +121,19 @@ def run(cfg: Eval) -> int:
     check_number("memory_gb", cfg.memory_gb, 0.1)
     if cfg.retry_errors and not cfg.resume:
         raise EvaluationError("there is nothing to retry", where="--retry-errors", fix="Pass --resume too.")
-    use_one_torch_thread()
+    shard = shard_of(cfg.shard)
+    check_policy(cfg.policy)
     protocol = load_protocol(cfg.protocol or "ms3-v1")
+    from robocas_ms3.evaluation.run import Settings, evaluate
+
+    use_one_torch_thread()
     name = re.sub(r"[^\w.-]+", "_", cfg.policy) + ("_weld" if cfg.weld else "")
     out = cfg.out or Path("eval") / protocol.rules.name / name
     settings = Settings(
         num_envs=cfg.envs,
         backend=cfg.backend,
         workers=cfg.workers,
-        shard=shard_of(cfg.shard),
+        shard=shard,
         tasks=cfg.words,
         episodes=cfg.episodes,
         split=cfg.split,
@@ -138,15 +141,15 @@ def run(cfg: Eval) -> int:
         limits=Limits(cfg.step_seconds, cfg.memory_gb),
     )
     succeeded = played = 0
-    with open_policy(cfg.policy) as policy, bar("episodes") as shown:
+    with open_policy(cfg.policy) as policy, bar("episodes played") as shown:
         try:
-            played_now = evaluate(
-                protocol, policy, cfg.policy, out, settings, resume=cfg.resume, again=cfg.retry_errors
-            )
-            for outcome, left in played_now:
+            again, begun = cfg.retry_errors, shown.start
+            for outcome in evaluate(
+                protocol, policy, cfg.policy, out, settings, resume=cfg.resume, again=again, on_start=begun
+            ):
                 played += 1
                 succeeded += outcome.success
-                shown.at(played, played + left)
+                shown.advance()
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command with --resume goes on") from None
     result = read(out)

@@ -35,7 +35,7 @@ def freeze(plan: Path, out: Path | None) -> int:
         raise EvaluationError("where to?", where="--out", expected="a folder")
     read = read_plan(plan)
     check_absent(out, EvaluationError)
-    with bar("episodes") as shown:
+    with bar("episodes chosen") as shown:
         for done, total in make(read, out):
             shown.at(done, total)
     say(f"{out}: {count_of(len(load_protocol(out).episodes), 'episode')}, {load_protocol(out).hash}")

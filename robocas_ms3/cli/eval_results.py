@@ -91,23 +91,24 @@ def videos(folder: Path, protocol: str | None, policy: str, count: int) -> int:
         EvaluationError: it is of a policy that is not builtin, and was not named again: a file chooses no code.
     """
     from robocas_ms3.cli.bars import bar, say
-    from robocas_ms3.demos.checks import check_number
     from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.policies import POLICIES, open_policy
     from robocas_ms3.evaluation.results import read
-    from robocas_ms3.evaluation.videos import failed_of_each_kind, film
-    from robocas_ms3.processes import use_one_torch_thread
+    from robocas_ms3.strict import check_number
 
     check_number("count", count, 1)
-    use_one_torch_thread()
     result = read(folder)
     loaded = protocol_of(result, protocol)
-    numbers = failed_of_each_kind(result, count)
     name = str(result.run["policy"]["name"])
     if name not in POLICIES.builtin and policy != name:
         fix = f"Name it yourself, if you trust it: --policy {name}"
         raise EvaluationError("this result is of a policy of somebody's own", where=folder, found=name, fix=fix)
-    with open_policy(name) as played, bar("videos") as shown:
+    from robocas_ms3.evaluation.videos import failed_of_each_kind, film
+    from robocas_ms3.processes import use_one_torch_thread
+
+    use_one_torch_thread()
+    numbers = failed_of_each_kind(result, count)
+    with open_policy(name) as played, bar("episodes filmed") as shown:
         for done, filmed in enumerate(film(result, loaded, played, numbers), start=1):
             say(str(filmed.path) + ("" if filmed.same else ": this time it came out differently"))
             shown.at(done, len(numbers))

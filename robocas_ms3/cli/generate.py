@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -86,10 +87,7 @@ def run(cfg: Generate) -> int:
 
     name = cfg.config or TASKS[cfg.task].default_config
     loaded = load_task_config(name)  # before seconds go by for what is imported next
-    from rich.console import Console
-    from rich.progress import Progress
-
-    from robocas_ms3.cli.bars import columns
+    from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.demos.checks import check_limits
     from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, recordable_config
     from robocas_ms3.demos.generate import generate
@@ -115,20 +113,15 @@ def run(cfg: Generate) -> int:
         planner=cfg.planner,
         robot=cfg.robot,
     )
-    progress = Progress(*columns(), console=Console(stderr=True))  # shown once there is something to do
+    with bar("episodes recorded") as shown:
 
-    def on_start() -> None:
-        progress.add_task(f"{cfg.task}: recording", total=cfg.episodes)
-        progress.start()
+        def on_result(result: EpisodeResult) -> None:
+            if result.success:
+                shown.advance()
+            else:
+                last = result.failures[-1]
+                shown.note(f"seed {result.seed}: given up ({last.stage}: {last.reason})")
 
-    def on_result(result: EpisodeResult) -> None:
-        if result.success:
-            progress.advance(progress.task_ids[0])
-        else:
-            last = result.failures[-1]
-            progress.console.print(f"seed {result.seed}: given up ({last.stage}: {last.reason})", highlight=False)
-
-    try:
         summary = generate(
             settings,
             out,
@@ -139,19 +132,14 @@ def run(cfg: Generate) -> int:
             limits=Limits(cfg.episode_seconds, cfg.memory_gb),
             resume=cfg.resume,
             overwrite=cfg.overwrite,
-            on_start=on_start,
+            on_start=partial(shown.start, cfg.episodes),
             on_result=on_result,
         )
-    finally:
-        if progress.live.is_started:  # else it would print an empty line
-            progress.stop()
+        shown.at(cfg.episodes, cfg.episodes)  # some of them may have been there beyond a seed that was not
     seconds = ", ".join(f"{part} {value:.2f}" for part, value in summary.mean_seconds.items())
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(
-        f"{count_of(summary.episodes, 'episode')} from {count_of(summary.seeds, 'seed')} ({summary.success_rate:.0%})"
-    )
-    console.print(f"mean seconds a seed: {seconds}; mean length {summary.mean_steps:.0f} steps")
+    say(f"{count_of(summary.episodes, 'episode')} from {count_of(summary.seeds, 'seed')} ({summary.success_rate:.0%})")
+    say(f"mean seconds a seed: {seconds}; mean length {summary.mean_steps:.0f} steps")
     if summary.failures:
-        console.print("failed attempts: " + ", ".join(f"{reason} x{n}" for reason, n in summary.failures.items()))
-    console.print(f"wrote {summary.trajectory}")
+        say("failed attempts: " + ", ".join(f"{reason} x{n}" for reason, n in summary.failures.items()))
+    say(f"wrote {summary.trajectory}")
     return 0

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from robocas_ms3.scenes.bank import LayoutBank
     from robocas_ms3.scenes.table import Engine, Pair
 
@@ -73,53 +71,47 @@ def main(cfg: Layouts) -> int:
 
 def build(command: Build) -> int:
     """Run ``build``."""
-    from rich.console import Console
-    from rich.progress import Progress
-
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.bars import columns
+    from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.config import load_task_config
-    from robocas_ms3.demos.checks import check_number
-    from robocas_ms3.scenes.bank import LayoutBank
-    from robocas_ms3.scenes.fill import fill, pairs_of
-    from robocas_ms3.scenes.model import SceneModel
+    from robocas_ms3.strict import check_number
 
     if command.jobs is not None:
         check_number("jobs", command.jobs, 1)
     objects = None if command.objects is None else objects_seeds(command.objects)
-    pairs = pairs_of(seed_range(command.seeds), objects)
-    model = SceneModel.load(
-        load_task_config(command.config), load_pack(command.pack), load_pack(command.furniture_pack)
-    )
+    seeds = seed_range(command.seeds)
+    config = load_task_config(command.config)
+    packs = load_pack(command.pack), load_pack(command.furniture_pack)  # before what takes seconds to import
+    from robocas_ms3.scenes.bank import LayoutBank
+    from robocas_ms3.scenes.fill import fill, pairs_of
+    from robocas_ms3.scenes.model import SceneModel
+
+    pairs = pairs_of(seeds, objects)
+    model = SceneModel.load(config, *packs)
     bank = LayoutBank(model, command.out or "auto")
     engine = choose_engine(command.engine) if objects is not None else None
     there = len(pairs) - len(bank.missing(pairs))
     failures = moving = 0
-    with Progress(*columns(), console=Console(stderr=True)) as progress:
-        bar = progress.add_task("layouts", total=len(pairs), completed=there)
+    with bar("layouts made") as shown:
+        shown.start(len(pairs), there)
         for (chosen, seed), problem in fill(bank, pairs, command.jobs or os.cpu_count() or 1):
-            progress.advance(bar)
+            shown.advance()
             if problem:
                 failures += 1
                 which = f"seed {seed}" if objects is None else f"objects {chosen}, seed {seed}"
-                progress.console.print(f"{which}: {problem}", highlight=False)
-        if engine is not None:  # for several envs, whose resets then read one file
-            writing = progress.add_task("writing them as one file", total=None)
-            bank.write_table(engine, pairs)
-            progress.remove_task(writing)
-        if engine == "gpu":
-            moving = try_all(bank, engine, progress, pack=command.pack, furniture_pack=command.furniture_pack)
-    console = Console(highlight=False, soft_wrap=True)
-    made = len(pairs) - there - failures
-    console.print(f"{count_of(made, 'layout')} made, {there} there already, {count_of(failures, 'seed')} without one")
-    if engine is not None and (table := bank.table(engine)) is not None:
-        sets, seeds = table.rows.shape
-        console.print(
-            f"table: {bank.table_path(engine)}, {count_of(sets, 'set')} of objects by {count_of(seeds, 'seed')}"
-        )
+                shown.note(f"{which}: {problem}")
+    if engine is not None:  # for several envs, whose resets then read one file
+        bank.write_table(engine, pairs)
     if engine == "gpu":
-        console.print(f"objects of {moving} move when the GPU lets go of them: no reset takes these")
-    console.print(f"bank: {bank.folder}")
+        moving = try_all(bank, engine, pack=command.pack, furniture_pack=command.furniture_pack)
+    made = len(pairs) - there - failures
+    say(f"{count_of(made, 'layout')} made, {there} there already, {count_of(failures, 'seed')} without one")
+    if engine is not None and (table := bank.table(engine)) is not None:
+        sets, arrangements = table.rows.shape
+        say(f"table: {bank.table_path(engine)}, {count_of(sets, 'set')} of objects by {count_of(arrangements, 'seed')}")
+    if engine == "gpu":
+        say(f"objects of {moving} move when the GPU lets go of them: no reset takes these")
+    say(f"bank: {bank.folder}")
     return 1 if failures else 0
 
 
@@ -138,8 +130,9 @@ def choose_engine(wanted: Literal["auto", "cpu", "gpu"]) -> Engine:
     return "gpu" if wanted != "cpu" and is_available() else "cpu"
 
 
-def try_all(bank: LayoutBank, engine: Engine, progress: Progress, **packs: str) -> int:
+def try_all(bank: LayoutBank, engine: Engine, **packs: str) -> int:
     """Let the engine try what it has not tried; how many layouts' objects move, of all in the table."""
+    from robocas_ms3.cli.bars import bar
     from robocas_ms3.scenes.table import State
     from robocas_ms3.tasks.trial import judged, try_layouts, untried
 
@@ -148,8 +141,11 @@ def try_all(bank: LayoutBank, engine: Engine, progress: Progress, **packs: str) 
         found: dict[Pair, State] = {}
         trial = try_layouts(bank, engine, seeds, **packs)
         try:
-            for pair, moved in progress.track(trial, sum(map(len, seeds.values())), description="trying them"):
-                found[pair] = judged(moved)
+            with bar("layouts tried") as shown:
+                shown.start(sum(map(len, seeds.values())))
+                for pair, moved in trial:
+                    found[pair] = judged(moved)
+                    shown.advance()
         finally:  # interrupted, it keeps what was found
             bank.mark_table(engine, found)
     table = bank.table(engine)

@@ -19,13 +19,13 @@ class List:
 
 def main(cfg: List) -> int:
     """Run the command."""
-    from rich.console import Console
+    from robocas_ms3.cli.bars import say
 
     found = collect()
     if cfg.json:
         import json
 
-        Console(soft_wrap=True, highlight=False, markup=False).print(json.dumps(found, indent=2, ensure_ascii=False))
+        say(json.dumps(found, indent=2, ensure_ascii=False))
     else:
         _print(found)
     return 0

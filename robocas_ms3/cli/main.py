@@ -78,6 +78,7 @@ def run(argv: Sequence[str]) -> int:
     if not debug:
         # ManiSkill's logger (the blank is in its name) remarks on its own installation, and on CPUs without a GPU.
         logging.getLogger("mani_skill ").addFilter(lambda record: record.levelno >= logging.ERROR)
+        logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # it says that it looks for fonts
     _lend_folders()
     try:
         return _dispatch(arguments)
@@ -106,6 +107,8 @@ def _dispatch(arguments: list[str]) -> int:
         known = subcommands(of_command)
         if known and rest and not rest[0].startswith("-") and rest[0] not in known:
             return _unknown(rest[0], f"command of robocas {name}", known)
+        if wrong := _misspelt(of_command, known, f"robocas {name}", rest):
+            return _say(f"error: {wrong}", sys.stderr, 2)
         cfg = tyro.cli(of_command, prog=f"robocas {name}", args=rest, config=CLI_STYLE)
         return module.main(cfg)
     if arguments and not arguments[0].startswith("-"):
@@ -123,6 +126,16 @@ def subcommands(of_command: type) -> dict[str, type]:
         return {}
     choices = map(get_args, get_args(get_type_hints(of_command, include_extras=True)["command"]))
     return {about.name: dataclass for dataclass, about in choices}
+
+
+def _misspelt(of_command: type, known: dict[str, type], prog: str, words: list[str]) -> str:
+    if not words or {"-h", "--help"} & set(words):
+        return ""
+    from robocas_ms3.cli.spelling import misspelt
+
+    if not known:
+        return misspelt(of_command, prog, words)
+    return misspelt(known[words[0]], f"{prog} {words[0]}", words[1:]) if words[0] in known else ""
 
 
 def _unknown(word: str, what: str, known: Iterable[str]) -> int:

@@ -37,7 +37,7 @@ def main(cfg: Merge) -> int:
     from robocas_ms3.datasets.manage.merging import merge
     from robocas_ms3.words import count_of
 
-    with bar("episodes") as shown:
+    with bar("episodes written") as shown:
         done = merge(
             cfg.datasets,
             cfg.out,

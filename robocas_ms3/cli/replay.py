@@ -42,17 +42,17 @@ class Replay:
 def main(cfg: Replay) -> int:
     """Run the command."""
     import numpy as np
-    from rich.console import Console
-    from rich.progress import track
 
-    from robocas_ms3.demos.replay import replay
-    from robocas_ms3.processes import use_one_torch_thread
+    from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.recordings.entries import read_json
 
-    use_one_torch_thread()
     trajectory = cfg.trajectory / "trajectory.h5" if cfg.trajectory.is_dir() else cfg.trajectory
     total = len(read_json(trajectory)["episodes"][: cfg.count])
-    results = replay(
+    from robocas_ms3.demos.replay import replay  # takes seconds to import
+    from robocas_ms3.processes import use_one_torch_thread
+
+    use_one_torch_thread()
+    replayed = replay(
         trajectory,
         control_mode=cfg.control_mode,
         obs_mode=cfg.obs_mode,
@@ -63,14 +63,17 @@ def main(cfg: Replay) -> int:
         overwrite=cfg.overwrite,
         pack=cfg.pack,
     )
-    console = Console(highlight=False, soft_wrap=True)
-    done = list(track(results, "replaying", total=total, console=Console(stderr=True)))
+    done = []
+    with bar("episodes replayed") as shown:
+        for result in replayed:
+            done.append(result)
+            shown.next_of(total)
     for result in done:
         if not result.success:
-            console.print(f"episode {result.episode_id} (seed {result.seed}): not successful")
+            say(f"episode {result.episode_id} (seed {result.seed}): not successful")
     good = sum(result.success for result in done)
-    console.print(f"{good} of {count_of(len(done), 'episode')} succeeded")
+    say(f"{good} of {count_of(len(done), 'episode')} succeeded")
     errors = [result.state_error for result in done if result.state_error is not None]
     if errors:
-        console.print(f"greatest difference from a recorded final state: {np.max(errors):.3g}")  # NaN where one is
+        say(f"greatest difference from a recorded final state: {np.max(errors):.3g}")  # NaN where one is
     return 0 if good == len(done) else 1

@@ -27,10 +27,15 @@ class Show:
 
 def main(cfg: Show) -> int:
     """Run the command."""
+    from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.config import load_task_config
     from robocas_ms3.errors import RobocasError
+    from robocas_ms3.recordings.seeds import GREATEST_SEED
+    from robocas_ms3.strict import check_number
 
+    check_number("seed", cfg.seed, 0, GREATEST_SEED)
     config = load_task_config(cfg.config)  # before seconds go by for what is imported next
+    load_pack(cfg.pack)
     if cfg.shader.startswith("rt"):
         _require_gpu(cfg.shader)
     import gymnasium as gym
@@ -38,12 +43,9 @@ def main(cfg: Show) -> int:
 
     import robocas_ms3.tasks  # noqa: F401  (registers the environments)
     from robocas_ms3.benchmark import TASKS
-    from robocas_ms3.demos.checks import check_number
     from robocas_ms3.files import make_folder, replacing
-    from robocas_ms3.recordings.seeds import GREATEST_SEED
     from robocas_ms3.tasks.transfer import TransferEnv
 
-    check_number("seed", cfg.seed, 0, GREATEST_SEED)
     shader = {"shader_pack": cfg.shader}
     env = gym.make(
         TASKS[config.task].env_id,

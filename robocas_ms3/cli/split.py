@@ -59,7 +59,7 @@ def main(cfg: Split) -> int:
         say(f"{cfg.dataset}: {count_of(len(train), 'episode')} for training, {len(val)} for validation")
         return 0
     part, pieces = _pieces(cfg, share)
-    with bar("episodes") as shown:
+    with bar("episodes written") as shown:
         done = write_parts(
             part,
             pieces,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from robocas_ms3.cli.bars import bar
+from robocas_ms3.cli.bars import bar, say
 from robocas_ms3.cli.options import Maybe
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.words import count_of
@@ -43,8 +43,6 @@ class Validate:
 
 def main(cfg: Validate) -> int:
     """Validate; gives the exit code."""
-    from rich.console import Console
-
     from robocas_ms3.datasets.checks.dataset import validate
     from robocas_ms3.datasets.formats import format_of
 
@@ -55,16 +53,15 @@ def main(cfg: Validate) -> int:
     found = format_of(cfg.dataset)
     if found and found.name != "robocas" and cfg.replay:
         raise DatasetError("only RoboCAS folders can be replayed", where=cfg.dataset)
-    with bar("checking", transient=True) as shown:
+    with bar("episodes checked", transient=True) as shown:
         check = found.part("checker") if found and found.checker else validate
         report: Report = check(cfg.dataset, on_episode=shown.at)
-    console = Console(soft_wrap=True, highlight=False, markup=False)
     if not cfg.json:
         for violation in report.violations:
-            console.print(str(violation))
+            say(str(violation))
         verdict = count_of(len(report.violations), "violation") if report.violations else "valid"
         counts = f"{count_of(report.episodes, 'episode')}, {count_of(report.steps, 'step')}"
-        console.print(f"{cfg.dataset}: {counts}, {verdict}")
+        say(f"{cfg.dataset}: {counts}, {verdict}")
     content, wrong = report.as_json(), bool(report.violations)
     if cfg.replay:
         replays = _replay(cfg.dataset, cfg.pack)
@@ -73,9 +70,9 @@ def main(cfg: Validate) -> int:
         wrong |= any((of_task["share"] or 0.0) < least for of_task in replays.by_task().values())
         if not cfg.json:
             for line in _lines(replays):
-                console.print(line)
+                say(line)
     if cfg.json:
-        console.print(json.dumps(content, indent=2, ensure_ascii=False))
+        say(json.dumps(content, indent=2, ensure_ascii=False))
     return 1 if wrong else 0
 
 
@@ -85,7 +82,7 @@ def _replay(root: Path, pack: str | None) -> ReplayReport:
     from robocas_ms3.processes import use_one_torch_thread
 
     use_one_torch_thread()
-    with bar("replaying", transient=True) as shown:
+    with bar("episodes replayed", transient=True) as shown:
         return replay_dataset(root, pack=pack, on_episode=lambda _, count: shown.next_of(count))
 
 

@@ -29,8 +29,7 @@ class Video:
 
 def main(cfg: Video) -> int:
     """Write them; gives the exit code."""
-    from rich.console import Console
-
+    from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.datasets.formats import open_source
     from robocas_ms3.datasets.pictures.video import contact_sheet, write_video
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER, episode_folder
@@ -41,10 +40,12 @@ def main(cfg: Video) -> int:
     for number in numbers:  # before anything is written
         dataset.episode(number)
     suffix = "" if cfg.kind == "rgb" else f"_{cfg.kind}"
-    console = Console(soft_wrap=True, highlight=False)
-    for number in numbers:
-        path = out / f"{episode_folder(number)}{suffix}.mp4"
-        console.print(str(write_video(dataset, number, path, speed=cfg.speed, kind=cfg.kind)))
+    with bar("episodes filmed") as shown:
+        shown.start(len(numbers))
+        for number in numbers:
+            path = out / f"{episode_folder(number)}{suffix}.mp4"
+            say(str(write_video(dataset, number, path, speed=cfg.speed, kind=cfg.kind)))
+            shown.advance()
     sheet = out / f"contact_sheet{suffix}.png"
-    console.print(str(contact_sheet(dataset, sheet, episodes=cfg.episodes or None, kind=cfg.kind)))
+    say(str(contact_sheet(dataset, sheet, episodes=cfg.episodes or None, kind=cfg.kind)))
     return 0

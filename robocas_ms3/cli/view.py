@@ -65,24 +65,21 @@ def main(cfg: View) -> int:
 
 
 def _write(cfg: View, out: Path, source, console) -> int:
-    from rich.console import Console
-    from rich.progress import Progress
-
+    from robocas_ms3.cli.bars import bar
     from robocas_ms3.outputs import check_overwrite, claim_output
     from robocas_ms3.viewer.export import export
 
     if cfg.overwrite:
         check_overwrite(out, ("data/index.js",), "made by `robocas view`")
     claim_output(out, resume=cfg.overwrite or None)  # what is there stays until the new one is written
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        bar = progress.add_task("episodes", total=None)
+    with bar("episodes written", transient=True) as shown:
         count, damaged = export(
             source,
             out,
             episodes=cfg.episodes,
             width=cfg.width,
             depth=cfg.depth,
-            on_episode=lambda done, all: progress.update(bar, completed=done, total=all),
+            on_episode=shown.at,
         )
     for number, wrong in damaged.items():
         console.print(f"episode {number} is damaged: {wrong}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
@@ -20,17 +19,7 @@ from robocas_ms3.planning.backends import BACKENDS
 from robocas_ms3.recordings.seeds import GREATEST_SEED
 from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.model import SceneModel
-
-
-def check_number(name: str, value: float, least: float, greatest: int | None = None) -> None:
-    """Check the range of a number.
-
-    Raises:
-        RobocasError: it is outside.
-    """
-    if not least <= value < math.inf or (greatest is not None and value > greatest):
-        expected = f"at least {least}" if greatest is None else f"{least} to {greatest}"
-        raise RobocasError("this number is out of range", where=name, expected=expected, found=value)
+from robocas_ms3.strict import check_number
 
 
 def check_limits(episode_seconds: float, memory_gb: float) -> None:

@@ -68,7 +68,7 @@ def generate(
     limits: Limits | None = None,
     resume: bool = False,
     overwrite: bool = False,
-    on_start: Callable[[], None] = lambda: None,
+    on_start: Callable[[int], None] = lambda there: None,
     on_result: Callable[[EpisodeResult], None] = lambda result: None,
 ) -> Summary:
     """Generate episodes of consecutive seeds until there are enough.
@@ -89,8 +89,9 @@ def generate(
             process down, is begun again once, and then given up. None: with one job this process does it.
         resume: go on with what is in ``out``.
         overwrite: replace what is in ``out``.
-        on_start: called once arguments, configuration, pack and output turned out right.
-        on_result: called for each seed, in order.
+        on_start: called once arguments, configuration, pack and output turned out right, with how many of the episodes
+            are there.
+        on_result: called for each seed that was not dealt with before, in order.
 
     Raises:
         OutputExistsError: ``out`` has content and neither flag is set, or what was made by another command.
@@ -107,9 +108,8 @@ def generate(
         check_same_run(out / RUN, run)
         make_folder(out)
         write_json(out / RUN, run)
-        on_start()
         with while_there(out / RUN):
-            return _generate_in(out, settings, episodes, first_seed, jobs, fork, limits, on_result)
+            return _generate_in(out, settings, episodes, first_seed, jobs, fork, limits, on_start, on_result)
 
 
 def _only_begun(out: Path) -> bool:
@@ -127,11 +127,13 @@ def _generate_in(
     jobs: int,
     fork: bool,
     limits: Limits | None,
+    on_start: Callable[[int], None],
     on_result: Callable[[EpisodeResult], None],
 ) -> Summary:
     shards, ledger = make_folder(out / "episodes"), Ledger(out / FAILURES_FILE)
     earlier = _finished(out, shards, ledger)
     ledger.keep_only(set(earlier))
+    on_start(sum(earlier[seed].success for seed in range(first_seed, first_seed + episodes) if seed in earlier))
     missing = (seed for seed in count(first_seed) if seed not in earlier)
     results: list[EpisodeResult] = []
     good = 0

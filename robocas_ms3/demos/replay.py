@@ -15,7 +15,6 @@ import torch
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES, parse_obs_mode_to_struct
 from mani_skill.trajectory.utils import dict_to_list_of_dicts
 
-from robocas_ms3.demos.checks import check_number
 from robocas_ms3.demos.convert_actions import CONVERTIBLE, convert_action
 from robocas_ms3.errors import DatasetError, RobocasError
 from robocas_ms3.files import make_folder
@@ -25,6 +24,7 @@ from robocas_ms3.recordings.environment import RecordedEnv, read_env
 from robocas_ms3.recordings.merging import merge
 from robocas_ms3.recordings.reading import open_trajectory, readable
 from robocas_ms3.recordings.writing import EpisodeRecorder
+from robocas_ms3.strict import check_number
 from robocas_ms3.tasks.base import RoboCASEnv
 
 

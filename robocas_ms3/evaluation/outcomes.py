@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import ValidatorFunctionWrapHandler, WrapValidator
 
 from robocas_ms3.benchmark import TASKS
 from robocas_ms3.benchmark.spec import STAGES as STAGES_ON_THE_WAY
-from robocas_ms3.evaluation import retrieval
+from robocas_ms3.evaluation.orders import order_of
 from robocas_ms3.evaluation.protocol import Episode
-from robocas_ms3.evaluation.rollout import Rollout
+
+if TYPE_CHECKING:
+    from robocas_ms3.evaluation.rollout import Rollout  # which imports the tasks; results are read without
 
 # evaluation_v0.md and the paper's table: reach, pick, recognise, clear
 STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
@@ -49,7 +51,7 @@ class Outcome:
         measures: ``path_length`` m, ``contact_impulse`` N s, ``disturbed_most``, ``fallen``; ``welds`` with the weld.
         inference_ms: clock time of the policy a step.
         p_vis: share of the target that is seen from above.
-        retrieval: in tasks with obstacles to clear: what was moved before the target, see `retrieval.outcome`.
+        retrieval: in tasks with obstacles to clear: what was moved before the target, see `orders.order_of`.
     """
 
     episode: int
@@ -77,7 +79,7 @@ class Outcome:
         flags, held_at, order = played.flags, played.flags.get("target_grasped"), None
         if played.retrieval is not None:
             cleared = flags.get("obstacles_cleared") is not None
-            order = retrieval.outcome(played.retrieval, objects, held_at, cleared=cleared)
+            order = order_of(played.retrieval, objects, held_at, cleared=cleared)
         return cls(
             episode=episode.episode,
             task=episode.task,

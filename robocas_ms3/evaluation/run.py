@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import platform
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,7 +67,8 @@ def evaluate(
     *,
     resume: bool = False,
     again: bool = False,
-) -> Iterator[tuple[Outcome, int]]:
+    on_start: Callable[[int], None] = lambda count: None,
+) -> Iterator[Outcome]:
     """Play the episodes that a result lacks, and write each as it ends.
 
     Args:
@@ -78,9 +79,10 @@ def evaluate(
         settings: how.
         resume: whether to go on with a result that is there.
         again: whether to play episodes again that an error broke off.
+        on_start: called with how many episodes are to be played.
 
     Yields:
-        What came of an episode, and how many are still to come.
+        What came of an episode.
 
     Raises:
         DatasetError: the policy wants to see, and there is no render device.
@@ -101,14 +103,13 @@ def evaluate(
     with locked_folder(folder):
         done = results.begin(folder, about(protocol, policy, name, settings), resume=resume, again=again)
         left = [episode for episode in wanted if episode.episode not in done]
-        count = len(left)
+        on_start(len(left))
         for config in dict.fromkeys(episode.config for episode in left):
             of_config = [episode for episode in left if episode.config == config]
             for outcome in _play(protocol, policy, of_config, settings):
                 with while_there(folder / results.RUN, EvaluationError):
                     results.append(folder, outcome)
-                count -= 1
-                yield outcome, count
+                yield outcome
 
 
 def chosen(episodes: Sequence[Episode], settings: Settings) -> list[Episode]:

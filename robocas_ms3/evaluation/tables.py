@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 
+from robocas_ms3.evaluation.orders import orders
 from robocas_ms3.evaluation.outcomes import STAGES, Outcome
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, success_by
 from robocas_ms3.words import count_of
 

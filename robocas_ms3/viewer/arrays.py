@@ -90,7 +90,7 @@ def _goal(goal: SubGoal) -> dict[str, Any]:
 
 def _objects(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
     layout, target = scene.get("layout") or {}, (scene.get("target") or {}).get("slot")
-    names = {thing["slot"]: called(thing.get("asset_id") or "", thing["name"]) for thing in scene.get("objects") or ()}
+    names = {thing["slot"]: called(thing["id"], thing["name"]) for thing in scene.get("objects") or ()}
     poses = layout.get("poses") or ()
     found = [
         {"name": names[slot], "target": slot == target, "path": [pose[:3]]}

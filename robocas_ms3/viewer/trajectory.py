@@ -110,7 +110,8 @@ def _objects(recording: Recording, scene: Mapping[str, Any], ids: Any, base_in_w
     """Paths of actors, thinned to one point where they stand still, without those parked far away."""
     target, world_to_base = scene.get("target") or {}, inverse(base_in_world)
     chosen = f"object_{target['slot']}" if target else ""
-    named = {f"object_{slot}": called(str(asset)) for slot, asset in enumerate(ids or ())}
+    names = {thing["slot"]: thing["name"] for thing in scene.get("objects") or ()}
+    named = {f"object_{slot}": called(str(asset), names.get(slot, "")) for slot, asset in enumerate(ids or ())}
     named |= {chosen: called(target.get("asset_id") or "", target.get("name") or "")}
     found = []
     for actor, states in recording.states.get("actors", {}).items():

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.cli import main as cli
+from robocas_ms3.cli.spelling import misspelt
 from robocas_ms3.errors import RobocasError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -86,18 +87,65 @@ def test_a_misspelt_command_is_one_line(word, fix, capsys):
     assert capsys.readouterr().err.startswith(f"error: {word}: no such command. {fix}")
 
 
-@pytest.mark.parametrize("command", [["generate", "pick", "--config"], ["show"]])
-def test_a_misspelt_configuration_is_told_before_anything_heavy_is_imported(command):
+MISTAKES = {  # said -> before anything heavy is imported
+    "generate pick --config pick_tabel_scattered": "Did you mean pick_table_scattered",
+    "show pick_tabel_scattered": "Did you mean pick_table_scattered",
+    "show --pack builtn": "builtn: no such asset pack",
+    "show --seed -1": "seed: this number is out of range",
+    "layouts build pick_tabel_scattered": "Did you mean pick_table_scattered",
+    "layouts build pick_table_scattered --seeds 3": "--seeds: no range of seeds",
+    "layouts build pick_table_scattered --jobs 0": "jobs: this number is out of range",
+    "replay missing.h5": "missing.json: the JSON that belongs to this trajectory is missing",
+    "convert missing.h5 --out o --to lerobt": "Did you mean lerobot?",
+    "convert missing.h5 --out o": "missing.h5: no such trajectory file",
+    "validate missing": "missing: no such dataset folder",
+    "stats missing": "missing: no dataset here",
+    "video missing": "missing: no dataset here",
+    "view missing": "missing: nothing to view here",
+    "merge missing other --out o": "missing: no dataset here",
+    "split missing": "how to split?",
+    "import-robocas missing": "missing: no dataset here",
+    "eval pik": "Did you mean pick?",
+    "eval --policy scriptd": "Did you mean scripted",
+    "eval --protocol ms3-v2": "ms3-v2: no such protocol",
+    "eval --shard 3": "--shard: no part of a whole",
+    "eval --episodes 0": "episodes: this number is out of range",
+    "eval report missing": "missing: no result of an evaluation",
+    "eval merge missing --out o": "missing: no result of an evaluation",
+    "eval compare missing other": "missing: no result of an evaluation",
+    "eval verify missing": "missing: no result of an evaluation",
+    "eval videos missing": "missing: no result of an evaluation",
+    "serve-policy scriptd": "Did you mean scripted",
+    "assets info builtn": "builtn: no such asset pack",
+}
+
+
+def test_mistakes_are_told_before_anything_heavy_is_imported(tmp_path):
+    """In one process, so that what one of them imported shows in all that follow."""
     code = (
         "import sys; from robocas_ms3.cli.main import run\n"
-        f"assert run({command!r} + ['pick_tabel_scattered']) == 1\n"
-        "assert not {'torch', 'sapien', 'mani_skill', 'gymnasium'} & set(sys.modules)"
+        f"for words in {list(MISTAKES)!r}:\n"
+        "    heavy = {'torch', 'sapien', 'mani_skill', 'gymnasium', 'matplotlib', 'trimesh', 'mplib'}\n"
+        "    assert run(words.split()) == 1, words\n"
+        "    assert not heavy & set(sys.modules), (words, heavy & set(sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "pick_tabel_scattered: no such task configuration" in done.stderr
-    assert "Did you mean pick_table_scattered" in done.stderr
+    for line, (words, said) in zip(done.stderr.splitlines(), MISTAKES.items(), strict=True):
+        assert line.startswith("error: ") and said in line, words
     assert "open_pick_cabinet_door" not in done.stderr  # not all forty
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_lists_things_imports_nothing_heavy(tmp_path):
+    code = (
+        "import sys; from robocas_ms3.cli.main import run\n"
+        "for words in ('list', 'eval protocols', 'assets list', 'assets info builtin'):\n"
+        "    assert run(words.split()) == 0, words\n"
+        "assert not {'torch', 'sapien', 'mani_skill', 'gymnasium', 'matplotlib', 'h5py', 'trimesh'} & set(sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
@@ -160,7 +208,47 @@ def test_no_arguments_show_the_overview(capsys):
     assert "generate" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("words", [["list", "--jsn"], ["convert"]])
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("list --jsn", "--jsn: no such option of robocas list. Did you mean --json"),
+        ("generate pick --episodez=3", "--episodez: no such option of robocas generate. Did you mean --episodes"),
+        (
+            "generate pik -n 3",
+            "pik: no such task (expected one of pick, select, search, open_pick). Did you mean pick",
+        ),
+        ("convert x.h5 --outt a", "--outt: no such option of robocas convert. Did you mean --out?"),
+        ("convert x --out y --image-format pgn", "pgn: no such image format (expected one of png, jpg, webp)."),
+        ("convert x --out y --no-vide", "--no-vide: no such option of robocas convert. Did you mean --no-video"),
+        ("split x --by seeds", "seeds: no such by (expected one of seed, target, task). Did you mean seed?"),
+        ("plan run tiny --out x --jbos 3", "--jbos: no such option of robocas plan run. Did you mean --jobs?"),
+        ("layouts info --quite", "--quite: no such option of robocas layouts info. See robocas layouts info --help."),
+        ("assets list --quite", "--quite: no such option of robocas assets list. See robocas assets list --help."),
+    ],
+)
+def test_a_misspelt_option_or_choice_is_one_line(words, said, capsys):
+    assert cli.run(words.split()) == 2
+    shown = capsys.readouterr()
+    assert shown.err.startswith(f"error: {said}")
+    assert (shown.err.count("\n"), shown.out) == (1, "")
+
+
+def test_no_option_that_there_is_counts_as_misspelt(capsys):
+    counted = 0
+    for words, of_command in every_help():
+        with pytest.raises(SystemExit):
+            cli.run([*words, "--help"])
+        rows = re.findall(r"^.? (-.+?)(?:  |│)", capsys.readouterr().out, flags=re.M)
+        for flag in re.findall(r"--[a-z-]+", " ".join(rows)):
+            assert misspelt(of_command, "it", [flag]) == "", (words, flag)
+            counted += 1
+    assert counted > 150
+    split = cli.config_type(cli.module_of("split"), "split")
+    for written in ("x --out_train a --out-val=b --by=seed", "x --by -1", "--tyro-print-completion bash", "x --parts"):
+        assert misspelt(split, "it", written.split()) == ""
+
+
+@pytest.mark.parametrize("words", [["convert"], ["generate", "pick", "-n", "three"]])
 def test_wrong_arguments_are_exit_code_2(words, capsys):
     with pytest.raises(SystemExit) as exit_info:
         cli.run(words)

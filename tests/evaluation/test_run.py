@@ -57,8 +57,10 @@ def test_outcomes_do_not_depend_on_how_many_envs_there_are_or_on_shards(alone, s
 @pytest.mark.slow
 def test_a_run_that_was_cut_off_goes_on_and_ends_the_same(alone, short, tmp_path):
     protocol, settings = load_protocol(short), Settings(1, "processes", tasks=("pick", "select"))
-    playing = evaluate(protocol, make_policy("random"), "random", tmp_path, settings)
-    assert next(playing)[1] == 3
+    begun: list[int] = []
+    playing = evaluate(protocol, make_policy("random"), "random", tmp_path, settings, on_start=begun.append)
+    next(playing)
+    assert begun == [4]
     playing.close()
     path = tmp_path / "episodes.jsonl"
     path.write_text(path.read_text() + path.read_text()[:100])  # and killed while it wrote

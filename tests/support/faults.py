@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -184,8 +185,8 @@ def alive(group):
 
 
 def lines_of(said):
-    """What is left of stderr without the bar."""
-    return [line for line in said.splitlines() if line.strip() and ": recording " not in line]
+    """What is left of stderr without the lines of progress."""
+    return [line for line in said.splitlines() if line.strip() and not re.match(r"[a-z ]+: \d+ of \d+(,|$)", line)]
 
 
 def is_one_line(said):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rich.progress import Progress
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli.layouts import try_all
@@ -59,7 +58,7 @@ def test_what_was_found_before_an_interruption_is_kept(bank, monkeypatch):
     monkeypatch.setattr(trial, "try_layouts", tried)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
-            try_all(bank, "cpu", Progress(disable=True))
+            try_all(bank, "cpu")
     table = bank.table("cpu")
     assert table is not None
     assert (table.pairs(State.STAYS), table.pairs(State.MOVES)) == ([(0, 0)], [(0, 1)])

@@ -89,6 +89,22 @@ def test_an_episode_of_a_trajectory(run_folder, made_up):
     assert [(f["stage"], f["reason"]) for f in episode["failures"]] == [("grasp", "slipped")]
 
 
+def test_objects_are_called_the_same_in_a_recording_and_in_its_dataset(run_folder, folder, tmp_path):
+    """By name, and by an id that says more; those of no pack that is here by their id."""
+    recorded = shutil.copytree(run_folder, tmp_path / "run") / "trajectory.json"
+    metadata = json.loads(recorded.read_text())
+    metadata["episodes"][0]["robocas"]["objects"] = ["cube", "toy_airplane_c", "some_thing"]
+    recorded.write_text(json.dumps(metadata))
+    converted = shutil.copytree(folder, tmp_path / "dataset") / "episode_0000000" / "scene.json"
+    scene = json.loads(converted.read_text())
+    scene["objects"][1] |= {"id": "toy_airplane_c", "name": "white toy airplane"}
+    scene["layout"]["poses"] = [[0.1 * slot, 0, 0.7, 1, 0, 0, 0] for slot in range(3)]
+    converted.write_text(json.dumps(scene))
+    for path, others in ((recorded.with_suffix(".h5"), {"some thing"}), (converted.parents[1], {"cube"})):
+        called = {thing["name"] for thing in open_source(path).episode(0)["trace"]["objects"]}
+        assert called - {"cube 3 (cube)"} == {"white toy airplane (toy airplane c)"} | others
+
+
 def test_the_tcp_of_a_trajectory_is_where_its_joints_put_it(run_folder):
     """Worked out from the Panda's published Denavit-Hartenberg parameters, for the first state of episode 0."""
     from scipy.spatial.transform import Rotation

@@ -86,9 +86,8 @@ def facts_of(episode: SourceEpisode) -> Facts:
         ids = layout.get("object_ids", [])
         poses = np.array(layout.get("poses", []), dtype=np.float64).reshape(-1, 7)
         slots = [slot for slot, there in enumerate(layout.get("present", [True] * len(ids))) if there]
-        names = {entry["id"]: entry["name"] for entry in scene.get("objects") or []}
-        if not names and {"asset_id", "name"} <= set(target):
-            names = {target["asset_id"]: target["name"]}
+        names = {target["asset_id"]: target["name"]} if {"asset_id", "name"} <= set(target) else {}
+        names |= {entry["id"]: entry["name"] for entry in scene.get("objects") or []}
         return Facts(
             instruction,
             task=scene.get("task") or UNKNOWN,

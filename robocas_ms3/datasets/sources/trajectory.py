@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.assets.pack import load_pack, pack_folders
 from robocas_ms3.config import load_task_config
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.datasets.sources.episode import DEFAULT_RATE
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Side, SourceEpisode
 from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry, succeeded
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.errors import DatasetError, RobocasError
+from robocas_ms3.errors import AssetError, DatasetError, RobocasError
 from robocas_ms3.recordings.entries import Entry
 from robocas_ms3.recordings.motion import sample_states, sample_stride
 from robocas_ms3.recordings.reading import Recording, TrajectoryFile
@@ -127,10 +128,17 @@ class TrajectorySource(EpisodeSource):
         return RecordedEpisode(self, number)
 
     def scene(self, number: int) -> dict[str, Any]:
-        """What the JSON says of how an episode was made."""
-        scene = self.said(number).scene
-        config = scene["env_info"]["env_kwargs"].get("config")
-        return {**scene, "config": config if isinstance(config, Mapping) else _shipped(str(config))}
+        """What the JSON says of how an episode was made, and what its objects are called, if their pack is here."""
+        said = self.said(number)
+        kwargs = said.scene["env_info"]["env_kwargs"]
+        config, names = kwargs.get("config"), _names(str(kwargs.get("pack", "builtin")))
+        objects = [
+            {"slot": slot, "id": asset, "name": names[asset]}
+            for slot, asset in enumerate(said.objects or ())
+            if isinstance(asset, str) and asset in names
+        ]
+        config = config if isinstance(config, Mapping) else _shipped(str(config))
+        return {**said.scene, "config": config, "objects": objects}
 
 
 class RecordedEpisode(SourceEpisode):
@@ -227,6 +235,15 @@ def _attempt(file: TrajectoryFile, index: int) -> SaidOfRecording | DatasetError
         return SaidOfRecording.read(file, index)
     except DatasetError as error:
         return error
+
+
+@cache
+def _names(pack: str) -> dict[str, str]:
+    """What instructions call the objects of an installed pack, by id; a file can't choose a folder."""
+    try:
+        return {asset: of.asset.name for asset, of in load_pack(pack).objects.items()} if pack in pack_folders() else {}
+    except AssetError:
+        return {}
 
 
 @cache

@@ -68,7 +68,22 @@ def make_policy(name: str) -> Policy:
     return policy
 
 
+def check_policy(name: str) -> None:
+    """Check that a name can be a policy's, without making that.
+
+    Raises:
+        EvaluationError: it can't.
+    """
+    kind, _, rest = name.partition(":")
+    known = [*POLICIES.builtin, *POLICIES.points]
+    of_own = re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier()
+    if not (name in known or of_own or (kind in ("ws", "wss", "replay") and rest)):
+        expected = f"{', '.join(known)}, replay:TRAJECTORY.h5, module:Class or ws://host:port"
+        raise EvaluationError("no such policy", where=name, expected=expected, fix=nearest(name, known))
+
+
 def _made(name: str) -> Policy:
+    check_policy(name)
     if name in POLICIES.builtin:
         return POLICIES[name]()
     kind, _, rest = name.partition(":")
@@ -82,10 +97,6 @@ def _made(name: str) -> Policy:
         return ReplayPolicy(Path(rest))
     if name in POLICIES:
         return _call(name, POLICIES[name])
-    if not re.fullmatch(r"\w+(\.\w+)*", kind) or not rest.isidentifier():
-        known = [*POLICIES.builtin, *POLICIES.points]
-        expected = f"{', '.join(known)}, replay:TRAJECTORY.h5, module:Class or ws://host:port"
-        raise EvaluationError("no such policy", where=name, expected=expected, fix=nearest(name, known))
     return _own(name, kind, rest)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from robocas_ms3.evaluation.orders import orders
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.background import measured_with
@@ -16,7 +17,6 @@ from robocas_ms3.evaluation.report.failed import failed_episodes
 from robocas_ms3.evaluation.report.marks import axis, bar, rate, round_up, section, spread, table
 from robocas_ms3.evaluation.report.stages import FAILURES, failure_of, funnel_of
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.retrieval import orders
 from robocas_ms3.evaluation.statistics import Share, share, success_by
 from robocas_ms3.evaluation.tables import P_VIS_EDGES, WELDED, first_splits
 from robocas_ms3.evaluation.tables import title as title_of
