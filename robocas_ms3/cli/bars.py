@@ -125,11 +125,13 @@ def speed(done: float, count: float, there: float, seconds: float) -> str:
 
 
 def span(seconds: float) -> str:
-    """``45 s``, ``6 min``, ``3 h 20 min``."""
+    """``45 s``, ``6 min``, ``3 h 20 min``, ``2.1 days``."""
     minutes = round(seconds / 60)
     if seconds < 59.5:
         return f"{seconds:.0f} s"
-    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+    if minutes < 60:
+        return f"{minutes} min"
+    return f"{minutes // 60} h {minutes % 60} min" if minutes < 2 * 24 * 60 else f"{seconds / 86400:.1f} days"
 
 
 def columns() -> tuple[Any, ...]:
@@ -165,14 +167,14 @@ def bar(description: str, *, transient: bool = False) -> Iterator[Bar]:
 @contextmanager
 def working(text: str) -> Iterator[None]:
     """Show on a terminal that something is going on, of which nobody knows how far it is."""
-    terminal = _terminal()
+    terminal = terminal_of_stderr()
     with terminal.status(text) if terminal else nullcontext():
         yield
 
 
 def _progress(transient: bool) -> Any:
     """Of rich; none where stderr is no terminal."""
-    terminal = _terminal()
+    terminal = terminal_of_stderr()
     if terminal is None:
         return None
     from rich.progress import Progress
@@ -181,7 +183,7 @@ def _progress(transient: bool) -> Any:
     return Progress(*columns(), console=terminal, transient=transient, redirect_stdout=beside)
 
 
-def _terminal() -> Any:
+def terminal_of_stderr() -> Any:
     """Rich's console of stderr, if that is a terminal that can move its cursor; FORCE_COLOR makes none of a log."""
     if not sys.stderr.isatty():
         return None

@@ -107,9 +107,8 @@ def run(command: Run) -> int:
             resume=command.resume,
             overwrite=command.overwrite,
             jobs=jobs,
-            on_start=progress.begin,
             on_progress=progress.at,
-            on_stage=progress.stage,
+            on_stage=progress.note,
         )
     say(f"{command.out}: {count_of(report['episodes'], 'episode')}; report.json")
     return 0

@@ -9,10 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from robocas_ms3.cli.bars import Log
+from robocas_ms3.cli.bars import Log, span, terminal_of_stderr
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.status import status
@@ -33,58 +32,61 @@ class PlanProgress:
     def __init__(self, plan: Plan, out: Path) -> None:
         self._plan, self._out = plan, out
         self._total = sum(part.episodes for part in plan.parts)
-        console = Console(stderr=True)
-        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-        self._shown = Progress(*columns, TextColumn("{task.fields[left]}"), console=console)
-        self._terminal, self._log = console.is_interactive, Log()
-        self._left, self._looked = "", -_LOOK
+        self._log = Log()
+        self._text = self._speed = ""
+        self._looked = -_LOOK
+        terminal = terminal_of_stderr()
+        columns = TextColumn("{task.description}"), BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn()
+        beside = sys.stdout.isatty()  # else what goes into a file or a pipe would be shown here instead
+        about = TextColumn("{task.fields[about]}")
+        self._shown = Progress(*columns, about, console=terminal, redirect_stdout=beside) if terminal else None
 
     def __enter__(self) -> PlanProgress:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._shown.live.is_started:  # else it prints an empty line
+        if self._shown is None:
+            if self._text:
+                self._log.tell(self._text, last=True)
+        elif self._shown.live.is_started:  # else it prints an empty line
             self._shown.stop()
 
     def at(self, counts: Sequence[int]) -> None:
         """So many episodes of each part are there."""
         self._estimate()
-        if not self._terminal:
-            self._log.tell(self._line(counts))
+        if self._shown is None:
+            self._text = self._line(counts)
+            self._log.tell(self._text, self._speed)
         else:
-            self._draw(counts)
+            self._draw(self._shown, counts)
 
-    def begin(self) -> None:
-        """Say what is to be made."""
-        if not self._terminal:
-            _print(f"{self._out}: {count_of(self._total, 'episode')} of {count_of(len(self._plan.parts), 'part')}")
-
-    def stage(self, text: str) -> None:
-        """What is done now."""
-        if self._shown.live.is_started:
-            self._shown.console.print(text, highlight=False, markup=False)
+    def note(self, text: str) -> None:
+        """Say what is done now."""
+        if self._shown is None:
+            print(text, file=sys.stderr, flush=True)
         else:
-            _print(text)
+            self._shown.console.print(text, soft_wrap=True, highlight=False, markup=False, emoji=False)
 
-    def _draw(self, counts: Sequence[int]) -> None:
+    def _draw(self, shown: Progress, counts: Sequence[int]) -> None:
         rows = [(f"{part.name}", part.episodes, count) for part, count in zip(self._plan.parts, counts, strict=True)]
         rows = [*(rows if 1 < len(rows) <= _BARS else []), ("all", self._total, sum(counts))]
-        if not self._shown.live.is_started:
+        if not shown.task_ids:
             for name, total, count in rows:
-                self._shown.add_task(name, total=total, completed=count, left="")
-            self._shown.start()
-        for bar, (_, _, count) in zip(self._shown.task_ids, rows, strict=True):
-            self._shown.update(bar, completed=count)
-        self._shown.update(self._shown.task_ids[-1], left=self._left)
+                shown.add_task(name, total=total, completed=count, about="")
+            shown.start()
+        for bar, (_, _, count) in zip(shown.task_ids, rows, strict=True):
+            shown.update(bar, completed=count)
+        shown.update(shown.task_ids[-1], about=self._speed)
 
     def _line(self, counts: Sequence[int]) -> str:
+        """How far all is, and the parts that are under way."""
         parts = [
             f"{part.name} {count} of {part.episodes}"
             for part, count in zip(self._plan.parts, counts, strict=True)
             if 0 < count < part.episodes
         ]
-        left = [self._left] if self._left else []
-        return "; ".join([f"{sum(counts)} of {count_of(self._total, 'episode')}", *parts[:_BARS], *left])
+        said = f"{sum(counts)} of {count_of(self._total, 'episode')}"
+        return f"{said} ({'; '.join(parts[:_BARS])})" if len(counts) > 1 and parts else said
 
     def _estimate(self) -> None:
         if time.monotonic() < self._looked + _LOOK:
@@ -93,17 +95,5 @@ class PlanProgress:
         with suppress(RobocasError, OSError):  # whoever does the work will say what is wrong with the folder
             found = status(self._out)
             if found.seconds_left is not None:
-                rate = round(found.episodes_an_hour)
-                self._left = f"{count_of(rate, 'episode')} an hour, {_span(found.seconds_left)} left"
-
-
-def _span(seconds: float) -> str:
-    """``40 s``, ``12 min``, ``3.5 h``, ``2.1 days``."""
-    for unit, name, digits in ((86400.0, "days", 1), (3600.0, "h", 1), (60.0, "min", 0)):
-        if seconds >= 2 * unit:
-            return f"{seconds / unit:.{digits}f} {name}"
-    return f"{seconds:.0f} s"
-
-
-def _print(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+                rate = count_of(round(found.episodes_an_hour), "episode")
+                self._speed = f"{rate} an hour, {span(found.seconds_left)} left"

@@ -7,18 +7,17 @@ from plan_stages import PLAN
 from rich.console import Console
 
 from robocas_ms3.cli import bars, plan_progress
-from robocas_ms3.cli.plan_progress import PlanProgress, _span
+from robocas_ms3.cli.plan_progress import PlanProgress
 
 
 @pytest.fixture
 def shown(monkeypatch, tmp_path):
-    """A progress on a made-up terminal or log, which looks and tells whenever it is asked; what it wrote."""
+    """A progress on a made-up terminal or in a log, which looks and tells whenever it is asked; what it wrote."""
 
     def show(terminal):
         file = io.StringIO()
-        monkeypatch.setattr(
-            plan_progress, "Console", lambda **_: Console(file=file, force_terminal=terminal, width=100)
-        )
+        console = Console(file=file, force_terminal=True, width=120) if terminal else None
+        monkeypatch.setattr(plan_progress, "terminal_of_stderr", lambda: console)
         monkeypatch.setattr(plan_progress, "_LOOK", 0.0)
         monkeypatch.setattr(bars, "EVERY", 0.0)
         found = type("Found", (), {"seconds_left": 5400.0, "episodes_an_hour": 120.0})
@@ -28,39 +27,39 @@ def shown(monkeypatch, tmp_path):
     return show
 
 
-def test_a_log_has_a_line_now_and_then(shown, capsys, tmp_path):
-    progress, file = shown(terminal=False)
+def test_a_log_has_a_line_now_and_then(shown, capsys):
+    progress, _ = shown(terminal=False)
     with progress:
-        progress.begin()
         progress.at([0, 0])
         progress.at([5, 1])
-        progress.stage("joining the dataset")
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == f"{tmp_path}: 7 episodes of 2 parts"
-    assert lines[1].startswith("0 of 7 episodes; 120 episodes an hour, 90 min left")
-    assert lines[2].startswith("6 of 7 episodes; b 1 of 2; 120 episodes an hour, 90 min left")
-    assert lines[3] == "joining the dataset"
-    assert file.getvalue() == ""
+        progress.note("joining the dataset")
+        progress.at([5, 2])
+    assert capsys.readouterr().err.splitlines() == [
+        "0 of 7 episodes, 120 episodes an hour, 1 h 30 min left",
+        "6 of 7 episodes (b 1 of 2), 120 episodes an hour, 1 h 30 min left",
+        "joining the dataset",
+        "7 of 7 episodes, 120 episodes an hour, 1 h 30 min left",
+    ]
+
+
+def test_the_last_line_comes_though_it_is_not_time(shown, capsys, monkeypatch):
+    progress, _ = shown(terminal=False)
+    monkeypatch.setattr(bars, "EVERY", 60.0)
+    with progress:
+        for counts in ([0, 0], [3, 0], [5, 2]):
+            progress.at(counts)
+    assert [line.partition(",")[0] for line in capsys.readouterr().err.splitlines()] == [
+        "0 of 7 episodes",
+        "7 of 7 episodes",
+    ]
 
 
 def test_a_terminal_has_a_bar_a_part_and_one_for_all(shown, capsys):
     progress, file = shown(terminal=True)
     with progress:
-        progress.begin()
         progress.at([2, 0])
         progress.at([5, 1])
-        progress.stage("joining [red]the dataset")
-    text = file.getvalue()
-    assert "5/5" in text
-    assert "1/2" in text
-    assert "6/7" in text
-    assert "120 episodes an hour, 90 min left" in text
-    assert "joining [red]the dataset" in text
+        progress.note("joining [red]the dataset")
+    for text in ("5/5", "1/2", "6/7", "120 episodes an hour, 1 h 30 min left", "joining [red]the dataset"):
+        assert text in file.getvalue()
     assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize(
-    ("seconds", "said"), [(40, "40 s"), (119, "119 s"), (720, "12 min"), (12600, "3.5 h"), (181440, "2.1 days")]
-)
-def test_spans(seconds, said):
-    assert _span(seconds) == said
