@@ -6,7 +6,6 @@ ManiSkill's folder holds ``info_pick_v0.json``, which maps a model's name to its
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Sequence
@@ -22,6 +21,7 @@ from asset_tools.prepare import prepare
 from asset_tools.scan import find_mesh
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import AssetError
 
 INFO, MODELS = "info_pick_v0.json", "models"
@@ -158,7 +158,7 @@ def _info(root: Path) -> dict[str, dict[str, Any]]:
     if not path.is_file():
         raise AssetError("ManiSkill's YCB objects are not there", where=root, expected=INFO, fix=DOWNLOAD)
     try:
-        info = json.loads(path.read_text(encoding="utf-8"))
+        info = load_json(path)
     except ValueError as error:
         raise AssetError("can't read the list of YCB objects", where=path, found=error, fix=DOWNLOAD) from error
     if not isinstance(info, dict) or not info or not all(isinstance(entry, dict) for entry in info.values()):

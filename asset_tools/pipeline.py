@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import re
 import shutil
@@ -20,10 +19,12 @@ from scipy.spatial import QhullError
 from robocas_ms3.assets.cooking import cooking_faults
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, Asset, FurnitureAsset, ObjectAsset, PackManifest
 from robocas_ms3.assets.pack import MANIFEST, sha256
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import AssetError, RobocasError
 from robocas_ms3.files import replacing_folder, write_json
 from robocas_ms3.outputs import check_overwrite
 from robocas_ms3.processes import Calls, Pool
+from robocas_ms3.strict import validate_json
 
 MADE_FROM = "made_from.json"  # of a pack: asset id -> hash of what it was made from
 ENTRY = "asset.json"  # what the manifest says of a kept asset; written last
@@ -169,7 +170,7 @@ def _failed(job: Job, message: str) -> JobResult:
 def _copied(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset | None:
     """Copy an asset that was kept; none if there is none, or it was damaged since."""
     try:
-        asset = _ASSET.validate_json((place / ENTRY).read_bytes(), strict=True)
+        asset = validate_json(_ASSET, (place / ENTRY).read_bytes())
         place.touch()
         shutil.copytree(place, folder, ignore=shutil.ignore_patterns(ENTRY))
         if all(sha256(folder / name) == found for name, found in asset.files.items()):
@@ -261,7 +262,7 @@ def check_target(folder: Path) -> None:
 def made_of(jobs: Sequence[Job], folder: Path, *, skip_bad: bool = False) -> bool:
     """Whether a pack was made of just these assets, by this code; with ``skip_bad``, some may have been left out."""
     try:
-        found = json.loads((folder / MADE_FROM).read_text(encoding="utf-8"))
+        found = load_json(folder / MADE_FROM)
         return found["content"] == {job.id: job.content for job in jobs} and (skip_bad or not found["left_out"])
     except (OSError, ValueError, TypeError, KeyError):
         return False

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import struct
 import unicodedata
@@ -16,6 +15,7 @@ from urllib.parse import unquote
 from PIL import Image
 from trimesh.resolvers import Resolver
 
+from robocas_ms3.documents import json_values
 from robocas_ms3.errors import AssetError
 
 LARGEST = 16384**2  # pixels of a texture: 0.8 GB once unpacked
@@ -157,9 +157,11 @@ def _of_gltf(path: Path, files: ScanFiles, repairs: list[str]) -> None:
     if path.suffix.lower() == ".glb":
         data = data[20 : 20 + struct.unpack("<I", data[12:16])[0]] if len(data) > 20 else b""
     try:
-        tree = json.loads(data.decode("utf-8"))
+        tree = json_values(data)
     except ValueError as error:
         raise AssetError("can't read this mesh", where=path, found=f"no JSON: {error}") from error
+    if not isinstance(tree, dict):
+        raise AssetError("can't read this mesh", where=path, expected="an object of JSON", found=str(tree)[:40])
     needed = [name for name in tree.get("extensionsRequired", []) if name in NEEDED]
     if needed:
         fix = "Export it without compression."

@@ -20,6 +20,7 @@ from robocas_ms3.errors import AssetError, MissingExtraError
 Array = NDArray[np.float64]
 
 CREASE = np.cos(np.deg2rad(40))  # faces that meet more sharply get an edge, not a smooth normal
+STUCK = 0.9  # of the faces left by a step of simplifying: a rougher one is needed
 SAMPLES = 150_000  # on the original surface, to find the face that a texel shows
 NORMAL_WEIGHT = 0.02  # of the diagonal; keeps the two sides of a thin shell apart, hardly moves anything else
 
@@ -56,7 +57,7 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
         uv = None if source.plain else source.uv
         texture = None if source.image is None else _shrunk(source.image, texture_size)
     else:
-        body = _simplified(mesh, triangles)
+        body = simplified(mesh, triangles)
         corner_normals = _crease_normals(body)
         faces, uv, texture = np.asarray(body.faces), None, None
         origin = np.arange(len(body.vertices))
@@ -113,18 +114,23 @@ def _shrunk(image: Image.Image, size: int) -> Image.Image:
     return image.resize((width, height), Image.Resampling.BOX if scale <= 0.5 else Image.Resampling.LANCZOS)
 
 
-def _simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
+def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     """Vertices merged by position, faces collapsed to the limit, wound outward."""
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     body.merge_vertices(digits_vertex=None)
     center, size = body.bounds.mean(axis=0), float(np.linalg.norm(body.extents))
     vertices, faces = (np.asarray(body.vertices) - center) / size, np.asarray(body.faces)
-    for aggression in (5, 7, 9, 12, 16, 20):  # gentle first: it may stop above the limit
-        if len(faces) <= triangles:
-            break
-        vertices, faces = fast_simplification.simplify(
-            np.ascontiguousarray(vertices), faces.astype(np.int32), target_count=triangles, agg=aggression
-        )[:2]
+    for aggression in (2, 3, 5, 7, 9, 12, 16, 20):  # gentle first: it may stop above the limit
+        before = np.inf
+        while triangles < len(faces) < STUCK * before:
+            before = len(faces)
+            # by halves: a dense mesh that is to lose most of its faces at once folds over
+            vertices, faces = fast_simplification.simplify(
+                np.ascontiguousarray(vertices),
+                faces.astype(np.int32),
+                target_count=max(triangles, before // 2),
+                agg=aggression,
+            )[:2]
     if len(faces) > triangles or len(faces) == 0:
         raise AssetError("can't simplify this mesh so far", expected=f"1 to {triangles} faces", found=len(faces))
     body = trimesh.Trimesh(vertices * size + center, faces, process=False)
@@ -233,7 +239,7 @@ def _closest(mesh: trimesh.Trimesh, points: Array, normals: Array) -> tuple[NDAr
     spots = np.random.default_rng(0).dirichlet((1, 1, 1), len(face))
     reach = NORMAL_WEIGHT * float(np.linalg.norm(mesh.extents))
     places = np.einsum("nc,ncd->nd", spots, triangles[face])
-    tree = KDTree(np.hstack([places, reach * facing[face]]), balanced_tree=False, compact_nodes=False)
+    tree = KDTree(np.hstack([places, reach * facing[face]]), balanced_tree=False)
     lengths = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     found = face[tree.query(np.hstack([points, reach * normals / lengths]))[1]]
     return found, _clamped(_barycentric(triangles, found, points))

@@ -33,7 +33,7 @@ from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import Noise
 from robocas_ms3.recordings.motion import Motion, sample_states, sample_stride
-from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.stored import open_trajectory
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.table import PANDA
 

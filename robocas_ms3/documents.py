@@ -11,6 +11,7 @@ import json
 import tokenize
 import zipfile
 import zlib
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ import yaml
 JSON_LIMIT = 256 * 2**20
 """Bytes: a hundred thousand recordings have 230 MB of it."""
 YAML_LIMIT = 4 * 2**20
+ARRAYS_LIMIT = 2**31
+"""Bytes that the arrays of an ``.npz`` may have: compressed, they can be a thousandth of that."""
 YAML_DEPTH = 64
 YAML_NODES = 500_000
 """Values, those that aliases stand for counted each time: nine aliases of nine aliases of ... are a billion."""
@@ -40,12 +43,20 @@ def load_json(path: Path) -> Any:
     """Read a JSON file.
 
     Raises:
-        DocumentError: it is no JSON, or too large or deep.
+        DocumentError: it is no JSON, or too large or deep, or a number in it is not finite.
         OSError: it can't be read.
     """
-    text = _text(path, JSON_LIMIT)
+    return json_values(_text(path, JSON_LIMIT))
+
+
+def json_values(text: str | bytes) -> Any:
+    """Values of a text of JSON. It knows no NaN and no infinity, whatever Python's own reader takes.
+
+    Raises:
+        DocumentError: it is no JSON, or too deep, or a number in it is not finite.
+    """
     try:
-        return json.loads(text)
+        return json.loads(text, parse_constant=_no_number, parse_float=_finite)
     except ValueError as error:
         raise DocumentError(str(error)) from error
     except RecursionError as error:
@@ -64,6 +75,33 @@ def load_yaml(path: Path) -> Any:
         return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
     except (yaml.YAMLError, ValueError, AttributeError, LookupError, TypeError) as error:
         raise DocumentError(" ".join(str(error).split())) from error
+
+
+def open_arrays(path: Path) -> Any:
+    """Open an ``.npz``; NumPy's reader of it, for a ``with`` statement, which makes no objects of Python's.
+
+    Raises:
+        ValueError: or another of `DAMAGED`: it is none, or its arrays are too large.
+    """
+    import numpy as np  # not for every command
+    from numpy.lib.npyio import NpzFile
+
+    file = np.load(path, allow_pickle=False)
+    if not isinstance(file, NpzFile):
+        raise DocumentError("one array, not an archive of several")
+    if file.zip is not None and sum(info.file_size for info in file.zip.infolist()) > ARRAYS_LIMIT:
+        file.close()
+        raise DocumentError(f"more than {ARRAYS_LIMIT >> 20} MB of arrays")
+    return file
+
+
+def _no_number(word: str) -> float:
+    raise DocumentError(f"{word} is no number of JSON")
+
+
+def _finite(word: str) -> float:
+    number = float(word)
+    return number if isfinite(number) else _no_number(word[:40])
 
 
 def _text(path: Path, limit: int) -> str:

@@ -1,6 +1,7 @@
 """Files of JSON lines that grow by a record at a time, as runs and evaluations keep what came of their parts.
 
-A run may be killed while it writes: a last line that was cut off is no line, and is written over.
+A run may be killed while it writes: a last line that was cut off is no line, and is written over. One with a number
+that is NaN or infinite is damaged.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import naming, replacing
-from robocas_ms3.strict import refusal
+from robocas_ms3.strict import refusal, validate_json
 
 Record = TypeVar("Record")
 _Error = TypeVar("_Error", bound=RobocasError)
@@ -77,7 +78,7 @@ class Ledger(Generic[Record]):
         """Add lines.
 
         Args:
-            records: what they say; if there are none, the file is not touched.
+            records: what they say, in finite numbers; if there are none, the file is not touched.
             sync: whether they are on the disk when this returns.
         """
         text = _text(records)
@@ -108,7 +109,7 @@ class Ledger(Generic[Record]):
 
     def _read(self, number: int, text: bytes, last: int) -> Line[Record]:
         try:
-            return Line(number, self._form.validate_json(text, strict=True))
+            return Line(number, validate_json(self._form, text))
         except ValidationError as problem:
             return Line(number, None, problem, cut_off=number == last)
 
@@ -130,4 +131,4 @@ class Ledger(Generic[Record]):
 
 def _text(records: Iterable[Any]) -> bytes:
     plain = (asdict(record) if is_dataclass(record) and not isinstance(record, type) else record for record in records)
-    return "".join(json.dumps(record) + "\n" for record in plain).encode()
+    return "".join(json.dumps(record, allow_nan=False) + "\n" for record in plain).encode()

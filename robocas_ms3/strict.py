@@ -15,9 +15,11 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
+from robocas_ms3.documents import DocumentError, json_values
 from robocas_ms3.errors import RobocasError
 
 _Model = TypeVar("_Model", bound=BaseModel)
+_Value = TypeVar("_Value")
 _Error = TypeVar("_Error", bound=RobocasError)
 
 # pydantic's words for what it wanted, where its message alone doesn't say it
@@ -34,6 +36,7 @@ _EXPECTED = {
     "dict_type": "a mapping",
 }
 _FOUND_LENGTH = 80  # of a wrong value in a message
+_ENDLESS = re.compile(rb"NaN|Infinity|\d[eE]\+?\d{3}|\d{309}")  # what may be a number that is not finite
 
 
 class StrictModel(BaseModel):
@@ -93,9 +96,28 @@ def parse_json(
 ) -> _Model:
     """The same of JSON."""
     try:
-        return model.model_validate_json(text, strict=True)
+        return validate_json(model, text)
     except ValidationError as problem:
         raise refusal(problem, model, error, where=where, about=about) from problem
+
+
+def validate_json(form: type[_Model] | TypeAdapter[_Value], text: str | bytes) -> Any:
+    """JSON in a declared form, by its types; no number is NaN or infinite, not even where the form takes anything.
+
+    Raises:
+        ValidationError: it says something else.
+    """
+    if isinstance(form, TypeAdapter):
+        found: Any = form.validate_json(text, strict=True)
+    else:
+        found = form.model_validate_json(text, strict=True)
+    if _ENDLESS.search(text.encode() if isinstance(text, str) else text):  # hardly ever: then it is read once more
+        try:
+            json_values(text)
+        except DocumentError as problem:
+            said: Any = {"type": "json_invalid", "loc": (), "input": "", "ctx": {"error": str(problem)}}
+            raise ValidationError.from_exception_data("JSON", [said]) from problem
+    return found
 
 
 def refusal(

@@ -1,6 +1,7 @@
 """Files of others are bounded before anything is built of them."""
 
 import json
+import re
 import time
 
 import pytest
@@ -57,6 +58,13 @@ def test_yaml_may_be_nested_so_deep_and_no_deeper(file):
 def test_json_nested_too_deeply(file):
     with pytest.raises(DocumentError, match="nested too deeply"):
         load_json(file("[" * 100_000 + "]" * 100_000))
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "-2.5E+400", "9" * 400 + ".0"])
+def test_json_knows_finite_numbers_only(file, number):
+    with pytest.raises(DocumentError, match=f"^{re.escape(number[:40])} is no number of JSON$"):
+        load_json(file(f'{{"a": [1, {number}]}}'))
+    assert load_json(file(f'["{number}", 1e300]')) == [number, 1e300]
 
 
 @pytest.mark.parametrize(("load", "limit"), [(load_json, "JSON_LIMIT"), (load_yaml, "YAML_LIMIT")])

@@ -61,6 +61,18 @@ def test_damaged_lines_are_told_from_one_that_was_cut_off(ledger):
     assert ledger.read() == [Try(1), Try(2), Try(3)]
 
 
+@pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999", "9" * 400 + ".5"])
+def test_a_number_that_is_not_finite_damages_its_line(tmp_path, number):
+    ledger: Ledger[Try] = Ledger(tmp_path / "tries.jsonl", Try)
+    ledger.path.write_text(f'{{"seed": 1, "seconds": {number}}}\n{{"seed": 2}}\n{{"seed": 3, "more": [{number}]}}\n')
+    assert [line.record for line in ledger.lines()] == [None, Try(2), None]
+    error = str(ledger.refusal(ledger.lines()[2], DatasetError, "no try"))
+    assert error.startswith(f"{ledger.path}:3: no try: this is not valid JSON (found {number[:20]}")
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        ledger.append([Try(4, float("nan"))])
+    assert len(ledger.lines()) == 3
+
+
 def test_lines_of_any_json(tmp_path):
     plain: Ledger[dict[str, int]] = Ledger(tmp_path / "plain.jsonl", dict[str, int])
     plain.append([{"a": 1}])

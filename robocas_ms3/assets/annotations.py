@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from robocas_ms3.assets.hulls import Array
+from robocas_ms3.documents import DAMAGED, open_arrays
 from robocas_ms3.errors import AssetError
 
 
@@ -72,17 +72,20 @@ class Annotations:
             AssetError: it is damaged, or an array is missing or has the wrong shape.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with open_arrays(path) as file:
                 arrays = {f.name: file[f.name] for f in fields(cls)}
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except (*DAMAGED, KeyError) as error:
             raise AssetError(
                 "can't read the annotations", where=path, found=error, fix="Make the pack again."
             ) from error
         for array in arrays.values():
             array.setflags(write=False)
         try:
+            for name, array in arrays.items():
+                if array.dtype.kind not in "fiu" or (array.ndim == 0) is not (name == "display_pose"):
+                    raise AssetError("no such numbers", where=name, found=f"{array.dtype} of shape {array.shape}")
             return cls(**{**arrays, "display_pose": int(arrays["display_pose"])})
-        except AssetError as error:
+        except (AssetError, ValueError, OverflowError) as error:
             raise AssetError(str(error), where=path, fix="Make the pack again.") from error
 
     def footprint(self, pose_index: int) -> Array:

@@ -52,7 +52,7 @@ def read_hulls(path: Path) -> list[Hull]:
     """Read ``hulls.obj``: one ``o`` group a hull, triangles only.
 
     Raises:
-        AssetError: the file is cut short, is no OBJ, or holds no hull.
+        AssetError: the file is cut short, is no OBJ, holds no hull, or numbers that are not finite.
     """
     vertices: list[list[float]] = []
     groups: list[list[list[int]]] = []
@@ -69,8 +69,12 @@ def read_hulls(path: Path) -> list[Hull]:
         for group in groups:
             faces = np.array(group, dtype=np.int64).reshape(-1, 3)
             used, local = np.unique(faces, return_inverse=True)
+            if len(used) and used[0] < 0:
+                raise IndexError(f"no vertex {used[0] + 1}")
             hulls.append(Hull(_frozen(points[used]), _frozen(local.reshape(-1, 3))))
-    except (ValueError, IndexError, UnicodeDecodeError) as error:
+        if not np.isfinite(points).all():
+            raise ValueError("NaN or infinity")
+    except (OSError, ValueError, IndexError, OverflowError) as error:
         raise AssetError(
             "can't read the convex hulls", where=path, found=str(error), fix="Make the pack again."
         ) from error

@@ -19,7 +19,7 @@ from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, FurnitureAsset, ObjectAsset, PackManifest
 from robocas_ms3.errors import AssetError
 from robocas_ms3.paths import builtin_packs_dir, data_dir
-from robocas_ms3.strict import mistakes, refusal
+from robocas_ms3.strict import mistakes, refusal, validate_json
 
 VisualLevel = Literal["fast", "full"]
 
@@ -255,7 +255,7 @@ def _files(folder: str, prefix: str = "") -> Iterator[str]:
 
 def _read(folder: Path, path: Path) -> Pack:
     try:
-        manifest = PackManifest.model_validate_json(path.read_bytes(), strict=True)
+        manifest = validate_json(PackManifest, path.read_bytes())
     except ValidationError as error:
         raise _damaged(path, error) from error
     if "schema_version" not in manifest.model_fields_set:

@@ -22,7 +22,7 @@ from robocas_ms3.planning.seconds import Seconds
 from robocas_ms3.processes import Limits
 from robocas_ms3.recordings.entries import read_json
 from robocas_ms3.recordings.merging import merge
-from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.stored import open_trajectory
 from robocas_ms3.recordings.versions import versions
 
 RUN = "run.json"

@@ -13,16 +13,16 @@ import gymnasium as gym
 import numpy as np
 import torch
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES, parse_obs_mode_to_struct
-from mani_skill.trajectory.utils import dict_to_list_of_dicts
 
 from robocas_ms3.demos.convert_actions import CONVERTIBLE, convert_action
+from robocas_ms3.demos.recorded import Recorded
 from robocas_ms3.errors import DatasetError, RobocasError
 from robocas_ms3.files import make_folder
 from robocas_ms3.outputs import claim_output
-from robocas_ms3.recordings.entries import read_json, read_reset
+from robocas_ms3.recordings.entries import read_json
 from robocas_ms3.recordings.environment import RecordedEnv, read_env
 from robocas_ms3.recordings.merging import merge
-from robocas_ms3.recordings.reading import open_trajectory, readable
+from robocas_ms3.recordings.stored import open_trajectory
 from robocas_ms3.recordings.writing import EpisodeRecorder
 from robocas_ms3.strict import check_number
 from robocas_ms3.tasks.base import RoboCASEnv
@@ -154,29 +154,18 @@ def _replay_all(
 def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env_states: bool) -> Replay:
     base_env = env.unwrapped
     assert isinstance(base_env, RoboCASEnv)
-    name = f"traj_{episode['episode_id']}"
-    where = f"{trajectory}, {name}"
-    with open_trajectory(trajectory) as file:
-        if name not in file:
-            raise DatasetError("the file lacks an episode its JSON lists", where=trajectory, found=name)
-        with readable(where):
-            group: Any = file[name]
-            actions, states = np.array(group["actions"]), dict_to_list_of_dicts(group["env_states"])
-            if len(states) != len(actions) + 1:
-                raise ValueError(f"{len(actions)} actions, {len(states)} states")
-    seed, options = read_reset(episode, where)
-    if not np.isfinite(actions).all():
-        raise DatasetError("NaN or infinity", where=f"{where}, actions", fix="Record it again.")
-    _, info = env.reset(seed=seed, options=options)
-    converted = base_env.control_mode != episode["control_mode"]
+    recorded = Recorded.read(trajectory, episode)
+    _, info = env.reset(seed=recorded.seed, options=recorded.options)
+    recorded.check_fits(base_env)
+    converted = base_env.control_mode != recorded.control_mode
     if use_env_states:
-        base_env.set_state_dict(states[0])
-    for action, state in zip(actions, states[1:], strict=True):
+        base_env.set_state_dict(recorded.states[0])
+    for action, state in zip(recorded.actions, recorded.states[1:], strict=True):
         *_, info = env.step(convert_action(action, base_env) if converted else action)
         if use_env_states:
             base_env.set_state_dict(state)
-    error = None if converted else state_distance(cast(Any, base_env.get_state_dict()), states[-1])
-    return Replay(episode["episode_id"], seed, bool(info["success"][0]), error)
+    error = None if converted else state_distance(cast(Any, base_env.get_state_dict()), recorded.states[-1])
+    return Replay(episode["episode_id"], recorded.seed, bool(info["success"][0]), error)
 
 
 def state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:

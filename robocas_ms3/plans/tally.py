@@ -10,6 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from robocas_ms3.files import write_json
 from robocas_ms3.plans.units import UNITS, Outcome
+from robocas_ms3.strict import validate_json
 
 RECENT = 600.0  # s that a rate is taken over
 
@@ -40,7 +41,7 @@ class Tally:
     def read(cls, path: Path) -> Tally:
         """What a file says; of none, or a damaged one, nothing."""
         try:
-            return _FORM.validate_json(path.read_bytes())
+            return validate_json(_FORM, path.read_bytes())
         except (OSError, ValidationError):
             return cls()
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.seeds import one_seed
+from robocas_ms3.recordings.seeds import GREATEST_SEED, one_seed
 from robocas_ms3.recordings.subgoals import SubGoal, read_subgoals
 
 _RESET_OPTIONS = ("reconfigure",)  # that a file may have
@@ -77,9 +77,9 @@ def read_reset(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str
         DatasetError: there is no such seed, or the options do more than a file may.
     """
     seed = one_seed(episode.get("episode_seed"))
-    if seed is None or seed < 0:
+    if seed is None or not 0 <= seed <= GREATEST_SEED:
         place, found = f"{where}, episode_seed", str(episode.get("episode_seed"))[:40]
-        raise DatasetError("no such seed", where=place, expected="an integer from 0 on", found=found)
+        raise DatasetError("no such seed", where=place, expected=f"an integer from 0 to {GREATEST_SEED}", found=found)
     begins = episode.get("reset_kwargs") or {}
     options = begins.get("options") if isinstance(begins, dict) else begins
     return seed, read_reset_options(options, f"{where}, reset_kwargs.options")

@@ -7,7 +7,7 @@ from typing import Any
 
 from robocas_ms3.files import replacing, write_json
 from robocas_ms3.recordings.entries import read_json
-from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.stored import copy_episode, open_trajectory
 from robocas_ms3.recordings.whole import reserved
 
 _MARGIN = 4096  # bytes an episode may need in a file of many beyond those of its own
@@ -34,7 +34,7 @@ def merge(shards: list[Path], out: Path) -> None:
                 with open_trajectory(shard) as source:
                     for episode in data["episodes"]:
                         number = len(episodes)
-                        source.copy(f"traj_{episode['episode_id']}", target, name=f"traj_{number}")
+                        copy_episode(source, episode["episode_id"], target, number)
                         episodes.append({**episode, "episode_id": number})
         # the JSON first: an HDF5 file that is there always has its JSON
         write_json(out.with_suffix(".json"), {**merged, "episodes": episodes})

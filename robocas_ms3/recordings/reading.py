@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.entries import Entry, read_entry, read_json, reason
+from robocas_ms3.recordings.entries import Entry, read_entry, read_json
 from robocas_ms3.recordings.environment import read_env
 from robocas_ms3.recordings.motion import Motion, gripper_commands
+from robocas_ms3.recordings.stored import (
+    open_episode,
+    open_trajectory,
+    read_actions,
+    read_bodies,
+    readable,
+)
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.table import RobotSpec
 
-_UNIT = 0.05  # a simulation keeps the length of quaternions better
 _STATE_DIM = 13 + 2 * RobotDescription.finger_slice.stop
 
 
@@ -154,22 +157,8 @@ class TrajectoryFile:
             DatasetError: it is damaged, or contradicts the JSON.
         """
         where, uid = self._where(index), self.robot.description.uid
-        with readable(where):
-            group: Any = self._file[f"traj_{self.episodes[index]['episode_id']}"]
-            actions = np.asarray(group["actions"], dtype=np.float32)
-            states = {
-                kind: {
-                    key: np.asarray(data, dtype=np.float32)
-                    for key, data in group["env_states"][kind].items()
-                    if bodies or key == uid
-                }
-                for kind in ("actors", "articulations")
-                if kind in group["env_states"]
-            }
-            if any(array.ndim != 2 for arrays in states.values() for array in arrays.values()):
-                raise ValueError("states that are no rows of numbers")
-        if actions.ndim != 2 or len(actions) == 0:
-            raise DatasetError("this episode has no actions", where=where)
+        group = open_episode(self._file, self.episodes[index]["episode_id"])
+        states, actions = read_bodies(group, only=None if bodies else uid), read_actions(group)
         entry = self.entry(index)
         lengths = {len(array) for arrays in states.values() for array in arrays.values()}
         if lengths != {len(actions) + 1} or entry.control_steps != len(actions):
@@ -188,44 +177,10 @@ class TrajectoryFile:
                 expected=f"{uid} of {width} numbers",
                 found=sorted(states.get("articulations", {})) if robot is None else robot.shape[1],
             )
-        recording = Recording(**vars(entry), actions=actions, states=states, robot=self.robot)
-        _check_finite(recording, where)
-        return recording
+        return Recording(**vars(entry), actions=actions, states=states, robot=self.robot)
 
     def _where(self, index: int) -> str:
         return f"{self.path}, traj_{self.episodes[index]['episode_id']}"
-
-
-@contextmanager
-def readable(where: object, what: str = "this episode is damaged") -> Iterator[None]:
-    """Read of an HDF5 file.
-
-    Raises:
-        DatasetError: it is damaged, whatever HDF5 says of that.
-    """
-    try:
-        yield
-    except (OSError, KeyError, RuntimeError, AttributeError, ValueError, TypeError, MemoryError) as error:
-        raise DatasetError(what, where=where, found=reason(error)) from error
-
-
-def open_trajectory(path: Path) -> h5py.File:
-    """Open an HDF5 trajectory for reading.
-
-    Raises:
-        DatasetError: it is missing, damaged or no HDF5 file.
-    """
-    try:
-        return h5py.File(path, "r")
-    except FileNotFoundError as error:
-        raise DatasetError("no such trajectory file", where=path) from error
-    except OSError as error:
-        raise DatasetError(
-            "can't read this HDF5 file: it is cut off, damaged, or no HDF5",
-            where=path,
-            found=reason(error),
-            fix="Generate it again.",
-        ) from error
 
 
 def _frequency(said: Any, path: Path) -> float:
@@ -234,23 +189,3 @@ def _frequency(said: Any, path: Path) -> float:
         where = f"{path}, robocas.control_freq"
         raise DatasetError("no such frequency", where=where, expected="a number > 0", found=freq)
     return float(freq)
-
-
-def _check_finite(recording: Recording, where: str) -> None:
-    """See that states are states: a policy can't learn from what is no number, and a simulation keeps it.
-
-    Raises:
-        DatasetError: NaN or infinity, or a quaternion that is none.
-    """
-    named = {f"{kind}/{name}": array for kind, of in recording.states.items() for name, array in of.items()}
-    for name, values in {"actions": recording.actions, **named}.items():
-        if not np.isfinite(values).all():
-            step = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-            place = f"{where}, {name}, row {step}"
-            raise DatasetError("NaN or infinity", where=place, expected="finite numbers", fix="Record it again.")
-    for name, values in named.items():
-        length = np.linalg.norm(values[:, 3:7].astype(np.float64), axis=1)
-        wrong = np.flatnonzero(abs(length - 1) > _UNIT)
-        if len(wrong):
-            place, found = f"{where}, {name}, row {wrong[0]}", f"{length[wrong[0]]:g}"
-            raise DatasetError("no orientation", where=place, expected="a quaternion of length 1", found=found)

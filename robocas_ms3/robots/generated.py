@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+from robocas_ms3.documents import load_json
 from robocas_ms3.files import make_folder, naming
 
 
@@ -55,7 +56,7 @@ def _publish(tmp: Path, folder: Path) -> None:
 
 def _is_complete(folder: Path) -> bool:
     try:
-        names = json.loads((folder / "files.json").read_text(encoding="utf-8"))
+        names = load_json(folder / "files.json")
     except (OSError, ValueError):
         return False
-    return all((folder / name).is_file() for name in names)
+    return isinstance(names, list) and all((folder / name).is_file() for name in names)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.assets.pack import MANIFEST, LoadedFurniture, sha256
-from robocas_ms3.documents import DAMAGED
+from robocas_ms3.documents import DAMAGED, open_arrays
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import make_folder, replacing, write_json
 from robocas_ms3.outputs import lock_file
@@ -201,7 +201,7 @@ def read_layout(path: Path) -> Layout:
     Raises:
         ValueError: or another of `documents.DAMAGED`, or KeyError or TypeError: the file is damaged.
     """
-    with np.load(path, allow_pickle=False) as file:
+    with open_arrays(path) as file:
         values = {f.name: file[f.name] for f in fields(Layout)}
     return Layout(
         **{

@@ -19,7 +19,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.glb import write_glb
-from asset_tools.visual import to_display
+from asset_tools.visual import simplified, to_display
 from robocas_ms3.errors import AssetError
 
 SHARED = Path(os.environ.get("ROBOCAS_SHARED", Path(__file__).resolve().parents[3] / "shared"))
@@ -104,6 +104,47 @@ def test_sides_have_flat_normals_though_vertices_meet(light_box):
     normals = light_box.vertex_normals[light_box.faces]
     agreement = np.einsum("fcd,fd->fc", normals, light_box.face_normals)
     assert agreement.min() > 0.99  # one smooth normal at a box's corner would give 0.58
+
+
+def dense_bottle(sections: int, rows: int) -> trimesh.Trimesh:
+    """A body, a shoulder and a neck, closed: its wall is straight upwards, and finely divided all the same."""
+    angle = np.linspace(0, 2 * np.pi, sections, endpoint=False)
+    ring = np.column_stack([np.cos(angle), np.sin(angle)])
+    heights = np.linspace(0, 2 * SIDE, rows + 1)
+    radii = np.interp(heights / SIDE, [0, 1.2, 1.5, 2], [0.3, 0.3, 0.1, 0.1]) * SIDE
+    wall = np.column_stack([(radii[:, None, None] * ring).reshape(-1, 2), np.repeat(heights, sections)])
+    row, column = (grid.reshape(-1) for grid in np.meshgrid(np.arange(rows), np.arange(sections), indexing="ij"))
+    a, b = row * sections + column, row * sections + (column + 1) % sections
+    low, high, k = len(wall), len(wall) + 1, np.arange(sections)
+    top, after = k + rows * sections, (k + 1) % sections
+    faces = [
+        np.column_stack([a, b, b + sections]),
+        np.column_stack([a, b + sections, a + sections]),
+        np.column_stack([after, k, np.full(sections, low)]),
+        np.column_stack([top, after + rows * sections, np.full(sections, high)]),
+    ]
+    vertices = np.vstack([wall, [[0, 0, 0], [0, 0, 2 * SIDE]]])
+    return trimesh.Trimesh(vertices, np.concatenate(faces), process=False)
+
+
+@pytest.mark.parametrize(
+    ("make", "triangles"),
+    [
+        (lambda: textured_box(130), 1000),
+        (lambda: trimesh.creation.icosphere(subdivisions=7, radius=SIDE), 1000),
+        (lambda: dense_bottle(400, 300), 1000),
+        (lambda: dense_bottle(400, 300), 12_000),
+    ],
+    ids=["box", "ball", "bottle", "fine bottle"],
+)
+def test_dense_meshes_do_not_fold_over(make, triangles):
+    dense = make()
+    assert len(dense.faces) > 200_000
+    light = simplified(dense, triangles)
+    assert len(light.faces) <= triangles
+    assert light.volume == pytest.approx(dense.volume, rel=0.01)
+    assert light.area == pytest.approx(dense.area, rel=0.01)
+    np.testing.assert_allclose(light.bounds, dense.bounds, atol=0.01 * SIDE)
 
 
 def test_round_things_have_smooth_normals():

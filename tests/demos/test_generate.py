@@ -24,7 +24,7 @@ from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Trajectory
 from robocas_ms3.recordings.entries import read_json
 from robocas_ms3.recordings.merging import merge
-from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.stored import open_trajectory
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 pytestmark = pytest.mark.slow

@@ -1,6 +1,7 @@
 """What was done to a result afterwards is found, as far as its files can tell."""
 
 import json
+import math
 import shutil
 from dataclasses import replace
 
@@ -61,7 +62,7 @@ def test_nothing_is_wrong_with_a_whole_result(folder, protocol):
         ({"flag_seconds": {"success": 3.6}}, "episode 0: success held first after its 3.5 s"),
         ({"flag_seconds": {}}, "episode 0: flag_seconds are not of its flags"),
         ({"measures": {"path_length": -1.0}}, "episode 0: a measure is no number from 0 on"),
-        ({"inference_ms": float("nan")}, "episode 0: a measure is no number from 0 on"),
+        ({"inference_ms": -1.0}, "episode 0: a measure is no number from 0 on"),
         ({"episode": 99}, "episode 99: the protocol has none of this number"),
         ({"episode": -1}, "episode -1: the protocol has none of this number"),
     ],
@@ -69,6 +70,13 @@ def test_nothing_is_wrong_with_a_whole_result(folder, protocol):
 def test_a_changed_episode_is_found(folder, protocol, values, said):
     tamper(folder, 0, **values)
     assert said in problems(read(folder), protocol)
+
+
+@pytest.mark.parametrize("values", [{"inference_ms": math.nan}, {"measures": {"path_length": math.inf}}])
+def test_a_measure_that_is_not_finite_makes_no_result(folder, values):
+    tamper(folder, 0, **values)
+    with pytest.raises(EvaluationError, match=f"{OUTCOMES}:1: no outcome of an episode: .* is no number of JSON"):
+        read(folder)
 
 
 def test_a_failure_made_a_success_is_found(folder, protocol):

@@ -19,7 +19,7 @@ import psutil
 
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.evaluation import results
-from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.stored import open_trajectory
 
 ROOT = Path(__file__).resolve().parents[2]
 SITE = Path(__file__).resolve().parent / "fault_site"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from robocas_ms3.datasets.lerobot.video import read_frames
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, Side, SourceEpisode
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.datasets.sources.tolerant import first_line
-from robocas_ms3.documents import load_json
+from robocas_ms3.documents import json_values, load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
 
@@ -56,7 +55,10 @@ class LeRobotDataset(EpisodeSource):
     def settings(self) -> dict[str, Any]:
         """``meta/robocas/conversion.json``; empty where there is none."""
         path = self.root / schema.CONVERSION_FILE
-        return load_json(path) if path.is_file() else {}
+        try:
+            return load_json(path) if path.is_file() else {}
+        except (OSError, ValueError) as error:
+            raise DatasetError("this JSON is damaged", where=path, found=first_line(error)) from error
 
     @property
     def rate_hz(self) -> float:
@@ -231,7 +233,7 @@ class LeRobotEpisode(SourceEpisode):
 
     @cached_property
     def _ours(self) -> dict[str, Any]:
-        return {key: json.loads(value) for key, value in self.dataset.described.get(self.number, {}).items()}
+        return {key: json_values(value) for key, value in self.dataset.described.get(self.number, {}).items()}
 
     @property
     def scene(self) -> dict[str, Any]:

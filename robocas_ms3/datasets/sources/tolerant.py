@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.arrays import wrap_angle
-from robocas_ms3.documents import DAMAGED
+from robocas_ms3.documents import DAMAGED, open_arrays
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import stored_motion
@@ -93,7 +93,7 @@ def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays
     unreadable: dict[str, Exception] = {}
     ignored: list[str] = []
     try:
-        with np.load(path, allow_pickle=False) as content:
+        with open_arrays(path) as content:
             for key in content.files:
                 if keys is not None and key not in keys:
                     ignored.append(key)
@@ -102,7 +102,7 @@ def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays
                     arrays[key] = _array(content[key])
                 except (*DAMAGED, MemoryError) as error:
                     unreadable[key] = error
-    except (*DAMAGED, TypeError) as error:  # TypeError: a single array is no context
+    except DAMAGED as error:
         unreadable[""] = error
     return EpisodeArrays(path, arrays, unreadable, ignored=tuple(ignored))
 

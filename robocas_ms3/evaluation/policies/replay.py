@@ -13,7 +13,7 @@ from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.recordings.entries import read_json, read_reset
 from robocas_ms3.recordings.environment import read_env
-from robocas_ms3.recordings.reading import open_trajectory
+from robocas_ms3.recordings.stored import open_episode, open_trajectory, read_actions
 
 
 class ReplayPolicy:
@@ -63,5 +63,10 @@ class ReplayPolicy:
         if seed not in self._episodes:
             return np.zeros((0, 8))
         with open_trajectory(self._trajectory) as file:
-            group: Any = file[f"traj_{self._episodes[seed]}"]
-            return np.array(group["actions"])
+            actions = read_actions(open_episode(file, self._episodes[seed]))
+        if actions.shape[1] != 8:
+            where = f"{self._trajectory}, traj_{self._episodes[seed]}"
+            raise EvaluationError(
+                "can't be played here", where=where, expected="8 numbers an action", found=actions.shape[1]
+            )
+        return actions
