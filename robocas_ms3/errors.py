@@ -55,6 +55,16 @@ class DatasetError(RobocasError):
     """A trajectory file or dataset can't be read or written."""
 
 
+class IncompleteError(DatasetError):
+    """Some episodes of a dataset can't be written; the others are.
+
+    Attributes:
+        reasons: why, by name of the episode's folder.
+    """
+
+    reasons: Mapping[str, str] = {}
+
+
 class PlanError(RobocasError):
     """A plan of datasets is wrong, or what it makes can't be made."""
 

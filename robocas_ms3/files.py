@@ -38,10 +38,14 @@ def naming(path: Path | str) -> Iterator[None]:
 
 
 @contextmanager
-def replacing(path: Path | str) -> Iterator[Path]:
+def replacing(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; on success it replaces ``path``, on failure it is removed.
 
     The temporary name keeps the suffix, since many writers choose their format by it.
+
+    Args:
+        path: of the file.
+        sync: whether it survives a power cut from then on, and none leaves half of it under its name.
     """
     path = Path(path)
     make_folder(path.parent)
@@ -49,7 +53,11 @@ def replacing(path: Path | str) -> Iterator[Path]:
     try:
         with naming(path):
             yield tmp
+            if sync:
+                _sync(tmp)
             os.replace(tmp, path)
+            if sync:
+                _sync(path.parent)
     finally:
         if tmp.is_dir():
             shutil.rmtree(tmp, ignore_errors=True)
@@ -57,11 +65,24 @@ def replacing(path: Path | str) -> Iterator[Path]:
             tmp.unlink(missing_ok=True)
 
 
+def _sync(path: Path) -> None:
+    """Wait until a file is on the disk, or what a folder says of its files."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 @contextmanager
-def replacing_folder(path: Path | str) -> Iterator[Path]:
+def replacing_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
     """Yield a fresh folder beside ``path``; on success it becomes ``path`` (an older one goes), else it is removed.
 
     A folder that has to stay where it is, see `is_fixed`, gets the new one's content, one entry after the other.
+
+    Args:
+        path: of the folder.
+        sync: whether its files are on the disk before it gets its name: a power cut leaves none that is half there.
     """
     path = Path(path)
     fixed = is_fixed(path)
@@ -72,6 +93,8 @@ def replacing_folder(path: Path | str) -> Iterator[Path]:
     try:
         with naming(path):
             yield tmp
+            if sync:
+                flush_to_disk(tmp)
             if fixed:
                 empty_folder(path, but=tmp)
                 for entry in list(tmp.iterdir()):
@@ -169,7 +192,7 @@ def flush_to_disk(folder: Path | str) -> None:
         os.close(descriptor)
 
 
-def write_json(path: Path | str, data: Any) -> None:
-    """Write JSON whole or not at all."""
-    with replacing(path) as tmp:
+def write_json(path: Path | str, data: Any, *, sync: bool = False) -> None:
+    """Write JSON whole or not at all; ``sync`` is that of `replacing`."""
+    with replacing(path, sync=sync) as tmp:
         tmp.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -1,8 +1,10 @@
 import errno
 import os
+from pathlib import Path
 
 import pytest
 
+from robocas_ms3 import files
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import make_folder, naming, replacing, replacing_folder, write_json
 
@@ -66,3 +68,26 @@ def test_a_full_disk_is_that_of_what_is_written_not_of_what_is_copied(tmp_path):
     with pytest.raises(OSError, match="No such file") as error, naming(tmp_path / "robots"):
         (tmp_path / "gone").read_text()
     assert error.value.filename == str(tmp_path / "gone")
+
+
+def test_what_is_to_survive_a_power_cut_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    done = []
+
+    def note(owner, name, say):
+        whole = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *args: (done.append(say(*args)), whole(*args))[1])
+
+    def path_of(descriptor):
+        return Path(f"/proc/self/fd/{descriptor}").readlink().name
+
+    note(os, "fsync", lambda descriptor: ("sync", path_of(descriptor)))
+    note(os, "replace", lambda before, after: ("rename", Path(before).name))
+    note(files, "flush_to_disk", lambda folder: ("sync", Path(folder).name))
+    write_json(tmp_path / "a.json", {})
+    write_json(tmp_path / "b.json", {}, sync=True)
+    temporary = f".b.{os.getpid()}.tmp.json"
+    assert done[1:] == [("sync", temporary), ("rename", temporary), ("sync", tmp_path.name)]
+    done.clear()
+    with replacing_folder(tmp_path / "folder", sync=True) as folder:
+        (folder / "file").write_text("")
+    assert done == [("sync", folder.name), ("rename", folder.name)]

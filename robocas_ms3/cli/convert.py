@@ -59,11 +59,13 @@ class Convert:
     """Go on with a conversion that was interrupted."""
     append: bool = False
     """Add to the dataset that is there; its episodes keep their numbers."""
+    leave_out: bool = False
+    """Warn of episodes that can't be written, in place of an error in the end; LeRobot datasets are joined without."""
     jobs: int = 1
     """Processes that render."""
     episode_seconds: float = 3600.0
     """Seconds an episode may take. One that takes longer, or more memory, or crashes, is begun again once, by another
-    process; then it is left out, and named in the end."""
+    process; then the others are written, and it is named in the end, as one is that can't be rendered or stored."""
     memory_gb: float = 8.0
     """GB of memory a process may use."""
     pack: Maybe[str] = None
@@ -114,7 +116,12 @@ def _format(cfg: Convert) -> Format:
     from robocas_ms3.errors import DatasetError
 
     chosen = FORMATS.find(cfg.to, where="--to")
-    flags = {"append": cfg.append, "image_format": cfg.image_format != "png", "codec": cfg.codec != "h264"}
+    flags = {
+        "append": cfg.append,
+        "leave_out": cfg.leave_out,
+        "image_format": cfg.image_format != "png",
+        "codec": cfg.codec != "h264",
+    }
     for option, given in flags.items():
         if given and option not in chosen.options:
             flag = f"--{option.replace('_', '-')}"
@@ -135,6 +142,7 @@ def _convert(cfg: Convert) -> int:
             "embeddings": cfg.embeddings,
             "previews": (True if cfg.all_videos else None) if cfg.video else False,
             "codec": cfg.codec,
+            "leave_out": cfg.leave_out,
             "episode_limits": Limits(cfg.episode_seconds, cfg.memory_gb),
         }
         done: Conversion = chosen.part("writer")(

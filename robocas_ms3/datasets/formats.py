@@ -84,7 +84,7 @@ _BUILTIN = (
         f"{_PACKAGE}.lerobot.reader:open_lerobot",
         f"{_PACKAGE}.lerobot.convert:convert_lerobot",
         f"{_PACKAGE}.lerobot.check:report_lerobot",
-        ("codec", "episode_limits"),
+        ("codec", "leave_out", "episode_limits"),
     ),
     Format(
         "robocas",
@@ -93,7 +93,7 @@ _BUILTIN = (
         f"{_PACKAGE}.sources.reader:open_folder",
         f"{_PACKAGE}.writing.convert:convert",
         f"{_PACKAGE}.checks.dataset:validate",
-        ("append", "embeddings", "previews", "image_format", "episode_limits"),
+        ("append", "embeddings", "previews", "image_format", "leave_out", "episode_limits"),
     ),
 )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass, fields
 from itertools import count
@@ -13,10 +13,10 @@ import numpy as np
 
 from robocas_ms3.demos.checks import check_arguments, check_same_run
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
-from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_stage
+from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_stage, failed_attempts
 from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.files import make_folder, write_json
+from robocas_ms3.files import flush_to_disk, make_folder, write_json
 from robocas_ms3.outputs import check_overwrite, check_run, check_there, claim_output, locked_folder, while_there
 from robocas_ms3.planning.seconds import Seconds
 from robocas_ms3.processes import Limits
@@ -132,8 +132,8 @@ def _generate_in(
 ) -> Summary:
     shards, ledger = make_folder(out / "episodes"), Ledger(out / FAILURES_FILE)
     earlier = _finished(out, shards, ledger)
-    ledger.keep_only(set(earlier))
-    on_start(sum(earlier[seed].success for seed in range(first_seed, first_seed + episodes) if seed in earlier))
+    ledger.settle([line for seed in sorted(earlier) for line in _lines(earlier[seed])])
+    on_start(min(episodes, sum(result.success for result in earlier.values())))
     missing = (seed for seed in count(first_seed) if seed not in earlier)
     results: list[EpisodeResult] = []
     good = 0
@@ -148,10 +148,7 @@ def _generate_in(
                     continue
                 result = next(new)
                 check_there(out / RUN)
-                lines = list(result.failures)
-                if not result.success:
-                    lines.append(Failure(seed, -1, "episode", "gave_up", 0.0))
-                ledger.append(lines)
+                ledger.append(_lines(result))
                 results.append(result)
                 good += result.success
                 on_result(result)
@@ -169,33 +166,48 @@ def _generate_in(
     return _finish(out, shards, ledger, results, earlier)
 
 
+def _lines(result: EpisodeResult) -> list[Failure]:
+    """What the ledger says of a seed."""
+    given_up = [] if result.success else [Failure(result.seed, -1, "episode", "gave_up", 0.0)]
+    return [*result.failures, *given_up]
+
+
 def _finished(out: Path, shards: Path, ledger: Ledger) -> dict[int, EpisodeResult]:
     """Seeds that an earlier run dealt with: in the merged file, in files of their own, or given up."""
-    results = {failure.seed: EpisodeResult(failure.seed, success=False) for failure in ledger.read() if failure.gave_up}
+    noted = ledger.by_seed()
+    results = {
+        seed: EpisodeResult(seed, success=False, failures=lines[:-1])
+        for seed, lines in noted.items()
+        if [line.attempt for line in lines] == [*range(len(lines) - 1), -1]  # else some are lost: it is run again
+    }
     for path in sorted(shards.glob("seed_*.h5")):
         try:
             open_trajectory(path).close()
-            results |= _recorded(path)
+            results |= _recorded(path, noted)
         except RobocasError:
             path.unlink()
-    return results | _merged(out)
+    return results | _merged(out, noted)
 
 
-def _recorded(path: Path) -> dict[int, EpisodeResult]:
-    """Seed -> what came of it, of each episode in a file."""
+def _recorded(path: Path, noted: Mapping[int, list[Failure]]) -> dict[int, EpisodeResult]:
+    """Seed -> what came of it, of each episode in a file; ``noted`` are the ledger's lines by seed."""
     results = {}
     for episode in read_json(path)["episodes"]:
         # the block is written last: without it the episode was cut short
-        if "robocas" in episode:
+        if said := episode.get("robocas"):
             seed = int(episode["episode_seed"])
-            results[seed] = EpisodeResult(seed, True, int(episode["elapsed_steps"]), episode["robocas"]["attempts"])
-            for part, value in episode["robocas"]["seconds"].items():
-                setattr(results[seed].seconds, part, value)
+            result = EpisodeResult(seed, True, int(episode["elapsed_steps"]), said["attempts"])
+            before = noted.get(seed, [])
+            known = said.get("failed_attempts")  # those of an earlier version don't say
+            result.failures = before if known is None else failed_attempts(seed, known, before)
+            for part, value in said["seconds"].items():
+                setattr(result.seconds, part, value)
+            results[seed] = result
     return results
 
 
-def _merged(out: Path) -> dict[int, EpisodeResult]:
-    """What the merged file holds."""
+def _merged(out: Path, noted: Mapping[int, list[Failure]]) -> dict[int, EpisodeResult]:
+    """What the merged file holds; parameters of `_recorded`."""
     path = out / "trajectory.h5"
     if not path.is_file():
         return {}
@@ -204,20 +216,22 @@ def _merged(out: Path) -> dict[int, EpisodeResult]:
         there = [episode for episode in data["episodes"] if f"traj_{episode['episode_id']}" in file]
     if len(there) < len(data["episodes"]):  # a merge was killed between its two files
         write_json(path.with_suffix(".json"), {**data, "episodes": there})
-    return _recorded(path)
+    return _recorded(path, noted)
 
 
 def _finish(
     out: Path, shards: Path, ledger: Ledger, results: list[EpisodeResult], earlier: dict[int, EpisodeResult]
 ) -> Summary:
-    trajectory, merged = out / "trajectory.h5", _merged(out)
+    trajectory, merged = out / "trajectory.h5", _merged(out, ledger.by_seed())
     beyond = range(results[-1].seed + 1, max(merged, default=-1) + 1)  # more are there than were asked for
     results = [*results, *(earlier[seed] for seed in beyond if seed in earlier)]
     good = [r for r in results if r.success]
     new = [shards / f"{shard_name(r.seed)}.h5" for r in good if r.seed not in merged]
     if new:
         merge(([trajectory] if merged else []) + new, trajectory)
+        flush_to_disk(out)  # before the files go that it is made of
     shutil.rmtree(shards)
+    ledger.settle([line for result in results for line in _lines(result)])
     parts = [part.name for part in fields(Seconds)]
     seconds = {p: round(float(np.mean([getattr(r.seconds, p) for r in results] or [0])), 3) for p in parts}
     summary = Summary(

@@ -222,6 +222,7 @@ class _Attempts:
             "facts": {"disturbed": int(executor.info["disturbed"][0]), **executor.facts},
             "seconds": {part: round(value, 3) for part, value in asdict(executor.seconds).items()},
             "attempts": len(self.result.failures) + 1,
+            "failed_attempts": [f"{failure.stage}: {failure.reason}" for failure in self.result.failures],
             "noisy_trials": None if not tried else settings.noisy_trials if self._noisy else 0,
             "recoveries": recoveries,
         }

@@ -21,7 +21,7 @@ class Failure:
         attempt: counted from 0; -1 marks the seed as given up.
         stage: where the policy could not go on.
         reason: why, in words that can be counted.
-        seconds: wall-clock time the attempt took.
+        seconds: wall-clock time the attempt took; 0 where a kill has come before it was noted.
     """
 
     seed: int
@@ -42,9 +42,35 @@ class Ledger(ledger.Ledger[Failure]):
     def __init__(self, path: Path) -> None:
         super().__init__(path, Failure)
 
-    def keep_only(self, seeds: set[int]) -> None:
-        """Drop the lines of seeds that will be run again."""
-        self.rewrite(failure for failure in self.read() if failure.seed in seeds)
+    def by_seed(self) -> dict[int, list[Failure]]:
+        """Lines of each seed, in their order; of one that is there twice the first."""
+        found: dict[int, dict[int, Failure]] = {}
+        for failure in self.read():
+            found.setdefault(failure.seed, {}).setdefault(failure.attempt, failure)
+        return {seed: list(attempts.values()) for seed, attempts in found.items()}
+
+    def settle(self, failures: list[Failure]) -> None:
+        """See that these are the lines, whatever a kill has lost, doubled or left behind."""
+        if [line.record for line in self.lines()] != failures:
+            self.rewrite(failures)
+
+
+def failed_attempts(seed: int, said: Iterable[str], noted: Iterable[Failure]) -> list[Failure]:
+    """What failed before a seed's episode was recorded.
+
+    Args:
+        seed: it.
+        said: ``stage: reason`` of each attempt, as the record has them.
+        noted: lines of the seed, as far as the file has them.
+    """
+    there = {failure.attempt: failure for failure in noted}
+    failures = []
+    for attempt, text in enumerate(said):
+        stage, _, reason = text.partition(": ")
+        known = there.get(attempt)
+        same = known is not None and (known.stage, known.reason) == (stage, reason)
+        failures.append(known if known and same else Failure(seed, attempt, stage, reason, 0.0))
+    return failures
 
 
 def count_by_stage(failures: Iterable[Failure]) -> dict[str, int]:

@@ -91,7 +91,7 @@ class EpisodeRecorder(gym.Wrapper):
                 group.create_dataset(name, data=values, dtype=bool)
             _write(group, "env_states", {**self.states, **_stacked(steps.beside_bodies)})
 
-        with replacing(self._trajectory) as tmp:
+        with replacing(self._trajectory, sync=True) as tmp:
             write_whole(tmp, fill)
             # the JSON first: an HDF5 file that is there always has its JSON
             write_json(
@@ -114,6 +114,7 @@ class EpisodeRecorder(gym.Wrapper):
                     "source_desc": "scripted policy of robocas_ms3",
                     "robocas": {"control_freq": env.control_freq, "sim_freq": env.sim_freq, "versions": versions()},
                 },
+                sync=True,
             )
 
     def _env_info(self) -> dict[str, Any]:

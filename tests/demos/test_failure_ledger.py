@@ -1,4 +1,4 @@
-from robocas_ms3.demos.ledger import Failure, Ledger, count_by_stage
+from robocas_ms3.demos.ledger import Failure, Ledger, count_by_stage, failed_attempts
 
 
 def test_lines_survive_and_a_cut_one_is_dropped(tmp_path):
@@ -13,11 +13,27 @@ def test_lines_survive_and_a_cut_one_is_dropped(tmp_path):
     assert [failure.gave_up for failure in ledger.read()] == [False, True]
 
 
-def test_keep_only_forgets_seeds_that_run_again(tmp_path):
+def test_settled_it_holds_what_it_should(tmp_path):
     ledger = Ledger(tmp_path / "failures.jsonl")
-    ledger.append([Failure(seed, 0, "grasp", "missed", 1.0) for seed in (1, 2, 3)])
-    ledger.keep_only({1, 3})
-    assert [failure.seed for failure in ledger.read()] == [1, 3]
+    lines = [Failure(seed, 0, "grasp", "missed", 1.0) for seed in (1, 2, 3)]
+    ledger.settle([])
+    assert not ledger.path.exists()
+    ledger.append([lines[2], lines[0], lines[0], Failure(9, 0, "grasp", "missed", 1.0)])
+    assert ledger.by_seed()[1] == [lines[0]]
+    ledger.settle(lines)
+    assert ledger.read() == lines
+    written = ledger.path.stat().st_mtime_ns
+    ledger.settle(lines)
+    assert ledger.path.stat().st_mtime_ns == written
+    ledger.path.write_bytes(ledger.path.read_bytes() + b"{damaged}\n")
+    ledger.settle(lines)
+    assert b"damaged" not in ledger.path.read_bytes()
+
+
+def test_what_a_record_says_of_failures_fills_what_the_file_has_lost():
+    noted = [Failure(4, 1, "reach", "far: too far", 2.5), Failure(4, 2, "lift", "slipped", 1.0)]
+    found = failed_attempts(4, ["lift: slipped", "reach: far: too far", "grasp: missed"], noted)
+    assert found == [Failure(4, 0, "lift", "slipped", 0.0), noted[0], Failure(4, 2, "grasp", "missed", 0.0)]
 
 
 def test_failures_are_counted_by_stage_and_reason():

@@ -10,7 +10,7 @@ import pytest
 from robocas_ms3.demos import generate as module
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.generate import generate
-from robocas_ms3.demos.ledger import Failure
+from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger
 from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.processes import Pool
@@ -18,6 +18,16 @@ from robocas_ms3.recordings.entries import read_json
 
 SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
 HOPELESS = 2  # a seed without an episode
+FAILED = {1: ["reach: far"], 2: ["reach: far", "lift: slipped"], 4: ["grasp: missed", "reach: far"]}
+
+
+def failures_of(seed):
+    return [Failure(seed, i, *text.split(": "), 0.0) for i, text in enumerate(FAILED.get(seed, []))]
+
+
+def lines_of(seed):
+    """What the ledger says of a seed."""
+    return [*failures_of(seed), *([Failure(seed, -1, "episode", "gave_up", 0.0)] if seed == HOPELESS else [])]
 
 
 def record(folder, seed):
@@ -27,7 +37,8 @@ def record(folder, seed):
         file.create_group("traj_0").attrs["seed"] = seed
     seconds = {"reset": 1.0, "planning": 2.0, "simulation": 3.0}
     episode = {"episode_id": 0, "episode_seed": seed, "elapsed_steps": 10 + seed}
-    episode["robocas"] = {"attempts": 1, "seconds": seconds}
+    failed = FAILED.get(seed, [])
+    episode["robocas"] = {"attempts": 1 + len(failed), "failed_attempts": failed, "seconds": seconds}
     path.with_suffix(".json").write_text(
         json.dumps({"env_info": {"env_id": "X-v1", "env_kwargs": {}}, "episodes": [episode]})
     )
@@ -41,11 +52,10 @@ def made(monkeypatch):
     def make(settings, seeds, folder, jobs, *, fork, limits):
         for seed in seeds:
             seeds_made.append(seed)
-            if seed == HOPELESS:
-                yield EpisodeResult(seed, success=False, failures=[Failure(seed, 0, "reach", "far", 0.0)])
-            else:
+            if seed != HOPELESS:
                 record(folder, seed)
-                yield EpisodeResult(seed, True, 10 + seed, 1)
+            failures = failures_of(seed)
+            yield EpisodeResult(seed, seed != HOPELESS, 10 + seed, 1 + len(failures), failures=failures)
 
     monkeypatch.setattr(module, "generate_seeds", make)
     return seeds_made
@@ -62,15 +72,12 @@ def seeds_of(out):
     return [episode["episode_seed"] for episode in episodes]
 
 
-def begun(out, shards, given_up=()):
+def begun(out, shards, lines=()):
     """A run that was killed: workers had finished some seeds, not all of them in their order."""
     run = {"settings": vars(SETTINGS), "first_seed": 0}
     (out / "episodes").mkdir(parents=True)
     (out / "run.json").write_text(json.dumps(run))
-    lines = [
-        {"seed": seed, "attempt": -1, "stage": "episode", "reason": "gave_up", "seconds": 0.0} for seed in given_up
-    ]
-    (out / "failures.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    Ledger(out / "failures.jsonl").append(lines)
     for seed in shards:
         record(out / "episodes", seed)
 
@@ -81,12 +88,62 @@ def begun(out, shards, given_up=()):
 )
 def test_seeds_that_workers_had_finished_ahead_are_in_nobodys_place(tmp_path, made, shards, given_up, missing):
     out = tmp_path / "out"
-    begun(out, shards, given_up)
+    begun(out, shards, [line for seed in given_up for line in lines_of(seed)])
     summary = generate(SETTINGS, out, episodes=3, resume=True)
     assert made == missing
     assert seeds_of(out) == [0, 1, 3]
     assert (summary.episodes, summary.seeds, summary.gave_up) == (3, 4, [HOPELESS])
     assert not (out / "episodes").exists()
+
+
+@pytest.mark.parametrize(
+    ("shards", "lines"),
+    [
+        ((0, 1, 3), ()),  # killed before its lines were written
+        ((0, 1, 3, 4), [*lines_of(1), *lines_of(2)]),  # workers had finished more
+        ((0, 1), lines_of(1) + lines_of(2)[:1]),  # some of a seed's lines
+        ((0, 1), lines_of(1) + lines_of(2)[1:]),  # damaged since: a line is lost
+        ((0,), [*lines_of(1), *lines_of(2), *lines_of(4)]),  # of a file that did not reach the disk
+        ((0, 1, 4), [*lines_of(1), *lines_of(1), *lines_of(4), *lines_of(2)]),
+        ((0, 1, 3, 4, 5), [*lines_of(1), *lines_of(2), *lines_of(4), *lines_of(5)]),
+    ],
+)
+def test_failures_are_told_as_if_it_had_not_been(tmp_path, shards, lines):
+    """Of all attempts, once each, in the order of the seeds."""
+    started = []
+    begun(tmp_path / "out", shards, lines)
+    found = generate(SETTINGS, tmp_path / "out", episodes=4, resume=True, on_start=started.append)
+    whole = generate(SETTINGS, tmp_path / "whole", episodes=4)
+    assert (tmp_path / "out" / FAILURES_FILE).read_text() == (tmp_path / "whole" / FAILURES_FILE).read_text()
+    assert found.failures == whole.failures == {"reach: far": 3, "lift: slipped": 1, "grasp: missed": 1}
+    assert started == [min(4, len(shards))]
+    generate(SETTINGS, tmp_path / "out", episodes=4, resume=True)
+    assert (tmp_path / "out" / FAILURES_FILE).read_text() == (tmp_path / "whole" / FAILURES_FILE).read_text()
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".json"])
+@pytest.mark.parametrize("left", [0.5, 0.99, 0])
+def test_what_was_cut_off_is_made_again(tmp_path, made, suffix, left):
+    out = tmp_path / "out"
+    begun(out, (0, 1), lines_of(1))
+    path = (out / "episodes" / shard_name(1)).with_suffix(suffix)
+    path.write_bytes(path.read_bytes()[: int(left * path.stat().st_size)])
+    generate(SETTINGS, out, episodes=3, resume=True)
+    assert made == [1, 2, 3]
+    assert seeds_of(out) == [0, 1, 3]
+    assert Ledger(out / FAILURES_FILE).read() == [*lines_of(1), *lines_of(2)]
+
+
+def test_files_that_do_not_tell_of_failures_leave_them_to_the_ledger(tmp_path):
+    """Those of an earlier version."""
+    out = tmp_path / "out"
+    begun(out, (0, 1), lines_of(1))
+    path = out / "episodes" / f"{shard_name(1)}.json"
+    content = json.loads(path.read_text())
+    del content["episodes"][0]["robocas"]["failed_attempts"]
+    path.write_text(json.dumps(content))
+    generate(SETTINGS, out, episodes=2, resume=True)
+    assert Ledger(out / FAILURES_FILE).read() == lines_of(1)
 
 
 def test_killed_when_all_was_merged_already(tmp_path, made):

@@ -20,6 +20,7 @@ from faults import (
     is_one_line,
     lines_of,
     note,
+    readable,
     run,
     running,
     succeed,
@@ -124,7 +125,7 @@ def test_a_task_whose_process(command, undisturbed, tmp_path, row, fault, times)
         return
     if command.name == "convert":  # an error that names it; what is left goes on
         assert code == 1
-        assert "episode_0000001: SIGSEGV" in said
+        assert "episode_0000001: its process died twice: SIGSEGV" in said
         assert command.finished(out) == EPISODES - 1
         succeed([*words, "--resume"])
         row.judge(expected, content(command, out))
@@ -195,6 +196,7 @@ shift 2
 set +e
 "$@" 2>"$0/said"; echo $? >"$0/code"
 df --output=avail "$0/disk" >"$0/room"
+cp -r "$0/disk/out" "$0/full"
 mount -o remount,"$AGAIN" "$0/disk" || exit 9
 "$@" --resume 2>"$0/said_after"; echo $? >"$0/code_after"
 cp -r "$0/disk/out" "$0/out"
@@ -214,6 +216,7 @@ def test_a_full_disk(command, undisturbed, tmp_path, row):
     said = (tmp_path / "said").read_text()
     assert (tmp_path / "code").read_text() == "1\n", said[-2000:]
     assert is_one_line(said) and "No space left on device" in said, said[-2000:]
+    row.note = f"{readable(command, tmp_path / 'full')} finished, readable"
     assert (tmp_path / "code_after").read_text() == "0\n", (tmp_path / "said_after").read_text()[-2000:]
     row.judge(undisturbed(command)[0], content(command, tmp_path / "out"))
 
@@ -264,24 +267,38 @@ def stopped_half_way(command, out, log):
 
 
 CUT = {
-    "generate": ("episodes/seed_*.h5", "episodes/seed_*.json"),
+    "generate": ("episodes/seed_*.h5", "episodes/seed_*.json", "failures.jsonl"),
+    "convert": ("episode_*/episode_info.npz", "episode_*/base_camera/rgb/0001.png", "episode_*/scene.json"),
     "plan run": ("units/*/*/seeds.jsonl",),
     "eval": ("episodes.jsonl",),
 }
 
 
-def test_a_file_of_a_run_that_was_cut_off(commands, undisturbed, tmp_path, row):
-    """A recording, its JSON, a ledger: what they held is done again."""
-    row.command = "generate, plan run, eval"
-    for name, patterns in CUT.items():
-        command, out = commands[name], tmp_path / name.replace(" ", "_")
-        stopped_half_way(command, out, tmp_path / "log")
-        for pattern in patterns:
-            for path in out.glob(pattern):
-                cut(path)
-                row.injected += 1
-        succeed(command.line(out, 2, "--resume"))
-        row.judge(undisturbed(command)[0], content(command, out))
+@pytest.mark.parametrize(("name", "pattern"), [(name, pattern) for name, of in CUT.items() for pattern in of])
+def test_a_file_of_a_run_that_was_cut_off(commands, undisturbed, tmp_path, row, name, pattern):
+    """A recording, its JSON, a ledger, a picture, arrays: what they held is done again."""
+    command, out = commands[name], tmp_path / "out"
+    row.command, row.fault = name, f"cut off: {pattern.rpartition('/')[2]}"
+    stopped_half_way(command, out, tmp_path / "log")
+    for path in out.glob(pattern):
+        cut(path)
+        row.injected += 1
+    succeed(command.line(out, 2, "--resume"))
+    row.judge(undisturbed(command)[0], content(command, out))
+
+
+def test_a_layout_bank_that_was_cut_off(commands, undisturbed, tmp_path, row, monkeypatch):
+    """Its layouts are made anew."""
+    command, cache = commands["generate"], tmp_path / "cache"
+    row.command = command.name
+    expected = undisturbed(command)[0]
+    monkeypatch.setenv("ROBOCAS_CACHE", str(cache))
+    succeed(command.line(tmp_path / "before"))
+    for path in (path for path in (cache / "layouts").rglob("*") if path.is_file()):
+        cut(path)
+        row.injected += 1
+    succeed(command.line(tmp_path / "out"))
+    row.judge(expected, content(command, tmp_path / "out"))
 
 
 def test_two_runs_into_one_folder(command, undisturbed, tmp_path, row):
@@ -296,9 +313,9 @@ def test_two_runs_into_one_folder(command, undisturbed, tmp_path, row):
     row.judge(undisturbed(command)[0], content(command, out))
 
 
-@pytest.mark.parametrize("name", ["generate", "plan run", "eval"])
+@pytest.mark.parametrize("name", COMMANDS)
 def test_another_version(commands, tmp_path, row, name):
-    """Whoever goes on with one is refused: what comes of it would be of two. Conversions don't look."""
+    """Whoever goes on with one is refused: what comes of it would be of two."""
     command = commands[name]
     row.command, row.injected = name, 1
     log, out = tmp_path / "log", tmp_path / "out"

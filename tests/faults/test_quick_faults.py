@@ -11,11 +11,12 @@ import pytest
 from faults import SITE, begun, files_of
 from synthetic import RayCaster, write_trajectory
 
+from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generate import generate
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.errors import IncompleteError
 from robocas_ms3.processes import Limits
 
 
@@ -37,12 +38,13 @@ def test_a_conversion_leaves_out_what_ends_its_process_twice_and_goes_on_later(b
     made = {"embeddings": False, "open_source": RayCaster, "pictures": Pictures(size=(64, 48))}
     convert(trajectory, tmp_path / "whole", **made)
     log = befalls(1, "crash", 2)
-    with pytest.raises(DatasetError, match="out: .*found episode_0000001: SIGSEGV.*--resume") as error:
+    with pytest.raises(IncompleteError, match=r"out: .*\(found episode_0000001: its.*: SIGSEGV\).*--resume") as error:
         convert(trajectory, tmp_path / "out", jobs=2, episode_limits=Limits(60, 4), **made)
     assert "\n" not in str(error.value)
     assert sorted(key for _, key in begun(log)) == ["0", "1", "1", "2"]
     there = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert there == ["conversion.json", "episode_0000000", "episode_0000002"]
+    assert there == ["conversion.json", "data_info.json", "episode_0000000", "episode_0000002"]
+    assert validate(tmp_path / "out").violations == []
     convert(trajectory, tmp_path / "out", resume=True, **made)
     assert files_of(tmp_path / "out") == files_of(tmp_path / "whole")
 

@@ -17,8 +17,12 @@ import h5py
 import numpy as np
 import psutil
 
+from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.cut_off import cut_off
+from robocas_ms3.demos.ledger import FAILURES_FILE, Ledger
 from robocas_ms3.evaluation import results
+from robocas_ms3.recordings.reading import TrajectoryFile
 from robocas_ms3.recordings.stored import open_trajectory
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -76,8 +80,13 @@ def content(command, out):
     """(episode, what came of it), without what a clock said; none may be there twice."""
     if command.name == "generate":
         episodes = json.loads((out / "trajectory.json").read_text())["episodes"]
+        failed = Ledger(out / FAILURES_FILE).by_seed()
+        assert list(failed) == sorted(failed)
         with open_trajectory(out / "trajectory.h5") as file:
-            found = [(one["episode_seed"], _of_recording(one, file[f"traj_{one['episode_id']}"])) for one in episodes]
+            found = [
+                (seed, (_of_recording(one, file[f"traj_{one['episode_id']}"]), _causes(failed.get(seed, []))))
+                for seed, one in ((one["episode_seed"], one) for one in episodes)
+            ]
     elif command.name == "eval":
         found = [(number, one.without_clock()) for number, one in results.read(out).outcomes.items()]
     elif command.name == "convert":
@@ -88,6 +97,28 @@ def content(command, out):
         assert len(folders) == len(data.numbers)
         found = [(seed, {k: v for k, v in files_of(one).items() if k != "scene.json"}) for seed, one in folders.items()]
     return found
+
+
+def readable(command, out):
+    """How many episodes of a run that ended early are there, each of which is whole."""
+    if command.name == "generate":
+        recorded = sorted((out / "episodes").glob("seed_*.h5"))
+        for path in recorded:
+            with TrajectoryFile(path) as file:
+                assert len(file.recording(0).actions)
+        return len(recorded)
+    if command.name == "eval":
+        lines = (out / "episodes.jsonl").read_bytes().splitlines(keepends=True)
+        return sum(bool(json.loads(line)) for line in lines if line.endswith(b"\n"))
+    folders = sorted(out.glob("episode_*" if command.name == "convert" else "units/*/*/episodes/*/episode_*"))
+    for folder in folders:
+        assert cut_off(folder, Pictures(size=(64, 48), depth=False)) is None, folder
+    return len(folders)
+
+
+def _causes(failures):
+    """Without the seconds of a clock."""
+    return [(one.attempt, one.stage, one.reason) for one in failures]
 
 
 def _of_recording(episode, group):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.schema import Limits
-from robocas_ms3.datasets.lerobot.stage import EPISODE_FILE, FRAMES_FILE, SUBGOAL, part_folder, video_name
+from robocas_ms3.datasets.lerobot.stage import EPISODE_FILE, FRAMES_FILE, SUBGOAL, video_name
 from robocas_ms3.datasets.lerobot.stats import Histogram, Levels, Range, vector_stats
 from robocas_ms3.datasets.lerobot.tables import RollingTable, column, numbers, write_texts
 from robocas_ms3.datasets.lerobot.video import Joiner, packet_times
@@ -28,11 +28,11 @@ _NUMERIC = (*(feature.key for feature in schema.FEATURES), schema.SUBTASK_INDEX.
 _ROWS = 64  # episodes a row group, of the tables about episodes
 
 
-def assemble(parts: Path, plan: dict[str, Any], fps: int, root: Path, limits: Limits) -> None:
+def assemble(parts: Sequence[Path], plan: dict[str, Any], fps: int, root: Path, limits: Limits) -> None:
     """Write a dataset from all the parts of a plan.
 
     Args:
-        parts: their folder.
+        parts: folder of each.
         plan: content of ``conversion.json``.
         fps: frames a second.
         root: where to write; an empty folder.
@@ -41,7 +41,7 @@ def assemble(parts: Path, plan: dict[str, Any], fps: int, root: Path, limits: Li
     Raises:
         DatasetError: a part is damaged.
     """
-    reader = _Parts(parts, len(plan["episodes"]))
+    reader = _Parts(parts)
     tasks, subgoals, ranges = _survey(reader)
     histograms = {key: Histogram(found.low, found.high) for key, found in ranges.items()}
     levels: dict[str, Levels] = {}
@@ -75,7 +75,7 @@ def assemble(parts: Path, plan: dict[str, Any], fps: int, root: Path, limits: Li
                 found = Levels(np.array(counts), steps)
                 stats[schema.image_key(camera)] = found.stats()
                 levels.setdefault(camera, Levels()).merge(found)
-            chunk, file = data.place((part_folder(parts, index) / FRAMES_FILE).stat().st_size)
+            chunk, file = data.place((parts[index] / FRAMES_FILE).stat().st_size)
             data.add(_data_table(columns, types))
             row = {
                 "episode_index": index,
@@ -87,7 +87,7 @@ def assemble(parts: Path, plan: dict[str, Any], fps: int, root: Path, limits: Li
                 "data/file_index": file,
             }
             for (kind, camera), joiner in joiners.items():
-                place = joiner.add(part_folder(parts, index) / video_name(camera, kind, codec), steps)
+                place = joiner.add(parts[index] / video_name(camera, kind, codec), steps)
                 name = f"videos/{schema.image_key(camera)}" if kind == "rgb" else f"depth/{camera}"
                 row[f"{name}/chunk_index"], row[f"{name}/file_index"] = place.chunk, place.file
                 row[f"{name}/from_timestamp"] = place.first / fps
@@ -117,18 +117,18 @@ _FLOATS = {feature.key for feature in schema.FEATURES} | {"timestamp"}
 class _Parts:
     """Reads parts."""
 
-    def __init__(self, folder: Path, count: int) -> None:
-        self._folder, self.count = folder, count
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self._folders, self.count = folders, len(folders)
 
     def about(self, index: int) -> dict[str, Any]:
-        path = part_folder(self._folder, index) / EPISODE_FILE
+        path = self._folders[index] / EPISODE_FILE
         try:
             return load_json(path)
         except (OSError, ValueError) as error:
             raise DatasetError("this part of a conversion is damaged", where=path, fix="Pass --overwrite.") from error
 
     def table(self, index: int) -> pa.Table:
-        path = part_folder(self._folder, index) / FRAMES_FILE
+        path = self._folders[index] / FRAMES_FILE
         try:
             return pq.read_table(path)
         except (OSError, pa.ArrowException) as error:

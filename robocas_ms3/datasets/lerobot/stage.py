@@ -27,6 +27,7 @@ from robocas_ms3.datasets.writing.players import Player, Request
 from robocas_ms3.datasets.writing.pool import do_all
 from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import replacing_folder
 from robocas_ms3.processes import Limits
@@ -45,6 +46,7 @@ class StageJob:
         codec: of RGB.
         tasks: (episode index, number in the source) of those to write.
         limits: of an episode; None: there are none, and one process is this one.
+        begun: whether there are parts already.
     """
 
     request: Request
@@ -52,11 +54,26 @@ class StageJob:
     codec: str
     tasks: list[tuple[int, int]]
     limits: Limits | None = None
+    begun: bool = False
 
 
 def part_folder(parts: Path, index: int) -> Path:
     """Folder of an episode's part."""
     return parts / episode_folder(index)
+
+
+def is_whole(part: Path) -> bool:
+    """Whether a part's files are as large as when they were written."""
+    try:
+        about = load_json(part / EPISODE_FILE)
+        return isinstance(about, dict) and about.get("sizes") == _sizes(part)
+    except (OSError, ValueError):
+        return False
+
+
+def _sizes(part: Path) -> dict[str, int]:
+    """Bytes of a part's files, without the one that says so."""
+    return {file.name: file.stat().st_size for file in sorted(part.iterdir()) if file.name != EPISODE_FILE}
 
 
 def video_name(camera: str, kind: str, codec: str) -> str:
@@ -68,7 +85,8 @@ def stage_all(job: StageJob, processes: int) -> Generator[WrittenEpisode, None, 
     """Write parts; gives each episode when it is done, in any order.
 
     Raises:
-        DatasetError: an episode can't be written, or ended its process twice.
+        IncompleteError: episodes can't be written; all others are.
+        Exception: what is wrong with all.
     """
     return do_all(
         partial(_Stager, job),
@@ -79,6 +97,8 @@ def stage_all(job: StageJob, processes: int) -> Generator[WrittenEpisode, None, 
         limits=job.limits,
         apart=job.limits is not None and job.request.renders,
         name=lambda task: episode_folder(task[0]),
+        begun=job.begun,
+        fix="--resume tries again; with --leave-out too, the others make the dataset where that fails.",
     )
 
 
@@ -102,7 +122,7 @@ def stage_episode(job: StageJob, player: Player, index: int, number: int) -> Wri
         DatasetError: it can't be shown or written.
     """
     started, timing, fps = time.perf_counter(), Timing(), whole_rate(player.rate_hz)
-    with replacing_folder(part_folder(job.parts, index)) as folder:
+    with replacing_folder(part_folder(job.parts, index), sync=True) as folder:
         played = player.open(number, timing)
         with _Videos(folder, job.codec, fps, timing) as videos, closing(played.frames()) as frames:
             for frame in frames:
@@ -130,6 +150,7 @@ def stage_episode(job: StageJob, player: Player, index: int, number: int) -> Wri
             },
             "depth": player.pictures.depth,
             "levels": {name: levels.counts.tolist() for name, levels in videos.levels.items()},
+            "sizes": _sizes(folder),
         }
         (folder / EPISODE_FILE).write_text(json.dumps(about, ensure_ascii=False), encoding="utf-8")
         size = sum(file.stat().st_size for file in folder.iterdir())

@@ -24,6 +24,11 @@ def fingerprint(recording: Recording) -> str:
 
 def recording_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
     """Which recording an episode is of, as ``conversion.json`` has it."""
+    return {**unread_entry(file, index), "recording": fingerprint(file.recording(index, bodies=False))}
+
+
+def unread_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
+    """The same of one that can't be read, which has no fingerprint."""
     episode = file.episodes[index]
     return {
         "trajectory": file.path.name,
@@ -31,7 +36,7 @@ def recording_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
         "seed": episode.get("episode_seed"),
         "success": succeeded(episode),
         "target": episode.get("robocas", {}).get("target"),
-        "recording": fingerprint(file.recording(index, bodies=False)),
+        "recording": None,
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -17,6 +18,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.preview import FEW, finish_previews, on_sheet
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing.cut_off import cut_off
 from robocas_ms3.datasets.writing.failures import add_failures
 from robocas_ms3.datasets.writing.frames import OpenSource
 from robocas_ms3.datasets.writing.info import write_info
@@ -26,14 +28,16 @@ from robocas_ms3.datasets.writing.plan import (
     appended_plan,
     dataset_settings,
     new_plan,
+    planned_sides,
     resumed_plan,
     still_missing,
+    without_unwritten,
 )
 from robocas_ms3.datasets.writing.players import Player, RecordingPlayer, Request, open_env
 from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.datasets.writing.workers import Job, write_all
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.errors import DatasetError, IncompleteError
 from robocas_ms3.files import make_folder, write_json
 from robocas_ms3.outputs import check_there, claim_output, kept_if_begun, locked_folder, sweep, while_there
 from robocas_ms3.processes import Limits
@@ -76,6 +80,7 @@ def convert(
     overwrite: bool = False,
     resume: bool = False,
     append: bool = False,
+    leave_out: bool = False,
     previews: bool | None = False,
     jobs: int = 1,
     pack: str | Path | None = None,
@@ -87,6 +92,7 @@ def convert(
     """Write a RoboCAS dataset from a trajectory file.
 
     Killed at any moment, it goes on with ``resume`` (or the same ``append`` again), and ends as if it had not been.
+    An episode that can't be written costs no other: in the end there is a dataset of the others, and an error.
     Warns where the actions were tried at another rate than that of the dataset.
 
     Args:
@@ -100,6 +106,7 @@ def convert(
         resume: keep the episodes that are there.
         append: add to the dataset in ``out``; what is there keeps its numbers and its side of the split, and recordings
             that it holds already are not added again.
+        leave_out: whether episodes that can't be written are no error, but a warning.
         previews: whether to write a video of each new episode, and a contact sheet; None: where they are at most 20.
         jobs: worker processes.
         pack: name or folder of the objects' pack, instead of what the file names.
@@ -112,6 +119,8 @@ def convert(
 
     Raises:
         DatasetError: the input is unusable, nothing to convert, no render device, another conversion is at it.
+        IncompleteError: episodes can't be written; the dataset is complete without, ``left_out`` in its
+            ``conversion.json`` says why, and ``resume`` tries again.
         OutputExistsError: ``out`` is not empty and no flag is set.
         MissingExtraError: embeddings are wanted and the ``language`` extra is not installed.
     """
@@ -141,15 +150,21 @@ def convert(
             make_folder(out)
             sweep(out)
             sweep(out / schema.PREVIEW_FOLDER)
+            before = _split_before(out)
+            _remove_cut_off(out, plan, player.pictures)
             missing = [task for task in plan.tasks if not (out / schema.episode_folder(task[0])).is_dir()]
             if on_start:
                 on_start(len(missing))
             sheet = None
             if previews or (previews is None and len(plan.tasks) <= FEW):
                 sheet = on_sheet(map(int, plan.content["episodes"]))
-            job = Job(request, out, vectors, sheet, missing, episode_limits)
+            job = Job(request, out, vectors, sheet, missing, episode_limits, begun=len(missing) < len(plan.tasks))
             with while_there(out / schema.CONVERSION_FILE, DatasetError):
-                written = _write(job, player.file.env_info, plan, jobs, on_episode)
+                written, incomplete = _write(job, player.file.env_info, plan, before, jobs, on_episode)
+            if incomplete and not leave_out:
+                raise incomplete
+            if incomplete:
+                _log.warning("%s", incomplete)
             if left := still_missing(out, plan.content):
                 _log.warning("%s: %s are still missing: convert that with --append", out, " and ".join(left))
     written.sort(key=lambda episode: episode.number)
@@ -161,11 +176,13 @@ def _write(
     job: Job,
     env_info: dict[str, Any],
     plan: Plan,
+    before: tuple[list[int], list[int]],
     jobs: int,
     on_episode: Callable[[WrittenEpisode], None] | None,
-) -> list[WrittenEpisode]:
+) -> tuple[list[WrittenEpisode], IncompleteError | None]:
+    """Write what is missing; gives that, and what is wrong with what can't be written."""
     written: list[WrittenEpisode] = []
-    before = _split_before(job.out)
+    incomplete: IncompleteError | None = None
     with kept_if_begun(job.out):
         write_json(job.out / schema.CONVERSION_FILE, plan.content)
         try:
@@ -175,21 +192,39 @@ def _write(
                     written.append(episode)
                     if on_episode:
                         on_episode(episode)
+        except IncompleteError as error:
+            incomplete = error
         finally:
             for folder in (job.out, job.out / schema.PREVIEW_FOLDER):
                 sweep(folder)  # what processes that died left; others did it again
+        if incomplete:
+            content = without_unwritten(job.out, plan, incomplete.reasons)
+            write_json(job.out / schema.CONVERSION_FILE, content)
         add_failures(job.request.path.parent, job.out, env_info)
-        write_info(job.out, before)
+        write_info(job.out, planned_sides(plan.content, before))
     if job.sheet is not None:
         finish_previews(job.out, {episode.number: episode.row for episode in written if episode.row is not None})
-    return written
+    return written, incomplete
+
+
+def _remove_cut_off(out: Path, plan: Plan, pictures: Pictures) -> None:
+    """Remove episodes of which a file was cut off since they were written, so that they are written again."""
+    for folder in (out / schema.episode_folder(number) for number, _ in plan.tasks):
+        if folder.is_dir() and (path := cut_off(folder, pictures)):
+            _log.warning("%s: cut off, or gone, since it was written; its episode is written again", path)
+            shutil.rmtree(folder)
 
 
 def _split_before(out: Path) -> tuple[list[int], list[int]]:
     """Training and validation episodes of the dataset that is there, if one is."""
     if not (out / schema.DATA_INFO_FILE).is_file():
         return [], []
-    return Dataset(out).sides
+    try:
+        return Dataset(out).sides
+    except DatasetError as error:
+        fix = "Delete it, and it is made anew; where there was an --append, episodes may change sides."
+        where = out / schema.DATA_INFO_FILE
+        raise DatasetError("the split can't be read", where=where, found=error.found, fix=fix) from error
 
 
 def embed_texts(player: Player, entries: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float32]]:
@@ -197,5 +232,13 @@ def embed_texts(player: Player, entries: Sequence[Mapping[str, Any]]) -> dict[st
     from robocas_ms3.language.embed import TextEmbedder
 
     embedder = TextEmbedder()
-    texts = list(dict.fromkeys(text for entry in entries for text in player.texts(entry["source"])))
+    texts = list(dict.fromkeys(text for entry in entries for text in _texts(player, entry["source"])))
     return dict(zip(texts, embedder(texts), strict=True))
+
+
+def _texts(player: Player, number: int) -> list[str]:
+    """Of an episode; none where it can't be read, which is said when it is its turn."""
+    try:
+        return player.texts(number)
+    except DatasetError:
+        return []

@@ -11,19 +11,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import robocas_ms3
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.datasets.sources.split import SPLIT_RULE
+from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
 from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.outputs import check_same, is_taken
+from robocas_ms3.recordings.seeds import one_seed
+from robocas_ms3.recordings.versions import versions
 
 Entries = Sequence[dict[str, Any]]
 """What is to be converted, see `players.Player.entries`."""
 
 SETTINGS = ("rate_hz", "cameras", "image_size", "image_format", "depth", "embeddings")
 """What all episodes of a dataset share."""
+
+LEFT_OUT = "left_out"
+"""Key of the episodes that could not be written, each with ``why``; a conversion that goes on tries them again."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,8 @@ def resumed_plan(out: Path, entries: Entries, settings: dict[str, Any]) -> Plan:
         return new_plan(entries, settings)
     before = _read(out, missing="can't resume: no conversion was begun here", fix="Pass --overwrite.")
     _check_settings(out, before, settings, "resume", "Pass --overwrite, or the settings of before.")
-    known, new = _divided(before, entries)
+    check_versions(out / schema.CONVERSION_FILE, before, "resume", "Install those, or pass --overwrite.")
+    content, known, new = _divided(before, entries)
     if new:
         raise DatasetError(
             "can't resume: these recordings are not what was begun here",
@@ -74,7 +79,7 @@ def resumed_plan(out: Path, entries: Entries, settings: dict[str, Any]) -> Plan:
             found=f"{len(new)} of {len(entries)} are new",
             fix="Pass --append to add them, --overwrite to begin again.",
         )
-    return Plan(before, known)
+    return Plan(content, known)
 
 
 def appended_plan(out: Path, entries: Entries, settings: dict[str, Any]) -> Plan:
@@ -85,17 +90,71 @@ def appended_plan(out: Path, entries: Entries, settings: dict[str, Any]) -> Plan
     """
     before = _read(out, missing="no dataset to append to", fix="Convert without --append first.")
     _check_settings(out, before, settings, "append", "Pass the settings of before.")
-    known, new = _divided(before, entries)
-    first = max((int(number) for number in before["episodes"]), default=-1) + 1
-    plan = _extended(before, before["episodes"], new, first)
+    fix = "Install those, or convert into another folder and robocas merge the two."
+    check_versions(out / schema.CONVERSION_FILE, before, "append", fix)
+    content, known, new = _divided(before, entries)
+    first = max(map(int, [*content["episodes"], *content.get(LEFT_OUT, {})]), default=-1) + 1
+    plan = _extended(content, content["episodes"], new, first)
     return Plan(plan.content, [*known, *plan.tasks])
 
 
-def _divided(before: Mapping[str, Any], entries: Entries) -> tuple[list[tuple[int, int]], list[dict[str, Any]]]:
-    """(Number, number in the source) of the episodes that are planned already, and the entries that are not."""
-    planned = {entry["recording"]: int(number) for number, entry in before["episodes"].items()}
-    known = [(planned[entry["recording"]], entry["source"]) for entry in entries if entry["recording"] in planned]
-    return known, [entry for entry in entries if entry["recording"] not in planned]
+def _divided(
+    before: Mapping[str, Any], entries: Entries
+) -> tuple[dict[str, Any], list[tuple[int, int]], list[dict[str, Any]]]:
+    """Content of ``conversion.json`` as it goes on, where what was left out and comes again is an episode again.
+
+    Also gives (number, number in the source) of the episodes that are planned already, and the entries that are not.
+    """
+    episodes, left_out = dict(before["episodes"]), dict(before.get(LEFT_OUT, {}))
+    planned = {entry["recording"]: number for number, entry in episodes.items() if entry["recording"]}
+    unread = {number: entry for number, entry in episodes.items() if not entry["recording"]}
+    again = {_place(entry): number for number, entry in {**unread, **left_out}.items()}
+    known, new = [], []
+    for entry in entries:
+        number = planned.get(entry["recording"]) or again.get(_place(entry))
+        if number is None:
+            new.append(entry)
+            continue
+        known.append((int(number), entry["source"]))
+        if number in unread or left_out.pop(number, None):
+            episodes[number] = _without_source(entry)
+    in_order = {number: episodes[number] for number in sorted(episodes, key=int)}
+    content = {key: value for key, value in before.items() if key != LEFT_OUT} | {"episodes": in_order}
+    return {**content, **({LEFT_OUT: left_out} if left_out else {})}, known, new
+
+
+def _place(entry: Mapping[str, Any]) -> str:
+    """What tells recordings apart that may not have been readable."""
+    return json.dumps([entry.get(key) for key in ("trajectory", "trajectory_episode", "seed")])
+
+
+def without_unwritten(out: Path, plan: Plan, reasons: Mapping[str, str]) -> dict[str, Any]:
+    """Content of ``conversion.json`` where episodes of a plan could not be written.
+
+    Args:
+        out: the dataset.
+        plan: it.
+        reasons: why, by name of the episode's folder.
+    """
+    episodes = dict(plan.content["episodes"])
+    left_out = dict(plan.content.get(LEFT_OUT, {}))
+    for number, _ in plan.tasks:
+        folder = schema.episode_folder(number)
+        if not (out / folder).is_dir():
+            left_out[str(number)] = {**episodes.pop(str(number)), "why": reasons[folder]}
+    in_order = {number: left_out[number] for number in sorted(left_out, key=int)}
+    return {**plan.content, "episodes": episodes, LEFT_OUT: in_order}
+
+
+def planned_sides(content: Mapping[str, Any], before: tuple[list[int], list[int]]) -> tuple[list[int], list[int]]:
+    """Training and validation episodes of all that are planned, so that those not there yet change no other's side.
+
+    Args:
+        content: of ``conversion.json``.
+        before: the sides so far.
+    """
+    seeds = {int(number): one_seed(entry.get("seed")) for number, entry in content["episodes"].items()}
+    return split_by_seed({number: number if seed is None else seed for number, seed in seeds.items()}, before)
 
 
 def still_missing(out: Path, content: Mapping[str, Any]) -> list[str]:
@@ -124,12 +183,29 @@ def _check_settings(out: Path, before: Mapping[str, Any], settings: Mapping[str,
     check_same(before, now, what, where=where, fix=fix, error=DatasetError)
 
 
+def check_versions(path: Path, before: Mapping[str, Any], verb: str, fix: str) -> None:
+    """See that what goes on was begun by the versions that are installed.
+
+    Args:
+        path: of what says so.
+        before: its content; what is older, or not of a conversion, names no others, and is not looked at.
+        verb: what is not done where they differ.
+        fix: for who reads the error.
+
+    Raises:
+        DatasetError: they differ.
+    """
+    made_with, now = before.get("made_with"), versions()
+    if isinstance(made_with, dict) and now.keys() <= made_with.keys():
+        check_same(made_with, now, f"can't {verb} with other versions", where=path, fix=fix, error=DatasetError)
+
+
 def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[str, Any]:
     """What ``conversion.json`` says of a dataset as a whole."""
     return {
         "format": "robocas",
         "schema_version": schema.SCHEMA_VERSION,
-        "made_with": {"robocas_ms3": robocas_ms3.__version__},
+        "made_with": versions(),
         **settings,
         "split": split_rule,
     }
@@ -137,11 +213,12 @@ def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[st
 
 def _extended(head: Mapping[str, Any], episodes: Mapping[str, Any], entries: Entries, first: int) -> Plan:
     tasks = [(number, entry["source"]) for number, entry in enumerate(entries, start=first)]
-    added = {
-        str(number): {key: value for key, value in entry.items() if key != "source"}
-        for number, entry in enumerate(entries, start=first)
-    }
+    added = {str(number): _without_source(entry) for number, entry in enumerate(entries, start=first)}
     return Plan(json.loads(json.dumps({**head, "episodes": {**episodes, **added}})), tasks)
+
+
+def _without_source(entry: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if key != "source"}
 
 
 def _read(out: Path, missing: str, fix: str) -> dict[str, Any]:

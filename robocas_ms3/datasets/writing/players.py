@@ -16,7 +16,7 @@ from robocas_ms3.datasets.formats import format_of
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.datasets.sources.episode import DEFAULT_RATE
-from robocas_ms3.datasets.sources.provenance import recording_entry, scene_record, succeeded
+from robocas_ms3.datasets.sources.provenance import recording_entry, scene_record, succeeded, unread_entry
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame, FrameSource, OpenSource
 from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.errors import DatasetError
@@ -157,12 +157,13 @@ class RecordingPlayer:
         """
         chosen = _choose(self.file, self._request.include_failed)
         _warn_untried(self.file, chosen, self.rate_hz)
-        entries = [{"source": index, **recording_entry(self.file, index)} for index in chosen]
-        once = {entry["recording"]: entry for entry in reversed(entries)}
+        entries = [{"source": index, **_entry(self.file, index)} for index in chosen]
+        first = {entry["recording"]: entry for entry in reversed(entries)}
+        once = [entry for entry in entries if entry["recording"] is None or first[entry["recording"]] is entry]
         if len(once) < len(entries):
-            again = [entry["trajectory_episode"] for entry in entries if once[entry["recording"]] is not entry]
-            _log.warning("%s: the same recordings again, left out: %s", self.file.path, ", ".join(map(str, again)))
-        return [entry for entry in entries if once[entry["recording"]] is entry]
+            again = [str(entry["trajectory_episode"]) for entry in entries if entry not in once]
+            _log.warning("%s: the same recordings again, left out: %s", self.file.path, ", ".join(again))
+        return once
 
     def texts(self, number: int) -> list[str]:
         """Instruction and sub-goals."""
@@ -229,6 +230,14 @@ class _PlayedRecording:
     def scene(self) -> dict[str, Any]:
         file = self.player.file
         return scene_record(file, self.number, self.recording, self.shown.scene(), self.player.rate_hz)
+
+
+def _entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
+    """Which recording it is; of one that can't be read, which is said when it is its turn, ``recording`` is None."""
+    try:
+        return recording_entry(file, index)
+    except DatasetError:
+        return unread_entry(file, index)
 
 
 def _choose(file: TrajectoryFile, include_failed: bool) -> list[int]:

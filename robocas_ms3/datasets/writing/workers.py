@@ -29,6 +29,7 @@ class Job:
         sheet: episodes on the contact sheet; None: no previews are made.
         tasks: (number in the dataset, number in the source) of each episode to write.
         limits: of an episode; None: there are none, and one process is this one.
+        begun: whether there are episodes already.
     """
 
     request: Request
@@ -37,13 +38,15 @@ class Job:
     sheet: tuple[int, ...] | None
     tasks: list[tuple[int, int]]
     limits: Limits | None = None
+    begun: bool = False
 
 
 def write_all(job: Job, processes: int) -> Generator[WrittenEpisode, None, None]:
     """Write the job's episodes; gives each when it is done, in any order.
 
     Raises:
-        DatasetError: an episode can't be written, or ended its process twice.
+        IncompleteError: episodes can't be written; all others are.
+        Exception: what is wrong with all.
     """
     return do_all(
         partial(_Writer, job),
@@ -53,6 +56,8 @@ def write_all(job: Job, processes: int) -> Generator[WrittenEpisode, None, None]
         limits=job.limits,
         apart=job.limits is not None and job.request.renders,
         name=lambda task: schema.episode_folder(task[0]),
+        begun=job.begun,
+        fix="The dataset is complete without, and valid; --resume tries again, --leave-out takes it as it is.",
     )
 
 

@@ -70,7 +70,7 @@ def write_episode(
         DatasetError: it can't be shown, or a file can't be written.
     """
     started, timing, pictures = time.perf_counter(), Timing(), player.pictures
-    with replacing_folder(root / schema.episode_folder(number)) as folder:
+    with replacing_folder(root / schema.episode_folder(number), sync=True) as folder:
         for camera in pictures.cameras:
             for kind in pictures.kinds:
                 (folder / camera / kind).mkdir(parents=True)

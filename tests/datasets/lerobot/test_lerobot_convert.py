@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from synthetic import RayCaster, write_trajectory
@@ -26,7 +27,7 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.writing.dataset_player import open_player
 from robocas_ms3.datasets.writing.players import Request
-from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.errors import DatasetError, IncompleteError, OutputExistsError, RobocasError
 from robocas_ms3.outputs import locked_folder
 from robocas_ms3.recordings.reading import TrajectoryFile
 
@@ -297,8 +298,33 @@ def test_what_breaks_is_gone_on_with(trajectory, lerobot, tmp_path):
     with pytest.raises(DatasetError, match="it broke"):
         convert_lerobot(trajectory, out, open_source=Breaking)
     assert {path.name for path in out.iterdir()} == {".parts"}
+    assert not (out / ".parts" / "episode_0000001").exists()
     done = run(trajectory, out, resume=True)
     assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
+    assert files_of(out) == files_of(lerobot)
+
+
+def test_with_other_versions_it_does_not_go_on(lerobot, trajectory, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(lerobot, out)
+    path = out / "meta/robocas/conversion.json"
+    about = json.loads(path.read_text())
+    about["made_with"]["sapien"] = "2.2.2"
+    path.write_text(json.dumps(about))
+    with pytest.raises(DatasetError, match="can't resume with other versions .expected sapien 2.2.2"):
+        run(trajectory, out, resume=True)
+
+
+def test_a_recording_that_is_mended_is_gone_on_with(lerobot, trajectory, tmp_path):
+    broken, out = tmp_path / trajectory.name, tmp_path / "out"
+    shutil.copy(trajectory.with_suffix(".json"), broken.with_suffix(".json"))
+    shutil.copy(trajectory, broken)
+    with h5py.File(broken, "a") as file:
+        del file["traj_2/actions"]
+    with pytest.raises(IncompleteError, match="found episode_0000001: .*traj_2: this episode is damaged"):
+        run(broken, out)
+    shutil.copy(trajectory, broken)
+    run(broken, out, resume=True)
     assert files_of(out) == files_of(lerobot)
 
 

@@ -66,10 +66,11 @@ def test_what_fails_is_measured_too(clock):
 
 
 def test_of_a_robocas_dataset(trajectory, tmp_path, monkeypatch, clock):
-    calls = Counter()
+    calls, write = Counter(), writer.write_picture
 
     def encode(path, picture):
         calls[picture.ndim] += 1
+        write(path, picture)
         return 0.5
 
     monkeypatch.setattr(writer, "write_picture", encode)

@@ -188,24 +188,6 @@ def test_errors_leave_nothing_behind(trajectory, tmp_path):
     fails("this episode is damaged", broken, out)
 
 
-def test_an_episode_that_breaks_leaves_the_ones_before(trajectory, tmp_path):
-    class Breaking(RayCaster):
-        def frames(self, recording, samples):
-            for index, frame in enumerate(super().frames(recording, samples)):
-                if recording.seed == 5 and index == 3:
-                    raise DatasetError("it broke")
-                yield frame
-
-    out = tmp_path / "out"
-    with pytest.raises(DatasetError, match="it broke"):
-        convert(trajectory, out, embeddings=False, open_source=Breaking)
-    assert {path.name for path in out.iterdir()} == {"conversion.json", "episode_0000000"}
-    run(trajectory, out, resume=True)
-    assert {path.name for path in out.iterdir()} == {
-        "conversion.json", "data_info.json", "episode_0000000", "episode_0000001",
-    }  # fmt: skip
-
-
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
 def test_a_folder_that_is_not_writable(trajectory, tmp_path):
     tmp_path.chmod(0o555)
@@ -300,6 +282,23 @@ def test_append_wants_a_dataset_of_the_same_settings(trajectory, tmp_path):
     with pytest.raises(DatasetError, match="can't append with other settings .expected rate_hz 5.0, found rate_hz 10"):
         run(trajectory, tmp_path / "out", append=True, rate_hz=10)
     assert files_of(tmp_path / "out") == before
+
+
+def test_with_other_versions_it_does_not_go_on(trajectory, tmp_path):
+    out, more = tmp_path / "out", write_trajectory(tmp_path / "more.h5", seeds=(10,))
+    run(trajectory, out)
+    about = json.loads((out / "conversion.json").read_text())
+    about["made_with"]["sapien"] = "2.2.2"
+    (out / "conversion.json").write_text(json.dumps(about))
+    before = files_of(out)
+    for source, how in ((trajectory, "resume"), (more, "append")):
+        with pytest.raises(DatasetError, match=f"can't {how} with other versions .expected sapien 2.2.2, found sapien"):
+            run(source, out, **{how: True})
+        assert files_of(out) == before
+    about["made_with"] = {"robocas_ms3": "0.1.0"}  # older ones said no more
+    (out / "conversion.json").write_text(json.dumps(about))
+    assert run(trajectory, out, resume=True).kept == 2
+    assert len(run(more, out, append=True).episodes) == 1
 
 
 @pytest.mark.parametrize("moment", ["picture", "arrays", "rename", "overview", "rmtree"])

@@ -15,7 +15,7 @@ class EpisodeGenerator:
         path = folder / f"{name}.h5"
         with h5py.File(path, "w") as file:
             file.create_group("traj_0").attrs["seed"] = seed
-        said = {"attempts": 1, "seconds": {}}
+        said = {"attempts": 1, "failed_attempts": [], "seconds": {}}
         episode = {"episode_id": 0, "episode_seed": seed, "elapsed_steps": 10, "robocas": said}
         about = {"env_info": {"env_id": "X-v1", "env_kwargs": {}}, "episodes": [episode]}
         path.with_suffix(".json").write_text(json.dumps(about))

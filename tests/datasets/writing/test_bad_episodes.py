@@ -1,0 +1,186 @@
+"""One episode that can't be written costs no other: these make a whole dataset, and an error tells which and why."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+from managing import files_of
+from synthetic import RayCaster, write_trajectory
+
+from robocas_ms3.cli.main import run as run_command
+from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.datasets.writing import convert as conversion
+from robocas_ms3.datasets.writing.convert import convert
+from robocas_ms3.errors import AssetError, DatasetError, IncompleteError
+
+SEEDS = tuple(range(10, 24))
+
+
+class Breaking(RayCaster):
+    """Can't show one of the recordings."""
+
+    seed = 13
+
+    def frames(self, recording, samples):
+        for step, frame in enumerate(super().frames(recording, samples)):
+            if recording.seed == self.seed and step == 3:
+                self.fail(frame)
+            yield frame
+
+    def fail(self, frame):
+        raise AssetError("no such object", where="cube")
+
+
+class Unencodable(Breaking):
+    def fail(self, frame):
+        frame.rgb["base_camera"] = np.zeros((0, 0, 3), np.uint8)
+
+
+class OfOddSeeds(RayCaster):
+    def load(self, recording):
+        if recording.seed % 2:
+            raise RuntimeError("odd")
+
+
+def run(trajectory, out, **kwargs):
+    return convert(trajectory, out, **{"embeddings": False, "open_source": RayCaster, **kwargs})
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory):
+    """Recordings, and what becomes of them where nothing is wrong."""
+    folder = tmp_path_factory.mktemp("many")
+    trajectory = write_trajectory(folder / "trajectory.h5", seeds=SEEDS, steps=16)
+    run(trajectory, folder / "whole")
+    return trajectory, folder / "whole"
+
+
+def spoil(path, number, how):
+    with h5py.File(path, "a") as file:
+        if how == "no states":
+            del file[f"traj_{number}/env_states"]
+        elif how == "NaN":
+            file[f"traj_{number}/env_states/actors/object_1"][2] = np.nan
+        elif how == "no actions":
+            del file[f"traj_{number}/actions"]
+
+
+@pytest.mark.parametrize("how", ["no states", "NaN", "no actions"])
+def test_a_broken_recording(many, tmp_path, how):
+    _, whole = many
+    trajectory, out = write_trajectory(tmp_path / "trajectory.h5", seeds=SEEDS, steps=16), tmp_path / "out"
+    spoil(trajectory, 3, how)
+    with pytest.raises(IncompleteError, match=r"out: 1 episode could not.*found episode_0000003: .*traj_3") as error:
+        run(trajectory, out)
+    assert "\n" not in str(error.value)
+    assert "--resume" in str(error.value)
+    assert validate(out).violations == []
+    expected, found = files_of(whole), files_of(out)
+    different = {name for name in expected if name not in found or found[name] != expected[name]}
+    assert {name.partition("/")[0] for name in different} == {"conversion.json", "data_info.json", "episode_0000003"}
+    said = json.loads((out / "conversion.json").read_text())
+    assert list(said["left_out"]) == ["3"]
+    assert said["left_out"]["3"]["why"] in str(error.value)
+    for side, sides in zip(("train", "val"), Dataset(whole).sides, strict=True):
+        assert Dataset(out).split(side) == [number for number in sides if number != 3]
+    run(write_trajectory(trajectory, seeds=SEEDS, steps=16), out, resume=True)  # mended
+    assert files_of(out) == files_of(whole)
+
+
+@pytest.mark.parametrize(("source", "jobs"), [(Breaking, 1), (Unencodable, 1), (Unencodable, 2)])
+def test_an_episode_that_cannot_be_shown_or_stored(many, tmp_path, source, jobs):
+    trajectory, whole = many
+    with pytest.raises(IncompleteError, match="found episode_0000003: .*(no such object|can't encode this picture)"):
+        run(trajectory, tmp_path / "out", open_source=source, jobs=jobs)
+    assert validate(tmp_path / "out").violations == []
+    assert len(Dataset(tmp_path / "out").numbers) == len(SEEDS) - 1
+    run(trajectory, tmp_path / "out", resume=True)
+    assert files_of(tmp_path / "out") == files_of(whole)
+
+
+def test_the_only_one_of_its_side(many, tmp_path):
+    """It comes back to its side, whatever was resumed between."""
+    trajectory, whole = many
+    (val,) = Dataset(whole).sides[1]
+
+    class OfVal(Breaking):
+        seed = SEEDS[val]
+
+    for resume in (False, True):
+        with pytest.raises(IncompleteError, match=f"episode_{val:07d}"):
+            run(trajectory, tmp_path / "out", open_source=OfVal, resume=resume)
+        assert validate(tmp_path / "out").violations == []
+        assert Dataset(tmp_path / "out").sides[1] == []
+    run(trajectory, tmp_path / "out", resume=True)
+    assert files_of(tmp_path / "out") == files_of(whole)
+
+
+def test_others_are_appended_meanwhile(many, tmp_path):
+    trajectory, _ = many
+    more = write_trajectory(tmp_path / "more.h5", seeds=(50, 51), steps=16)
+    with pytest.raises(IncompleteError):
+        run(trajectory, tmp_path / "out", open_source=OfOddSeeds)
+    run(more, tmp_path / "out", append=True)
+    assert validate(tmp_path / "out").violations == []
+    ledger = json.loads((tmp_path / "out" / "conversion.json").read_text())
+    assert list(ledger["left_out"]) == [str(number) for number in range(1, 14, 2)]
+    assert [ledger["episodes"][number]["seed"] for number in ("12", "14", "15")] == [22, 50, 51]
+    done = run(trajectory, tmp_path / "out", resume=True)
+    assert [episode.number for episode in done.episodes] == list(range(1, 14, 2))
+    assert validate(tmp_path / "out").violations == []
+    ledger = json.loads((tmp_path / "out" / "conversion.json").read_text())
+    assert list(ledger["episodes"]) == [str(number) for number in range(16)]
+    assert "left_out" not in ledger
+
+
+def test_what_is_wrong_with_the_first_three_is_wrong_with_all(many, tmp_path):
+    class Hopeless(RayCaster):
+        def load(self, recording):
+            raise DatasetError(f"seed {recording.seed}: no renderer")
+
+    with pytest.raises(DatasetError, match="^seed 10: no renderer$"):
+        run(many[0], tmp_path / "out", open_source=Hopeless)
+    assert not (tmp_path / "out").exists()
+
+
+def test_texts_that_cannot_be_read(many, tmp_path, monkeypatch):
+    trajectory = write_trajectory(tmp_path / "trajectory.h5", seeds=SEEDS, steps=16)
+    content = json.loads(trajectory.with_suffix(".json").read_text())
+    del content["episodes"][3]["robocas"]["instruction"]
+    trajectory.with_suffix(".json").write_text(json.dumps(content))
+    embedder = type("Embedder", (), {"__call__": lambda self, texts: np.eye(384, dtype=np.float32)[: len(texts)]})
+    monkeypatch.setattr("robocas_ms3.language.embed.TextEmbedder", embedder)
+    with pytest.raises(IncompleteError, match="episode_0000003: .*traj_3: the JSON's entry is incomplete"):
+        run(trajectory, tmp_path / "out", embeddings=True)
+    assert validate(tmp_path / "out").violations == []
+
+
+@pytest.mark.parametrize("to", ["robocas", "lerobot"])
+def test_the_command(many, tmp_path, monkeypatch, capsys, to):
+    """An exit code, one line that says how to go on, and a flag with which that is all."""
+    if to == "lerobot":
+        pytest.importorskip("av", reason="needs the extra 'lerobot'")
+        from robocas_ms3.datasets.lerobot import convert as lerobot
+
+        owner, name = lerobot, "convert_lerobot"
+    else:
+        owner, name = conversion, "convert"
+    whole, source = getattr(owner, name), [Breaking]
+    monkeypatch.setattr(owner, name, lambda *args, **more: whole(*args, open_source=source[0], **more))
+    out = tmp_path / "out"
+    command = ["convert", str(many[0]), "--to", to, "--out", str(out), "--no-embeddings", "--no-video"]
+    assert run_command(command) == 1
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert "1 episode could not be written (found episode_0000003: cube: no such object). " in line
+    assert "--resume" in line
+    assert "--leave-out" in line
+    assert run_command([*command, "--resume", "--leave-out"]) == 0
+    assert run_command(["validate", str(out)]) == 0
+    assert "13 episodes" in capsys.readouterr().out
+    source[0] = RayCaster
+    assert run_command([*command, "--resume"]) == 0
+    assert run_command(["validate", str(out)]) == 0
+    count = 14 if to == "robocas" else 13  # LeRobot's numbers have no gap that it could fill
+    assert f"{count} episodes" in capsys.readouterr().out
