@@ -5,6 +5,8 @@
 #     scripts/slurm_here.sh status    says what runs; ends with 0 if Slurm answers
 #     scripts/slurm_here.sh stop      cancels all jobs and ends what was started
 #
+# Jobs go to the partition `here`; those of a second one, `first`, preempt them: they are sent back to the queue.
+#
 # Needs no systemd, so it works in a container. Started twice, it is started once. A slurm.conf that is none of its own
 # stays as it is, and then nothing is started. What the daemons say is in /var/log/robocas-slurm, what they remember in
 # /var/lib/robocas-slurm. Memory is not shared out: jobs may ask for what they like.
@@ -65,6 +67,8 @@ ClusterName=here
 SlurmctldHost=$host(127.0.0.1)
 SlurmUser=root
 AuthType=auth/munge
+# a requeued job waits until its credentials are over, two minutes by default
+AuthInfo=cred_expire=15
 CredType=cred/munge
 StateSaveLocation=$state/ctld
 SlurmdSpoolDir=$state/d
@@ -84,8 +88,12 @@ ReturnToService=2
 SlurmctldTimeout=30
 SlurmdTimeout=30
 JobRequeue=1
+# jobs of \`first\` send those of \`here\` back to the queue
+PreemptType=preempt/partition_prio
+PreemptMode=REQUEUE
 $node NodeAddr=127.0.0.1 State=UNKNOWN
-PartitionName=here Nodes=ALL Default=YES MaxTime=INFINITE State=UP
+PartitionName=here Nodes=ALL Default=YES MaxTime=INFINITE State=UP PriorityTier=1 PreemptMode=REQUEUE
+PartitionName=first Nodes=ALL MaxTime=INFINITE State=UP PriorityTier=10 PreemptMode=OFF
 END
 }
 
@@ -116,8 +124,8 @@ start() {
     running /run/robocas-slurmctld.pid slurmctld >/dev/null || slurmctld
     wait_until answers || refuse "slurmctld does not answer; see $logs/slurmctld.log"
     running /run/robocas-slurmd.pid slurmd >/dev/null || slurmd
-    wait_until node_is_up || refuse "the node is $(sinfo --noheader --format=%T); see $logs/slurmd.log"
-    say "a cluster of $(sinfo --noheader --format=%c) cores is up; scripts/slurm_here.sh stop ends it"
+    wait_until node_is_up || refuse "the node is $(sinfo --noheader --partition=here --format=%T); see $logs/slurmd.log"
+    say "a cluster of $(sinfo --noheader --partition=here --format=%c) cores is up; scripts/slurm_here.sh stop ends it"
 }
 
 stop() {

@@ -18,7 +18,7 @@ ray = pytest.importorskip("ray", reason="needs the ray extra: plans on a cluster
 from plan_stages import PLAN, MadeUp, assert_same, render, stages
 from ray.cluster_utils import Cluster
 
-from robocas_ms3.errors import PlanError
+from robocas_ms3.errors import MissingExtraError, PlanError
 from robocas_ms3.plans.engines import ray as engine
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.engines.ray import RayEngine
@@ -255,16 +255,16 @@ def test_a_cluster_that_is_not_there_is_said(tmp_path):
 
 @GATHER
 def test_an_error_of_all_seeds_ends_the_plan_in_one_line(cluster, slots, tmp_path, gather):
-    with pytest.raises(ValueError, match="a bug"):
-        run(cluster, tmp_path / "out", gather, Stages(Bug, render))
+    with pytest.raises(MissingExtraError, match="nothing to record with"):
+        run(cluster, tmp_path / "out", gather, Stages(Lacking, render))
     assert slots() == []
 
 
-class Bug(MadeUp):
+class Lacking(MadeUp):
     """Meets the same at every seed."""
 
     def do(self, task):
-        raise ValueError("a bug")
+        raise MissingExtraError("nothing to record with")
 
 
 def test_a_unit_that_goes_on_killing_its_actors_ends_the_plan(cluster, slots, tmp_path):

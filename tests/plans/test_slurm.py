@@ -1,87 +1,51 @@
 """Plans by submitit's jobs: the outcome is the local engine's, whatever befalls the jobs."""
 
-import json
-import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
-import psutil
 import pytest
 
 pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install "robocas-ms3[slurm]"')
 
 from plan_stages import PLAN, assert_same, plan_faults, stages
+from slurm_runs import (
+    LOCAL,
+    NO_SLURM,
+    SLURM,
+    assert_done_once,
+    holds,
+    processes_of,
+    run,
+    slurm_answers,
+    stages_in_jobs,
+    start,
+    wait_for,
+)
 
-from robocas_ms3.errors import PlanError
+from robocas_ms3.errors import MissingExtraError, PlanError
 from robocas_ms3.plans.engines import open_engine
 from robocas_ms3.plans.engines.local import LocalEngine
-from robocas_ms3.plans.engines.slurm import SlurmEngine
 from robocas_ms3.plans.run import run_plan
 from robocas_ms3.plans.units import Unit, deaths
-
-SUPPORT = Path(__file__).resolve().parents[1] / "support"
-
-LOCAL = {"executor": "local", "lease": "6"}
-
-
-def sinfo_answers():
-    try:
-        return subprocess.run(["sinfo", "--noheader"], capture_output=True, timeout=10, check=False).returncode == 0
-    except (OSError, subprocess.TimeoutExpired):
-        return False
-
 
 EXECUTORS = [
     pytest.param(LOCAL, id="local"),
     pytest.param(
-        {"executor": "slurm", "lease": "6", "time": "10", "mem_gb": "1"},
+        SLURM,
         id="slurm",
         marks=[
             pytest.mark.slow,
-            pytest.mark.skipif(not sinfo_answers(), reason="no Slurm answers here: scripts/slurm_here.sh starts one"),
+            pytest.mark.skipif(not slurm_answers(), reason=NO_SLURM),
         ],
     ),
 ]
 
 
 @pytest.fixture(autouse=True)
-def stages_in_jobs(monkeypatch):
-    path = [str(SUPPORT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
-
-
-def run(out, options=LOCAL, plan=PLAN, jobs=2, **more):
-    def open_slurm(plan, out):
-        return SlurmEngine(plan, out, jobs, options, stages="plan_stages:stages")
-
-    return run_plan(plan, out, open_slurm, jobs=1, **more)
-
-
-def wait_for(what, seconds=120):
-    until = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < until
-        time.sleep(0.05)
-
-
-def assert_done_once(out):
-    """Nobody did again what another had done."""
-    for folder in (out / "units").glob("*/*"):
-        lines = [json.loads(line)["seed"] for line in (folder / "seeds.jsonl").read_text().splitlines()]
-        assert sorted(set(lines)) == sorted(lines)
-
-
-def processes_of(out, word="submitit.core._submit"):
-    """Of the jobs that are at a plan: those that do units."""
-    found = []
-    for process in psutil.process_iter(["cmdline"]):
-        line = process.info["cmdline"] or []
-        if word in line and str(out / "slurm") in line and not line[0].endswith("srun"):
-            found.append(process)
-    return found
+def jobs_know_the_stages(monkeypatch):
+    stages_in_jobs(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -106,9 +70,7 @@ def test_jobs_make_what_this_machine_makes(undisturbed, tmp_path, options, units
 def test_a_job_that_is_killed_costs_nothing(undisturbed, tmp_path, options):
     out = tmp_path / "out"
     plan_faults(out, {11: ["hang"], 4: ["hang"]})
-    runner = subprocess.Popen(
-        [sys.executable, __file__, str(out), json.dumps(options)], stderr=subprocess.PIPE, text=True
-    )
+    runner = start(out, options, stderr=subprocess.PIPE)
     killed = set()
     for seed in (11, 4):
         tries = out.with_name(f"out-tries-{seed}")
@@ -124,17 +86,11 @@ def test_a_job_that_is_killed_costs_nothing(undisturbed, tmp_path, options):
     assert [death for unit in (Unit(0, 0), Unit(1, 0)) for death in deaths(unit.folder(PLAN, out)).read()] == []
 
 
-def holds(process, out, seed):
-    """Whether a job has the claim on the unit of a seed."""
-    claims = out / "slurm" / "claims" / ("a" if seed >= 10 else "b")
-    return any(path.read_text().split()[1:2] == [str(process.pid)] for path in claims.glob("00000.*"))
-
-
 @pytest.mark.parametrize("number", [signal.SIGUSR2, signal.SIGTERM], ids=["time is up", "told to end"])
 def test_a_signal_to_all_processes_of_a_job_is_blamed_on_no_seed(undisturbed, tmp_path, number):
     out = tmp_path / "out"
     plan_faults(out, {11: ["hang"]})
-    runner = subprocess.Popen([sys.executable, __file__, str(out), json.dumps(LOCAL)])
+    runner = start(out, LOCAL)
     wait_for(out.with_name("out-tries-11").exists)
     (job,) = [process for process in processes_of(out) if holds(process, out, 11)]
     for process in [*reversed(job.children(recursive=True)), job]:  # Slurm goes through them in no order
@@ -149,7 +105,7 @@ def test_a_signal_to_all_processes_of_a_job_is_blamed_on_no_seed(undisturbed, tm
 def test_ctrl_c_ends_jobs_at_once_and_the_plan_goes_on_later(undisturbed, tmp_path, options):
     out = tmp_path / "out"
     plan_faults(out, {10: ["hang"]})
-    runner = subprocess.Popen([sys.executable, __file__, str(out), json.dumps(options)], stderr=subprocess.DEVNULL)
+    runner = start(out, options, stderr=subprocess.DEVNULL)
     wait_for(out.with_name("out-tries-10").exists)
     begun = time.monotonic()
     runner.send_signal(signal.SIGINT)
@@ -165,7 +121,7 @@ def test_ctrl_c_ends_jobs_at_once_and_the_plan_goes_on_later(undisturbed, tmp_pa
 @pytest.mark.parametrize("options", EXECUTORS)
 def test_jobs_of_a_killed_run_and_those_of_the_next_are_never_at_one_unit(undisturbed, tmp_path, options):
     out = tmp_path / "out"
-    runner = subprocess.Popen([sys.executable, __file__, str(out), json.dumps(options)], stderr=subprocess.DEVNULL)
+    runner = start(out, options, stderr=subprocess.DEVNULL)
     wait_for(lambda: list((out / "slurm").glob("claims/a/*")))
     runner.kill()
     runner.wait()
@@ -185,10 +141,10 @@ def test_a_unit_whose_jobs_die_again_and_again_is_an_error_with_their_log(tmp_pa
 def test_an_error_of_all_seeds_crosses_over_and_ends_the_run(undisturbed, tmp_path):
     out = tmp_path / "out"
     plan_faults(out, {13: ["refuse"]})
-    with pytest.raises(ValueError, match="a bug"):
-        run(out)
+    with pytest.raises(MissingExtraError, match="nothing to record with"):
+        run(out, LOCAL)
     wait_for(lambda: not processes_of(out), 5)
-    run(out, resume=True)
+    run(out, LOCAL, resume=True)
     assert_same(undisturbed, out)
 
 
@@ -210,32 +166,3 @@ def test_without_slurm_the_engine_says_so(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(PlanError, match="there is no Slurm here.*executor=local"):
         open_engine("slurm", PLAN, tmp_path, 1, {})
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not sinfo_answers(), reason="no Slurm answers here: scripts/slurm_here.sh starts one")
-def test_what_sbatch_refuses_is_said(tmp_path):
-    with pytest.raises(PlanError, match="Slurm takes no such jobs.*partition"):
-        run(tmp_path / "out", {"partition": "none_of_this_name"})
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not sinfo_answers(), reason="no Slurm answers here: scripts/slurm_here.sh starts one")
-def test_a_requeued_job_goes_on(undisturbed, tmp_path):
-    out = tmp_path / "out"
-    plan_faults(out, {11: ["hang"]})
-    options = EXECUTORS[1].values[0]
-    runner = subprocess.Popen([sys.executable, __file__, str(out), json.dumps(options)])
-    wait_for(out.with_name("out-tries-11").exists)
-    running = ["squeue", "--noheader", "--array", "--states=RUNNING", "--format=%i"]
-    for job in subprocess.run(running, capture_output=True, text=True, check=True).stdout.split():
-        subprocess.run(["scontrol", "requeue", job], check=True)
-    assert runner.wait(240) == 0
-    assert_same(undisturbed, out)
-    assert_done_once(out)
-    assert deaths(Unit(0, 0).folder(PLAN, out)).read() == []
-
-
-if __name__ == "__main__":
-    sys.path.insert(0, str(SUPPORT))
-    run(Path(sys.argv[1]), json.loads(sys.argv[2]), resume=True)

@@ -29,6 +29,7 @@ from robocas_ms3.processes import SentError
 _LOOK = 0.5  # s between two looks at the folders
 _AGAIN, _AGAIN_TIMES = 30.0, 20  # s between two tries to hand jobs in, where Slurm took some before
 _JOIN = 0.5  # s
+_LEFT = 60.0  # s that Slurm may take to cancel what is left
 
 
 @dataclass
@@ -95,7 +96,7 @@ class SlurmEngine:
         self._options = read_options(options or {})
         self._plan, self._out, self._at_once, self._stages = plan, out.absolute(), jobs, stages
         self._queue = open_queue(self._options, self._out, jobs, self._options.mem_gb or 2 * plan.limits.memory_gb)
-        self._queue.cancel()  # what a killed run left there
+        self._queue.cancel(seconds=_LEFT)  # what a killed run left there; later it would meet jobs of this one
         self.slots = jobs * self._options.units_per_job
         self._waiting: list[_Asked] = []
         self._jobs: list[_Job] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import re
 import subprocess
@@ -29,7 +30,9 @@ except ImportError as error:
 
 _ASK = 5.0  # s between two questions to Slurm
 _ANSWER = 60.0  # s that one may take
-_AT_ONCE = 1.0  # s for one that must not be waited for
+AT_ONCE = 1.0
+"""Seconds for a question that must not be waited for."""
+_log = logging.getLogger(__name__)
 _STUCK = ("JobHoldMaxRequeue", "launch_failed_requeued_held", "launch failed requeued held")
 
 
@@ -57,8 +60,8 @@ class Queue(Protocol):
         """End a job."""
         ...
 
-    def cancel(self, *, waiting_only: bool = False) -> None:
-        """End all jobs of the plan at once, those of a killed run too; or those that do not run yet."""
+    def cancel(self, *, waiting_only: bool = False, seconds: float = AT_ONCE) -> None:
+        """End all jobs of the plan, those of a killed run too, or those that do not run yet; wait for so long."""
         ...
 
 
@@ -86,6 +89,7 @@ class SlurmQueue:
             "additional_parameters": {"requeue": True, **{k: v == "true" or v for k, v in options.sbatch.items()}},
         }
         self._asked, self._alive, self._hopeless = 0.0, None, set[str]()
+        self._silent = False
 
     def submit(self, jobs: Sequence[UnitsJob], parallel: int) -> list[Any]:
         """Hand in a job array."""
@@ -104,7 +108,11 @@ class SlurmQueue:
     def _ask(self) -> set[str] | None:
         said = _say(["squeue", "--noheader", "--array", *self._mine, "--format=%i|%r"])
         if said is None:
+            if not self._silent:
+                _log.warning("squeue does not answer; jobs go on, and it is asked again every %g s", _ASK)
+            self._silent = True
             return None
+        self._silent = False
         reasons = dict(line.strip().split("|", 1) for line in said.splitlines())
         stuck = {job for job, reason in reasons.items() if reason in _STUCK}
         for job in stuck:  # Slurm would keep it forever
@@ -123,9 +131,12 @@ class SlurmQueue:
         """By its id."""
         _say(["scancel", "--quiet", job.job_id])
 
-    def cancel(self, *, waiting_only: bool = False) -> None:
-        """By their name."""
-        _say(["scancel", "--quiet", *self._mine, *(["--state=PENDING"] if waiting_only else [])], _AT_ONCE)
+    def cancel(self, *, waiting_only: bool = False, seconds: float = AT_ONCE) -> None:
+        """By their name; a slow scancel goes on by itself."""
+        command = ["scancel", "--quiet", *self._mine, *(["--state=PENDING"] if waiting_only else [])]
+        with suppress(OSError, subprocess.TimeoutExpired):
+            if _begin(command).wait(seconds):
+                _log.warning("jobs of this plan may be left: %s failed", " ".join(command))
 
 
 class LocalQueue:
@@ -158,13 +169,13 @@ class LocalQueue:
         """Interrupt it."""
         job.cancel()
 
-    def cancel(self, *, waiting_only: bool = False) -> None:
+    def cancel(self, *, waiting_only: bool = False, seconds: float = AT_ONCE) -> None:
         """Interrupt them: they kill what does not leave within a second."""
         if waiting_only:
             return
         for job in self._jobs:
             job.cancel()
-        until = time.monotonic() + 1
+        until = time.monotonic() + seconds
         while time.monotonic() < until and self.alive(()):
             time.sleep(0.05)
 
@@ -192,11 +203,17 @@ def error_of(job: Any) -> tuple[Unit, SentError] | None:
     return None
 
 
-def _say(command: list[str], seconds: float = _ANSWER) -> str | None:
+def _begin(command: list[str]) -> subprocess.Popen[bytes]:
+    """Begin a command of Slurm's that Ctrl-C does not reach."""
+    nothing = subprocess.DEVNULL
+    return subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True)
+
+
+def _say(command: list[str]) -> str | None:
     """What a command of Slurm's prints; None: it failed."""
     try:
         return subprocess.run(
-            command, check=True, capture_output=True, text=True, timeout=seconds, start_new_session=True
+            command, check=True, capture_output=True, text=True, timeout=_ANSWER, start_new_session=True
         ).stdout
     except (OSError, subprocess.SubprocessError):
         return None
