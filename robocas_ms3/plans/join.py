@@ -7,6 +7,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Callable[[str
             _convert_lerobot(plan, robocas, out / DATASETS / "lerobot", jobs)
         if "statistics" in plan.stages:
             say("drawing statistics")
-            _write_statistics(robocas, out / STATISTICS)
+            _write_statistics(out)
         write_json(out / REPORT, _report(plan, chosen))
     flush_to_disk(out)
     for path in [*(out / UNITS).glob("*/*/seed_*"), *(out / UNITS).glob(f"*/*/{EPISODES}")]:
@@ -124,11 +125,12 @@ def _convert_lerobot(plan: Plan, robocas: Path, out: Path, jobs: int) -> None:
     convert_lerobot(robocas, out, resume=True, jobs=jobs, episode_limits=limits)
 
 
-def _write_statistics(robocas: Path, out: Path) -> None:
+def _write_statistics(out: Path) -> None:
     from robocas_ms3.datasets.statistics.collect import collect
     from robocas_ms3.datasets.statistics.plots import write_stats
 
-    write_stats(collect(robocas), out)
+    dataset = Path(DATASETS, "robocas")
+    write_stats(replace(collect(out / dataset), path=dataset), out / STATISTICS)  # the same wherever the folder lies
 
 
 def _report(plan: Plan, chosen: Chosen) -> dict[str, Any]:

@@ -58,10 +58,9 @@ class Records:
         if not task.recording.is_file():  # else its process died after it was there
             made = task.recording.with_name(f".{task.recording.stem}.tmp.h5")
             result = self._generator.generate(task.seed, task.folder, made.stem)
-            failures = [f"{failure.stage}: {failure.reason}" for failure in result.failures]
             if not result.success:
-                return {"success": False, "failures": failures}
-            _forget_clock(made, failures)
+                return {"success": False, "failures": [f"{one.stage}: {one.reason}" for one in result.failures]}
+            _forget_clock(made)
             os.replace(made.with_suffix(".json"), task.recording.with_suffix(".json"))
             os.replace(made, task.recording)
         said = read_json(task.recording)["episodes"][0]
@@ -86,13 +85,12 @@ class Records:
         self._settings = self._generator = None
 
 
-def _forget_clock(recording: Path, failures: list[str]) -> None:
-    """Leave out of a recording what a clock said, so that whoever makes it makes the same; note what failed."""
+def _forget_clock(recording: Path) -> None:
+    """Leave out of a recording what a clock said, so that whoever makes it makes the same."""
     path = recording.with_suffix(".json")
     content = read_json(recording)
     for episode in content["episodes"]:
         episode["robocas"].pop("seconds", None)
-        episode["robocas"]["failed_attempts"] = failures
     write_json(path, content)
 
 
