@@ -87,7 +87,7 @@ def run(command: Run) -> int:
     from robocas_ms3.cli.bars import say
     from robocas_ms3.cli.plan_progress import PlanProgress
     from robocas_ms3.demos.checks import check_number
-    from robocas_ms3.plans.engines import open_engine
+    from robocas_ms3.plans.engines import check_engine, open_engine
     from robocas_ms3.plans.plan import load_plan
     from robocas_ms3.plans.run import run_plan
 
@@ -95,6 +95,7 @@ def run(command: Run) -> int:
     check_number("jobs", jobs, 1)
     options = dict(_option(word) for word in command.set)
     plan = load_plan(command.plan)
+    check_engine(command.on, options)
     if command.on == "local" and plan.makes_datasets:
         from robocas_ms3.datasets.writing.render import require_renderer
 

@@ -179,3 +179,12 @@ def test_a_tally_keeps_the_times_of_ten_minutes(tmp_path):
     tally = Tally.read(tmp_path / "tally.json")
     assert tally.times == [1000.0, 1150.0]
     assert (tally.good, tally.blocks) == (4, {0, 1, 2, 3})
+
+
+def test_a_wrong_option_of_an_engine_costs_nothing_that_is_there(tmp_path, capsys):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / PLAN).write_text('{"versions": {}, "plan": {}}')
+    assert run(["plan", "run", "tiny", "--out", str(out), "--overwrite", "--set", "partition=cpu"]) == 1
+    assert "no options of the engine local" in capsys.readouterr().err
+    assert (out / PLAN).is_file()

@@ -39,6 +39,16 @@ class Engine(Protocol):
         ...
 
 
+def check_engine(name: str, options: Mapping[str, str]) -> None:
+    """See that an engine could be opened, before anything of an older run is deleted.
+
+    Raises:
+        PlanError: it has no such option.
+        MissingExtraError: what it needs is not installed.
+    """
+    load(ENGINES[name]).check(options)
+
+
 def open_engine(name: str, plan: Plan, out: Path, jobs: int, options: Mapping[str, str]) -> Engine:
     """Open an engine.
 

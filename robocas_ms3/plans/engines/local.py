@@ -21,11 +21,16 @@ class LocalEngine:
     def __init__(
         self, plan: Plan, out: Path, jobs: int, options: Mapping[str, str] | None = None, stages: Stages | None = None
     ) -> None:
-        refuse_options("local", options or {})
+        self.check(options or {})
         self.slots = jobs
         self._idle = [Slot(plan, out, stages) for _ in range(jobs)]
         self._all, self._lock = list(self._idle), threading.Lock()
         self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="slot")
+
+    @staticmethod
+    def check(options: Mapping[str, str]) -> None:
+        """See that there are no options."""
+        refuse_options("local", options)
 
     def submit(self, unit: Unit) -> Future[list[Outcome]]:
         """Have a unit done."""

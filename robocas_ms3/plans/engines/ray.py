@@ -106,6 +106,12 @@ class RayEngine:
         for thread in self._threads:
             thread.start()
 
+    @staticmethod
+    def check(options: Mapping[str, str]) -> None:
+        """See that Ray is there, and has such options."""
+        require_ray()
+        read_options(options)
+
     def submit(self, unit: Unit) -> Future[list[Outcome]]:
         """Have a unit done."""
         job = _Job(unit)

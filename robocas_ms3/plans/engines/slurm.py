@@ -21,7 +21,7 @@ from typing import Any
 from robocas_ms3.errors import PlanError
 from robocas_ms3.plans.engines.slurm_job import UnitsJob
 from robocas_ms3.plans.engines.slurm_options import read_options
-from robocas_ms3.plans.engines.slurm_queue import error_of, open_queue
+from robocas_ms3.plans.engines.slurm_queue import error_of, open_queue, require_slurm
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import DONE, Outcome, Unit, outcomes
 from robocas_ms3.processes import SentError
@@ -104,6 +104,12 @@ class SlurmEngine:
         self._lock, self._closed = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._look_after, name="slurm", daemon=True)
         self._thread.start()
+
+    @staticmethod
+    def check(options: Mapping[str, str]) -> None:
+        """See that Slurm is there and has such options; that submitit is, was seen when this was imported."""
+        if read_options(options).executor == "slurm":
+            require_slurm()
 
     def submit(self, unit: Unit) -> Future[list[Outcome]]:
         """Have a unit done."""

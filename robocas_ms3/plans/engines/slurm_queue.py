@@ -71,11 +71,8 @@ class SlurmQueue:
     grace, at_a_time = 10.0, 1000
 
     def __init__(self, options: SlurmOptions, out: Path, mem_gb: float) -> None:
-        try:
-            self._executor = SlurmExecutor(make_folder(out / FOLDER), max_num_timeout=options.tries)
-        except RuntimeError as error:
-            fix = "Run this where sbatch and srun are, or try --set executor=local."
-            raise PlanError("there is no Slurm here", where="--on slurm", found=error, fix=fix) from error
+        require_slurm()
+        self._executor = SlurmExecutor(make_folder(out / FOLDER), max_num_timeout=options.tries)
         digest = hashlib.sha256(os.fsencode(out.resolve())).hexdigest()[:8]
         self._mine = [f"--name=robocas-{re.sub(r'[^A-Za-z0-9-]', '-', out.name)}-{digest}", f"--user={os.getuid()}"]
         self._parameters: dict[str, Any] = {
@@ -178,6 +175,17 @@ class LocalQueue:
         until = time.monotonic() + seconds
         while time.monotonic() < until and self.alive(()):
             time.sleep(0.05)
+
+
+def require_slurm() -> None:
+    """See that Slurm's commands are here.
+
+    Raises:
+        PlanError: they aren't.
+    """
+    if SlurmExecutor.affinity() < 0:
+        fix = "Run this where sbatch and srun are, or try --set executor=local."
+        raise PlanError("there is no Slurm here", where="--on slurm", expected="srun", fix=fix)
 
 
 def open_queue(options: SlurmOptions, out: Path, jobs: int, mem_gb: float) -> Queue:
