@@ -15,12 +15,12 @@ from robocas_ms3.demos.checks import check_arguments, check_same_run
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_stage, failed_attempts
 from robocas_ms3.demos.workers import generate_seeds, shard_name
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.errors import DatasetError, RobocasError
 from robocas_ms3.files import flush_to_disk, make_folder, write_json
 from robocas_ms3.outputs import check_overwrite, check_run, check_there, claim_output, locked_folder, while_there
 from robocas_ms3.planning.seconds import Seconds
 from robocas_ms3.processes import Limits
-from robocas_ms3.recordings.entries import read_json
+from robocas_ms3.recordings.entries import read_json, reason
 from robocas_ms3.recordings.merging import merge
 from robocas_ms3.recordings.stored import open_trajectory
 from robocas_ms3.recordings.versions import versions
@@ -190,19 +190,29 @@ def _finished(out: Path, shards: Path, ledger: Ledger) -> dict[int, EpisodeResul
 
 
 def _recorded(path: Path, noted: Mapping[int, list[Failure]]) -> dict[int, EpisodeResult]:
-    """Seed -> what came of it, of each episode in a file; ``noted`` are the ledger's lines by seed."""
+    """Seed -> what came of it, of each episode in a file; ``noted`` are the ledger's lines by seed.
+
+    Raises:
+        DatasetError: its JSON says something else.
+    """
     results = {}
     for episode in read_json(path)["episodes"]:
-        # the block is written last: without it the episode was cut short
-        if said := episode.get("robocas"):
-            seed = int(episode["episode_seed"])
-            result = EpisodeResult(seed, True, int(episode["elapsed_steps"]), said["attempts"])
-            before = noted.get(seed, [])
-            known = said.get("failed_attempts")  # those of an earlier version don't say
-            result.failures = before if known is None else failed_attempts(seed, known, before)
-            for part, value in said["seconds"].items():
-                setattr(result.seconds, part, value)
-            results[seed] = result
+        try:
+            # the block is written last: without it the episode was cut short
+            if said := episode.get("robocas"):
+                seed = int(episode["episode_seed"])
+                result = EpisodeResult(seed, True, int(episode["elapsed_steps"]), int(said["attempts"]))
+                before = noted.get(seed, [])
+                known = said.get("failed_attempts")  # those of an earlier version don't say
+                result.failures = before if known is None else failed_attempts(seed, known, before)
+                for part, value in said["seconds"].items():
+                    setattr(result.seconds, part, float(value))
+                results[seed] = result
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            where, fix = path.with_suffix(".json"), "Choose another --out, or --overwrite."
+            raise DatasetError(
+                "this is not of `robocas generate`", where=where, found=reason(error), fix=fix
+            ) from error
     return results
 
 

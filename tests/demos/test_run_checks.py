@@ -5,6 +5,7 @@ from dataclasses import asdict
 
 import h5py
 import pytest
+from synthetic import write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.config import load_task_config
@@ -12,10 +13,10 @@ from robocas_ms3.demos import generate as module
 from robocas_ms3.demos.checks import SIM_FREQ, check_same_run
 from robocas_ms3.demos.convert_actions import CONVERTIBLE
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
-from robocas_ms3.demos.generate import generate
+from robocas_ms3.demos.generate import _recorded, generate
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.replay import replay
-from robocas_ms3.errors import OutputExistsError, RobocasError
+from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.outputs import locked_folder
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -187,3 +188,17 @@ def test_other_versions_do_not_go_on_with_an_output(tmp_path):
         check_same_run(tmp_path / "run.json", made)
     (tmp_path / "run.json").write_text(json.dumps({"settings": made["settings"]}))  # before they were noted
     check_same_run(tmp_path / "run.json", made)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"episode_seed": None}, {"robocas": {"seconds": {}}}, {"robocas": {"attempts": 1, "seconds": {"ik": "x"}}}],
+)
+def test_a_trajectory_of_something_else_is_not_gone_on_with(tmp_path, change):
+    path = write_trajectory(tmp_path / "trajectory.h5", seeds=(3,))
+    content = json.loads(path.with_suffix(".json").read_text())
+    about = {"attempts": 1, "seconds": {"ik": 0.5}}
+    episode = {**content["episodes"][0], "robocas": about, **change}
+    path.with_suffix(".json").write_text(json.dumps({**content, "episodes": [episode]}))
+    with pytest.raises(DatasetError, match=r"trajectory.json: this is not of `robocas generate`.*--overwrite"):
+        _recorded(path, {})
