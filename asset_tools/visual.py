@@ -20,6 +20,7 @@ from robocas_ms3.errors import AssetError, MissingExtraError
 Array = NDArray[np.float64]
 
 CREASE = np.cos(np.deg2rad(40))  # faces that meet more sharply get an edge, not a smooth normal
+DENSE = 3  # times as many faces as are wanted
 STUCK = 0.9  # of the faces left by a step of simplifying: a rougher one is needed
 SAMPLES = 150_000  # on the original surface, to find the face that a texel shows
 NORMAL_WEIGHT = 0.02  # of the diagonal; keeps the two sides of a thin shell apart, hardly moves anything else
@@ -120,16 +121,14 @@ def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     body.merge_vertices(digits_vertex=None)
     center, size = body.bounds.mean(axis=0), float(np.linalg.norm(body.extents))
     vertices, faces = (np.asarray(body.vertices) - center) / size, np.asarray(body.faces)
-    for aggression in (2, 3, 5, 7, 9, 12, 16, 20):  # gentle first: it may stop above the limit
+    gentle = (2, 3) if len(faces) > DENSE * triangles else ()
+    for aggression in (*gentle, 5, 7, 9, 12, 16, 20):  # it may stop above the limit
         before = np.inf
         while triangles < len(faces) < STUCK * before:
-            before = len(faces)
-            # by halves: a dense mesh that is to lose most of its faces at once folds over
+            before = len(faces)  # by halves: a dense mesh that loses most of its faces at once folds over
+            target = max(triangles, before // 2) if gentle else triangles
             vertices, faces = fast_simplification.simplify(
-                np.ascontiguousarray(vertices),
-                faces.astype(np.int32),
-                target_count=max(triangles, before // 2),
-                agg=aggression,
+                np.ascontiguousarray(vertices), faces.astype(np.int32), target_count=target, agg=aggression
             )[:2]
     if len(faces) > triangles or len(faces) == 0:
         raise AssetError("can't simplify this mesh so far", expected=f"1 to {triangles} faces", found=len(faces))

@@ -1,5 +1,6 @@
 """Pictures of steps in a run: the same as one by one, each video opened once, and closed whatever happens."""
 
+import errno
 import inspect
 from types import SimpleNamespace
 
@@ -96,7 +97,7 @@ def test_a_conversion_that_fails_leaves_no_video_open(lerobot, tmp_path, runs, m
 
     def full(self, picture):
         if self.frames == 2:
-            raise OSError("no space left")
+            raise OSError(errno.ENOSPC, "no space left")
         add(self, picture)
 
     monkeypatch.setattr(video.Encoder, "add", full)
