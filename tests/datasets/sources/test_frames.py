@@ -101,7 +101,7 @@ def test_a_conversion_that_fails_leaves_no_video_open(lerobot, tmp_path, runs, m
         add(self, picture)
 
     monkeypatch.setattr(video.Encoder, "add", full)
-    with pytest.raises(OSError, match="no space left"):
+    with pytest.raises(OSError, match="No space left"):
         convert_lerobot(lerobot, tmp_path / "out")
     assert len(runs) == SIZES + 2 * len(CAMERAS)
     assert all_closed(runs)
