@@ -63,6 +63,7 @@ class PlanProgress:
     def note(self, text: str) -> None:
         """Say what is done now."""
         if self._shown is None:
+            self._log.tell(self._text, last=True)  # how far it was when this began
             print(text, file=sys.stderr, flush=True)
         else:
             self._shown.console.print(text, soft_wrap=True, highlight=False, markup=False, emoji=False)

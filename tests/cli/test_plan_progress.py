@@ -48,9 +48,11 @@ def test_the_last_line_comes_though_it_is_not_time(shown, capsys, monkeypatch):
     with progress:
         for counts in ([0, 0], [3, 0], [5, 2]):
             progress.at(counts)
+        progress.note("joining the dataset")
     assert [line.partition(",")[0] for line in capsys.readouterr().err.splitlines()] == [
         "0 of 7 episodes",
         "7 of 7 episodes",
+        "joining the dataset",
     ]
 
 
