@@ -32,6 +32,7 @@ from robocas_ms3.plans.units import DRIVER, PLAN, Outcome, Task, Unit, outcomes
 from robocas_ms3.words import count_of
 
 _AHEAD = 2  # units a slot that are under way, so that none waits for the next
+_ROUNDS = 3  # so often is made again what a disk does not keep
 _LOOK = 1.0  # s between two looks at what is under way
 OpenEngine = Callable[[Plan, Path], Engine]
 OnProgress = Callable[[Sequence[int]], None]
@@ -160,8 +161,13 @@ class _Part:
 def _do_all(
     plan: Plan, out: Path, engine: Engine, on_progress: OnProgress, on_stage: Callable[[str], None]
 ) -> list[_Part]:
-    """Do units until there are enough episodes, all of whose files are as they were written."""
-    while True:
+    """Do units until there are enough episodes, all of whose files are as they were written.
+
+    Raises:
+        PlanError: they never are; or one of `_do_units`.
+    """
+    damaged: dict[Unit, list[int]] = {}
+    for _ in range(_ROUNDS):
         parts = [_Part(plan, number) for number in range(len(plan.parts))]
         _do_units(plan, out, engine, parts, on_progress)
         damaged = {} if has_begun(out) else _damaged(plan, out, parts)
@@ -171,6 +177,10 @@ def _do_all(
         on_stage(f"{count_of(count, 'episode')} again: their files are not what was written")
         for unit, seeds in damaged.items():
             unit.forget(plan, out, seeds)
+    unit = min(damaged)
+    where, fix = unit.folder(plan, out), "Look at the disk; then --resume."
+    found = f"seed {damaged[unit][0]}, made {_ROUNDS} times"
+    raise PlanError("files don't keep the sizes that they were written with", where=where, found=found, fix=fix)
 
 
 def _damaged(plan: Plan, out: Path, parts: Sequence[_Part]) -> dict[Unit, list[int]]:

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 import pytest
 
 from robocas_ms3.errors import PlanError
-from robocas_ms3.plans.claims import claimed, refuse_claimed
+from robocas_ms3.plans.claims import claimed, refuse_claimed, sole
 from robocas_ms3.plans.engines import open_engine
 from robocas_ms3.plans.units import CLAIMS
 
@@ -153,3 +153,16 @@ def test_a_claim_is_judged_by_the_lease_that_it_was_made_with(tmp_path):
         assert waiting.is_alive()
     waiting.join(10)
     assert not waiting.is_alive()
+
+
+@pytest.mark.parametrize("gone", [True, False])
+def test_who_runs_a_plan_leaves_if_another_does_not_if_the_folder_is_gone(tmp_path, monkeypatch, gone):
+    left = threading.Event()
+    monkeypatch.setattr(os, "_exit", lambda code: left.set())
+    out = tmp_path / "out"
+    with sole(out / ".driver", 0.5):
+        if gone:
+            os.rename(out, tmp_path / "away")
+        else:
+            (out / ".driver.2").touch()
+        assert left.wait(1.0) != gone

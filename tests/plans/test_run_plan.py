@@ -153,6 +153,13 @@ def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, tmp_path)
     assert_same(undisturbed, out)
 
 
+def test_a_disk_that_keeps_nothing_ends_the_run(tmp_path, monkeypatch):
+    monkeypatch.setattr("robocas_ms3.plans.run._damaged", lambda *_: {Unit(1, 0): [4]})
+    with pytest.raises(PlanError, match=r"b/00000: files don't keep the sizes .*found seed 4, made 3 times"):
+        run(tmp_path / "out")
+    assert not (tmp_path / "out" / "datasets").exists()
+
+
 def test_a_plan_on_another_machine_is_left_alone(undisturbed, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
