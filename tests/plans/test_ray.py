@@ -20,7 +20,6 @@ from ray.cluster_utils import Cluster
 
 from robocas_ms3.errors import MissingExtraError, PlanError
 from robocas_ms3.plans.engines import ray as engine
-from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.engines.ray import RayEngine
 from robocas_ms3.plans.engines.ray_cluster import RayOptions, read_options
 from robocas_ms3.plans.run import run_plan
@@ -51,13 +50,6 @@ class Slow(MadeUp):
 def slow_stages(notes, seconds=1.0):
     notes.mkdir()
     return Stages(partial(Slow, notes, seconds), render)
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    out = tmp_path_factory.mktemp("plan") / "out"
-    run_plan(PLAN, out, lambda plan, out: LocalEngine(plan, out, 2, stages=stages()))
-    return out
 
 
 @pytest.fixture(scope="module")

@@ -38,13 +38,6 @@ def run(out, plan=PLAN, jobs=1, stop_before_join=False, **more):
     return run_plan(plan, out, lambda plan, out: LocalEngine(plan, out, jobs, stages=stages()), jobs=1, **more)
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    out = tmp_path_factory.mktemp("plan") / "out"
-    run(out)
-    return out
-
-
 def test_a_plan_makes_demonstrations_and_one_dataset_of_all_parts(undisturbed):
     report = json.loads((undisturbed / "report.json").read_text())
     assert report["episodes"] == 7

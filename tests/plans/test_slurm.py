@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install "robocas-ms3[slurm]"')
 
-from plan_stages import PLAN, assert_same, plan_faults, stages
+from plan_stages import PLAN, assert_same, plan_faults
 from slurm_runs import (
     LOCAL,
     NO_SLURM,
@@ -26,8 +26,6 @@ from slurm_runs import (
 
 from robocas_ms3.errors import MissingExtraError, PlanError
 from robocas_ms3.plans.engines import open_engine
-from robocas_ms3.plans.engines.local import LocalEngine
-from robocas_ms3.plans.run import run_plan
 from robocas_ms3.plans.units import Unit, deaths
 
 EXECUTORS = [
@@ -46,13 +44,6 @@ EXECUTORS = [
 @pytest.fixture(autouse=True)
 def jobs_know_the_stages(monkeypatch):
     stages_in_jobs(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    out = tmp_path_factory.mktemp("plan") / "out"
-    run_plan(PLAN, out, lambda plan, out: LocalEngine(plan, out, 1, stages=stages()), jobs=1)
-    return out
 
 
 @pytest.mark.parametrize("options", EXECUTORS)

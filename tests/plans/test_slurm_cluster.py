@@ -10,13 +10,11 @@ import pytest
 
 pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install "robocas-ms3[slurm]"')
 
-from plan_stages import PLAN, assert_same, plan_faults, stages
+from plan_stages import PLAN, assert_same, plan_faults
 from slurm_runs import NO_SLURM, SLURM, assert_done_once, holds, run, slurm_answers, stages_in_jobs, start, wait_for
 from slurm_runs import processes_of as processes_at
 
 from robocas_ms3.errors import PlanError
-from robocas_ms3.plans.engines.local import LocalEngine
-from robocas_ms3.plans.run import run_plan
 from robocas_ms3.plans.units import Unit, deaths
 
 CONF = Path("/etc/slurm/slurm.conf")
@@ -29,13 +27,6 @@ ours = pytest.mark.skipif(not OURS, reason="this Slurm is not that of scripts/sl
 @pytest.fixture(autouse=True)
 def jobs_know_the_stages(monkeypatch):
     stages_in_jobs(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    out = tmp_path_factory.mktemp("plan") / "out"
-    run_plan(PLAN, out, lambda plan, out: LocalEngine(plan, out, 1, stages=stages()), jobs=1)
-    return out
 
 
 class Running:
