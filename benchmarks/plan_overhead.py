@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import tyro
 
+from robocas_ms3.errors import PlanError
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.run import run_plan
@@ -80,7 +81,7 @@ def main(cfg: Benchmark) -> None:
     with tempfile.TemporaryDirectory() as folder:
         out, begun = Path(folder) / "out", time.time()
         cpu = time.process_time()
-        with suppress(AllDoneError):
+        with suppress(AllDoneError, PlanError):  # there is nothing to join
             run_plan(
                 plan,
                 out,

@@ -41,7 +41,9 @@ class Benchmark:
     turn: int = 10
     """Episodes of a turn."""
     pictures: bool = True
-    """Whether they are rendered: three cameras, RGB-D, 640 x 480, 5 Hz."""
+    """Whether they are rendered: three cameras, RGB-D, 5 Hz."""
+    size: tuple[int, int] = (640, 480)
+    """Of them; small ones cost little, and memory grows by what scenes hold."""
     seed: int = 0
     """The first; take ones that were never used."""
 
@@ -76,14 +78,14 @@ def main(cfg: Benchmark) -> None:
 
 def plan_of(cfg: Benchmark) -> dict[str, Any]:
     """Turns of the tasks, more than can be done."""
-    turns = max(1, int(cfg.minutes * cfg.jobs))
+    turns, apart = max(1, int(cfg.minutes * cfg.jobs)), max(1000, 10 * cfg.turn)
     parts = [
-        {"task": task, "episodes": cfg.turn, "seed": cfg.seed + 1000 * turn, "name": f"{task}-{turn:04d}"}
+        {"task": task, "episodes": cfg.turn, "seed": cfg.seed + apart * turn, "name": f"{task}-{turn:04d}"}
         for turn in range(turns)
         for task in cfg.tasks
     ]
     stages = ["demonstrations", "datasets"] if cfg.pictures else ["demonstrations"]
-    return {"parts": parts, "stages": stages, "embeddings": False, "block": 1}
+    return {"parts": parts, "stages": stages, "pictures": {"size": list(cfg.size)}, "embeddings": False, "block": 1}
 
 
 def watch(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:

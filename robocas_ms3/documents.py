@@ -11,6 +11,8 @@ import json
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -36,7 +38,22 @@ DAMAGED = (
 
 
 class DocumentError(ValueError):
-    """A file that is too large, nested too deeply, or not of its language; in one line."""
+    """A file that is too large, nested too deeply, or not of its language; in one line.
+
+    Attributes:
+        filename: of the file, as errors of the system have it; empty where a text was read.
+    """
+
+    filename: str = ""
+
+
+@contextmanager
+def _of(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except DocumentError as error:
+        error.filename = str(path)
+        raise
 
 
 def load_json(path: Path) -> Any:
@@ -46,7 +63,8 @@ def load_json(path: Path) -> Any:
         DocumentError: it is no JSON, or too large or deep, or a number in it is not finite.
         OSError: it can't be read.
     """
-    return json_values(_text(path, JSON_LIMIT))
+    with _of(path):
+        return json_values(_text(path, JSON_LIMIT))
 
 
 def json_values(text: str | bytes) -> Any:
@@ -70,11 +88,12 @@ def load_yaml(path: Path) -> Any:
         DocumentError: it is no YAML, or too large or deep, or its aliases stand for too much.
         OSError: it can't be read.
     """
-    text = _text(path, YAML_LIMIT)
-    try:
-        return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
-    except (yaml.YAMLError, ValueError, AttributeError, LookupError, TypeError) as error:
-        raise DocumentError(" ".join(str(error).split())) from error
+    with _of(path):
+        text = _text(path, YAML_LIMIT)
+        try:
+            return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
+        except (yaml.YAMLError, ValueError, AttributeError, LookupError, TypeError) as error:
+            raise DocumentError(" ".join(str(error).split())) from error
 
 
 def open_arrays(path: Path) -> Any:

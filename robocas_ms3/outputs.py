@@ -17,6 +17,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from fnmatch import fnmatchcase
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
@@ -29,11 +30,31 @@ from robocas_ms3.files import empty_folder, is_fixed, make_folder
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS})
 _log = logging.getLogger(__name__)
 _INSIDE = ".lock"  # of a folder that can't have it beside it
+# What a plan's run has in its folder before it says what it is: one that was killed then leaves nothing else
+_BEFORE = (_INSIDE, ".driver.*", ".plan.*.tmp.json")
 
 
 def is_taken(path: Path) -> bool:
-    """Whether there is something: a file, or a folder that holds more than its lock."""
-    return path.exists() and not (path.is_dir() and all(entry.name == _INSIDE for entry in path.iterdir()))
+    """Whether there is something: a file, or a folder that holds more than what says who is at it."""
+    if not path.is_dir():
+        return path.exists()
+    return any(not any(fnmatchcase(entry.name, name) for name in _BEFORE) for entry in path.iterdir())
+
+
+def check_one_way(where: str, *, resume: bool, overwrite: bool, error: type[RobocasError] = RobocasError) -> None:
+    """See that an output is not to be gone on with and replaced as well.
+
+    Args:
+        where: the command.
+        resume: its flag.
+        overwrite: its flag.
+        error: to be raised.
+
+    Raises:
+        RobocasError: ``error``: both are set.
+    """
+    if resume and overwrite:
+        raise error("these exclude each other", where=where, expected="one of them", found="--resume --overwrite")
 
 
 def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool | None = False) -> None:
@@ -186,10 +207,13 @@ def check_run(path: Path, key: str, command: str, error: type[RobocasError] = Ou
 
 
 @contextmanager
-def locked_folder(path: Path | str) -> Iterator[None]:
+def locked_folder(path: Path | str) -> Iterator[bool]:
     """Hold a lock on a folder that may not exist yet; it ends with the process, however that ends.
 
     If the folder is not there in the end, the parents made for the lock go too.
+
+    Yields:
+        Whether it is held: False on a file system that has no locks.
 
     Raises:
         RobocasError: another process holds it, or nothing can be written there.
@@ -198,9 +222,10 @@ def locked_folder(path: Path | str) -> Iterator[None]:
     new = [folder for folder in path.parents if not folder.exists()]
     lock = _lock_of(path)
     try:
-        with _locked(lock, path):
+        file, held = _locked(lock, path)
+        with file:
             try:
-                yield
+                yield held
             finally:
                 lock.unlink(missing_ok=True)
     finally:
@@ -218,8 +243,8 @@ def _lock_of(path: Path) -> Path:
     return path.parent / f".{path.name}.lock"
 
 
-def _locked(lock: Path, path: Path) -> TextIOWrapper:
-    """Open and lock a file that whoever held it before may just have removed."""
+def _locked(lock: Path, path: Path) -> tuple[TextIOWrapper, bool]:
+    """Open and lock a file that whoever held it before may just have removed; and whether there are locks."""
     while True:
         make_folder(lock.parent)
         try:
@@ -228,23 +253,26 @@ def _locked(lock: Path, path: Path) -> TextIOWrapper:
             what = "can't write into this folder"
             raise RobocasError(what, where=lock.parent, found=error.strerror, fix="Choose another.") from error
         try:
-            lock_file(file, path, wait=False)
+            held = lock_file(file, path, wait=False)
         except BaseException:
             file.close()
             raise
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
-                return file
+                return file, held
         file.close()
 
 
-def lock_file(file: TextIOWrapper, path: Path, *, wait: bool) -> None:
+def lock_file(file: TextIOWrapper, path: Path, *, wait: bool) -> bool:
     """Hold a lock on an open file until it is closed; on a file system that has none go on without, and say so.
 
     Args:
         file: open for writing.
         path: what the lock is for.
         wait: until nobody else holds it.
+
+    Returns:
+        Whether it is held.
 
     Raises:
         RobocasError: somebody else holds it; or it can't be had for a reason of the system's.
@@ -257,6 +285,8 @@ def lock_file(file: TextIOWrapper, path: Path, *, wait: bool) -> None:
         if error.errno not in _NO_LOCKS:
             raise RobocasError("can't lock this folder", where=path, found=error.strerror) from error
         _log.warning("%s: its file system has no locks (%s): see that no other run writes there", path, error.strerror)
+        return False
+    return True
 
 
 def sweep(folder: Path) -> None:

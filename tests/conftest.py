@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import NoReturn
@@ -65,22 +64,12 @@ def shared_dir() -> Path:
 
 
 @pytest.fixture(scope="session")
-def needs_renderer() -> Iterator[str]:
-    """The render device. Without one: a skip, on CI a failure, as setup installs one there.
-
-    One render system stays until the end: with the last one SAPIEN forgets the tables of its light, and the next one
-    makes them anew, which takes a renderer in software 7 s.
-    """
+def needs_renderer() -> str:
+    """The render device. Without one: a skip, on CI a failure, as setup installs one there."""
     device, problem = _render_device()
     if device is None:
         without_renderer(problem)
-    kept = None
-    if "llvmpipe" in device:
-        import sapien
-
-        kept = sapien.render.RenderSystem(sapien.Device("cpu"))
-    yield device
-    del kept
+    return device
 
 
 def without_renderer(problem: str) -> NoReturn:

@@ -170,7 +170,8 @@ def test_a_file_system_without_locks_is_said_and_gone_on_without(tmp_path, monke
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr("fcntl.flock", flock)
-    with locked_folder(tmp_path / "out"):
+    with locked_folder(tmp_path / "out") as held:
+        assert held is False
         (tmp_path / "out").mkdir()
     (said,) = caplog.messages
     assert f"{tmp_path}/out: its file system has no locks ({os.strerror(number)})" in said

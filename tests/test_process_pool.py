@@ -1,9 +1,12 @@
 """The pool as every room uses it: order, errors, deaths of a worker and of the parent, Ctrl-C."""
 
+import errno
+import math
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 from itertools import count
@@ -13,6 +16,7 @@ import pytest
 
 from robocas_ms3.errors import AssetError, RobocasError
 from robocas_ms3.processes import Calls, Limits, Pool
+from robocas_ms3.processes.child import Child
 
 
 class Slow:
@@ -29,6 +33,8 @@ class Slow:
         if task == "die once" and not (self.log.parent / "died").exists():
             (self.log.parent / "died").touch()
             os.kill(os.getpid(), signal.SIGSEGV)
+        if task == "told to end":
+            os.kill(os.getpid(), signal.SIGTERM)
         if task == "hang":
             time.sleep(1000)
         if task == "grow":
@@ -210,6 +216,68 @@ def test_workers_end_with_a_parent_that_is_killed(running):
     program, workers = running
     program.kill()
     assert all_gone(workers)
+
+
+def test_workers_end_with_a_parent_that_is_killed_though_native_code_holds_python_s_lock(tmp_path):
+    (tmp_path / "begun").mkdir()
+    (tmp_path / "program.py").write_text(
+        PROGRAM.replace("    time.sleep(60)", "    import ctypes\n    ctypes.PyDLL(None).sleep(60)")
+    )
+    with begin(tmp_path) as program:
+        while len(begun := list((tmp_path / "begun").iterdir())) < 2:
+            time.sleep(0.02)
+            assert program.poll() is None
+        workers = [int(path.name.partition("-")[2]) for path in begun]
+        time.sleep(0.5)
+        assert not any(map(gone, workers))
+        program.kill()
+        assert all_gone(workers)
+
+
+def test_a_process_stays_when_the_thread_that_asked_for_it_ends():
+    child = Child(Slow, math.inf)
+    found = []
+    thread = threading.Thread(target=lambda: found.append(child.do("a", 60)))
+    thread.start()
+    thread.join()
+    time.sleep(0.2)
+    assert child.do("b", 60) == ("b", found[0][1], 2)
+    child.end()
+
+
+def test_what_tells_a_whole_job_to_end_is_no_death():
+    child = Child(Slow, math.inf)
+    assert child.do("told to end", 60)[0] == "told to end"
+    child.stop()
+    child.wait(10)
+
+
+def test_a_process_that_the_system_refuses_is_an_error_and_ends_nothing(monkeypatch):
+    def refuse(process):
+        raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    child = Child(Slow, math.inf)
+    with monkeypatch.context() as patch:
+        patch.setattr("multiprocessing.context.SpawnProcess.start", refuse)
+        with pytest.raises(RobocasError, match="can't start another process .found Resource temporarily unavailable"):
+            child.do("a", 60)
+        child.stop()
+        child.wait(0)
+    with Pool(Slow, 1, here=False) as pool:
+        assert tasks_of(pool.do(["a"])) == ["a"]
+
+
+def test_a_fork_starts_processes_of_its_own():
+    with Pool(Slow, 1, here=False) as pool:
+        list(pool.do(["a"]))
+        pid = os.fork()
+        if not pid:
+            child = Child(Slow, math.inf)
+            try:
+                os._exit(0 if child.do("b", 60)[0] == "b" else 1)
+            finally:
+                os._exit(2)
+        assert os.waitpid(pid, 0)[1] == 0
 
 
 def test_ctrl_c_while_processes_start_begins_nothing_either(tmp_path):

@@ -171,7 +171,7 @@ def _make(jobs: list[Job], command: _Making, name: str, what: str) -> int:
     from robocas_ms3.errors import AssetError, OutputExistsError
     from robocas_ms3.paths import builtin_packs_dir, data_dir
 
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True, markup=False)
     if (builtin_packs_dir() / name).exists() or Path(name).name != name:
         raise AssetError("this can't be the name of an imported pack", found=name, fix="Choose another with --pack.")
     out = data_dir() / "packs" / name

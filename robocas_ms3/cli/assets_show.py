@@ -64,6 +64,7 @@ class Sheet:
 
 def list_packs(command: ListPacks) -> int:
     """Run ``list``; a pack that can't be read is listed with the reason."""
+    from rich.markup import escape
     from rich.table import Column, Table
 
     from robocas_ms3.assets.pack import load_pack, pack_folders
@@ -73,15 +74,16 @@ def list_packs(command: ListPacks) -> int:
     for name, folder in pack_folders().items():
         try:
             pack = load_pack(name)
-            table.add_row(name, str(len(pack.objects)), str(len(pack.furniture)), str(folder))
+            table.add_row(escape(name), str(len(pack.objects)), str(len(pack.furniture)), escape(str(folder)))
         except AssetError as error:
-            table.add_row(name, "-", "-", f"[red]{error}[/red]")
+            table.add_row(escape(name), "-", "-", f"[red]{escape(str(error))}[/red]")
     _console().print(table)
     return 0
 
 
 def info(command: Info) -> int:
     """Run ``info``."""
+    from rich.markup import escape
     from rich.table import Column, Table
 
     from robocas_ms3.assets.pack import load_pack
@@ -101,7 +103,7 @@ def info(command: Info) -> int:
                 f"{asset.quality.volume_iou:.3f}",
                 str(len(loaded.annotations.resting_poses)),
                 str(asset.grasp_count),
-                "; ".join(asset.repairs),
+                escape("; ".join(asset.repairs)),
             )
         console.print(table)
     if pack.furniture:
@@ -131,7 +133,7 @@ def verify(command: Verify) -> int:
     for loaded in pack.objects.values():
         _ = loaded.annotations
     faults = cooking_faults(pack.root)
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True, markup=False)
     console.print(f"{pack.name}: {count_of(len(pack.manifest.assets), 'asset')}, every file is as it should be")
     for fault in faults:
         console.print(str(fault), style="red")

@@ -1,4 +1,4 @@
-"""Ctrl-C: the first one ends the command, soon and in one line, whatever it is at; others change nothing."""
+"""Ctrl-C and SIGTERM: the first ends the command, soon and in one line, whatever it is at; others change nothing."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from contextlib import suppress
 from types import FrameType
 
 INTERRUPTED = 130  # what a shell reports of a program that Ctrl-C ended
+_TERMINATED = 143  # and of one that `timeout`, `kill` or a batch system did
 _GRACE = 2.2  # s to end in: processes, files, policies
 
 
@@ -18,6 +19,8 @@ def heed_ctrl_c() -> None:
     """Let the first Ctrl-C be the only one, of a command that is this process's own program."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where a shell has it ignored
         signal.signal(signal.SIGINT, _interrupt)
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _interrupt)
 
 
 def leave(code: int) -> None:
@@ -27,13 +30,19 @@ def leave(code: int) -> None:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()
-        os._exit(INTERRUPTED)
+        os._exit(_code)
     sys.exit(code)
 
 
+_code = INTERRUPTED
+
+
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who is impatient would interrupt what ends the processes
-    last = threading.Timer(_GRACE, os._exit, (INTERRUPTED,))
+    global _code  # noqa: PLW0603  (a signal's handler has nobody to tell)
+    for one in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(one, signal.SIG_IGN)  # who is impatient would interrupt what ends the processes
+    _code = _TERMINATED if number == signal.SIGTERM else INTERRUPTED
+    last = threading.Timer(_GRACE, os._exit, (_code,))
     last.daemon = True
     last.start()
     raise KeyboardInterrupt

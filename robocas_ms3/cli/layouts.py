@@ -154,6 +154,7 @@ def try_all(bank: LayoutBank, engine: Engine, **packs: str) -> int:
 
 def info(command: Info) -> int:
     """Run ``info``."""
+    from rich.markup import escape
     from rich.table import Table
 
     from robocas_ms3.cli.tables import table_console
@@ -169,9 +170,10 @@ def info(command: Info) -> int:
             of = (config["task"], config["layout"]["kind"], config["objects"]["count"], about["object_pack"]["name"])
         except (OSError, ValueError, KeyError, TypeError):  # it is the layouts that count: they are still of use
             of, furniture = (f"{ABOUT} is damaged", "", "", ""), ""
-        table.add_row(path.parent.name, str(count_layouts(path.parent)), *map(str, of), furniture)
+        row = (path.parent.name, count_layouts(path.parent), *of, furniture)
+        table.add_row(*(escape(str(value)) for value in row))
     table_console().print(
-        table if table.row_count else f"no banks in {root}", soft_wrap=not table.row_count, highlight=False
+        table if table.row_count else escape(f"no banks in {root}"), soft_wrap=not table.row_count, highlight=False
     )
     return 0
 

@@ -52,7 +52,13 @@ DESCRIPTION = (
     "`robocas COMMAND --help` explains a command; --debug with any of them shows tracebacks."
 )
 CLI_STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.DisallowNone)
-_ENVIRONMENT = {*FULL, errno.EACCES, errno.EPERM, errno.EROFS}
+# What the system says of disks, file servers, names and limits, which no traceback explains
+_ENVIRONMENT = {
+    *FULL,
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG),
+    *(errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH),
+    *(errno.EMFILE, errno.ENFILE),
+}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -92,6 +98,13 @@ def run(argv: Sequence[str]) -> int:
         if debug:
             raise
         return _say(f"error: {' '.join(str(error).split())}", sys.stderr, 1)
+    except ValueError as error:
+        from robocas_ms3.documents import DocumentError  # with YAML, which no command waits for that fails otherwise
+
+        if debug or not isinstance(error, DocumentError):
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        return _say(f"error: {where}{' '.join(str(error).split())}", sys.stderr, 1)
     except OSError as error:
         if debug or error.errno not in _ENVIRONMENT:
             raise

@@ -90,6 +90,7 @@ def run(command: Run) -> int:
     from robocas_ms3.plans.engines import check_engine, open_engine
     from robocas_ms3.plans.plan import load_plan
     from robocas_ms3.plans.run import run_plan
+    from robocas_ms3.plans.units import REPORT
 
     jobs = command.jobs if command.jobs is not None else os.cpu_count() or 1
     check_number("jobs", jobs, 1)
@@ -111,7 +112,8 @@ def run(command: Run) -> int:
             on_progress=progress.at,
             on_stage=progress.note,
         )
-    say(f"{command.out}: {count_of(report['episodes'], 'episode')}; report.json")
+    made = [str(path.relative_to(command.out)) for path in sorted(command.out.glob("d[ae]*s/*"))]
+    say(f"{command.out}: {count_of(report['episodes'], 'episode')}; {', '.join([*made, REPORT])}")
     return 0
 
 
@@ -128,6 +130,7 @@ def show_status(command: Status) -> int:
     """Run ``status``."""
     import json
 
+    from rich.markup import escape
     from rich.table import Table
 
     from robocas_ms3.cli.bars import say
@@ -138,14 +141,14 @@ def show_status(command: Status) -> int:
     if command.json:
         say(json.dumps(found.as_json(), indent=2))
         return 0
-    table = Table("part", "episodes", "seeds", "failed", "record, CPU s", "render, CPU s", "MB")
+    table = Table("part", "episodes", "seeds", "failed", "record, CPU s each", "render, CPU s each", "MB")
     for part in found.parts:
         failed = ", ".join(f"{reason} x{count}" for reason, count in part.failed.items()) or "-"
         table.add_row(
             part.name,
             f"{part.done} of {part.wanted}",
             str(part.tried),
-            failed,
+            escape(failed),  # a reason may be anything
             f"{part.record_seconds:.1f}",
             f"{part.render_seconds:.1f}",
             f"{part.bytes / 1e6:.0f}",
@@ -153,8 +156,11 @@ def show_status(command: Status) -> int:
     table_console().print(table)
     if found.finished:
         say("finished")
-    elif found.seconds_left is not None:
+        return 0
+    if found.seconds_left is not None:
         left, idle = found.seconds_left / 60, found.idle_seconds or 0.0
         rate = count_of(round(found.episodes_an_hour), "episode")
         say(f"{rate} an hour, {left:.0f} min left; the last {idle:.0f} s ago")
+    joins = ", and joins" * all(part.done == part.wanted for part in found.parts)
+    say(f"{found.at_work} is at it{joins}" if found.at_work else "nobody is at it; --resume goes on")
     return 0

@@ -70,7 +70,7 @@ def main(cfg: Show) -> int:
     overview = base_env.render_rgb_array()
     assert overview is not None  # there is a render device, and the environment has a camera for it
     pictures["overview"] = overview[0]
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True, markup=False)
     for name, pixels in pictures.items():
         path = cfg.out / f"{Path(cfg.config).stem}_seed{cfg.seed}_{name}.png"
         with replacing(path) as tmp:

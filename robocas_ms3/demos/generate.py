@@ -17,7 +17,15 @@ from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_st
 from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.errors import DatasetError, RobocasError
 from robocas_ms3.files import flush_to_disk, make_folder, write_json
-from robocas_ms3.outputs import check_overwrite, check_run, check_there, claim_output, locked_folder, while_there
+from robocas_ms3.outputs import (
+    check_one_way,
+    check_overwrite,
+    check_run,
+    check_there,
+    claim_output,
+    locked_folder,
+    while_there,
+)
 from robocas_ms3.planning.seconds import Seconds
 from robocas_ms3.processes import Limits
 from robocas_ms3.recordings.entries import read_json, reason
@@ -95,9 +103,10 @@ def generate(
 
     Raises:
         OutputExistsError: ``out`` has content and neither flag is set, or what was made by another command.
-        RobocasError: an argument is wrong, which leaves no trace; ``out`` was made with other settings or versions, or
-            another process writes there; far too many seeds fail.
+        RobocasError: an argument is wrong, or both flags are set, which leaves no trace; ``out`` was made with other
+            settings or versions, or another process writes there; far too many seeds fail.
     """
+    check_one_way("generate", resume=resume, overwrite=overwrite)
     check_arguments(settings, episodes=episodes, first_seed=first_seed, jobs=jobs)
     if overwrite:
         check_overwrite(out, (RUN,), "made by `robocas generate`")

@@ -7,6 +7,8 @@ a lease, or finds a higher number, its process ends at once: so a job that lost 
 again elsewhere while the first still lived, has left before the next one comes. Ages are told by the clock of the file
 server alone: a claim's time of change against that of a file just touched. A claim that is given back is of 1970.
 
+A process that was halted itself looks as soon as it wakes, and goes on if nobody came.
+
 One gap remains: a machine that is halted for longer than a lease as a whole and then wakes looks only after up to a
 tenth of it. What two could do in that time is little: episodes of a seed are the same whoever makes them, are renamed
 into place, and of two lines of a ledger the first counts.
@@ -14,6 +16,7 @@ into place, and of two lines of a ledger the first counts.
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import socket
@@ -29,21 +32,33 @@ from robocas_ms3.files import make_folder
 
 LEASE = 60.0
 """Seconds without news after which the holder of a claim counts as dead."""
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+# What the system says where a file can't have two names
+_NO_LINKS = frozenset({errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK})
 _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def claimed(path: Path, lease: float = LEASE, on_lost: Callable[[], object] = lambda: os._exit(75)) -> Iterator[Path]:
+def claimed(
+    path: Path,
+    lease: float = LEASE,
+    on_lost: Callable[[], object] = lambda: os._exit(75),
+    on_gone: Callable[[], object] | None = None,
+    *,
+    stays: bool = True,
+) -> Iterator[Path]:
     """Hold the claim on something, and yield its file; waits as long as somebody else holds it.
 
     Args:
         path: of the claims, without their number.
         lease: s; whoever asks goes by the one that the claim it finds was made with.
         on_lost: ends at once what is done inside, from another thread; by default this process.
+        on_gone: the same where the whole folder was removed; default: ``on_lost``.
+        stays: whether its file does when it is given back, so that the next one has the next number.
     """
-    token = f"{socket.gethostname()} {os.getpid()} {uuid.uuid4().hex} {lease}"
+    token = f"{socket.gethostname()} {os.getpid()} {uuid.uuid4().hex} {lease} {_boot()}"
     claim = _take(path, token, lease)
-    keeper = _Keeper(claim, token, lease, on_lost)
+    keeper = _Keeper(claim, token, lease, on_lost, on_gone or on_lost)
     try:
         yield claim
     finally:
@@ -51,6 +66,8 @@ def claimed(path: Path, lease: float = LEASE, on_lost: Callable[[], object] = la
         with suppress(OSError):  # then it ends with its lease
             if claim.read_text(encoding="utf-8") == token:
                 os.utime(claim, (0, 0))
+                if not stays:
+                    claim.unlink()
 
 
 def refuse_claimed(folder: Path) -> None:
@@ -68,57 +85,24 @@ def refuse_claimed(folder: Path) -> None:
     for path, number in last.items():
         claim = _numbered(path, number)
         with suppress(FileNotFoundError):
-            if claim.stat().st_mtime > 0 and (age := _age(claim)) < 2 * _lease_of(claim):  # with room to spare
+            if claim.stat().st_mtime > 0 and (age := age_of(claim)) < 2 * lease_of(claim):  # with room to spare
                 fix = "Go on with --on slurm, or cancel its jobs and wait until the claim is not renewed any more."
                 found = f"{claim.read_text(encoding='utf-8').split(' ')[0]}, {age:.0f} s ago"
                 raise PlanError("jobs of Slurm are at this plan", where=claim, found=found, fix=fix)
 
 
-@contextmanager
-def sole(path: Path, lease: float = LEASE) -> Iterator[None]:
-    """Hold the claim on what only one machine may do, and end this process if it is lost; see `claimed`.
-
-    On this machine a lock tells already that nobody else is there, so a claim of its own is one that was killed.
-
-    Raises:
-        PlanError: another machine holds it.
-    """
-    known = _claims(path)
-    refuse_other(path)
-    for old in known.values():
-        with suppress(FileNotFoundError):
-            os.utime(old, (0, 0))
-    # where the folder is gone there is nothing left to guard, and who works there says so
-    with claimed(path, lease, lambda: path.parent.is_dir() and os._exit(75)) as claim:
-        for old in known.values():
-            old.unlink(missing_ok=True)
-        yield
-    claim.unlink(missing_ok=True)
-
-
-def refuse_other(path: Path) -> None:
-    """See that no other machine holds a claim.
-
-    Raises:
-        PlanError: one does.
-    """
-    claims = _claims(path)
-    if not claims:
-        return
-    claim = claims[max(claims)]
-    with suppress(FileNotFoundError):
-        host = claim.read_text(encoding="utf-8").split(" ")[0]
-        lease = _lease_of(claim)
-        if host != socket.gethostname() and claim.stat().st_mtime > 0 and (age := _age(claim)) < lease:
-            found, fix = f"{host}, {age:.0f} s ago", f"Wait until it is done, or was dead for {lease:.0f} s."
-            raise PlanError("another machine runs this plan", where=path.parent, found=found, fix=fix)
-
-
 class _Keeper:
     """Renews a claim, and says when it is lost; two threads, as a file server that hangs holds one up."""
 
-    def __init__(self, claim: Path, token: str, lease: float, on_lost: Callable[[], object]) -> None:
-        self._claim, self._token, self._lease, self._on_lost = claim, token, lease, on_lost
+    def __init__(
+        self,
+        claim: Path,
+        token: str,
+        lease: float,
+        on_lost: Callable[[], object],
+        on_gone: Callable[[], object],
+    ) -> None:
+        self._claim, self._token, self._lease, self._on_lost, self._on_gone = claim, token, lease, on_lost, on_gone
         self._renewed, self._ended = time.monotonic(), threading.Event()
         self._renewer = threading.Thread(target=self._renew, daemon=True)
         for thread in (self._renewer, threading.Thread(target=self._watch, daemon=True)):
@@ -130,11 +114,14 @@ class _Keeper:
             before = time.monotonic()
             try:
                 if following.exists() or self._claim.read_text(encoding="utf-8") != self._token:
-                    self._lose("somebody else has it")
+                    self._lose("somebody else has it", self._on_lost)
                     return
                 os.utime(self._claim)
             except FileNotFoundError:
-                self._lose("its folder is gone")
+                if self._claim.parent.is_dir():
+                    self._lose("somebody removed it", self._on_lost)
+                else:
+                    self._lose("its folder is gone", self._on_gone)
                 return
             except OSError as error:  # for a moment, mostly
                 _log.warning("%s can't be renewed: %s", self._claim, error)
@@ -142,15 +129,28 @@ class _Keeper:
                 self._renewed = before
 
     def _watch(self) -> None:
-        while not self._ended.wait(min(1.0, self._lease / 20)):
-            if time.monotonic() - self._renewed > self._lease / 2:
-                self._lose("it could not be renewed")
+        pause = min(1.0, self._lease / 20)
+        while True:
+            before = time.monotonic()
+            if self._ended.wait(pause):
+                return
+            if self._is_late() and time.monotonic() - before > pause + self._lease / 4:
+                self._ended.wait(self._lease / 10)  # this process was halted: the other thread looks now, and renews
+            if self._is_late():
+                self._lose("it could not be renewed", self._on_lost)
                 return
 
-    def _lose(self, why: str) -> None:
+    def _is_late(self) -> bool:
+        return time.monotonic() - self._renewed > self._lease / 2
+
+    def _lose(self, why: str, then: Callable[[], object]) -> None:
+        """Say so, and have what is done inside ended, without asking a file server that may hang for anything."""
         if not self._ended.is_set():
-            _log.error("%s is lost: %s", self._claim, why)
-            self._on_lost()
+            self._ended.set()
+            said = threading.Thread(target=_log.error, args=("%s is lost: %s", self._claim, why), daemon=True)
+            said.start()
+            said.join(1.0)  # a log may lie there too
+            then()
 
     def end(self) -> None:
         """Renew it no more."""
@@ -162,23 +162,52 @@ def _take(path: Path, token: str, lease: float) -> Path:
     make_folder(path.parent)
     said = False
     while True:
-        last = max(_claims(path), default=0)
+        last = max(claims_of(path), default=0)
         try:
-            free = not last or _age(before := _numbered(path, last)) >= _lease_of(before, lease)
-        except FileNotFoundError:  # it went just now
-            continue
-        if free:
-            claim = _numbered(path, last + 1)
-            with suppress(FileExistsError), claim.open("x", encoding="utf-8") as file:
-                file.write(token)
+            free = not last or age_of(before := _numbered(path, last)) >= lease_of(before, lease)
+            if free and _make(claim := _numbered(path, last + 1), token):
                 return claim
-        elif not said:
+        except FileNotFoundError:  # a claim went just now, or a file that another one who begins took for a leftover
+            if not path.parent.is_dir():
+                raise
+            continue
+        if not (free or said):
             said = True
             _log.warning("waiting: another process is at %s", path)
         time.sleep(min(2.0, lease / 10))
 
 
-def _claims(path: Path) -> dict[int, Path]:
+def _make(claim: Path, token: str) -> bool:
+    """Make a claim that has its text from the first moment; False: another one was first."""
+    new = _temporary(claim)
+    try:
+        new.write_text(token, encoding="utf-8")
+        os.link(new, claim)
+        return True
+    except FileExistsError:
+        return claim.read_text(encoding="utf-8") == token  # its answer was lost, and the file server asked again
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+    finally:
+        new.unlink(missing_ok=True)
+    try:
+        with claim.open("x", encoding="utf-8") as file:
+            file.write(token)
+    except FileExistsError:
+        return False
+    except OSError:  # a full disk
+        claim.unlink(missing_ok=True)
+        raise
+    return True
+
+
+def _temporary(claim: Path) -> Path:
+    """A name beside a claim that is none of its numbers."""
+    return claim.with_name(f".{claim.stem.lstrip('.')}.t{uuid.uuid4().hex}.tmp")
+
+
+def claims_of(path: Path) -> dict[int, Path]:
     """Number -> file of the claims on something."""
     return {int(name.suffix[1:]): name for name in path.parent.glob(f"{path.name}.[0-9]*")}
 
@@ -187,7 +216,7 @@ def _numbered(path: Path, number: int) -> Path:
     return path.with_name(f"{path.name}.{number}")
 
 
-def _lease_of(claim: Path, default: float = LEASE) -> float:
+def lease_of(claim: Path, default: float = LEASE) -> float:
     """Seconds, as whoever made a claim said; one that was killed at that moment said nothing."""
     try:
         return float(claim.read_text(encoding="utf-8").split(" ")[3])
@@ -195,9 +224,26 @@ def _lease_of(claim: Path, default: float = LEASE) -> float:
         return default
 
 
-def _age(claim: Path) -> float:
-    """Seconds since a claim was renewed, by the file server's clock."""
-    probe = claim.with_name(f".{uuid.uuid4().hex}.tmp")
+def is_of_here(text: str) -> bool:
+    """Whether what a claim says is of this machine, since it was started: several may have one name."""
+    words = text.split(" ")
+    return words[0] == socket.gethostname() and words[4:5] == [_boot()]
+
+
+def _boot() -> str:
+    """What no two machines have in common, nor two starts of one; ``-`` where the system has no such thing."""
+    with suppress(OSError):
+        return _BOOT.read_text(encoding="utf-8").strip() or "-"
+    return "-"
+
+
+def age_of(claim: Path) -> float:
+    """Seconds since a claim was renewed, by the file server's clock.
+
+    Raises:
+        FileNotFoundError: it is not there any more.
+    """
+    probe = _temporary(claim)
     try:
         probe.touch()
         os.utime(probe)

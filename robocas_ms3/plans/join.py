@@ -6,34 +6,45 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.provenance import recording_entry
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings, header
-from robocas_ms3.documents import load_json
+from robocas_ms3.documents import DAMAGED, load_json
+from robocas_ms3.errors import PlanError
 from robocas_ms3.files import flush_to_disk, make_folder, replacing, write_json
 from robocas_ms3.outputs import sweep
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.sides import rule_of, sides_of
 from robocas_ms3.plans.units import EPISODES, REPORT, UNITS, Outcome, Task, Unit
 from robocas_ms3.processes.child import Limits
-from robocas_ms3.recordings.merging import merge
+from robocas_ms3.recordings.entries import reason
+from robocas_ms3.recordings.merging import damage_of, merge
 from robocas_ms3.recordings.reading import TrajectoryFile
 from robocas_ms3.scenes.frozen import join_frozen
+from robocas_ms3.words import count_of
 
 LAYOUTS, DEMOS, DATASETS, STATISTICS = "layouts", "demos", "datasets", "statistics"
 TRAJECTORY = "trajectory.h5"
 Chosen = Mapping[int, Sequence[tuple[Unit, Outcome]]]
 """Part -> its episodes, in the order of their seeds."""
+Tasks = Mapping[int, Sequence[Task]]
+Say = Callable[[str], None]
 
 
-def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Callable[[str], None]) -> dict[str, Any]:
+def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Say) -> dict[str, Any]:
     """Join everything; killed at any moment, it goes on and ends the same.
+
+    What was made by units is deleted once what was joined of it is on the disk, and holds what it must.
 
     Args:
         plan: it.
@@ -44,36 +55,31 @@ def join(plan: Plan, out: Path, chosen: Chosen, *, jobs: int, say: Callable[[str
 
     Returns:
         The report.
+
+    Raises:
+        PlanError: what was joined is damaged, and what it was joined from is gone; or the disk does not keep it.
     """
-    if not (out / REPORT).is_file():
-        tasks = {
-            number: [Task(number, outcome.seed, unit.folder(plan, out)) for unit, outcome in episodes]
-            for number, episodes in chosen.items()
-        }
-        if plan.makes_layouts:
-            say("joining layouts")
-            _join_layouts(plan, out / LAYOUTS, tasks)
-        robocas = out / DATASETS / "robocas"
-        if plan.makes_datasets and not (robocas / schema.DATA_INFO_FILE).is_file():
-            say("joining the dataset")
-            _join_episodes(plan, robocas, tasks)
-        for number, recorded in tasks.items() if plan.makes_demonstrations else ():
-            path = make_folder(out / DEMOS / f"{plan.parts[number].name}") / TRAJECTORY
-            sweep(path.parent)
-            if not path.is_file():
-                say(f"joining demonstrations, {plan.parts[number].name}")
-                merge([task.recording for task in recorded], path)
+    report = _report(plan, chosen)
+    tasks = {
+        number: [Task(number, outcome.seed, unit.folder(plan, out)) for unit, outcome in episodes]
+        for number, episodes in chosen.items()
+    }
+    finished = _is_written(out / REPORT, report)
+    if not finished or _left(out):
+        _join_units(plan, out, tasks, say)
+    if not finished:
         if plan.makes_datasets and "lerobot" in plan.formats:
             say("making the LeRobot dataset")
-            _convert_lerobot(plan, robocas, out / DATASETS / "lerobot", jobs)
+            _convert_lerobot(plan, out / DATASETS / "robocas", out / DATASETS / "lerobot", jobs)
         if "statistics" in plan.stages:
             say("drawing statistics")
             _write_statistics(out)
-        write_json(out / REPORT, _report(plan, chosen))
     flush_to_disk(out)
-    for path in [*(out / UNITS).glob("*/*/seed_*"), *(out / UNITS).glob(f"*/*/{EPISODES}")]:
+    if not finished:
+        write_json(out / REPORT, report, sync=True)
+    for path in _left(out):
         shutil.rmtree(path) if path.is_dir() else path.unlink()  # they are joined, or more than were asked for
-    return load_json(out / REPORT)
+    return report
 
 
 def has_begun(out: Path) -> bool:
@@ -81,16 +87,112 @@ def has_begun(out: Path) -> bool:
     return (out / DATASETS).exists() or (out / DEMOS).exists() or (out / REPORT).is_file()
 
 
-def _join_layouts(plan: Plan, out: Path, tasks: Mapping[int, Sequence[Task]]) -> None:
-    make_folder(out)
-    sweep(out)
-    for number, made in tasks.items():
-        join_frozen(out / f"{plan.parts[number].name}.npy", [task.layout for task in made])
+def _is_written(path: Path, report: Mapping[str, Any]) -> bool:
+    """Whether the report is there; one that is damaged is written again."""
+    with suppress(OSError, ValueError):
+        return load_json(path) == report
+    return False
 
 
-def _join_episodes(plan: Plan, out: Path, tasks: Mapping[int, Sequence[Task]]) -> None:
+def _left(out: Path) -> list[Path]:
+    """What units made and nobody has deleted."""
+    return [*(out / UNITS).glob("*/*/seed_*"), *(out / UNITS).glob(f"*/*/{EPISODES}")]
+
+
+def _join_units(plan: Plan, out: Path, tasks: Tasks, say: Say) -> None:
+    """Join what units made, where that is not done."""
+    for number, made in tasks.items() if plan.makes_layouts else ():
+        path, sources = out / LAYOUTS / f"{plan.parts[number].name}.npy", [task.layout for task in made]
+        sweep(make_folder(path.parent))
+        _join_once(
+            path,
+            sources,
+            partial(_damage_of_layouts, path, [task.seed for task in made]),
+            partial(join_frozen, path, sources),
+            partial(say, f"joining layouts, {plan.parts[number].name}"),
+        )
+    if plan.makes_datasets:
+        robocas = out / DATASETS / "robocas"
+        _join_once(
+            robocas,
+            _needed(plan, robocas, tasks),
+            partial(_damage_of_dataset, robocas, sum(map(len, tasks.values()))),
+            partial(_join_episodes, plan, robocas, tasks),
+            partial(say, "joining the dataset"),
+        )
+    for number, recorded in tasks.items() if plan.makes_demonstrations else ():
+        path, sources = out / DEMOS / f"{plan.parts[number].name}" / TRAJECTORY, [task.recording for task in recorded]
+        sweep(make_folder(path.parent))
+        _join_once(
+            path,
+            sources,
+            partial(damage_of, path, [task.seed for task in recorded]),
+            partial(merge, sources, path),
+            partial(say, f"joining demonstrations, {plan.parts[number].name}"),
+        )
+
+
+def _join_once(
+    path: Path, sources: Iterable[Path], damage: Callable[[], str], join: Callable[[], None], say: Callable[[], None]
+) -> None:
+    """Join some files, unless that is done and nothing is wrong with it.
+
+    Args:
+        path: of what is made of them.
+        sources: the files.
+        damage: says what is wrong with it, if anything.
+        join: makes it.
+        say: that it is made.
+
+    Raises:
+        PlanError: it is damaged and some of the files are gone, or it is not what it should be right after it was made.
+    """
+    if not (found := damage()):
+        return
+    if gone := next((source for source in sources if not source.exists()), None):
+        found, fix = f"{found}; {gone.name} is gone", "Put either back from a copy, or begin again with --overwrite."
+        raise PlanError("this is not whole, and can't be joined again", where=path, found=found, fix=fix)
+    say()
+    join()
+    if found := damage():
+        raise PlanError("this is not what was written", where=path, found=found, fix="Look at the disk; then --resume.")
+
+
+def _damage_of_layouts(path: Path, seeds: Sequence[int]) -> str:
+    try:
+        found = np.load(path, allow_pickle=False)["seed"].tolist()
+    except (*DAMAGED, IndexError, KeyError, TypeError) as error:
+        return _said(error)
+    return "" if found == list(seeds) else f"{len(found)} layouts, of other seeds"
+
+
+def _damage_of_dataset(root: Path, count: int) -> str:
+    try:
+        load_json(root / schema.DATA_INFO_FILE)
+        said = len(load_json(root / schema.CONVERSION_FILE)["episodes"])
+        there = set(os.listdir(root))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        return _said(error)
+    missing = sorted({schema.episode_folder(number) for number in range(count)} - there)
+    return f"no {missing[0]}" if missing else "" if said == count else f"{said} of {count_of(count, 'episode')}"
+
+
+def _said(error: Exception) -> str:
+    return "it is not there" if isinstance(error, FileNotFoundError) else reason(error)
+
+
+def _needed(plan: Plan, robocas: Path, tasks: Tasks) -> Iterator[Path]:
+    """What a dataset is made of, as far as it is not there yet."""
+    for part, recorded in tasks.items():
+        for place, task in enumerate(recorded):
+            yield task.recording
+            if not (robocas / schema.episode_folder(plan.first_episode(part) + place)).is_dir():
+                yield task.episode
+
+
+def _join_episodes(plan: Plan, out: Path, tasks: Tasks) -> None:
     """Move the rendered episodes into one dataset, numbered part by part."""
-    make_folder(out)
+    sweep(make_folder(out))
     entries: dict[str, Any] = {}
     for part, recorded in tasks.items():
         name = plan.parts[part].name
@@ -105,7 +207,8 @@ def _join_episodes(plan: Plan, out: Path, tasks: Mapping[int, Sequence[Task]]) -
                 entry = recording_entry(file, 0)
             entries[str(number)] = {**entry, **joined, "trajectory_episode": place}
     settings = dataset_settings(plan.rate, plan.pictures.chosen(), plan.embeddings)
-    write_json(out / schema.CONVERSION_FILE, {**header(settings, rule_of(plan)), "episodes": entries})
+    write_json(out / schema.CONVERSION_FILE, {**header(settings, rule_of(plan)), "episodes": entries}, sync=True)
+    flush_to_disk(out)  # what was moved, before there is what says that all of it was
     write_info(out, sides_of(plan, out))
 
 
@@ -113,7 +216,7 @@ def _say_source(path: Path, source: dict[str, Any]) -> None:
     """Say in an episode's ``scene.json`` where its recording is in the end."""
     scene = load_json(path)
     text = json.dumps({**scene, "source": {**scene["source"], **source}}, indent=1, ensure_ascii=False)
-    with replacing(path) as tmp:
+    with replacing(path, sync=True) as tmp:  # nobody else makes it again
         tmp.write_text(text + "\n", encoding="utf-8")
 
 

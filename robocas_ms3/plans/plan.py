@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from robocas_ms3.assets.pack import pack_folders
+from robocas_ms3.assets.pack import MANIFEST, pack_folders, sha256
 from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import load_config_of
+from robocas_ms3.config import load_config_of, shipped_configs
 from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import PlanError, RobocasError
 from robocas_ms3.paths import plans_dir
@@ -20,6 +20,7 @@ from robocas_ms3.recordings.seeds import GREATEST_SEED
 from robocas_ms3.strict import StrictModel, nearest, parse
 
 Stage = Literal["layouts", "demonstrations", "datasets", "statistics"]
+_ALWAYS = "builtin"  # the pack of the furniture
 _NEEDS = {"datasets": "demonstrations", "statistics": "datasets"}
 
 
@@ -38,6 +39,7 @@ class Plan(StrictModel):
     split: SplitConfig | None = Field(default=None, description="default: as `robocas convert` has it, 90 : 10 by seed")
     block: Annotated[int, Field(ge=1, le=1000)] = Field(default=10, description="seeds of a unit of work")
     limits: LimitsConfig = LimitsConfig()
+    packs: dict[str, str] = Field(default={}, description="pack -> sha256 of its manifest, as they were on loading")
 
     @field_validator("formats")
     @classmethod
@@ -73,6 +75,10 @@ class Plan(StrictModel):
         """Whether episodes are rendered."""
         return "datasets" in self.stages
 
+    def block_of(self, part: int) -> int:
+        """Seeds of a part's units: no more than it has episodes, since what is beyond them is made for nothing."""
+        return min(self.block, self.parts[part].episodes)
+
     def first_episode(self, part: int) -> int:
         """Number of a part's first episode in the dataset."""
         return sum(one.episodes for one in self.parts[:part])
@@ -98,23 +104,23 @@ def load_plan(plan: str | Path) -> Plan:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:
         raise PlanError("this plan can't be read", where=path, found=error) from error
-    loaded = parse(Plan, data, PlanError, where=path, about="no plan")
+    loaded = parse(Plan, data, PlanError, where=path, about="not a valid plan")
     try:
         loaded.pictures.chosen()
     except RobocasError as error:
-        raise PlanError("no plan: pictures", where=path, found=error) from error
+        raise PlanError("not a valid plan: pictures", where=path, found=error) from error
     parts, scenes = [], []
     for number, part in enumerate(loaded.parts):
         if part.task not in TASKS:
-            known, found = ", ".join(TASKS), repr(part.task)
-            raise PlanError("no plan: no such task", where=f"{path}, parts.{number}", expected=known, found=found)
+            where, expected, fix = f"{path}, parts.{number}", ", ".join(TASKS), nearest(part.task, list(TASKS))
+            raise PlanError("no such task", where=where, expected=expected, found=repr(part.task), fix=fix)
         spec = TASKS[part.task]
         name, config = part.config or spec.default_config, part.config or spec.default_config
         if isinstance(config, str) and (path.parent / config).is_file():
             config = path.parent / config
         loaded_config = load_config_of(spec, config)
         scenes.append((part.task, loaded_config, pack := _pack(part.pack, path.parent)))
-        shipped = isinstance(config, str)
+        shipped = isinstance(config, str) and config in shipped_configs()  # a file may be another by the next run
         stem = Path(name).stem if isinstance(name, str) else part.task
         parts.append(
             part.model_copy(
@@ -127,7 +133,9 @@ def load_plan(plan: str | Path) -> Plan:
         )
     _check_names(parts, path)
     _check_seeds(parts, scenes, loaded.block, path)
-    return loaded.model_copy(update={"parts": parts})
+    found = {pack: digest for pack in sorted({_ALWAYS, *(part.pack for part in parts)}) if (digest := _digest(pack))}
+    check_packs(loaded, found)
+    return loaded.model_copy(update={"parts": parts, "packs": found})
 
 
 def most_seeds(episodes: int, block: int) -> int:
@@ -136,8 +144,34 @@ def most_seeds(episodes: int, block: int) -> int:
 
 
 def _pack(named: str, folder: Path) -> str:
-    """A pack's name, or its folder, which may be named from where the plan lies."""
-    return str((folder / named).resolve()) if named not in pack_folders() and (folder / named).is_dir() else named
+    """A pack's name, or the whole path of its folder, which may be named from where the plan lies, or from here."""
+    if named in pack_folders():
+        return named
+    return next((str(path.resolve()) for path in (folder / named, Path(named)) if path.is_dir()), named)
+
+
+def check_packs(plan: Plan, packs: str | Iterable[str]) -> None:
+    """See that packs are those that a plan was loaded with, as far as it says; the furniture's is among them.
+
+    Args:
+        plan: it.
+        packs: names or folders, or one of them.
+
+    Raises:
+        PlanError: one has changed, or is another on this machine.
+    """
+    for pack in {_ALWAYS, *([packs] if isinstance(packs, str) else packs)}:
+        expected, found = plan.packs.get(pack), _digest(pack)
+        if expected and found and found != expected:
+            what, fix = "this pack is not the one that the plan was begun with", "Use that one, or begin again."
+            said, is_now = f"a manifest of sha256 {expected[:12]}...", f"{found[:12]}..."
+            raise PlanError(what, where=pack, expected=said, found=is_now, fix=fix)
+
+
+def _digest(pack: str) -> str:
+    """Of a pack's manifest, which has those of its files; empty where there is no such pack."""
+    path = pack_folders().get(pack, Path(pack)) / MANIFEST
+    return sha256(path) if path.is_file() else ""
 
 
 def _check_names(parts: Sequence[PartConfig], path: Path) -> None:

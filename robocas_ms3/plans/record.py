@@ -11,6 +11,7 @@ from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import write_json
 from robocas_ms3.plans.layouts import LayoutMaker
+from robocas_ms3.plans.opening import opening
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import Task
 from robocas_ms3.processes import use_one_torch_thread
@@ -39,7 +40,7 @@ class Records:
     def do(self, task: Task) -> dict[str, Any]:
         """Make a seed's layout and record its episode, whatever is asked for, and say what came of it."""
         begun = _cpu_seconds()
-        self._turn_to(settings_of(self._plan, task.part))
+        self._turn_to(task.part)
         found = self._make_layout(task)
         if found["success"] and self._plan.makes_demonstrations:
             found = self._record(task)
@@ -70,12 +71,14 @@ class Records:
             "failures": said["robocas"]["failed_attempts"],
         }
 
-    def _turn_to(self, settings: EpisodeSettings) -> None:
+    def _turn_to(self, part: int) -> None:
+        settings = settings_of(self._plan, part)
         if settings == self._settings:
             return
         self.close()
-        self._layouts = LayoutMaker(settings) if self._plan.makes_layouts else None
-        self._generator = EpisodeGenerator(settings) if self._plan.makes_demonstrations else None
+        with opening(self._plan, part):
+            self._layouts = LayoutMaker(settings) if self._plan.makes_layouts else None
+            self._generator = EpisodeGenerator(settings) if self._plan.makes_demonstrations else None
         self._settings = settings
 
     def close(self) -> None:

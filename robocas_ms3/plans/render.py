@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.writing.frames import OpenSource
+from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.writing.frames import FrameSource, OpenSource
 from robocas_ms3.datasets.writing.players import RecordingPlayer, Request, open_env
 from robocas_ms3.datasets.writing.writer import write_episode
+from robocas_ms3.plans.opening import opening
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import Task
 from robocas_ms3.processes import use_one_torch_thread
+from robocas_ms3.recordings.environment import RecordedEnv
 
 
 class Renders:
@@ -45,11 +48,16 @@ class Renders:
         if self._player is None or self._part != task.part:
             self.close()
             pictures, pack = self._plan.pictures.chosen(), self._plan.parts[task.part].pack
-            request = Request(task.recording, self._plan.rate, pictures, open_source=self._open_source, pack=pack)
+            request = Request(task.recording, self._plan.rate, pictures, open_source=self._open, pack=pack)
             self._part, self._player = task.part, RecordingPlayer(request)
         else:
             self._player.turn_to(task.recording)
         return self._player
+
+    def _open(self, env: RecordedEnv, control_mode: str, pictures: Pictures) -> FrameSource:
+        assert self._part is not None
+        with opening(self._plan, self._part):
+            return self._open_source(env, control_mode, pictures)
 
     def _embed(self, texts: list[str]) -> NDArray[np.float32]:
         from robocas_ms3.language.embed import TextEmbedder

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
@@ -12,6 +15,7 @@ from typing import Any
 from robocas_ms3.errors import PlanError
 from robocas_ms3.files import make_folder, write_json
 from robocas_ms3.outputs import (
+    check_one_way,
     check_overwrite,
     check_run,
     check_there,
@@ -23,17 +27,20 @@ from robocas_ms3.outputs import (
 )
 from robocas_ms3.plans.begun import check_plan_of, content_of
 from robocas_ms3.plans.checks import check_plan
-from robocas_ms3.plans.claims import refuse_other, sole
+from robocas_ms3.plans.claims import refuse_claimed
+from robocas_ms3.plans.driver import new_run, refuse_other, sole, wait_for_killed
 from robocas_ms3.plans.engines import Engine
 from robocas_ms3.plans.join import has_begun, join
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.tally import Tally, tally_path
-from robocas_ms3.plans.units import DRIVER, PLAN, Outcome, Task, Unit, outcomes
+from robocas_ms3.plans.units import CLAIMS, DRIVER, PLAN, Outcome, Task, Unit, outcomes
 from robocas_ms3.words import count_of
 
 _AHEAD = 2  # units a slot that are under way, so that none waits for the next
 _ROUNDS = 3  # so often is made again what a disk does not keep
-_LOOK = 1.0  # s between two looks at what is under way
+_LOOK = 1.0  # s between two looks at what is under way, at least
+_LOOKS = 200.0  # units a second that are looked at, at most
+_log = logging.getLogger(__name__)
 OpenEngine = Callable[[Plan, Path], Engine]
 OnProgress = Callable[[Sequence[int]], None]
 """Takes the episodes there are of each part, not more than were asked for."""
@@ -68,28 +75,39 @@ def run_plan(
         The report: what is in ``report.json``.
 
     Raises:
-        PlanError: ``out`` was begun with another plan or other versions, or far too many seeds of a part fail.
+        PlanError: both flags are set; ``out`` was begun with another plan or other versions; somebody is at it; or far
+            too many seeds of a part fail.
         OutputExistsError: ``out`` is not empty and neither flag is set.
         RobocasError: another run writes there; something is wrong with all episodes.
     """
+    check_one_way("plan run", resume=resume, overwrite=overwrite, error=PlanError)
     check_plan(plan)
     if overwrite:
         check_overwrite(out, (PLAN,), "made by `robocas plan run`", PlanError)
         check_run(out / PLAN, "versions", "plan run", PlanError)
-    with locked_folder(out):
-        refuse_other(out / DRIVER)
+    with locked_folder(out) as locked:
+        refuse_other(out / DRIVER, locked=locked)
+        if not overwrite and is_taken(out) and not (out / PLAN).exists():
+            raise PlanError("this is no plan's folder", where=out, expected=PLAN, fix="Choose another --out.")
+        if overwrite:  # what goes on with it asks when it begins, unless it is of Slurm itself
+            refuse_claimed(out / CLAIMS)
+        wait_for_killed(out)
         claim_output(out, overwrite=overwrite, resume=resume)
         if is_taken(out):
             check_plan_of(out, plan)
+        elif resume:
+            _log.warning("%s: no plan was begun there, so it begins", out)
         sweep(make_folder(out))
-        with while_there(out / PLAN, PlanError), sole(out / DRIVER):
+        with while_there(out / PLAN, PlanError), sole(out / DRIVER, locked=locked):
             write_json(out / PLAN, content_of(plan))
             on_start()
-            engine = open_engine(plan, out)
-            try:
-                parts = _do_all(plan, out, engine, on_progress, on_stage)
-            finally:
-                engine.close()
+            with new_run(out) as run:
+                engine = open_engine(plan, out)
+                try:
+                    run.write(engine.lingers)
+                    parts = _do_all(plan, out, engine, on_progress, on_stage)
+                finally:
+                    engine.close()
             return join(plan, out, {part.number: list(part.chosen()) for part in parts}, jobs=jobs, say=on_stage)
 
 
@@ -114,7 +132,7 @@ class _Part:
 
     def wants_more(self) -> bool:
         """Whether there may be too few even if all that is under way succeeds."""
-        under_way = (self.next_block - len(self.done)) * self.plan.block
+        under_way = (self.next_block - len(self.done)) * self.plan.block_of(self.number)
         return self.good + under_way < self.plan.parts[self.number].episodes
 
     def next(self) -> Unit:
@@ -138,9 +156,17 @@ class _Part:
             self.judged_good += sum(outcome.success for outcome in block)
             failed = self.judged_seeds - self.judged_good
             if failed > max(20, 3 * self.judged_good):
-                where, found_now = unit.folder(self.plan, out).parent, f"{failed} of {self.judged_seeds}"
+                where, found_now = (
+                    unit.folder(self.plan, out).parent,
+                    f"{failed} of {self.judged_seeds}{self._mostly()}",
+                )
                 fix = "See seeds.jsonl there; a smaller objects.count may help."
                 raise PlanError("far too many seeds fail", where=where, found=found_now, fix=fix)
+
+    def _mostly(self) -> str:
+        """What most of what failed says."""
+        said = Counter(one.failures[-1] for done in self.done.values() for one in done if one.failures)
+        return f", most of them: {said.most_common(1)[0][0]}" if said else ""
 
     def write_tally(self, out: Path) -> None:
         """Say in the plan's folder what came of the units that are done, if there are more of them."""
@@ -195,7 +221,7 @@ def _damaged(plan: Plan, out: Path, parts: Sequence[_Part]) -> dict[Unit, list[i
 
 def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_progress: OnProgress) -> None:
     under_way: dict[Future[list[Outcome]], Unit] = {}
-    said = -_LOOK
+    said = -math.inf
     while True:
         for part in parts:
             while part.wants_more() and len(under_way) < _AHEAD * engine.slots:
@@ -204,7 +230,8 @@ def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_
                     part.take(unit, unit.result(plan, out), out)
                 else:
                     under_way[engine.submit(unit)] = unit
-        if not under_way or time.monotonic() > said + _LOOK:  # it reads as many files as there are units under way
+        pause = max(_LOOK, len(under_way) / _LOOKS)  # each look reads as many files
+        if not under_way or time.monotonic() > said + pause:
             check_there(out / PLAN, PlanError)
             for part in parts:
                 part.write_tally(out)

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.errors import MissingExtraError, PlanError
+from robocas_ms3.errors import DatasetError, LayoutError, PlanError, PlanningFailed, RobocasError, SimulationError
 from robocas_ms3.files import flush_to_disk, make_folder, write_json
 from robocas_ms3.outputs import sweep
 from robocas_ms3.plans.begun import check_versions
@@ -21,6 +21,7 @@ from robocas_ms3.recordings.versions import versions
 
 TRIES = 2
 """How often a seed is begun again whose process died, counting the first time."""
+_OF_A_SEED = (LayoutError, PlanningFailed, SimulationError, DatasetError)  # of our errors; others befall every seed
 OpenStage = Callable[[Plan], Worker[Task, dict[str, Any]]]
 
 
@@ -113,13 +114,13 @@ class Slot:
                 return {"success": False, "failures": [f"{stage}: {died[-1].why}"]}
             try:
                 return child.do(task, seconds)
-            except (Stopped, PlanError, MissingExtraError, OSError):
-                raise  # it would befall every seed
-            except NotBegun as failed:  # so would this
+            except NotBegun as failed:  # it would befall every seed
                 raise PlanError("a process could not begin", found=failed.said()) from failed.error
             except ChildDied as death:
                 why = str(death)
-            except Exception as error:  # a bug that this seed has found, or some memory that was missing
+            except Exception as error:
+                if not _is_of_a_seed(error):
+                    raise
                 why = f"{type(error).__name__}: {error}".splitlines()[0][:200]
                 child.end()
             noted.append([Death(task.seed, stage, why)], sync=True)
@@ -136,6 +137,16 @@ class Slot:
         until = time.monotonic() + 2 if until is None else until
         for child in (self._record, self._render):
             child.wait(max(0.0, until - time.monotonic()))
+
+
+def _is_of_a_seed(error: Exception) -> bool:
+    """Whether an error is a seed's own: one of its scene or files, a bug that it has found, memory that was missing.
+
+    What is wrong with the disk, the system or what is installed is not: all seeds of a machine would be left out.
+    """
+    if isinstance(error, RobocasError):
+        return isinstance(error, _OF_A_SEED)
+    return not isinstance(error, Stopped | OSError)
 
 
 def _sweep(folder: Path) -> None:

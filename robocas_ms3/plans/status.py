@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.plans.begun import read_plan
+from robocas_ms3.plans.driver import who_runs
 from robocas_ms3.plans.tally import RECENT, Tally, tally_path
-from robocas_ms3.plans.units import REPORT, begun, outcomes
+from robocas_ms3.plans.units import DRIVER, REPORT, begun, outcomes
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class PartStatus:
         tried: seeds.
         failed: ``stage: reason`` -> how many seeds failed for it in the end.
         record_seconds, render_seconds: CPU time an episode, s.
-        bytes: of their files.
+        bytes: of the files of those that are done.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Status:
             known.
         idle_seconds: since the last episode; None: there is none.
         finished: whether everything is joined.
+        at_work: the machine that runs the plan now; None: nobody does.
     """
 
     parts: list[PartStatus]
@@ -55,6 +57,7 @@ class Status:
     seconds_left: float | None
     idle_seconds: float | None
     finished: bool
+    at_work: str | None = None
 
     def as_json(self) -> dict[str, Any]:
         """For ``--json``."""
@@ -85,6 +88,7 @@ def status(out: Path) -> Status:
         None if left is None else round(left, 1),
         round(max(0.0, time.time() - max(times)[0]), 1) if times else None,
         (out / REPORT).is_file(),
+        who_runs(out / DRIVER),
     )
 
 
@@ -98,7 +102,7 @@ def _part(name: str, wanted: int, tally: Tally) -> PartStatus:
         tally.failed,
         round(tally.record_seconds / each, 2),
         round(tally.render_seconds / each, 2),
-        tally.size,
+        round(tally.size * min(wanted, tally.good) / each),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -25,7 +26,8 @@ class Tally:
         failed: ``stage: reason`` -> how many seeds failed for it in the end.
         record_seconds, render_seconds: CPU time of all, s.
         size: bytes of the files of episodes.
-        times: when episodes were done, s since 1970; written of the last `RECENT` before the last one.
+        times: when episodes were done, s since 1970; written of the last `RECENT` before the last one. Without those
+            that a machine's clock puts far ahead: they would outlast all others.
     """
 
     blocks: set[int] = field(default_factory=set)
@@ -54,6 +56,7 @@ class Tally:
     def add(self, block: int, found: Iterable[Outcome]) -> None:
         """Count what came of a unit's seeds, or of some of them."""
         self.blocks.add(block)
+        until = time.time() + RECENT
         for outcome in found:
             self.tried += 1
             self.record_seconds += outcome.record_seconds
@@ -61,7 +64,8 @@ class Tally:
             if outcome.success:
                 self.good += 1
                 self.size += outcome.size
-                self.times.append(outcome.at)
+                if outcome.at <= until:
+                    self.times.append(outcome.at)
             elif outcome.failures:
                 self.failed[outcome.failures[-1]] = self.failed.get(outcome.failures[-1], 0) + 1
 

@@ -34,8 +34,9 @@ class Unit:
 
     def seeds(self, plan: Plan) -> range:
         """The seeds."""
-        first = plan.parts[self.part].seed + self.block * plan.block
-        return range(first, first + plan.block)
+        size = plan.block_of(self.part)
+        first = plan.parts[self.part].seed + self.block * size
+        return range(first, first + size)
 
     def is_done(self, plan: Plan, out: Path) -> bool:
         """Whether all its seeds are; a line of the ledger that was damaged since is done again."""

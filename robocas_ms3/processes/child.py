@@ -21,6 +21,7 @@ import psutil
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.processes.lives import is_too_large, leave_with, uninterrupted
 from robocas_ms3.processes.sent import SentError
+from robocas_ms3.processes.starting import end_with, start
 from robocas_ms3.processes.worker import Worker
 
 Task = TypeVar("Task")
@@ -99,6 +100,7 @@ class Child(Generic[Task, Result]):
             ChildDied: the process died, or was ended for time or memory.
             NotBegun: it died, or failed, before it could begin: not for the task.
             Stopped: `stop` was called.
+            RobocasError: the system allows no more processes, memory or open files.
             Exception: whatever the task raises.
         """
         with self._guard:
@@ -153,15 +155,27 @@ class Child(Generic[Task, Result]):
     def _begun(self) -> Any:
         if self._process is None or not self._process.is_alive():
             self._end()
-            context = multiprocessing.get_context("spawn")
-            self._pipe, theirs = context.Pipe()
-            self._process = context.Process(target=_serve, args=(self._open_worker, theirs, os.getpid()), daemon=True)
-            resource_tracker.ensure_running()  # not below: it lets Ctrl-C in again
-            with uninterrupted():  # the process inherits that until it can deal with Ctrl-C
-                self._process.start()
-            self._open = False
-            theirs.close()
+            try:
+                self._begin()
+            except OSError as error:
+                what, fix = "can't start another process", "Use fewer --jobs, or raise the limits (ulimit -u, -n)."
+                raise RobocasError(what, found=error.strerror or error, fix=fix) from error
         return self._pipe
+
+    def _begin(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        resource_tracker.ensure_running()  # not below: it lets Ctrl-C in again
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(self._open_worker, theirs, os.getpid()), daemon=True)
+        try:
+            with uninterrupted():  # the process inherits that until it can deal with Ctrl-C
+                start(process)
+        except BaseException:
+            ours.close()
+            raise
+        finally:
+            theirs.close()
+        self._process, self._pipe, self._open = process, ours, False
 
     def stop(self) -> None:
         """Want nothing more of the process; does not wait for its end. Another thread's `do` raises `Stopped`."""
@@ -204,8 +218,10 @@ def _kill(process: Any) -> None:
 
 
 def _serve(open_worker: Callable[[], Worker[Any, Any]], pipe: Connection, parent: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # its parent ends it
+    for number in (signal.SIGINT, signal.SIGTERM):  # which all of a group or a job may get: its parent ends it
+        signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    end_with(parent)
     leave_with(parent)
     worker: Worker[Any, Any] | None = None
     while True:

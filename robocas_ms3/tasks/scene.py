@@ -32,6 +32,7 @@ from robocas_ms3.tasks.bodies import Bodies
 from robocas_ms3.tasks.contacts import Contacts
 from robocas_ms3.tasks.engine_errors import EngineErrors
 from robocas_ms3.tasks.gpu_memory import gpu_memory
+from robocas_ms3.tasks.renderer import keep_renderer
 from robocas_ms3.tasks.seeds import SeededEnv
 from robocas_ms3.tasks.vector.backend import check_one_process
 
@@ -159,6 +160,10 @@ class SceneEnv(SeededEnv):
         self.agent = None  # pyright: ignore[reportAttributeAccessIssue]
         self._sensors, self._human_render_cameras, self._hidden_objects = {}, {}, []
         self.scene = None  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _setup_scene(self) -> None:
+        keep_renderer(self.backend.render_device)
+        super()._setup_scene()
 
     def _clear_sim_state(self) -> None:
         """Stop everything in the envs that are being reset, on a GPU in two writes."""

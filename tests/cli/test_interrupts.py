@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command once and soon, however often it is pressed."""
+"""Ctrl-C and SIGTERM end a command once and soon, however often they come."""
 
 import os
 import signal
@@ -23,16 +23,17 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize(("seconds", "said"), [(0.5, "interrupted\n"), (100, "")])
-def test_it_ends_once_and_soon(seconds, said):
+def test_it_ends_once_and_soon(seconds, said, number, code):
     env = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
     words = [sys.executable, "-c", PROGRAM, str(seconds)]
     with subprocess.Popen(words, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout.readline() == "ready\n"
         begun = time.monotonic()
         for _ in range(3):
-            process.send_signal(signal.SIGINT)
+            process.send_signal(number)
             time.sleep(0.1)
         assert process.communicate(timeout=20)[1] == said
         assert time.monotonic() - begun < 3
-    assert process.returncode == 130
+    assert process.returncode == code

@@ -12,6 +12,7 @@ import pytest
 
 from robocas_ms3.cli import main as cli
 from robocas_ms3.cli.spelling import misspelt
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import RobocasError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -293,6 +294,24 @@ def test_a_full_disk_is_one_line_but_a_bug_is_not(failing, capsys):
 
     failing(FileNotFoundError(errno.ENOENT, "No such file or directory", "x"))
     with pytest.raises(FileNotFoundError):
+        cli.run(["list"])
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.ENAMETOOLONG])
+def test_what_disks_and_file_servers_say_is_a_line(failing, capsys, number):
+    failing(OSError(number, os.strerror(number), "out/x.h5"))
+    assert cli.run(["list"]) == 1
+    assert capsys.readouterr().err == f"error: out/x.h5: {os.strerror(number)}\n"
+
+
+def test_a_damaged_document_is_a_line_that_names_it(monkeypatch, tmp_path, capsys):
+    path = tmp_path / "report.json"
+    path.write_text("")
+    monkeypatch.setattr("robocas_ms3.cli.list.main", lambda cfg: load_json(path))
+    assert cli.run(["list"]) == 1
+    assert capsys.readouterr().err == f"error: {path}: Expecting value: line 1 column 1 (char 0)\n"
+    monkeypatch.setattr("robocas_ms3.cli.list.main", lambda cfg: int("a bug"))
+    with pytest.raises(ValueError, match="a bug"):
         cli.run(["list"])
 
 

@@ -116,6 +116,13 @@ def test_results_of_an_evaluation_are_not_touched(tmp_path, hopeless, notes, fla
     assert (tmp_path / "run.json").read_text() == notes
 
 
+def test_to_go_on_and_to_begin_again_exclude_each_other(tmp_path, hopeless):
+    out = begun(tmp_path / "out", ledger="kept")
+    with pytest.raises(RobocasError, match=r"generate: these exclude each other .*found --resume --overwrite"):
+        generate(SETTINGS, out, episodes=1, resume=True, overwrite=True)
+    assert (out / "failures.jsonl").read_text() == "kept"
+
+
 def test_two_runs_do_not_share_a_folder(tmp_path, hopeless):
     out = begun(tmp_path / "out")
     with locked_folder(out), pytest.raises(RobocasError, match="another process is writing here"):

@@ -15,7 +15,7 @@ import torch
 import robocas_ms3  # noqa: F401
 from robocas_ms3.cli.main import run as cli
 from robocas_ms3.errors import EvaluationError
-from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation import results, videos
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.run import Settings, evaluate
@@ -211,12 +211,13 @@ def test_where_nothing_is_lifted_it_changes_nothing(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_evaluation_with_it_counts_it_says_so_and_is_filmed_alike(tmp_path, needs_renderer):
+def test_an_evaluation_with_it_counts_it_says_so_and_is_filmed_alike(tmp_path, monkeypatch, needs_renderer):
     protocol, folder = load_protocol("paper-v1"), tmp_path / "out"
     (outcome,) = play(folder, protocol.folder, "scripted-motions", episodes=1, weld=True).values()
     assert outcome["success"] and outcome["measures"]["welds"] == 1
     result = results.read(folder)
     assert result.run["weld"] is True
     assert problems(result, protocol) == ["missing: 399 of 400 episodes"]
+    monkeypatch.setattr(videos, "SIZE", (64, 48))
     (filmed,) = film(result, protocol, make_policy("scripted-motions"), [0])
     assert filmed.same and filmed.outcome.measures["welds"] == 1

@@ -267,7 +267,7 @@ def stopped_half_way(command, out, log):
 
 
 CUT = {
-    "generate": ("episodes/seed_*.h5", "episodes/seed_*.json", "failures.jsonl"),
+    "generate": ("episodes/seed_*.h5", "episodes/seed_*.json"),
     "convert": ("episode_*/episode_info.npz", "episode_*/base_camera/rgb/0001.png", "episode_*/scene.json"),
     "plan run": ("units/*/*/seeds.jsonl",),
     "eval": ("episodes.jsonl",),
@@ -283,6 +283,7 @@ def test_a_file_of_a_run_that_was_cut_off(commands, undisturbed, tmp_path, row, 
     for path in out.glob(pattern):
         cut(path)
         row.injected += 1
+    assert row.injected
     succeed(command.line(out, 2, "--resume"))
     row.judge(undisturbed(command)[0], content(command, out))
 
@@ -297,6 +298,7 @@ def test_a_layout_bank_that_was_cut_off(commands, undisturbed, tmp_path, row, mo
     for path in (path for path in (cache / "layouts").rglob("*") if path.is_file()):
         cut(path)
         row.injected += 1
+    assert row.injected
     succeed(command.line(tmp_path / "out"))
     row.judge(expected, content(command, tmp_path / "out"))
 

@@ -1,5 +1,6 @@
 """Claims keep a second process out for as long as the first may live, and no longer."""
 
+import errno
 import json
 import os
 import subprocess
@@ -11,7 +12,8 @@ from contextlib import ExitStack
 import pytest
 
 from robocas_ms3.errors import PlanError
-from robocas_ms3.plans.claims import claimed, refuse_claimed, sole
+from robocas_ms3.plans.claims import claimed, refuse_claimed
+from robocas_ms3.plans.driver import sole
 from robocas_ms3.plans.engines import open_engine
 from robocas_ms3.plans.units import CLAIMS
 
@@ -28,11 +30,19 @@ with claimed(path, lease):
     with notes.open("a") as file:
         file.write(json.dumps(["out", time.time()]) + "\\n")
 """
+SLOW = """
+import os, time
+utime = os.utime
+def slow(*more):
+    time.sleep(0.05)
+    utime(*more)
+os.utime = slow
+"""
 
 
-def holding(path, notes, seconds, lease=LEASE):
+def holding(path, notes, seconds, lease=LEASE, before=""):
     """Another process that holds a claim for some seconds."""
-    command = [sys.executable, "-c", HOLD, path, notes, str(lease), str(seconds)]
+    command = [sys.executable, "-c", before + HOLD, path, notes, str(lease), str(seconds)]
     return subprocess.Popen([str(word) for word in command], stderr=subprocess.DEVNULL)
 
 
@@ -87,6 +97,47 @@ def test_a_holder_that_wakes_after_its_lease_leaves_at_once(tmp_path):
         assert process.wait(LEASE) == 75
         mine = max(tmp_path.glob("00000.*"))
         assert time.time() - mine.stat().st_mtime < LEASE  # it did not give back what is not its own
+
+
+def test_a_holder_that_was_halted_goes_on_if_nobody_came(tmp_path):
+    notes = tmp_path / "notes"
+    process = holding(tmp_path / "00000", notes, 3 * LEASE, before=SLOW)  # which does not renew in no time
+    wait_for(lambda: read(notes) == ["in"])
+    time.sleep(0.3 * LEASE)
+    process.send_signal(19)  # SIGSTOP
+    time.sleep(1.2 * LEASE)
+    process.send_signal(18)
+    assert process.wait(6 * LEASE) == 0
+    assert read(notes) == ["in", "out"]
+
+
+@pytest.mark.parametrize("number", [0, errno.EPERM, errno.EOPNOTSUPP])
+def test_a_claim_has_its_text_from_the_first_moment(tmp_path, monkeypatch, number):
+    link, texts = os.link, []
+
+    def look(new, claim):
+        texts.append(new.read_text())
+        if number:
+            raise OSError(number, os.strerror(number))
+        link(new, claim)
+
+    monkeypatch.setattr(os, "link", look)
+    for count in (1, 2):
+        with claimed(tmp_path / "00000", LEASE) as claim:
+            assert claim.name == f"00000.{count}"
+            assert claim.read_text() == texts[-1] != ""
+    assert {path.name for path in tmp_path.iterdir()} == {"00000.1", "00000.2"}
+
+
+def test_a_full_disk_leaves_no_claim(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(tmp_path), "write_text", full)
+        with pytest.raises(OSError, match="No space"), claimed(tmp_path / "00000", LEASE):
+            pass
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_lost_claim_is_noticed(tmp_path):

@@ -1,17 +1,24 @@
 """Plans as files: what is wrong with one is a line; the shipped ones are whole."""
 
+import errno
+import time
 from dataclasses import asdict, replace
 
 import pytest
+from plan_stages import MadeUp
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.errors import ConfigError, ExtensionError, PlanError, RobocasError
+from robocas_ms3.errors import ConfigError, ExtensionError, MissingExtraError, PlanError, RobocasError
+from robocas_ms3.files import write_json
+from robocas_ms3.plans.begun import check_plan_of, content_of
 from robocas_ms3.plans.checks import check_plan
+from robocas_ms3.plans.opening import opening
 from robocas_ms3.plans.plan import load_plan, most_seeds, shipped_plans
 from robocas_ms3.plans.record import settings_of
+from robocas_ms3.plans.render import Renders
 from robocas_ms3.plans.status import PartStatus, _seconds_left, status
 from robocas_ms3.plans.tally import Tally, tally_path
-from robocas_ms3.plans.units import LEDGER, PLAN, Outcome, Unit, ledger
+from robocas_ms3.plans.units import LEDGER, PLAN, Outcome, Task, Unit, ledger
 
 GOOD = "parts:\n  - {task: pick, episodes: 3}\n"
 
@@ -62,6 +69,75 @@ def test_a_configuration_beside_the_plan_is_taken_whole(written, tmp_path):
     plan = load_plan(written("parts:\n  - {task: pick, config: mine.yaml, episodes: 3}\n"))
     assert isinstance(plan.parts[0].config, dict)
     assert plan.parts[0].name == "00-mine"
+
+
+def test_a_configuration_in_the_working_directory_is_taken_whole(written, tmp_path, monkeypatch):
+    from robocas_ms3.config import load_task_config
+
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (tmp_path / "here" / "mine.yaml").write_text(load_task_config("pick_shelf_scattered").model_dump_json())
+    plan = load_plan(written("parts:\n  - {task: pick, config: mine.yaml, episodes: 3}\n"))
+    assert isinstance(plan.parts[0].config, dict)
+    assert load_plan(written(GOOD)).parts[0].config == "pick_table_scattered"  # a shipped one keeps its name
+
+
+def test_a_pack_in_the_working_directory_is_named_in_full(written, tmp_path, monkeypatch):
+    (tmp_path / "here" / "packs" / "mine").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    plan = load_plan(written("parts:\n  - {task: pick, pack: packs/mine, episodes: 3}\n"))
+    assert plan.parts[0].pack == str(tmp_path / "here" / "packs" / "mine")
+
+
+def test_a_pack_that_was_changed_is_noticed(written, tmp_path):
+    pack, out = tmp_path / "mine", tmp_path / "out"
+    pack.mkdir()
+    out.mkdir()
+    path = written("parts:\n  - {task: pick, pack: mine, episodes: 3, name: a}\n")
+    (pack / "manifest.json").write_text("{}")
+    plan = load_plan(path)
+    assert plan.packs.keys() == {str(pack), "builtin"}
+    write_json(out / PLAN, content_of(plan))
+    check_plan_of(out, load_plan(path))
+    with opening(plan, 0):
+        pass
+    (pack / "manifest.json").write_text("{ }")
+    with pytest.raises(PlanError, match="begun with another plan .found packs\..*mine: "):
+        check_plan_of(out, load_plan(path))
+    with (
+        pytest.raises(PlanError, match=f"{pack}: this pack is not the one that the plan was begun with"),
+        opening(plan, 0),
+    ):
+        pass
+    path.write_text(f"{path.read_text()}packs: {{{pack}: 12ab}}\n")
+    with pytest.raises(PlanError, match="expected a manifest of sha256 12ab"):
+        load_plan(path)
+
+
+@pytest.mark.parametrize(
+    ("error", "raised", "match"),
+    [
+        (
+            ConfigError("no such thing"),
+            PlanError,
+            "part a: what this part needs can't be opened .found ConfigError: no",
+        ),
+        (RuntimeError("no device\nat all"), PlanError, "found RuntimeError: no device at all"),
+        (OSError("can't be read"), PlanError, "found OSError: can't be read"),
+        (OSError(errno.EIO, "Input/output error", "x"), OSError, "Input/output error"),
+        (MissingExtraError("nothing to render with"), MissingExtraError, "nothing to render with"),
+    ],
+)
+def test_what_fails_while_a_part_is_opened_ends_the_run(written, tmp_path, error, raised, match):
+    def fail(*_):
+        raise error
+
+    plan = load_plan(written("embeddings: false\nparts:\n  - {task: pick, episodes: 3, name: a}\n"))
+    task = Task(0, 7, tmp_path)
+    MadeUp(plan).do(task)
+    with pytest.raises(raised, match=match) as found:
+        Renders(plan, fail).do(task)
+    assert "\n" not in str(found.value)
 
 
 @pytest.mark.parametrize(
@@ -144,6 +220,17 @@ def test_status_is_read_from_the_folder_alone(written, tmp_path, capsys):
     assert status(out).parts[0].tried == 1  # a damaged one is none
 
 
+def test_status_shows_reasons_with_brackets(written, tmp_path, capsys):
+    out = tmp_path / "out"
+    plan = load_plan(written("block: 4\nparts:\n  - {task: pick, episodes: 6, name: a}\n"))
+    folder = Unit(0, 0).folder(plan, out)
+    folder.mkdir(parents=True)
+    write_json(out / PLAN, content_of(plan))
+    ledger(folder).append([Outcome(0, False, failures=["record: KeyError: [/red]"])])
+    assert run(["plan", "status", str(out)]) == 0
+    assert "[/red] x1" in capsys.readouterr().out
+
+
 def test_what_is_left_costs_what_its_part_costs():
     def part(name, wanted, done, seconds):
         return PartStatus(name, wanted, done, done, {}, seconds, 0.0, 0)
@@ -179,6 +266,15 @@ def test_a_tally_keeps_the_times_of_ten_minutes(tmp_path):
     tally = Tally.read(tmp_path / "tally.json")
     assert tally.times == [1000.0, 1150.0]
     assert (tally.good, tally.blocks) == (4, {0, 1, 2, 3})
+
+
+def test_a_clock_that_is_a_day_ahead_wipes_no_times(tmp_path):
+    now, tally = time.time(), Tally()
+    for block, at in enumerate((now - 100, now + 86400, now)):
+        tally.add(block, [Outcome(block, True, at=at)])
+    tally.write(tmp_path / "tally.json")
+    assert Tally.read(tmp_path / "tally.json").times == [now - 100, now]
+    assert tally.good == 3
 
 
 def test_a_wrong_option_of_an_engine_costs_nothing_that_is_there(tmp_path, capsys):

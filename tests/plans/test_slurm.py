@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install "robocas-ms3[slurm]"')
 
-from plan_stages import PLAN, assert_same, plan_faults
+from plan_stages import PLAN, assert_same, plan_faults, stages
 from slurm_runs import (
     LOCAL,
     NO_SLURM,
@@ -25,8 +25,11 @@ from slurm_runs import (
 )
 
 from robocas_ms3.errors import MissingExtraError, PlanError
+from robocas_ms3.plans.claims import refuse_claimed
 from robocas_ms3.plans.engines import open_engine
-from robocas_ms3.plans.units import Unit, deaths
+from robocas_ms3.plans.engines.local import LocalEngine
+from robocas_ms3.plans.run import run_plan
+from robocas_ms3.plans.units import CLAIMS, Unit, deaths
 
 EXECUTORS = [
     pytest.param(LOCAL, id="local"),
@@ -121,9 +124,32 @@ def test_jobs_of_a_killed_run_and_those_of_the_next_are_never_at_one_unit(undist
     assert_done_once(out)
 
 
+def test_jobs_of_a_killed_run_leave_once_another_engine_is_to_go_on(undisturbed, tmp_path):
+    out = tmp_path / "out"
+    runner = start(out, LOCAL | {"units_per_job": "2"}, stderr=subprocess.DEVNULL)
+    wait_for(lambda: list((out / "slurm").glob("claims/a/*")))
+    runner.kill()
+    runner.wait()
+
+    def open_local(plan, out):
+        refuse_claimed(out / CLAIMS)  # as `open_engine`, which knows no made-up stages
+        return LocalEngine(plan, out, 1, stages=stages())
+
+    with pytest.raises(PlanError, match="jobs of Slurm are at this plan"):
+        run_plan(PLAN, out, open_local, resume=True)
+    wait_for(lambda: not processes_of(out))
+    assert "leaving: the run that wanted this job is over" in "".join(
+        path.read_text() for path in (out / "slurm").glob("*_log.out")
+    )
+    assert not Unit(0, 1).is_done(PLAN, out)
+    run_plan(PLAN, out, open_local, resume=True)
+    assert_same(undisturbed, out)
+    assert_done_once(out)
+
+
 def test_a_unit_whose_jobs_die_again_and_again_is_an_error_with_their_log(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[2]))  # no plan_stages in the jobs
-    with pytest.raises(PlanError, match=r"units/a/00000: the jobs of this unit die .*2 in a row.*_log.out") as error:
+    with pytest.raises(PlanError, match=r"units/a/0000[01]: the jobs of this unit die .*2 in a row.*_log.out") as error:
         run(tmp_path / "out", LOCAL | {"tries": "2"})
     log = Path(str(error.value.fix).split()[1].rstrip(";"))
     assert "plan_stages" in log.read_text()

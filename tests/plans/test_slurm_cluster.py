@@ -15,6 +15,7 @@ from slurm_runs import NO_SLURM, SLURM, assert_done_once, holds, run, slurm_answ
 from slurm_runs import processes_of as processes_at
 
 from robocas_ms3.errors import PlanError
+from robocas_ms3.plans.run import run_plan
 from robocas_ms3.plans.units import Unit, deaths
 
 CONF = Path("/etc/slurm/slurm.conf")
@@ -144,6 +145,21 @@ def test_a_run_that_is_killed_leaves_jobs_that_the_next_ends(running, undisturbe
     running.process = start(running.out, running.options, stderr=subprocess.PIPE)
     left.wait(60)
     running.ends_well(undisturbed)
+
+
+def test_jobs_that_wait_when_their_run_is_killed_do_nothing_once_they_start(tmp_path):
+    out = tmp_path / "out"
+    process = start(out, SLURM | {"begin": "now+8"}, stderr=subprocess.DEVNULL)
+    wait_for(lambda: "robocas-out" in say("squeue", "--noheader", "--format=%j"))
+    process.kill()
+    process.wait()
+    with pytest.raises(ZeroDivisionError):
+        run_plan(PLAN, out, lambda *_: 1 / 0, resume=True)  # another engine, which does not know of the queue
+    wait_for(lambda: "robocas-out" not in say("squeue", "--noheader", "--format=%j"))
+    logs = [path.read_text() for path in (out / "slurm").glob("*_log.out")]
+    assert logs
+    assert all("leaving: the run that wanted this job is over" in log for log in logs)
+    assert not list((out / "units").glob("*/*"))
 
 
 def test_ctrl_c_cancels_all_jobs(running, undisturbed):

@@ -7,8 +7,13 @@ import pytest
 
 pytest.importorskip("submitit", reason='the engine slurm needs submitit: pip install "robocas-ms3[slurm]"')
 
+from plan_stages import PLAN
+
+from robocas_ms3.plans.driver import current_run, new_run
 from robocas_ms3.plans.engines import slurm_queue
+from robocas_ms3.plans.engines.slurm import SlurmEngine
 from robocas_ms3.plans.engines.slurm_options import read_options
+from robocas_ms3.plans.units import Unit
 
 
 @pytest.fixture
@@ -76,3 +81,26 @@ def test_a_held_job_that_can_never_start_is_cancelled(queue, command, tmp_path):
     command("scancel", f"echo \"$@\" >>'{tmp_path}/cancelled'")
     assert queue.alive(()) == {"7_0"}
     assert (tmp_path / "cancelled").read_text() == "7_1\n"
+
+
+def test_ctrl_c_while_sbatch_is_slow_lets_the_jobs_leave_by_themselves(command, tmp_path):
+    out = tmp_path / "out"
+    command("sbatch", f"touch '{tmp_path}/asked'; sleep 1.5; echo 'Submitted batch job 7'")
+    with new_run(out) as run:
+        engine = SlurmEngine(PLAN, out, 1)
+        engine.submit(Unit(0, 0))
+        until = time.monotonic() + 20
+        while not (tmp_path / "asked").exists():
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        assert (current_run(out) or run).name == run.name
+        engine.close()
+        assert current_run(out) is None  # what a job looks for when it begins
+
+
+def test_many_units_are_looked_at_less_often(command, tmp_path):
+    engine = SlurmEngine(PLAN, tmp_path / "out", 1)
+    engine.close()
+    few = engine._pause()
+    engine._jobs = [type("Job", (), {"units": [None] * 1000})] * 2
+    assert engine._pause() == 10.0 > few == 0.5

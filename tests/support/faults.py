@@ -217,7 +217,8 @@ def alive(group):
 
 def lines_of(said):
     """What is left of stderr without the lines of progress."""
-    return [line for line in said.splitlines() if line.strip() and not re.match(r"[a-z ]+: \d+ of \d+(,|$)", line)]
+    progress = re.compile(r"([a-z ]+: )?\d+ of \d+( episodes)?(,|$)")
+    return [line for line in said.splitlines() if line.strip() and not progress.match(line)]
 
 
 def is_one_line(said):

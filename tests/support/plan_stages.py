@@ -10,7 +10,7 @@ import time
 
 from synthetic import RayCaster, write_trajectory
 
-from robocas_ms3.errors import MissingExtraError
+from robocas_ms3.errors import DatasetError, MissingExtraError, RobocasError
 from robocas_ms3.files import replacing_folder
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.render import Renders
@@ -41,6 +41,10 @@ class MadeUp:
             raise ValueError("a bug\nof two lines")
         elif fault == "refuse":
             raise MissingExtraError("nothing to record with")
+        elif fault == "limit":  # as `demos.forking` has it
+            raise RobocasError("can't start another process")
+        elif fault == "damaged":
+            raise DatasetError("this recording is damaged")
         elif fault == "fail":
             return {"success": False, "failures": ["grasp: slipped"]}
         if not task.recording.is_file():

@@ -29,7 +29,10 @@ def near(root: Path) -> Path | None:
     """The first dataset or recording in a folder."""
     if not root.is_dir():
         return None
-    datasets = sorted(root.glob(f"*/{schema.CONVERSION_FILE}")) or sorted(root.glob(f"*/{schema.DATA_INFO_FILE}"))
+    files = (
+        f"{folder}*/{name}" for folder in ("", "datasets/") for name in (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
+    )
+    datasets = next(filter(None, (sorted(root.glob(file)) for file in files)), [])  # a plan has its own in datasets/
     return next(iter([path.parent for path in datasets] or sorted(root.glob("*.h5"))), None)
 
 

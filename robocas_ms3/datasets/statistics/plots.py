@@ -53,7 +53,7 @@ def _matplotlib() -> FigureOf:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingExtraError(
-            "statistics are drawn with matplotlib", found=error.name or error, fix='pip install "robocas-ms3[plots]"'
+            "statistics are drawn with matplotlib, which is not installed", fix='Run pip install "robocas-ms3[plots]".'
         ) from error
 
     def figure_of(width: float, height: float) -> Any:

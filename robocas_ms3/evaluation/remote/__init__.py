@@ -11,7 +11,6 @@ try:
     import websockets  # noqa: F401
 except ImportError as error:
     raise MissingExtraError(
-        "remote policies need websockets and msgpack",
-        found=error.name or error,
+        f"remote policies need {error.name or 'websockets and msgpack'}, which is not installed",
         fix='Run pip install "robocas-ms3[remote]".',
     ) from error

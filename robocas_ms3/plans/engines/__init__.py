@@ -26,9 +26,11 @@ class Engine(Protocol):
 
     Attributes:
         slots: how many it does at once.
+        lingers: s that what does units may go on, and claim none of them, after this process was killed.
     """
 
     slots: int
+    lingers: float
 
     def submit(self, unit: Unit) -> Future[list[Outcome]]:
         """Have a unit done; of one folder no two at a time."""

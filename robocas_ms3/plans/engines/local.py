@@ -18,6 +18,8 @@ from robocas_ms3.processes import uninterrupted
 class LocalEngine:
     """Threads that each look after the processes of a slot; see `engines.Engine`."""
 
+    lingers = 0.0  # they end with this process
+
     def __init__(
         self, plan: Plan, out: Path, jobs: int, options: Mapping[str, str] | None = None, stages: Stages | None = None
     ) -> None:

@@ -84,6 +84,7 @@ class RayEngine:
         self, plan: Plan, out: Path, jobs: int, options: Mapping[str, str] | None = None, stages: Stages | None = None
     ) -> None:
         self.slots = jobs
+        self.lingers = 0.0
         self._options, self._plan, self._out = read_options(options or {}), plan, out
         self._ray = require_ray()
         self._lost = (
@@ -92,6 +93,8 @@ class RayEngine:
             self._ray.exceptions.OutOfMemoryError,
         )
         shared = None if self._options.gather else out.absolute()
+        if shared is not None:
+            self.lingers = LEASE + ENDING
         self._terms = Terms(plan, shared, LEASE, versions(), stages)
         self._disconnects = connect(self._options, jobs)
         self._remote = self._ray.remote(

@@ -61,7 +61,7 @@ def require_ray() -> Any:
         return import_module("ray")
     except ImportError as error:
         fix = 'Run pip install "robocas-ms3[ray]".'
-        raise MissingExtraError("a cluster of Ray needs ray", found=error.name or error, fix=fix) from error
+        raise MissingExtraError("plans on Ray need ray, which is not installed", fix=fix) from error
 
 
 def connect(options: RayOptions, jobs: int) -> bool:

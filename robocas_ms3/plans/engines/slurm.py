@@ -2,7 +2,7 @@
 
 What came of a unit is read from its folder; a job's end alone says nothing. A job that ends early, whatever it died of,
 costs its units nothing but time: they are handed in again and go on where their ledgers stop. That no two are ever at
-one unit is seen to by `plans.claims`.
+one unit is seen to by `plans.claims`; that none is at one for a run that is over, by `plans.driver`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.errors import PlanError
+from robocas_ms3.plans.driver import current_run
 from robocas_ms3.plans.engines.slurm_job import UnitsJob
 from robocas_ms3.plans.engines.slurm_options import read_options
 from robocas_ms3.plans.engines.slurm_queue import error_of, open_queue, require_slurm
@@ -26,7 +27,8 @@ from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import DONE, Outcome, Unit, outcomes
 from robocas_ms3.processes import SentError
 
-_LOOK = 0.5  # s between two looks at the folders
+_LOOK = 0.5  # s between two looks at the folders, at least
+_LOOKS = 200.0  # folders a second that are looked at, at most
 _AGAIN, _AGAIN_TIMES = 30.0, 20  # s between two tries to hand jobs in, where Slurm took some before
 _JOIN = 0.5  # s
 _LEFT = 60.0  # s that Slurm may take to cancel what is left
@@ -82,6 +84,8 @@ class _Job:
 class SlurmEngine:
     """A thread that hands units in and looks after them; see `engines.Engine`.
 
+    Jobs do units for the run that the folder is of now, see `plans.driver`.
+
     Args:
         plan: of the units.
         out: the plan's folder, which all nodes see under the same path.
@@ -90,10 +94,13 @@ class SlurmEngine:
         stages: import path of what gives other stages than the plan's own, in each job.
     """
 
+    lingers = 0.0  # a job claims its units
+
     def __init__(
         self, plan: Plan, out: Path, jobs: int, options: Mapping[str, str] | None = None, stages: str | None = None
     ) -> None:
         self._options = read_options(options or {})
+        self._run = current_run(out)
         self._plan, self._out, self._at_once, self._stages = plan, out.absolute(), jobs, stages
         self._queue = open_queue(self._options, self._out, jobs, self._options.mem_gb or 2 * plan.limits.memory_gb)
         self._queue.cancel(seconds=_LEFT)  # what a killed run left there; later it would meet jobs of this one
@@ -120,14 +127,16 @@ class SlurmEngine:
         return asked.future
 
     def close(self) -> None:
-        """Cancel the jobs."""
+        """Cancel the jobs; those that Slurm is just taking leave by themselves."""
         self._closed.set()
+        if self._run is not None:
+            self._run.end()
         # what runs and has nothing left is about to end well
         self._queue.cancel(waiting_only=not any(job.units for job in list(self._jobs)))
         self._thread.join(_JOIN)
 
     def _look_after(self) -> None:
-        while not self._closed.wait(_LOOK):
+        while not self._closed.wait(self._pause()):
             try:
                 self._hand_in()
                 self._look()
@@ -139,6 +148,9 @@ class SlurmEngine:
                         one.future.set_exception(error)
                 return
 
+    def _pause(self) -> float:
+        return max(_LOOK, sum(len(job.units) for job in self._jobs) / _LOOKS)
+
     def _hand_in(self) -> None:
         free = self._free()
         with self._lock:
@@ -146,8 +158,9 @@ class SlurmEngine:
         if free <= 0 or not waiting or time.monotonic() < self._not_before:
             return
         groups = self._grouped(waiting, free)[: self._queue.at_a_time]
+        lease, run = self._options.lease, self._run.name if self._run is not None else None
         jobs = [
-            UnitsJob(self._plan, self._out, tuple(one.unit for one in group), self._options.lease, self._stages)
+            UnitsJob(self._plan, self._out, tuple(one.unit for one in group), lease, self._stages, run)
             for group in groups
         ]
         try:

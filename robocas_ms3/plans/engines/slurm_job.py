@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
 from concurrent.futures import Future, wait
@@ -11,6 +12,7 @@ from typing import Any
 
 from robocas_ms3.extensions import load
 from robocas_ms3.plans.claims import claimed
+from robocas_ms3.plans.driver import is_current
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import CLAIMS, Outcome, Unit
@@ -18,6 +20,7 @@ from robocas_ms3.processes import SentError
 
 FOLDER = CLAIMS.parent.name
 """In the plan's folder: logs of the jobs, what submitit keeps, and claims."""
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,7 @@ class UnitsJob:
         units: to be done.
         lease: s, of the claims on them.
         stages: import path of what gives the stages; None: the plan's own.
+        run: name of the one that wants them; once the folder is of another one, nothing more is done.
     """
 
     plan: Plan
@@ -37,6 +41,7 @@ class UnitsJob:
     units: tuple[Unit, ...]
     lease: float
     stages: str | None = None
+    run: str | None = None
 
     def __call__(self) -> tuple[Unit, SentError] | None:
         """Do the units.
@@ -48,6 +53,10 @@ class UnitsJob:
         engine = LocalEngine(self.plan, self.out, 1, stages=load(self.stages)() if self.stages else None)
         try:
             for unit in self.units:
+                if unit.is_done(self.plan, self.out):
+                    continue
+                if not self._is_wanted():
+                    break
                 error = self._do(engine, unit)
                 if error is not None:
                     return unit, SentError.of(error, "a job")
@@ -57,9 +66,9 @@ class UnitsJob:
 
     def _do(self, engine: LocalEngine, unit: Unit) -> BaseException | None:
         folder = unit.folder(self.plan, self.out)
-        if unit.is_done(self.plan, self.out):
-            return None
         with claimed(self.out / CLAIMS / folder.parent.name / folder.name, self.lease):
+            if not self._is_wanted():  # whoever begins another run now sees the claim; before, it saw none
+                return None
             try:
                 future = self._submit(engine, unit)
                 wait([future])  # in its thread: what a signal raises here is no error of the unit
@@ -67,6 +76,12 @@ class UnitsJob:
             except BaseException:
                 engine.close()  # before the claim is given back
                 raise
+
+    def _is_wanted(self) -> bool:
+        wanted = is_current(self.out, self.run)
+        if not wanted:
+            _log.warning("leaving: the run that wanted this job is over, or another one has begun in %s", self.out)
+        return wanted
 
     def _submit(self, engine: LocalEngine, unit: Unit) -> Future[list[Outcome]]:
         """Begin in a thread, and so in processes, that don't hear what Slurm says before the time is up."""

@@ -42,6 +42,10 @@ def datasets(root):
         (root / name / "conversion.json").write_text("{}")
 
 
+def plan(root):
+    datasets(root / "datasets")
+
+
 def recording(root):
     root.mkdir()
     (root / "trajectory.h5").touch()
@@ -65,6 +69,7 @@ def test_a_lerobot_dataset_is_counted_as_one(tmp_path):
     ("make", "said"),
     [
         (datasets, "here: no dataset here .*Did you mean .*here/part_0[?]$"),
+        (plan, "here: no dataset here .*Did you mean .*here/datasets/part_0[?]$"),
         (recording, "here: no dataset here .*Did you mean .*here/trajectory.h5[?]$"),
     ],
 )

@@ -1,0 +1,116 @@
+"""What is joined is whole before what it was joined from goes, whatever a power cut or a disk left of it."""
+
+import os
+import shutil
+
+import h5py
+import pytest
+from plan_stages import PLAN, assert_same, stages
+
+from robocas_ms3.errors import PlanError
+from robocas_ms3.plans.engines.local import LocalEngine
+from robocas_ms3.plans.run import run_plan
+
+
+def run(out):
+    return run_plan(PLAN, out, lambda plan, out: LocalEngine(plan, out, 1, stages=stages()), resume=True)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """The folder of a plan, all of whose units are done; nobody may change it."""
+    out = tmp_path_factory.mktemp("done") / "out"
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(ZeroDivisionError):
+        patch.setattr("robocas_ms3.plans.run.join", lambda *_, **__: 1 / 0)
+        run(out)
+    return out
+
+
+@pytest.fixture
+def out(done, tmp_path):
+    return shutil.copytree(done, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["demos/a/trajectory.h5", "datasets/robocas/conversion.json", "datasets/robocas/data_info.json", "report.json"],
+)
+def test_a_file_that_a_power_cut_left_empty_is_joined_again(undisturbed, out, name):
+    (out / name).parent.mkdir(parents=True, exist_ok=True)
+    (out / name).write_bytes(b"")
+    run(out)
+    assert_same(undisturbed, out)
+    assert not list((out / "units").rglob("seed_*"))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["demos/a/trajectory.h5", "demos/a/trajectory.json", "datasets/robocas/conversion.json"],
+)
+def test_what_was_cut_off_while_joining_is_joined_again(undisturbed, out, monkeypatch, name):
+    with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
+        patch.setattr("robocas_ms3.plans.join._report", lambda *_: {"x": 1})
+        patch.setattr("robocas_ms3.plans.join.flush_to_disk", lambda path: (out / "demos").exists() and 1 / 0)
+        run(out)
+    os.truncate(out / name, (out / name).stat().st_size // 2)
+    run(out)
+    assert_same(undisturbed, out)
+
+
+def test_a_report_that_is_damaged_after_all_is_deleted_is_made_again(undisturbed, tmp_path):
+    out = shutil.copytree(undisturbed, tmp_path / "out")
+    (out / "report.json").write_bytes(b"")
+    assert run(out)["episodes"] == 7
+    assert_same(undisturbed, out)
+
+
+def test_what_is_damaged_and_has_no_sources_any_more_is_an_error(undisturbed, tmp_path):
+    out = shutil.copytree(undisturbed, tmp_path / "out")
+    (out / "report.json").unlink()
+    os.truncate(out / "demos/b/trajectory.h5", 2000)
+    with pytest.raises(PlanError, match=r"demos/b/trajectory.h5: this is not whole, .* seed_0000000003.h5 is gone"):
+        run(out)
+
+
+def test_nothing_is_deleted_where_the_disk_does_not_keep_what_is_joined(out, monkeypatch):
+    def without_one(shards, path):
+        with h5py.File(path, "w"):
+            shutil.copy(shards[0].with_suffix(".json"), path.with_suffix(".json"))
+
+    before = {path for path in (out / "units").rglob("seed_*")}
+    monkeypatch.setattr("robocas_ms3.plans.join.merge", without_one)
+    with pytest.raises(PlanError, match="demos/a/trajectory.h5: this is not what was written .found other episodes"):
+        run(out)
+    assert before == {path for path in (out / "units").rglob("seed_*")}
+    assert not (out / "report.json").exists()
+
+
+def test_what_is_left_of_a_finished_plan_is_not_deleted_for_damaged_demonstrations(undisturbed, tmp_path, monkeypatch):
+    out = shutil.copytree(undisturbed, tmp_path / "out")
+    (out / "units" / "a" / "00000" / "seed_0000000010.h5").write_bytes(b"left")
+    os.truncate(out / "demos/a/trajectory.h5", 0)
+    with pytest.raises(PlanError, match="can't be joined again"):
+        run(out)
+    assert (out / "units" / "a" / "00000" / "seed_0000000010.h5").exists()
+
+
+def test_all_that_is_joined_is_on_the_disk_before_it_has_its_name(out, monkeypatch):
+    synced, named = set(), []
+    sync, replace = os.fsync, os.replace
+    monkeypatch.setattr("os.fsync", lambda fd: (synced.add(os.fstat(fd).st_ino), sync(fd)))
+
+    def note(old, new):
+        if os.path.isfile(old) and os.stat(old).st_ino in synced:
+            named.append(os.path.basename(new))
+        replace(old, new)
+
+    monkeypatch.setattr("os.replace", note)
+    run(out)
+    assert set(named) >= {"trajectory.h5", "trajectory.json", "conversion.json", "scene.json", "report.json"}
+
+
+def test_nothing_is_joined_twice(undisturbed, tmp_path):
+    out = shutil.copytree(undisturbed, tmp_path / "out")
+    said = []
+    run_plan(PLAN, out, lambda plan, out: LocalEngine(plan, out, 1, stages=stages()), resume=True, on_stage=said.append)
+    assert said == []
