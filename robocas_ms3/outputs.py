@@ -15,6 +15,7 @@ import logging
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
@@ -29,6 +30,7 @@ from robocas_ms3.files import empty_folder, is_fixed, make_folder
 # What the system says where there are none: of some network file systems, or of a lock server that is gone
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS})
 _log = logging.getLogger(__name__)
+_DYING = 0.5  # s that a killed process may hold a lock for: one that it was just starting has it too
 _INSIDE = ".lock"  # of a folder that can't have it beside it
 # What a plan's run has in its folder before it says what it is: one that was killed then leaves nothing else
 _BEFORE = (_INSIDE, ".driver.*", ".plan.*.tmp.json")
@@ -269,7 +271,7 @@ def lock_file(file: TextIOWrapper, path: Path, *, wait: bool) -> bool:
     Args:
         file: open for writing.
         path: what the lock is for.
-        wait: until nobody else holds it.
+        wait: until nobody else holds it; else half a second, since one that was killed may take a moment to be gone.
 
     Returns:
         Whether it is held.
@@ -277,10 +279,17 @@ def lock_file(file: TextIOWrapper, path: Path, *, wait: bool) -> bool:
     Raises:
         RobocasError: somebody else holds it; or it can't be had for a reason of the system's.
     """
+    until = time.monotonic() + _DYING
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError as error:
-        raise RobocasError("another process is writing here", where=path, fix="Wait until it is done.") from error
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+                break
+            except BlockingIOError as error:
+                if time.monotonic() > until:
+                    what, fix = "another process is writing here", "Wait until it is done."
+                    raise RobocasError(what, where=path, fix=fix) from error
+                time.sleep(0.02)
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             raise RobocasError("can't lock this folder", where=path, found=error.strerror) from error

@@ -3,6 +3,8 @@
 import errno
 import fcntl
 import os
+import threading
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -121,6 +123,14 @@ def test_one_lock_whatever_links_lead_to_a_folder(tmp_path):
         refused = pytest.raises(RobocasError, match="another process is writing here")
         with locked_folder(tmp_path / "disk"), refused, locked_folder(other):
             pass
+
+
+def test_a_lock_that_is_about_to_go_is_waited_for(tmp_path):
+    holding = ExitStack()
+    holding.enter_context(locked_folder(tmp_path / "out"))
+    threading.Timer(0.15, holding.close).start()
+    with locked_folder(tmp_path / "out") as held:
+        assert held
 
 
 @pytest.fixture

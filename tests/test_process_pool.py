@@ -305,6 +305,52 @@ def test_ctrl_c_ends_what_is_under_way_begins_nothing_and_prints_nothing(running
     assert len(list((tmp_path / "begun").iterdir())) == 2
 
 
+CLOSING = """
+import os, signal, sys, threading, time
+from robocas_ms3.processes import uninterrupted
+def other():
+    started.set()
+    time.sleep(60)
+started = threading.Event()
+threading.Thread(target=other, daemon=True).start()
+started.wait()
+try:
+    with uninterrupted():
+        os.kill(os.getpid(), signal.{name})  # the other thread gets it
+        time.sleep(0.3)
+        print("done", flush=True)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_what_must_not_be_interrupted_is_not_though_another_thread_gets_the_signal(name):
+    handler = "signal.signal(signal.SIGTERM, signal.default_int_handler)\n" if name == "SIGTERM" else ""
+    program = CLOSING.format(name=name).replace("started = ", handler + "started = ")
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    words = [sys.executable, "-c", program]
+    found = subprocess.run(words, env=env, capture_output=True, text=True, timeout=60, check=False)
+    assert (found.stdout.split(), found.stderr) == (["done", "interrupted"], "")
+
+
+def test_a_process_that_nobody_ended_does_not_keep_its_program(tmp_path):
+    (tmp_path / "begun").mkdir()
+    forgets = PROGRAM[: PROGRAM.index("        with Pool")] + FORGETS + PROGRAM[PROGRAM.index("    except") :]
+    (tmp_path / "program.py").write_text(forgets.replace("time.sleep(60)", "pass"))
+    with begin(tmp_path) as program:
+        try:
+            assert (program.communicate(timeout=60)[1], program.returncode) == ("", 0)
+        finally:
+            program.kill()
+
+
+FORGETS = """        from robocas_ms3.processes.child import Child
+        child = Child(partial(Calls, wait), 1.0)
+        child.do(0, 60)
+"""
+
+
 class TooLarge(Slow):
     def __init__(self):
         self.hog = bytearray(300 * 2**20)

@@ -7,9 +7,11 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from robocas_ms3.errors import PlanError
@@ -221,6 +223,7 @@ def _damaged(plan: Plan, out: Path, parts: Sequence[_Part]) -> dict[Unit, list[i
 
 def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_progress: OnProgress) -> None:
     under_way: dict[Future[list[Outcome]], Unit] = {}
+    done: SimpleQueue[Future[list[Outcome]]] = SimpleQueue()  # not `concurrent.futures.wait`: see `Pool`
     said = -math.inf
     while True:
         for part in parts:
@@ -229,7 +232,9 @@ def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_
                 if unit.is_done(plan, out):
                     part.take(unit, unit.result(plan, out), out)
                 else:
-                    under_way[engine.submit(unit)] = unit
+                    future = engine.submit(unit)
+                    under_way[future] = unit
+                    future.add_done_callback(done.put)
         pause = max(_LOOK, len(under_way) / _LOOKS)  # each look reads as many files
         if not under_way or time.monotonic() > said + pause:
             check_there(out / PLAN, PlanError)
@@ -239,9 +244,17 @@ def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_
             said = time.monotonic()
         if not under_way:
             return
-        for future in wait(under_way, _LOOK, FIRST_COMPLETED).done:
+        for future in _some_done(done):
             unit = under_way.pop(future)
             parts[unit.part].take(unit, future.result(), out)
+
+
+def _some_done(done: SimpleQueue[Future[Any]]) -> Iterator[Future[Any]]:
+    """What is done by now; waits a moment for the first."""
+    with suppress(Empty):
+        yield done.get(timeout=_LOOK)
+        while True:
+            yield done.get_nowait()
 
 
 def _counts(plan: Plan, out: Path, parts: Sequence[_Part], under_way: Mapping[Any, Unit]) -> list[int]:

@@ -8,6 +8,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
+from typing import Any
 
 import psutil
 
@@ -42,12 +44,35 @@ def leave_with(parent: int, look: Callable[[], object] = lambda: time.sleep(_LOO
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back for a moment."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    """Hold Ctrl-C back for a moment; processes that are started meanwhile inherit that."""
+    with _deferred():
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _deferred() -> Iterator[None]:
+    """Call what deals with Ctrl-C and SIGTERM afterwards, once.
+
+    A mask is not enough: the system gives the signal to another thread, of which Python tells the main one.
+    """
+    came: list[tuple[int, FrameType | None]] = []
+    held: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if callable(handler := signal.getsignal(number)):
+                held[number] = handler
+                signal.signal(number, lambda number, frame: came.append((number, frame)))
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in held.items():
+            signal.signal(number, handler)
+        if came:
+            held[came[0][0]](*came[0])
 
 
 def is_too_large(pid: int, memory_gb: float, *, forks: bool = True) -> bool:

@@ -15,8 +15,10 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from itertools import islice
+from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from robocas_ms3.errors import RobocasError
@@ -29,6 +31,7 @@ Result = TypeVar("Result")
 
 _AHEAD = 2  # tasks a process that are under way, so that none waits for the next
 _GRACE = 1.0  # s that processes have to leave in
+_LOOK = 1.0  # s between two looks whether a signal came
 _log = logging.getLogger(__name__)
 
 
@@ -83,15 +86,19 @@ class Pool(Generic[Task, Result]):
     def _do_elsewhere(self, tasks: Iterable[Task], in_order: bool) -> Generator[Result, None, None]:
         left = iter(tasks)
         under_way: list[Future[Result]] = []  # the first ones first
+        done: SimpleQueue[Future[Result]] = SimpleQueue()
         try:
             while True:
-                ahead = _AHEAD * self._processes - len(under_way)
-                under_way += [self._submit(task) for task in islice(left, ahead)]
+                for task in islice(left, _AHEAD * self._processes - len(under_way)):
+                    under_way.append(self._submit(task))
+                    under_way[-1].add_done_callback(done.put)
                 if not under_way:
                     return
-                done = under_way[0] if in_order else _any_done(under_way)
-                under_way.remove(done)
-                yield done.result()
+                found = under_way[0] if in_order else _next_done(done)
+                while not found.done():
+                    _next_done(done)
+                under_way.remove(found)
+                yield found.result()
         finally:
             for future in under_way:
                 future.cancel()
@@ -150,6 +157,12 @@ def _refuse(task: Any, why: str) -> Any:
     raise RobocasError(what, where=_named(task), found=why, fix=fix)
 
 
-def _any_done(under_way: list[Future[Any]]) -> Future[Any]:
-    done = wait(under_way, return_when=FIRST_COMPLETED).done
-    return next(future for future in under_way if future in done)
+def _next_done(done: SimpleQueue[Future[Any]]) -> Future[Any]:
+    """What is done next.
+
+    Not by `concurrent.futures.wait`: Ctrl-C at the wrong moment leaves its locks held for good. And with looks, since a
+    signal that another thread got wakes nobody here.
+    """
+    while True:
+        with suppress(Empty):
+            return done.get(timeout=_LOOK)

@@ -6,16 +6,20 @@ started it. So all are started by one thread, which lives as long as this proces
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import os
 import signal
 import sys
 import threading
+import weakref
 from concurrent.futures import Future
+from contextlib import suppress
 from queue import SimpleQueue
 from typing import Any
 
 _PR_SET_PDEATHSIG = 1
+_started: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 class _Starter:
@@ -41,6 +45,7 @@ def _start_all(asked: SimpleQueue[tuple[Any, set[Any], Future[None]]]) -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, held_back)
         try:
             process.start()
+            _started.add(process)
         except BaseException as error:  # noqa: BLE001  (it is raised where it was asked for)
             started.set_exception(error)
         else:
@@ -48,7 +53,16 @@ def _start_all(asked: SimpleQueue[tuple[Any, set[Any], Future[None]]]) -> None:
         del process, started  # else the last one would be kept
 
 
+@atexit.register
+def _kill_all() -> None:
+    """Before `multiprocessing` waits for what ignores its SIGTERM."""
+    for process in list(_started):
+        with suppress(ValueError):  # closed
+            process.kill()
+
+
 _starter = _Starter()
+os.register_at_fork(after_in_child=_started.clear)  # a fork's parent's are none of its own
 os.register_at_fork(after_in_child=_starter.__init__)  # a fork lacks the thread, and may have its lock held
 
 
