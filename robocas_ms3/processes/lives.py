@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Any
 
@@ -69,8 +69,9 @@ def _deferred() -> Iterator[None]:
     try:
         yield
     finally:
-        for number, handler in held.items():
-            signal.signal(number, handler)
+        with ExitStack() as restored:  # one that comes now interrupts this, but not what is restored after it
+            for number, handler in held.items():
+                restored.callback(signal.signal, number, handler)
         if came:
             held[came[0][0]](*came[0])
 
