@@ -109,6 +109,10 @@ class PolicyFailed(EvaluationError):
         super().__init__("a policy failed", found="; ".join(f"env {env}: {why}" for env, why in reasons.items()))
 
 
+class TrainingError(RobocasError):
+    """A baseline can't be trained: its configuration, its run, its checkpoint or what it learns from is wrong."""
+
+
 class PlanningFailed(RobocasError):
     """A scripted policy could not go on.
 

@@ -44,6 +44,7 @@ COMMANDS = (
     "assets",
     "layouts",
     "plan",
+    "train",
     "eval",
     "serve-policy",
 )

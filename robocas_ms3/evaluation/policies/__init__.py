@@ -1,6 +1,7 @@
 """Policies by name: builtin ones, those of installed packages, ``replay:DATASET``, ``module:Class``, ``ws://host:port``.
 
-A package offers policies as entry points of the group `GROUP`: see docs/extending.md.
+A package offers policies as entry points of the group `GROUP`: see docs/extending.md. Folders that hold a policy, such as
+the runs of `robocas train`, are opened by entry points of the group `FOLDERS_GROUP`, named by a file that is in them.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from robocas_ms3.extensions import Table
 from robocas_ms3.strict import nearest
 
 GROUP = "robocas_ms3.policies"
+FOLDERS_GROUP = "robocas_ms3.policy_folders"
 
 
 def _scripted(speaks: Literal["joint_positions", "robocas"]) -> Policy:
@@ -42,6 +44,8 @@ POLICIES: Table[Callable[[], Policy]] = Table(
     },
 )
 """By name, what makes them."""
+FOLDERS: Table[Callable[[Path], Policy]] = Table("kind of policy folder", FOLDERS_GROUP, Callable, {})
+"""By a file that such a folder holds, what opens it."""
 
 
 def make_policy(name: str) -> Policy:
@@ -49,7 +53,8 @@ def make_policy(name: str) -> Policy:
 
     Args:
         name: of a builtin one, or of one that a package brings; ``replay:TRAJECTORY.h5``; ``module:Class`` of your
-            own, called without arguments; or the address of a server (`remote.address.read_address`).
+            own, called without arguments; a folder of `robocas train`; or the address of a server
+            (`remote.address.read_address`).
 
     Raises:
         EvaluationError: there is no such policy, or it is none.
@@ -77,8 +82,8 @@ def check_policy(name: str) -> None:
     kind, _, rest = name.partition(":")
     known = [*POLICIES.builtin, *POLICIES.points]
     of_own = re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier()
-    if not (name in known or of_own or (kind in ("ws", "wss", "replay") and rest)):
-        expected = f"{', '.join(known)}, replay:TRAJECTORY.h5, module:Class or ws://host:port"
+    if not (name in known or of_own or _opener(name) or (kind in ("ws", "wss", "replay") and rest)):
+        expected = f"{', '.join(known)}, a folder of robocas train, replay:TRAJECTORY.h5, module:Class or ws://host:port"
         raise EvaluationError("no such policy", where=name, expected=expected, fix=nearest(name, known))
 
 
@@ -97,7 +102,15 @@ def _made(name: str) -> Policy:
         return ReplayPolicy(Path(rest))
     if name in POLICIES:
         return _call(name, POLICIES[name])
+    if opener := _opener(name):
+        return FOLDERS[opener](Path(name))
     return _own(name, kind, rest)
+
+
+def _opener(name: str) -> str:
+    """Which of `FOLDERS` opens a folder of this name; empty: none."""
+    folder = Path(name)
+    return next((file for file in FOLDERS.points if (folder / file).is_file()), "") if folder.is_dir() else ""
 
 
 def _own(name: str, module: str, of: str) -> Policy:

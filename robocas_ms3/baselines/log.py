@@ -1,0 +1,81 @@
+"""What a training says of itself: a CSV, the same for TensorBoard, and both cut back where a run goes on."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.baselines.runs import BOARD, METRICS
+from robocas_ms3.files import naming, replacing
+
+_FIRST = ("step", "split", "epoch", "seconds", "learning_rate")
+
+
+class MetricsLog:
+    """Appends lines to ``metrics.csv`` and events to ``tensorboard/``.
+
+    Args:
+        folder: of the run.
+        step: steps done before; lines after that are of a training that was broken off, and go.
+    """
+
+    def __init__(self, folder: Path, step: int) -> None:
+        from torch.utils.tensorboard.writer import SummaryWriter
+
+        self._path = folder / METRICS
+        self._columns: list[str] = []
+        self.seconds = 0.0
+        """Spent up to ``step`` by those before."""
+        if self._path.is_file():
+            self._cut(step)
+        self._board: Any = SummaryWriter(str(folder / BOARD), purge_step=step + 1 if step else None)
+
+    def add(self, step: int, split: str, about: Mapping[str, float], metrics: Mapping[str, float]) -> None:
+        """Write a line.
+
+        Args:
+            step: steps done.
+            split: ``train`` (means since the last line) or ``val``.
+            about: epoch, seconds and learning rate.
+            metrics: by name.
+        """
+        row = {"step": step, "split": split, **about, **metrics}
+        new = not self._columns
+        if new:
+            self._columns = [*_FIRST, *metrics]
+        with naming(self._path), self._path.open("a", newline="", encoding="utf-8") as file:
+            lines = csv.DictWriter(file, self._columns, extrasaction="ignore", lineterminator="\n")
+            if new:
+                lines.writeheader()
+            lines.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
+        for key, value in {**metrics, "learning_rate": about["learning_rate"]}.items():
+            if math.isfinite(value):
+                self._board.add_scalar(f"{split}/{key}", value, step)
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._board.close()
+
+    def _cut(self, step: int) -> None:
+        with self._path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        kept = [row for row in rows if _number(row.get("step")) <= step]
+        self._columns = list(rows[0]) if rows else []
+        if kept:
+            self.seconds = _number(kept[-1].get("seconds"), 0.0)
+        with replacing(self._path) as tmp, tmp.open("w", newline="", encoding="utf-8") as file:
+            lines = csv.DictWriter(file, self._columns, extrasaction="ignore", lineterminator="\n")
+            if self._columns:
+                lines.writeheader()
+            lines.writerows(kept)
+
+
+def _number(text: Any, missing: float = math.inf) -> float:
+    """A number of a line, which a kill may have cut off."""
+    try:
+        return float(text)
+    except (TypeError, ValueError):
+        return missing

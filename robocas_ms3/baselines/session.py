@@ -1,0 +1,172 @@
+"""A run from its beginning to its end, or on from where it was: what `robocas train` does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Samples
+from robocas_ms3.baselines.runs import RUN, DataRecord, RunRecord, hash_of, read_run, write_run
+from robocas_ms3.baselines.table import find_baseline
+from robocas_ms3.errors import DatasetError, OutputExistsError, TrainingError
+from robocas_ms3.files import make_folder
+from robocas_ms3.outputs import check_one_way, check_overwrite, check_run, claim_output, locked_folder
+from robocas_ms3.strict import parse
+
+_PACKAGES = ("robocas-ms3", "torch", "accelerate", "safetensors", "transformers", "numpy")
+
+
+@dataclass
+class Said:
+    """What to call as a training goes on.
+
+    Attributes:
+        note: a line for people.
+        step: steps done, and all.
+    """
+
+    note: Callable[[str], None] = field(default=lambda text: None)
+    step: Callable[[int, int], None] = field(default=lambda done, of: None)
+
+
+def train_run(
+    name: str,
+    data: Path,
+    out: Path,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    device: str = "auto",
+    resume: bool = False,
+    overwrite: bool = False,
+    said: Said | None = None,
+) -> RunRecord:
+    """Train a baseline.
+
+    Args:
+        name: of the baseline.
+        data: dataset.
+        out: folder of the run.
+        changes: of its configuration, nested as that is; for a run that goes on they may be left out.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        resume: whether to go on with a run that is there.
+        overwrite: whether to replace one.
+        said: what to call meanwhile.
+
+    Raises:
+        TrainingError: the configuration is wrong, or the run that is there is of something else.
+        DatasetError: the data does not suit the baseline.
+        OutputExistsError: there is something.
+        KeyboardInterrupt: Ctrl-C; ``resume`` goes on.
+    """
+    check_one_way("train", resume=resume, overwrite=overwrite, error=TrainingError)
+    baseline, said = find_baseline(name), said or Said()
+    before = read_run(out) if resume and (out / RUN).is_file() else None
+    config = _config(baseline, changes, before, out)
+    check_run(out / RUN, "baseline", "train")
+    from robocas_ms3.baselines.train import Trainer, make_accelerator
+
+    accelerator = make_accelerator(device, config.train.precision)
+    with ExitStack() as stack:
+        if accelerator.is_main_process:
+            stack.enter_context(locked_folder(out))
+            if overwrite:
+                check_overwrite(out, [RUN], "a run of robocas train")
+            claim_output(out, overwrite=overwrite and before is None, resume=resume)
+        hashed = hash_of(data)
+        if before is not None:
+            _check_same(before, baseline, hashed, out)
+        said.note(f"reading {data}")
+        samples = baseline.data(config, data, "train")
+        check = _validation(baseline, config, data, said)
+        record = before or RunRecord(
+            baseline=name,
+            version=baseline.version,
+            config=config.model_dump(mode="json"),
+            facts=samples.facts,
+            data=DataRecord(name=data.name, hash=hashed, episodes=samples.episodes, samples=len(samples)),
+            versions=_versions(),
+            device=str(accelerator.device.type),
+            precision=str(accelerator.mixed_precision),
+        )
+        trainer = Trainer(
+            baseline, config, samples, check, out, record, accelerator, resume=resume, on_note=said.note
+        )
+        if accelerator.is_main_process and before is None:
+            make_folder(out)
+            write_run(out, record)
+        accelerator.wait_for_everyone()
+        count = sum(parameter.numel() for parameter in trainer.parameters())
+        said.note(
+            f"{name}: {count / 1e6:.2f} M parameters, {len(samples)} samples of {samples.episodes} episodes, "
+            f"{accelerator.device.type}, {'bf16' if accelerator.mixed_precision == 'bf16' else 'fp32'}"
+        )
+        trainer.train(said.step)
+    return record
+
+
+def _config(
+    baseline: Baseline, changes: Mapping[str, Any] | None, before: RunRecord | None, out: Path
+) -> BaselineConfig:
+    if before is None:
+        return parse(baseline.Config, dict(changes or {}), TrainingError, where=baseline.name, about="no configuration")
+    if before.baseline != baseline.name:
+        raise TrainingError("a run of another baseline", where=out, expected=baseline.name, found=before.baseline)
+    config = parse(baseline.Config, before.config, TrainingError, where=out / RUN)
+    if changes:
+        wanted = parse(baseline.Config, merged(before.config, changes), TrainingError, where=baseline.name)
+        if wanted != config:
+            fix = "Leave these options out, or train anew with --overwrite."
+            raise TrainingError("a run goes on as it was begun", where=out, fix=fix)
+    return config
+
+
+def _check_same(before: RunRecord, baseline: Baseline, hashed: str, out: Path) -> None:
+    if before.version != baseline.version:
+        raise TrainingError(
+            f"a run of another version of {baseline.name}",
+            where=out,
+            expected=baseline.version,
+            found=before.version,
+            fix="Train anew with --overwrite.",
+        )
+    if before.data.hash != hashed:
+        raise TrainingError(
+            "a run on another dataset",
+            where=out,
+            expected=f"{before.data.name}, {before.data.hash[:12]}",
+            found=hashed[:12],
+            fix="Name that one by --data, or choose another --out.",
+        )
+
+
+def _validation(baseline: Baseline, config: BaselineConfig, data: Path, said: Said) -> Samples | None:
+    try:
+        return baseline.data(config, data, "val")
+    except DatasetError as error:
+        if "split" not in error.what:
+            raise
+        said.note("no episodes to validate with: there are too few")
+        return None
+
+
+def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested mappings, the second one's values first."""
+    result = dict(below)
+    for key, value in above.items():
+        inner = result.get(key)
+        result[key] = merged(inner, value) if isinstance(inner, Mapping) and isinstance(value, Mapping) else value
+    return result
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found

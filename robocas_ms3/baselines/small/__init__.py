@@ -1,0 +1,35 @@
+"""`small`: our own visuomotor policy, made to be trained on two processor cores."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from robocas_ms3.baselines.chunk_policy import ChunkPolicy
+from robocas_ms3.baselines.small.config import SmallConfig
+from robocas_ms3.baselines.small.data import SmallSamples
+from robocas_ms3.baselines.small.model import SmallModel
+from robocas_ms3.baselines.small.policy import make_policy
+
+
+class Small:
+    """See `Baseline`."""
+
+    name, version = "small", 1
+    about = "base and gripper camera, language; chunks of poses by a small transformer"
+    Config = SmallConfig
+
+    def data(self, config: SmallConfig, folder: Path, split: Literal["train", "val"]) -> SmallSamples:
+        """Samples of a dataset with pictures and embeddings."""
+        return SmallSamples(config, folder, split)
+
+    def model(self, config: SmallConfig, facts: dict[str, Any]) -> SmallModel:
+        """The network."""
+        return SmallModel(config, facts)
+
+    def policy(self, config: SmallConfig, facts: dict[str, Any], model: SmallModel) -> ChunkPolicy:
+        """What acts by it."""
+        return make_policy(config, facts, model)
+
+
+BASELINE = Small()

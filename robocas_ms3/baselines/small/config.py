@@ -1,0 +1,67 @@
+"""How the `small` baseline sees, thinks and is trained."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
+from robocas_ms3.strict import StrictModel
+
+
+class View(StrictModel):
+    """What is taken of a camera's pictures.
+
+    Attributes:
+        rendered: width and height of the pictures that are asked for, in pixels.
+        part: left, top, right, bottom of the part that is looked at, in shares of the picture.
+        size: width and height that this part is scaled to, in pixels; multiples of 16.
+    """
+
+    rendered: tuple[int, int] = (256, 192)
+    part: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    size: tuple[int, int] = (128, 96)
+
+    def box(self) -> tuple[int, int, int, int]:
+        """Left, top, right, bottom of the part in pixels."""
+        width, height = self.rendered
+        left, top, right, bottom = self.part
+        return round(left * width), round(top * height), round(right * width), round(bottom * height)
+
+
+class SmallConfig(BaselineConfig):
+    """Configuration of `small`.
+
+    Attributes:
+        views: by camera. The base camera sees the room from behind the arm: what can be reached lies in the lower
+            middle of its picture.
+        language: whether it is told what to do.
+        chunk: steps it predicts, at the dataset's rate.
+        channels: of the first feature maps.
+        width: of the transformer.
+        heads, layers: of the transformer.
+        dropout: of the transformer.
+        keys_weight: weight of the loss of where the gripper will close or open next, beside that of the chunk.
+        gripper_weight: weight of the loss of the gripper's commands.
+        shift: pixels that pictures are shifted by at most, at random, in training.
+        brightness: share that brightness and contrast change by at most, at random, in training.
+        fade: how fast older predictions lose weight when it acts, see `ChunkPolicy`.
+        train: see `TrainSettings`.
+    """
+
+    views: dict[str, View] = {
+        "base_camera": View(part=(0.17, 0.5, 0.8, 1.0), size=(160, 96)),
+        "gripper_camera": View(),
+    }
+    language: bool = True
+    chunk: int = Field(8, ge=1)
+    channels: int = Field(32, ge=8, multiple_of=8)
+    width: int = Field(128, ge=8)
+    heads: int = Field(4, ge=1)
+    layers: int = Field(3, ge=1)
+    dropout: float = Field(0.1, ge=0, lt=1)
+    keys_weight: float = Field(0.5, ge=0)
+    gripper_weight: float = Field(0.5, ge=0)
+    shift: int = Field(3, ge=0)
+    brightness: float = Field(0.2, ge=0, lt=1)
+    fade: float = Field(0.5, ge=0)
+    train: TrainSettings = TrainSettings(steps=16_000, batch_size=96, learning_rate=6e-4, weight_decay=0.01)

@@ -1,0 +1,141 @@
+"""A dataset's pictures, decoded once and kept in memory, with the poses that the network is to predict."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from robocas_ms3.baselines.baseline import Batch
+from robocas_ms3.baselines.chunks import encode, next_keys, spread
+from robocas_ms3.baselines.small.config import SmallConfig, View
+from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.sources.protocol import EpisodeSource
+from robocas_ms3.datasets.training.sample_arrays import check_holds
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.poses import from_xyzw
+
+_KEYS = ("ee_pos", "ee_orn", "gripper_width", "gripper_status")
+
+
+class SmallSamples:
+    """Samples of `small`, one of every step.
+
+    Args:
+        config: what is looked at and predicted.
+        path: of the dataset.
+        split: of it.
+        on_episode: called with the number of episodes after each that was read.
+
+    Raises:
+        DatasetError: the dataset lacks a camera or embeddings, is damaged, or its pictures are smaller than asked for.
+    """
+
+    def __init__(
+        self,
+        config: SmallConfig,
+        path: Path,
+        split: Literal["train", "val"],
+        on_episode: Callable[[int], None] = lambda count: None,
+    ) -> None:
+        source = open_source(path)
+        check_holds(source, list(config.views), depth=False, embedding=config.language)
+        numbers = source.split(split)
+        self.episodes = len(numbers)
+        if not numbers:
+            fix = "Add episodes: a tenth of them validates."
+            raise DatasetError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
+        first = np.concatenate([[0], np.cumsum([source.lengths[number] for number in numbers])])
+        count = int(first[-1])
+        self._pictures = {
+            camera: torch.empty((count, view.size[1], view.size[0], 3), dtype=torch.uint8)
+            for camera, view in config.views.items()
+        }
+        self._state = torch.empty((count, 10))
+        self._chunks = torch.empty((count, config.chunk, 10))
+        self._keys = torch.empty((count, 9))
+        self._words = torch.zeros((len(numbers), 384))
+        self._episode = torch.from_numpy(np.repeat(np.arange(len(numbers)), np.diff(first)))
+
+        def read(place: int) -> None:
+            self._read(config, source, numbers[place], place, int(first[place]))
+
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            for _ in pool.map(read, range(len(numbers))):
+                on_episode(len(numbers))
+        self.facts: dict[str, Any] = {
+            "rate_hz": source.rate_hz,
+            "chunk": spread(self._chunks[..., :9].numpy()),
+            "keys": spread(self._keys.numpy()),
+        }
+
+    def __len__(self) -> int:
+        return len(self._state)
+
+    def __getitems__(self, indices: list[int]) -> Batch:
+        """A batch: pictures by camera, ``state``, ``words``, and what is to be predicted: ``chunk``, ``key``."""
+        rows = torch.tensor(indices)
+        return {
+            **{camera: pictures[rows] for camera, pictures in self._pictures.items()},
+            "state": self._state[rows],
+            "words": self._words[self._episode[rows]],
+            "chunk": self._chunks[rows],
+            "key": self._keys[rows],
+        }
+
+    def _read(self, config: SmallConfig, source: EpisodeSource, number: int, place: int, first: int) -> None:
+        episode = source.episode(number)
+        arrays = episode.read([*_KEYS, *(["language_embedding"] if config.language else [])])
+        length = source.lengths[number]
+        for key, array in arrays.items():
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                fix = "robocas validate says more."
+                raise DatasetError("not a number", where=f"{source.root}, episode {number}, {key}", fix=fix)
+        poses = from_xyzw(arrays["ee_pos"].astype(np.float64), arrays["ee_orn"].astype(np.float64))
+        opened, rows = arrays["gripper_status"].reshape(-1), slice(first, first + length)
+        self._state[rows] = torch.from_numpy(state_of(poses, arrays["gripper_width"].reshape(-1)))
+        self._chunks[rows] = torch.from_numpy(encode(poses, opened, config.chunk))
+        self._keys[rows] = torch.from_numpy(next_keys(poses, opened))
+        if config.language:
+            self._words[place] = torch.from_numpy(arrays["language_embedding"])
+        for camera, view in config.views.items():
+            with closing(episode.frames(camera, "rgb", 0, length)) as pictures:
+                for row, picture in enumerate(pictures, start=first):
+                    self._pictures[camera][row] = torch.from_numpy(looked_at(picture, view, source.root))
+
+
+def state_of(poses: NDArray[np.floating], widths: NDArray[np.floating]) -> NDArray[np.float32]:
+    """(N, 10) of poses (N, 4, 4) of the TCP in the arm's base and gripper widths (N,), in m: what the arm feels."""
+    turns = poses[:, :3, :2].swapaxes(1, 2).reshape(len(poses), 6)
+    return np.concatenate([poses[:, :3, 3], turns, widths[:, None] / 0.08], axis=1).astype(np.float32)
+
+
+def looked_at(picture: NDArray[np.uint8], view: View, where: object = "") -> NDArray[np.uint8]:
+    """The part (h, w, 3) of a picture (H, W, 3) that is looked at, scaled by areas.
+
+    Raises:
+        DatasetError: the picture is smaller than the view wants it, or of another shape.
+    """
+    width, height = view.rendered
+    if picture.shape[1::-1] != (width, height):
+        if picture.shape[1] * height != picture.shape[0] * width or picture.shape[1] < width:
+            fix = f"robocas convert --size {width} {height}, or change views."
+            found = f"{picture.shape[1]} x {picture.shape[0]}"
+            raise DatasetError(
+                "pictures of another size", where=where, expected=f"{width} x {height}", found=found, fix=fix
+            )
+        picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+    left, top, right, bottom = view.box()
+    part = picture[top:bottom, left:right]
+    smaller = part.shape[1] >= view.size[0]
+    return np.ascontiguousarray(
+        cv2.resize(part, view.size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+    )

@@ -1,0 +1,141 @@
+"""The network of `small`: a convolutional net a camera, and a transformer that asks them what it needs to know.
+
+Feature maps at a sixteenth of the pictures' size are what its queries look at: one query a step of the chunk, one for the
+next key pose. Language and the arm's state are part of what is looked at; language also tells the nets what
+to look for, by a scale and shift of each channel (FiLM, Perez et al. 2018).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from robocas_ms3.baselines.baseline import Batch
+from robocas_ms3.baselines.chunks import ROW, Scale
+from robocas_ms3.baselines.small.config import SmallConfig, View
+
+_WORDS, _STATE = 384, 10
+
+
+class Block(nn.Module):
+    """A residual block (He et al. 2016) whose channels language scales and shifts."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, words: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
+        self.second = nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False)
+        self.norms = nn.ModuleList([nn.GroupNorm(8, outputs), nn.GroupNorm(8, outputs)])
+        self.short = nn.Identity() if stride == 1 and inputs == outputs else nn.Conv2d(inputs, outputs, 1, stride)
+        self.film = nn.Linear(words, 2 * outputs)
+        nn.init.zeros_(self.film.weight)
+        nn.init.zeros_(self.film.bias)
+
+    def forward(self, seen: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
+        """(B, C, h, w) of (B, c, H, W) and words (B, W)."""
+        inner = self.norms[1](self.second(F.relu(self.norms[0](self.first(seen)))))
+        scale, shift = self.film(words)[:, :, None, None].chunk(2, dim=1)
+        return F.relu(inner * (1 + scale) + shift + self.short(seen))
+
+
+class Eye(nn.Module):
+    """Tokens of a camera's pictures."""
+
+    def __init__(self, view: View, channels: int, width: int, words: int) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(3, channels, 4, 4)
+        self.norm = nn.GroupNorm(8, channels)
+        self.blocks = nn.ModuleList(
+            [
+                Block(channels, channels, 1, words),
+                Block(channels, 2 * channels, 2, words),
+                Block(2 * channels, 4 * channels, 2, words),
+            ]
+        )
+        self.project = nn.Conv2d(4 * channels, width, 1)
+        self.places = nn.Parameter(torch.randn(view.size[0] * view.size[1] // 256, width) * 0.2)
+
+    def forward(self, pictures: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
+        """(B, h w / 256, width) of pictures (B, 3, h, w) around 0."""
+        seen = F.relu(self.norm(self.stem(pictures)))
+        for block in self.blocks:
+            seen = block(seen, words)
+        return self.project(seen).flatten(2).transpose(1, 2) + self.places
+
+
+class SmallModel(nn.Module):
+    """See the module; predicts chunks (B, K, 10) and key poses (B, 9)."""
+
+    def __init__(self, config: SmallConfig, facts: dict[str, Any]) -> None:
+        super().__init__()
+        self.config, width = config, config.width
+        self.chunk_scale, self.key_scale = Scale(**facts["chunk"]), Scale(**facts["keys"])
+        self.words = nn.Sequential(nn.Linear(_WORDS, width), nn.ReLU(), nn.Dropout(config.dropout))
+        self.state = nn.Sequential(nn.Linear(_STATE, width), nn.ReLU(), nn.Linear(width, width))
+        self.eyes = nn.ModuleDict(
+            {camera: Eye(view, config.channels, width, width) for camera, view in config.views.items()}
+        )
+        self.queries = nn.Parameter(torch.randn(config.chunk + 1, width) * 0.2)
+        layer = nn.TransformerDecoderLayer(
+            width, config.heads, 4 * width, config.dropout, batch_first=True, norm_first=True
+        )
+        self.decoder = nn.TransformerDecoder(layer, config.layers, nn.LayerNorm(width))
+        self.out, self.key_out = nn.Linear(width, ROW), nn.Linear(width, 9)
+
+    def predict(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
+        """Chunks (B, K, 10), normalised but for the logits of the commands, and normalised key poses (B, 9)."""
+        words = self.words(batch["words"])
+        state = self.state(batch["state"])
+        seen = [eye(self._picture(batch[camera]), words) for camera, eye in self.eyes.items()]
+        memory = torch.cat([*seen, words[:, None], state[:, None]], dim=1)
+        queries = self.queries + (words + state)[:, None]
+        thought = self.decoder(queries, memory)
+        return self.out(thought[:, :-1]).float(), self.key_out(thought[:, -1]).float()
+
+    def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """Losses: L1 of normalised poses, cross entropy of the commands."""
+        chunk, key = self.predict(batch)
+        wanted = self.chunk_scale(batch["chunk"][..., :9])
+        motion = F.l1_loss(chunk[..., :9], wanted)
+        gripper = F.binary_cross_entropy_with_logits(chunk[..., 9], batch["chunk"][..., 9])
+        keys = F.l1_loss(key, self.key_scale(batch["key"]))
+        with torch.no_grad():
+            off = (self.key_scale.back(key) - batch["key"])[:, :3].norm(dim=1).mean()
+            ahead = (self.chunk_scale.back(chunk[..., :9]) - batch["chunk"][..., :9])[..., :3].norm(dim=-1)
+        return {
+            "loss": motion + self.config.gripper_weight * gripper + self.config.keys_weight * keys,
+            "motion": motion,
+            "gripper": gripper,
+            "keys": keys,
+            "key_mm": 1000 * off,
+            "first_mm": 1000 * ahead[:, 0].mean(),
+            "last_mm": 1000 * ahead[:, -1].mean(),
+        }
+
+    def act(self, batch: Batch) -> torch.Tensor:
+        """(B, K, 10) chunks: poses as they are, commands as shares, 1 = open."""
+        chunk, _ = self.predict(batch)
+        return torch.cat([self.chunk_scale.back(chunk[..., :9]), chunk[..., 9:].sigmoid()], dim=-1)
+
+    def _picture(self, pictures: torch.Tensor) -> torch.Tensor:
+        """(B, 3, h, w) around 0 of (B, h, w, 3) uint8; in training shifted and in another light, each its own way."""
+        if self.training and self.config.shift:
+            pictures = shifted(pictures, self.config.shift)
+        seen = pictures.permute(0, 3, 1, 2).contiguous().float() / 127.5 - 1  # norms are slow where channels are last
+        if self.training and self.config.brightness:
+            amount = self.config.brightness * (2 * torch.rand(2, len(seen), 1, 1, 1, device=seen.device) - 1)
+            seen = seen * (1 + amount[0]) + amount[1]
+        return seen
+
+
+def shifted(pictures: torch.Tensor, most: int) -> torch.Tensor:
+    """Pictures (B, h, w, C) shifted by up to ``most`` pixels each way, each its own way; edges go on outwards."""
+    count, height, width, _ = pictures.shape
+    device = pictures.device
+    by = torch.randint(-most, most + 1, (2, count, 1), device=device)
+    rows = (by[0] + torch.arange(height, device=device)).clamp(0, height - 1)  # (B, h)
+    columns = (by[1] + torch.arange(width, device=device)).clamp(0, width - 1)
+    picked = torch.arange(count, device=device)[:, None, None]
+    return pictures[picked, rows[:, :, None], columns[:, None, :]]

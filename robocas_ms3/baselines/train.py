@@ -1,0 +1,274 @@
+"""The trainer: any baseline, on a processor, a GPU or several (``accelerate launch``), and on from where it was."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+from accelerate.utils import DataLoaderConfiguration, send_to_device
+from torch.optim.swa_utils import AveragedModel
+from torch.utils.data import DataLoader
+
+from robocas_ms3.baselines import checkpoints
+from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Batch, Precision, Samples
+from robocas_ms3.baselines.log import MetricsLog
+from robocas_ms3.baselines.runs import CHECKPOINT, WEIGHTS, RunRecord
+from robocas_ms3.baselines.schedule import Batches, epochs_at, learning_rate
+from robocas_ms3.errors import TrainingError
+from robocas_ms3.outputs import check_there
+from robocas_ms3.processes.lives import uninterrupted
+
+_BETAS = (0.9, 0.95)
+
+
+class Trainer:
+    """Trains a model, and writes checkpoints, weights and metrics into its run's folder.
+
+    Args:
+        baseline: what is trained.
+        config: its configuration.
+        samples: of training.
+        check: of validation; None: there is none.
+        folder: of the run, with its ``run.json``.
+        record: that.
+        accelerator: see `make_accelerator`.
+        resume: whether to go on from the folder's checkpoint, if it has one.
+        on_note: called with a line when there is something to say.
+    """
+
+    def __init__(
+        self,
+        baseline: Baseline,
+        config: BaselineConfig,
+        samples: Samples,
+        check: Samples | None,
+        folder: Path,
+        record: RunRecord,
+        accelerator: Accelerator,
+        *,
+        resume: bool = False,
+        on_note: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        self.settings, self._samples, self._check = config.train, samples, check
+        self._folder, self._note, self._accelerator = folder, on_note, accelerator
+        self._about = {"baseline": record.baseline, "version": str(record.version), "dataset": record.data.hash}
+        torch.manual_seed(self.settings.seed)
+        model = baseline.model(config, record.facts).to(accelerator.device)
+        self._average = AveragedModel(model, multi_avg_fn=self._mix) if self.settings.ema else None
+        optimizer = torch.optim.AdamW(_groups(model, self.settings.weight_decay), lr=1.0, betas=_BETAS)
+        self.step = 0
+        self._sums: dict[str, torch.Tensor] = {}
+        if resume and (folder / CHECKPOINT).is_file():
+            self._go_on(model, optimizer)
+        else:
+            torch.manual_seed(self.settings.seed + 1 + accelerator.process_index)
+        self._bare = model
+        self._model, self._optimizer = accelerator.prepare(model, optimizer)
+
+    def train(self, on_step: Callable[[int, int], None] = lambda done, of: None) -> None:
+        """Take all steps that are left.
+
+        Args:
+            on_step: called with the steps done and all steps.
+
+        Raises:
+            TrainingError: the loss is no number any more, or somebody removed the folder.
+            KeyboardInterrupt: Ctrl-C; what was done is kept.
+        """
+        settings = self.settings
+        log = MetricsLog(self._folder, self.step) if self._accelerator.is_main_process else None
+        begun = time.monotonic() - (log.seconds if log else 0.0)
+        on_step(self.step, settings.steps)
+        saved = self.step
+        try:
+            for batch in self._batches():
+                with uninterrupted():
+                    self._take(batch)
+                on_step(self.step, settings.steps)
+                last = self.step == settings.steps
+                if last or self.step % settings.log_every == 0:
+                    self._tell(log, "train", self._means(), time.monotonic() - begun)
+                if self._check is not None and (last or self.step % settings.check_every == 0):
+                    self._tell(log, "val", self._checked(self._check), time.monotonic() - begun)
+                if last or self.step % settings.save_every == 0:
+                    self._save()
+                    saved = self.step
+        except KeyboardInterrupt:
+            if self.step > saved:
+                self._save()
+            raise
+        finally:
+            if log:
+                log.close()
+
+    def parameters(self) -> Iterator[torch.nn.Parameter]:
+        """Of the network."""
+        return self._bare.parameters()
+
+    def _batches(self) -> Iterator[Batch]:
+        accelerator = self._accelerator
+        part = (accelerator.process_index, accelerator.num_processes)
+        batches = Batches(len(self._samples), self.settings, self.step, part)
+        loader = _loader(self._samples, batches, self.settings.workers)
+        for batch in loader:
+            yield send_to_device(batch, accelerator.device, non_blocking=True)
+
+    def _take(self, batch: Batch) -> None:
+        rate = learning_rate(self.step, len(self._samples), self.settings)
+        for group in self._optimizer.param_groups:
+            group["lr"] = rate
+        self._model.train()
+        with self._accelerator.autocast():
+            found = self._model(batch)
+        self._accelerator.backward(found["loss"])
+        if self.settings.clip_norm:
+            self._accelerator.clip_grad_norm_(self._model.parameters(), self.settings.clip_norm)
+        self._optimizer.step()
+        self._optimizer.zero_grad()
+        self.step += 1
+        if self._average is not None:
+            self._average.update_parameters(self._bare)
+        for name, value in found.items():
+            value = value.detach().double()
+            self._sums[name] = self._sums[name] + value if name in self._sums else value
+        count = self._sums.get("", torch.zeros((), dtype=torch.float64))
+        self._sums[""] = count + 1
+
+    def _mix(self, average: Any, now: Any, _: Any) -> None:
+        """Move an average of the weights on: fast at first, as it begins with what is random."""
+        decay = min(self.settings.ema, (self.step + 1) / (self.step + 10))
+        torch._foreach_lerp_(average, now, 1 - decay)
+
+    def _means(self) -> dict[str, float]:
+        count = float(self._sums.pop("", torch.ones(())))
+        means = {name: float(value) / count for name, value in self._sums.items()}
+        self._sums = {}
+        if not math.isfinite(means["loss"]):
+            raise TrainingError(
+                "the loss is no number any more",
+                where=f"{self._folder}, step {self.step}",
+                fix="Lower train.learning_rate; --resume goes on from the last checkpoint.",
+            )
+        return means
+
+    @torch.no_grad()
+    def _checked(self, samples: Samples) -> dict[str, float]:
+        """Means of the validation split, of the average of the weights; changes nothing of what is to come."""
+        model = (self._average.module if self._average is not None else self._bare).eval()
+        count = min(len(samples), self.settings.check_samples)
+        places = torch.linspace(0, len(samples) - 1, count).long().tolist()
+        sums: dict[str, float] = {}
+        size = self.settings.batch_size
+        with torch.random.fork_rng(), self._accelerator.autocast():
+            torch.manual_seed(self.settings.seed)
+            for first in range(0, count, size):
+                chosen = places[first : first + size]
+                batch = send_to_device(samples.__getitems__(chosen), self._accelerator.device)
+                for name, value in model(batch).items():
+                    sums[name] = sums.get(name, 0.0) + float(value) * len(chosen) / count
+        return sums
+
+    def _tell(self, log: MetricsLog | None, split: str, metrics: dict[str, float], seconds: float) -> None:
+        if log is None:
+            return
+        check_there(self._folder / "run.json", TrainingError)
+        about = {
+            "epoch": epochs_at(self.step, len(self._samples), self.settings),
+            "seconds": seconds,
+            "learning_rate": learning_rate(self.step - 1, len(self._samples), self.settings),
+        }
+        log.add(self.step, split, about, metrics)
+        if split == "val":
+            said = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
+            self._note(f"step {self.step}, epoch {about['epoch']:.1f}, validation: {said}")
+
+    def _save(self) -> None:
+        if any(not torch.isfinite(value) for value in self._sums.values()):
+            return  # the next line of the log ends the run, and the last good checkpoint stays
+        tensors = {f"model.{name}": value for name, value in self._bare.state_dict().items()}
+        if self._average is not None:
+            tensors |= {f"average.{name}": value for name, value in self._average.state_dict().items()}
+        optimizer = checkpoints.optimizer_tensors(self._optimizer)
+        tensors |= {f"optimizer.{name}": value for name, value in optimizer.items()}
+        tensors |= {f"sums.{name}": value for name, value in self._sums.items()}
+        tensors["random.cpu"] = torch.get_rng_state()
+        if self._accelerator.device.type == "cuda":
+            tensors["random.cuda"] = torch.cuda.get_rng_state()
+        if not self._accelerator.is_main_process:
+            return
+        check_there(self._folder / "run.json", TrainingError)
+        with uninterrupted():
+            checkpoints.save(self._folder / CHECKPOINT, tensors, {**self._about, "step": str(self.step)})
+            acting = self._average.module if self._average is not None else self._bare
+            checkpoints.save(self._folder / WEIGHTS, acting.state_dict(), {**self._about, "step": str(self.step)})
+
+    def _go_on(self, model: torch.nn.Module, optimizer: torch.optim.Optimizer) -> None:
+        path = self._folder / CHECKPOINT
+        tensors, about = checkpoints.load(path, self._about)
+        checkpoints.put_in(model, checkpoints.part(tensors, "model."), path)
+        if self._average is not None:
+            checkpoints.put_in(self._average, checkpoints.part(tensors, "average."), path)
+        checkpoints.put_in_optimizer(optimizer, checkpoints.part(tensors, "optimizer."))
+        device = self._accelerator.device
+        self._sums = {k: v.to(device if k else "cpu") for k, v in checkpoints.part(tensors, "sums.").items()}
+        torch.set_rng_state(tensors["random.cpu"])
+        if "random.cuda" in tensors and device.type == "cuda":
+            torch.cuda.set_rng_state(tensors["random.cuda"])
+        self.step = int(about["step"])
+
+
+def make_accelerator(device: str, precision: Precision) -> Accelerator:
+    """What a run computes on.
+
+    Args:
+        device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``.
+        precision: see `TrainSettings`.
+
+    Raises:
+        TrainingError: there is no GPU.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise TrainingError("there is no GPU that torch can use", where="--device", found="cuda", fix="--device cpu")
+    cpu = device == "cpu" or not torch.cuda.is_available()
+    if precision == "auto":
+        precision = "bf16" if (_cpu_has_bf16() if cpu else torch.cuda.is_bf16_supported()) else "fp32"
+    return Accelerator(
+        cpu=cpu,
+        mixed_precision="bf16" if precision == "bf16" else "no",
+        dataloader_config=DataLoaderConfiguration(dispatch_batches=False),
+    )
+
+
+def _cpu_has_bf16() -> bool:
+    """Whether the processor multiplies bf16 by itself; where it does not, bf16 is slower than fp32."""
+    cpu: Any = torch.cpu
+    return any(getattr(cpu, name, bool)() for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"))
+
+
+def _loader(samples: Any, batches: Batches, workers: int) -> DataLoader:
+    return DataLoader(
+        samples,
+        batch_sampler=batches,
+        collate_fn=_as_it_is,
+        num_workers=workers,
+        persistent_workers=workers > 0,
+        multiprocessing_context="forkserver" if workers else None,
+    )
+
+
+def _as_it_is(batch: Batch) -> Batch:
+    return batch
+
+
+def _groups(model: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
+    """Parameters with weight decay, matrices and kernels, and those without."""
+    parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    return [
+        {"params": [one for one in parameters if one.ndim > 1], "weight_decay": decay},
+        {"params": [one for one in parameters if one.ndim <= 1], "weight_decay": 0.0},
+    ]

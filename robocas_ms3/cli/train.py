@@ -1,0 +1,120 @@
+"""``robocas train``: train a baseline on demonstrations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from robocas_ms3.cli.options import Maybe, Several
+
+
+@dataclass
+class Train:
+    """Train a baseline on a dataset of `robocas convert`, for `robocas eval TASK --policy RUN`.
+
+    - small: base and gripper camera, language; made for two processor cores
+    - bc-state: what only a simulator knows, from the trajectory.h5 of `robocas generate`
+    - rt1: the paper's RT-1
+
+    docs/baselines.md says what they are, what they cost and what they reach. Several GPUs:
+    `accelerate launch -m robocas_ms3.cli.main train ...`.
+    """
+
+    baseline: Annotated[str, tyro.conf.Positional] = "small"
+    """Which: small, bc-state, rt1, or another package's."""
+    data: Maybe[Path] = None
+    """Folder of a dataset, or a trajectory.h5. Needed."""
+    out: Maybe[Path] = None
+    """Folder of the run. Default: runs/BASELINE-DATA."""
+    config: Maybe[Path] = None
+    """YAML file of what differs from the baseline's defaults."""
+    set: Annotated[Several[str], tyro.conf.UseAppendAction] = ()
+    """A value of the configuration, such as `--set chunk=4` or `--set train.learning_rate=3e-4`; may be given again."""
+    steps: Maybe[int] = None
+    """Steps of the optimiser; train.steps of the configuration."""
+    batch_size: Maybe[int] = None
+    """Samples a step; train.batch_size."""
+    seed: Maybe[int] = None
+    """Of everything random; train.seed."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where it computes. Auto: a GPU if there is one."""
+    resume: bool = False
+    """Go on with a run that was interrupted, as if it had not been."""
+    overwrite: bool = False
+    """Replace the run that is there."""
+
+
+def main(cfg: Train) -> int:
+    """Run the command; gives the exit code."""
+    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.errors import TrainingError
+
+    if cfg.data is None:
+        raise TrainingError("on what?", where="--data", expected="a dataset's folder or a trajectory.h5")
+    from robocas_ms3.baselines.session import Said, train_run
+
+    data = cfg.data.resolve()
+    out = cfg.out or Path("runs") / f"{cfg.baseline}-{data.parent.name if data.is_file() else data.name}"
+    with bar("steps trained") as shown:
+        said = Said(note=shown.note, step=shown.at)
+        try:
+            train_run(
+                cfg.baseline,
+                cfg.data,
+                out,
+                changes_of(cfg),
+                device=cfg.device,
+                resume=cfg.resume,
+                overwrite=cfg.overwrite,
+                said=said,
+            )
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("the same command with --resume goes on") from None
+    say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol paper-v1")
+    return 0
+
+
+def changes_of(cfg: Train) -> dict[str, Any]:
+    """What differs from the defaults, as the file and the options have it; options win."""
+    from robocas_ms3.baselines.session import merged
+    from robocas_ms3.documents import load_yaml
+    from robocas_ms3.errors import TrainingError
+
+    found: dict[str, Any] = {}
+    if cfg.config is not None:
+        read = load_yaml(cfg.config)
+        if not isinstance(read, dict):
+            raise TrainingError("no configuration", where=cfg.config, expected="a mapping", found=type(read).__name__)
+        found = read
+    for text in cfg.set:
+        found = merged(found, _nested(text))
+    for key in ("steps", "batch_size", "seed"):
+        if (value := getattr(cfg, key)) is not None:
+            found = merged(found, {"train": {key: value}})
+    return found
+
+
+def _nested(text: str) -> dict[str, Any]:
+    """``a.b=1`` as ``{"a": {"b": 1}}``."""
+    import yaml
+
+    from robocas_ms3.errors import TrainingError
+
+    key, sign, value = text.partition("=")
+    if not (sign and all(key.split("."))):
+        raise TrainingError("not a value", where="--set", expected="KEY=VALUE, such as train.seed=1", found=text)
+    try:
+        nested: Any = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise TrainingError("not a value", where="--set", expected="YAML", found=value) from error
+    if isinstance(nested, str):  # YAML 1.1 reads 3e-4 as a word
+        try:
+            nested = float(nested)
+        except ValueError:
+            pass
+    for part in reversed(key.split(".")):
+        nested = {part: nested}
+    return nested
