@@ -36,24 +36,24 @@ class TrainSettings(StrictModel):
         check_samples: of the validation split at most, the same each time.
     """
 
-    steps: int = Field(20_000, ge=1)
-    batch_size: int = Field(128, ge=1)
-    learning_rate: float = Field(1e-3, gt=0)
-    min_learning_rate: float = Field(0.0, ge=0)
-    weight_decay: float = Field(1e-4, ge=0)
-    warmup_steps: int = Field(200, ge=0)
+    steps: int = Field(default=20_000, ge=1)
+    batch_size: int = Field(default=128, ge=1)
+    learning_rate: float = Field(default=1e-3, gt=0)
+    min_learning_rate: float = Field(default=0.0, ge=0)
+    weight_decay: float = Field(default=1e-4, ge=0)
+    warmup_steps: int = Field(default=200, ge=0)
     schedule: Literal["cosine", "constant", "restarts"] = "cosine"
-    restart_epochs: float = Field(20, gt=0)
-    restart_factor: int = Field(2, ge=1)
-    clip_norm: float = Field(1.0, ge=0)
-    ema: float = Field(0.999, ge=0, lt=1)
-    seed: int = Field(0, ge=0)
+    restart_epochs: float = Field(default=20, gt=0)
+    restart_factor: int = Field(default=2, ge=1)
+    clip_norm: float = Field(default=1.0, ge=0)
+    ema: float = Field(default=0.999, ge=0, lt=1)
+    seed: int = Field(default=0, ge=0)
     precision: Precision = "auto"
-    workers: int = Field(0, ge=0)
-    log_every: int = Field(50, ge=1)
-    check_every: int = Field(1000, ge=1)
-    save_every: int = Field(500, ge=1)
-    check_samples: int = Field(2048, ge=1)
+    workers: int = Field(default=0, ge=0)
+    log_every: int = Field(default=50, ge=1)
+    check_every: int = Field(default=1000, ge=1)
+    save_every: int = Field(default=500, ge=1)
+    check_samples: int = Field(default=2048, ge=1)
 
 
 class BaselineConfig(StrictModel):

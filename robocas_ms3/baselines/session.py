@@ -12,7 +12,7 @@ from typing import Any
 from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Samples
 from robocas_ms3.baselines.runs import RUN, DataRecord, RunRecord, hash_of, read_run, write_run
 from robocas_ms3.baselines.table import find_baseline
-from robocas_ms3.errors import DatasetError, OutputExistsError, TrainingError
+from robocas_ms3.errors import DatasetError, TrainingError
 from robocas_ms3.files import make_folder
 from robocas_ms3.outputs import check_one_way, check_overwrite, check_run, claim_output, locked_folder
 from robocas_ms3.strict import parse
@@ -92,9 +92,7 @@ def train_run(
             device=str(accelerator.device.type),
             precision=str(accelerator.mixed_precision),
         )
-        trainer = Trainer(
-            baseline, config, samples, check, out, record, accelerator, resume=resume, on_note=said.note
-        )
+        trainer = Trainer(baseline, config, samples, check, out, record, accelerator, resume=resume, on_note=said.note)
         if accelerator.is_main_process and before is None:
             make_folder(out)
             write_run(out, record)

@@ -56,5 +56,5 @@ def need_extra() -> None:
         try:
             import_module(module)
         except ModuleNotFoundError as error:
-            fix = "pip install 'robocas-ms3[train]'"
-            raise MissingExtraError("baselines need an extra", expected="train", found=f"no {error.name}", fix=fix) from error
+            fix = 'Run pip install "robocas-ms3[train]".'
+            raise MissingExtraError("baselines need an extra", found=f"no {error.name}", fix=fix) from error

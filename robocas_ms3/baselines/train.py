@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 from accelerate import Accelerator
-from accelerate.utils import DataLoaderConfiguration, send_to_device
+from accelerate.utils import DataLoaderConfiguration
 from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader
 
@@ -116,7 +116,7 @@ class Trainer:
         batches = Batches(len(self._samples), self.settings, self.step, part)
         loader = _loader(self._samples, batches, self.settings.workers)
         for batch in loader:
-            yield send_to_device(batch, accelerator.device, non_blocking=True)
+            yield _sent(batch, accelerator)
 
     def _take(self, batch: Batch) -> None:
         rate = learning_rate(self.step, len(self._samples), self.settings)
@@ -134,15 +134,14 @@ class Trainer:
         if self._average is not None:
             self._average.update_parameters(self._bare)
         for name, value in found.items():
-            value = value.detach().double()
-            self._sums[name] = self._sums[name] + value if name in self._sums else value
+            self._sums[name] = self._sums.get(name, 0.0) + value.detach().double()
         count = self._sums.get("", torch.zeros((), dtype=torch.float64))
         self._sums[""] = count + 1
 
     def _mix(self, average: Any, now: Any, _: Any) -> None:
         """Move an average of the weights on: fast at first, as it begins with what is random."""
         decay = min(self.settings.ema, (self.step + 1) / (self.step + 10))
-        torch._foreach_lerp_(average, now, 1 - decay)
+        torch._foreach_lerp_(average, now, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
 
     def _means(self) -> dict[str, float]:
         count = float(self._sums.pop("", torch.ones(())))
@@ -168,8 +167,8 @@ class Trainer:
             torch.manual_seed(self.settings.seed)
             for first in range(0, count, size):
                 chosen = places[first : first + size]
-                batch = send_to_device(samples.__getitems__(chosen), self._accelerator.device)
-                for name, value in model(batch).items():
+                batch = samples.__getitems__(chosen)
+                for name, value in model(_sent(batch, self._accelerator)).items():
                     sums[name] = sums.get(name, 0.0) + float(value) * len(chosen) / count
         return sums
 
@@ -250,6 +249,10 @@ def _cpu_has_bf16() -> bool:
     return any(getattr(cpu, name, bool)() for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"))
 
 
+def _sent(batch: Batch, accelerator: Accelerator) -> Batch:
+    return {name: tensor.to(accelerator.device, non_blocking=True) for name, tensor in batch.items()}
+
+
 def _loader(samples: Any, batches: Batches, workers: int) -> DataLoader:
     return DataLoader(
         samples,
@@ -261,7 +264,7 @@ def _loader(samples: Any, batches: Batches, workers: int) -> DataLoader:
     )
 
 
-def _as_it_is(batch: Batch) -> Batch:
+def _as_it_is(batch: Any) -> Any:
     return batch
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -103,18 +104,17 @@ def _nested(text: str) -> dict[str, Any]:
 
     from robocas_ms3.errors import TrainingError
 
-    key, sign, value = text.partition("=")
+    key, sign, word = text.partition("=")
     if not (sign and all(key.split("."))):
         raise TrainingError("not a value", where="--set", expected="KEY=VALUE, such as train.seed=1", found=text)
     try:
-        nested: Any = yaml.safe_load(value)
+        nested: Any = yaml.safe_load(word)
     except yaml.YAMLError as error:
-        raise TrainingError("not a value", where="--set", expected="YAML", found=value) from error
+        raise TrainingError("not a value", where="--set", expected="YAML", found=word) from error
     if isinstance(nested, str):  # YAML 1.1 reads 3e-4 as a word
-        try:
+        with suppress(ValueError):
             nested = float(nested)
-        except ValueError:
-            pass
-    for part in reversed(key.split(".")):
+    first, *inner = key.split(".")
+    for part in reversed(inner):
         nested = {part: nested}
-    return nested
+    return {first: nested}

@@ -107,6 +107,11 @@ class Observations:
     state: NDArray[np.float32] | None
 
 
+def privileged(extra: Mapping[str, Any]) -> NDArray[np.float32]:
+    """(N, D) ``Observations.state`` of what an environment says besides, its ``obs["extra"]``, arrays (N, ...)."""
+    return np.concatenate([np.asarray(value) for name, value in extra.items() if name != "tcp_pose"], axis=1)
+
+
 class Policy(Protocol):
     """A policy. It is made once for a run, and plays several episodes at a time."""
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.policy import Observations, Policy, Start
+from robocas_ms3.evaluation.policy import Observations, Policy, Start, privileged
 from robocas_ms3.evaluation.tracking import MEASURES, summed
 from robocas_ms3.language.embed import TextEmbedder
 
@@ -192,8 +192,7 @@ class Rollouts:
 
     def _observed(self, envs: list[int]) -> Observations:
         obs, wants, index = self._obs, self._policy.wants, np.array(envs)
-        agent, extra, cameras = obs["agent"], dict(obs["extra"]), obs.get("sensor_data", {})
-        extra.pop("tcp_pose", None)
+        agent, cameras = obs["agent"], obs.get("sensor_data", {})
         playing = [self._playing[env].start for env in envs]
         texts = [start.instruction if wants.language != "none" else "" for start in playing]
         return Observations(
@@ -205,7 +204,7 @@ class Rollouts:
             qpos=agent["qpos"][index],
             tcp_in_base=agent["tcp_in_arm_base"][index],
             gripper_width=agent["gripper_width"][index],
-            state=np.concatenate([value[index] for value in extra.values()], axis=1) if wants.state else None,
+            state=privileged(obs["extra"])[index] if wants.state else None,
         )
 
     def _note(self) -> None:

@@ -118,7 +118,7 @@ def state_of(poses: NDArray[np.floating], widths: NDArray[np.floating]) -> NDArr
     return np.concatenate([poses[:, :3, 3], turns, widths[:, None] / 0.08], axis=1).astype(np.float32)
 
 
-def looked_at(picture: NDArray[np.uint8], view: View, where: object = "") -> NDArray[np.uint8]:
+def looked_at(picture: NDArray[Any], view: View, where: object = "") -> NDArray[Any]:
     """The part (h, w, 3) of a picture (H, W, 3) that is looked at, scaled by areas.
 
     Raises:

@@ -1,8 +1,8 @@
 """The network of `small`: a convolutional net a camera, and a transformer that asks them what it needs to know.
 
-Feature maps at a sixteenth of the pictures' size are what its queries look at: one query a step of the chunk, one for the
-next key pose. Language and the arm's state are part of what is looked at; language also tells the nets what
-to look for, by a scale and shift of each channel (FiLM, Perez et al. 2018).
+Feature maps at a sixteenth of the pictures' size are what its queries look at: one query a step of the chunk, one for
+the next key pose. Language and the arm's state are part of what is looked at; language also tells the nets what to look
+for, by a scale and shift of each channel (FiLM, Perez et al. 2018).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from robocas_ms3.baselines.baseline import Batch
+from robocas_ms3.baselines.chunk_loss import chunk_losses
 from robocas_ms3.baselines.chunks import ROW, Scale
 from robocas_ms3.baselines.small.config import SmallConfig, View
 
@@ -95,24 +96,8 @@ class SmallModel(nn.Module):
         return self.out(thought[:, :-1]).float(), self.key_out(thought[:, -1]).float()
 
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """Losses: L1 of normalised poses, cross entropy of the commands."""
-        chunk, key = self.predict(batch)
-        wanted = self.chunk_scale(batch["chunk"][..., :9])
-        motion = F.l1_loss(chunk[..., :9], wanted)
-        gripper = F.binary_cross_entropy_with_logits(chunk[..., 9], batch["chunk"][..., 9])
-        keys = F.l1_loss(key, self.key_scale(batch["key"]))
-        with torch.no_grad():
-            off = (self.key_scale.back(key) - batch["key"])[:, :3].norm(dim=1).mean()
-            ahead = (self.chunk_scale.back(chunk[..., :9]) - batch["chunk"][..., :9])[..., :3].norm(dim=-1)
-        return {
-            "loss": motion + self.config.gripper_weight * gripper + self.config.keys_weight * keys,
-            "motion": motion,
-            "gripper": gripper,
-            "keys": keys,
-            "key_mm": 1000 * off,
-            "first_mm": 1000 * ahead[:, 0].mean(),
-            "last_mm": 1000 * ahead[:, -1].mean(),
-        }
+        """Losses, see `chunk_losses`."""
+        return chunk_losses(self, batch, *self.predict(batch))
 
     def act(self, batch: Batch) -> torch.Tensor:
         """(B, K, 10) chunks: poses as they are, commands as shares, 1 = open."""

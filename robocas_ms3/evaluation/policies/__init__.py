@@ -1,7 +1,7 @@
 """Policies by name: builtin ones, those of installed packages, ``replay:DATASET``, ``module:Class``, ``ws://host:port``.
 
-A package offers policies as entry points of the group `GROUP`: see docs/extending.md. Folders that hold a policy, such as
-the runs of `robocas train`, are opened by entry points of the group `FOLDERS_GROUP`, named by a file that is in them.
+A package offers policies as entry points of the group `GROUP`: see docs/extending.md. Folders that hold a policy, such
+as the runs of `robocas train`, are opened by entry points of the group `FOLDERS_GROUP`, named by a file in them.
 """
 
 from __future__ import annotations
@@ -83,7 +83,9 @@ def check_policy(name: str) -> None:
     known = [*POLICIES.builtin, *POLICIES.points]
     of_own = re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier()
     if not (name in known or of_own or _opener(name) or (kind in ("ws", "wss", "replay") and rest)):
-        expected = f"{', '.join(known)}, a folder of robocas train, replay:TRAJECTORY.h5, module:Class or ws://host:port"
+        expected = (
+            f"{', '.join(known)}, a folder of robocas train, replay:TRAJECTORY.h5, module:Class or ws://host:port"
+        )
         raise EvaluationError("no such policy", where=name, expected=expected, fix=nearest(name, known))
 
 

@@ -1,0 +1,53 @@
+"""`bc-state`: chunks from what only a simulator knows. What can be had without having to see."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from robocas_ms3.baselines.bc_state.config import BcStateConfig
+from robocas_ms3.baselines.bc_state.data import StateSamples, inputs
+from robocas_ms3.baselines.bc_state.model import BcStateModel
+from robocas_ms3.baselines.chunk_policy import ChunkPolicy
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.policy import Observations, Wants
+from robocas_ms3.poses import from_wxyz
+
+
+class BcState:
+    """See `Baseline`."""
+
+    name, version = "bc-state", 1
+    about = "what only a simulator knows; chunks of poses by residual layers"
+    Config = BcStateConfig
+
+    def data(self, config: BcStateConfig, folder: Path, split: Literal["train", "val"]) -> StateSamples:
+        """Samples of a ``trajectory.h5``."""
+        return StateSamples(config, folder, split)
+
+    def model(self, config: BcStateConfig, facts: dict[str, Any]) -> BcStateModel:
+        """The network."""
+        return BcStateModel(config, facts)
+
+    def policy(self, config: BcStateConfig, facts: dict[str, Any], model: BcStateModel) -> ChunkPolicy:
+        """What acts by it."""
+        device, size = next(model.parameters()).device, len(facts["inputs"]["mean"])
+
+        def predict(seen: Observations) -> NDArray[np.floating]:
+            assert seen.state is not None
+            told = inputs(seen.state, from_wxyz(seen.tcp_in_base), seen.gripper_width.reshape(-1))
+            if told.shape[1] != size:
+                what, fix = "other scenes than it was trained in", "Evaluate it in the task and scenes of its data."
+                raise EvaluationError(what, where="bc-state", expected=f"{size} numbers", found=told.shape[1], fix=fix)
+            with torch.inference_mode():
+                return model.act(torch.from_numpy(told).to(device)).cpu().numpy()
+
+        wants = Wants("robocas", reference="tcp", rate_hz=facts["rate_hz"], state=True, language="none")
+        return ChunkPolicy(wants, predict, config.fade, {})
+
+
+BASELINE = BcState()

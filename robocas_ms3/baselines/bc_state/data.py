@@ -1,0 +1,149 @@
+"""What a simulator knew at each step of recorded episodes: their environment is put into these states, and asked.
+
+That takes some minutes for a thousand episodes; what came of it is kept among the caches.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from robocas_ms3.baselines.baseline import Batch
+from robocas_ms3.baselines.bc_state.config import BcStateConfig
+from robocas_ms3.baselines.chunks import encode, next_keys, spread
+from robocas_ms3.baselines.runs import hash_of
+from robocas_ms3.baselines.small.data import state_of
+from robocas_ms3.datasets.sources.split import split_by_seed
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.evaluation.policy import privileged
+from robocas_ms3.files import replacing
+from robocas_ms3.paths import cache_dir
+from robocas_ms3.recordings.motion import sample_states, sample_stride
+from robocas_ms3.recordings.reading import TrajectoryFile
+
+_VERSION = 1  # of what is kept
+_LEAST = 1e-2  # deviation; what hardly ever changes says little, and must not be blown up
+
+
+class StateSamples:
+    """Samples of `bc-state`, one of every step.
+
+    Args:
+        config: what is predicted.
+        path: ``trajectory.h5``.
+        split: of its seeds, as a conversion has them.
+
+    Raises:
+        DatasetError: it is no trajectory file, or its scenes hold different numbers of things.
+    """
+
+    def __init__(self, config: BcStateConfig, path: Path, split: Literal["train", "val"]) -> None:
+        told = _told(path, config.rate_hz)
+        seeds = told["seeds"].tolist()
+        sides = split_by_seed({number: seed for number, seed in enumerate(seeds)})
+        numbers = sides[0 if split == "train" else 1]
+        self.episodes = len(numbers)
+        if not numbers:
+            fix = "Add episodes: a tenth of them validates."
+            raise DatasetError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
+        first = np.concatenate([[0], np.cumsum(told["lengths"])])
+        rows = [slice(int(first[number]), int(first[number + 1])) for number in numbers]
+        poses, opened = told["poses"], told["opened"]
+        self._chunks = _joined([encode(poses[row], opened[row], config.chunk) for row in rows])
+        self._keys = _joined([next_keys(poses[row], opened[row]) for row in rows])
+        self._told = _joined([inputs(told["told"][row], poses[row], told["widths"][row]) for row in rows])
+        values = self._told.numpy()
+        self.facts: dict[str, Any] = {
+            "rate_hz": config.rate_hz,
+            "inputs": {
+                "mean": values.mean(0).tolist(),
+                "deviation": np.maximum(values.std(0), _LEAST).tolist(),
+            },
+            "chunk": spread(self._chunks[..., :9].numpy()),
+            "keys": spread(self._keys.numpy()),
+        }
+
+    def __len__(self) -> int:
+        return len(self._told)
+
+    def __getitems__(self, indices: list[int]) -> Batch:
+        """A batch: ``told``, and what is to be predicted: ``chunk``, ``key``."""
+        rows = torch.tensor(indices)
+        return {"told": self._told[rows], "chunk": self._chunks[rows], "key": self._keys[rows]}
+
+
+def inputs(
+    told: NDArray[np.floating], poses: NDArray[np.floating], widths: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """(N, D + 10) what a simulator knows (N, D), and what the arm feels (`state_of`)."""
+    return np.concatenate([told, state_of(poses, widths)], axis=1).astype(np.float32)
+
+
+def _joined(parts: list[NDArray[np.float32]]) -> torch.Tensor:
+    return torch.from_numpy(np.concatenate(parts))
+
+
+def _told(path: Path, rate_hz: float) -> dict[str, NDArray[Any]]:
+    """What is kept of a trajectory file, or what it says now."""
+    if path.is_dir() or path.suffix != ".h5":
+        fix = "Name the trajectory.h5 of robocas generate."
+        raise DatasetError("bc-state learns from recorded states", where=path, expected="a trajectory.h5", fix=fix)
+    kept = cache_dir() / "bc-state" / f"{hash_of(path)[:32]}-{rate_hz:g}-{_VERSION}.npz"
+    if kept.is_file():
+        try:
+            with np.load(kept) as arrays:
+                return dict(arrays)
+        except (OSError, ValueError, KeyError, EOFError):
+            kept.unlink()  # damaged: it is made anew
+    told = _ask(path, rate_hz)
+    with replacing(kept) as tmp:
+        np.savez(tmp, **told)  # pyright: ignore[reportArgumentType]  (its stub takes no mapping)
+    return told
+
+
+def _ask(path: Path, rate_hz: float) -> dict[str, NDArray[Any]]:
+    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in ("told", "poses", "opened", "widths")}
+    lengths, seeds, env = [], [], None
+    with TrajectoryFile(path) as file:
+        stride = sample_stride(file.control_freq, rate_hz)
+        try:
+            for index, entry in enumerate(file.episodes):
+                if not entry.get("success", True):
+                    continue
+                recording = file.recording(index)
+                if env is None:
+                    env = file.env.make(obs_mode="state_dict", render_backend="none", reward_mode="none")
+                env.reset(seed=recording.seed, options=dict(recording.reset_options))
+                samples = sample_states(recording.control_steps, stride)
+                motion = recording.motion(samples)
+                base: Any = env.unwrapped
+                rows = [_row(base, recording.state(int(sample))) for sample in samples]
+                if parts["told"] and parts["told"][0].shape[1] != len(rows[0]):
+                    expected, found = parts["told"][0].shape[1], len(rows[0])
+                    where = f"{path}, episode {recording.episode_id}"
+                    raise DatasetError("other things stand in this scene", where=where, expected=expected, found=found)
+                parts["told"].append(np.stack(rows))
+                parts["poses"].append(motion.tcp_in_base)
+                parts["opened"].append(motion.gripper_open)
+                parts["widths"].append(motion.qpos[:, -2:].sum(1))
+                lengths.append(len(samples))
+                seeds.append(recording.seed)
+        finally:
+            if env is not None:
+                env.close()
+    if not lengths:
+        raise DatasetError("no successful episodes", where=path)
+    joined = {name: np.concatenate(part) for name, part in parts.items()}
+    for name, array in joined.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise DatasetError("not a number", where=f"{path}, {name}", fix="robocas validate says more.")
+    return {**joined, "lengths": np.array(lengths), "seeds": np.array(seeds)}
+
+
+def _row(env: Any, state: dict[str, dict[str, NDArray[np.float32]]]) -> NDArray[np.float32]:
+    env.set_state_dict({kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()})
+    return privileged(env.get_obs({})["extra"])[0]
