@@ -1,0 +1,101 @@
+"""Checkpoints: whole or not there, of one thing only, and what is damaged is said."""
+
+import errno
+
+import pytest
+import torch
+from safetensors import SafetensorError
+
+from robocas_ms3.baselines import checkpoints
+from robocas_ms3.errors import TrainingError
+
+ABOUT = {"baseline": "x", "version": "1", "dataset": "d"}
+
+
+def test_there_and_back(tmp_path):
+    path = tmp_path / "c.safetensors"
+    checkpoints.save(path, {"a": torch.arange(3.0), "b": torch.tensor(2)}, {**ABOUT, "step": "7"})
+    tensors, about = checkpoints.load(path, ABOUT)
+    assert tensors["a"].tolist() == [0, 1, 2] and tensors["b"].item() == 2 and about["step"] == "7"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["c.safetensors"]
+
+
+@pytest.mark.parametrize("key", ABOUT)
+def test_of_something_else(tmp_path, key):
+    path = tmp_path / "c.safetensors"
+    checkpoints.save(path, {"a": torch.zeros(1)}, ABOUT)
+    with pytest.raises(TrainingError, match=f"of another {key}"):
+        checkpoints.load(path, {**ABOUT, key: "other"})
+
+
+@pytest.mark.parametrize("content", [b"", b"abc", b"\xff" * 100])
+def test_damaged(tmp_path, content):
+    path = tmp_path / "c.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(TrainingError, match="can't be read"):
+        checkpoints.load(path, ABOUT)
+
+
+def test_cut_off(tmp_path):
+    path = tmp_path / "c.safetensors"
+    checkpoints.save(path, {"a": torch.zeros(1000)}, ABOUT)
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(TrainingError, match="can't be read"):
+        checkpoints.load(path, ABOUT)
+
+
+def test_none(tmp_path):
+    with pytest.raises(TrainingError, match="no such file"):
+        checkpoints.load(tmp_path / "c.safetensors", ABOUT)
+
+
+def test_a_full_disk_leaves_the_one_before(tmp_path, monkeypatch):
+    path = tmp_path / "c.safetensors"
+    checkpoints.save(path, {"a": torch.zeros(1)}, ABOUT)
+
+    def full(*_):
+        raise SafetensorError("Error while serializing: IoError(Os { code: 28, kind: StorageFull }) (os error 28)")
+
+    monkeypatch.setattr(checkpoints, "save_file", full)
+    with pytest.raises(OSError) as caught:
+        checkpoints.save(path, {"a": torch.ones(1)}, ABOUT)
+    assert caught.value.errno == errno.ENOSPC
+    assert checkpoints.load(path, ABOUT)[0]["a"].item() == 0
+    assert [entry.name for entry in tmp_path.iterdir()] == ["c.safetensors"]
+
+
+@pytest.mark.parametrize(
+    ("tensors", "found"),
+    [
+        ({"weight": torch.zeros(2, 3)}, "lacks bias"),
+        ({"weight": torch.zeros(2, 3), "bias": torch.zeros(2), "more": torch.zeros(1)}, "has besides more"),
+        ({"weight": torch.zeros(2, 4), "bias": torch.zeros(2)}, "has in another shape weight"),
+    ],
+)
+def test_weights_of_another_model(tensors, found):
+    with pytest.raises(TrainingError, match=found):
+        checkpoints.put_in(torch.nn.Linear(3, 2), tensors, "w")
+
+
+def test_an_optimizer_goes_on():
+    def made():
+        torch.manual_seed(0)
+        model = torch.nn.Linear(3, 2)
+        return model, torch.optim.AdamW(model.parameters(), lr=0.1)
+
+    def step(model, optimizer, number):
+        model(torch.full((1, 3), float(number))).square().sum().backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    one, its = made()
+    for number in range(3):
+        step(one, its, number)
+    other, theirs = made()
+    for number in range(2):
+        step(other, theirs, number)
+    third, of_third = made()
+    third.load_state_dict(other.state_dict())
+    checkpoints.put_in_optimizer(of_third, checkpoints.optimizer_tensors(theirs))
+    step(third, of_third, 2)
+    assert torch.equal(one.weight, third.weight)

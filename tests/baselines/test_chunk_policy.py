@@ -1,0 +1,84 @@
+"""How chunks become motions: relative to where the TCP is, and agreed on by the last predictions."""
+
+import numpy as np
+import pytest
+
+from robocas_ms3.baselines.chunk_policy import ChunkPolicy
+from robocas_ms3.evaluation.policy import Observations, Start, Wants
+
+STAY = [0, 0, 0, 1, 0, 0, 0, 1, 0, 1.0]
+
+
+def seen(tcps, envs=(0,)):
+    count = len(envs)
+    return Observations(
+        envs=np.array(envs),
+        instructions=[""] * count,
+        embeddings=None,
+        images={},
+        depths={},
+        qpos=np.zeros((count, 12), np.float32),
+        tcp_in_base=np.array(tcps, np.float32),
+        gripper_width=np.zeros((count, 1), np.float32),
+        state=None,
+    )
+
+
+def start(env):
+    return Start(env, 0, "pick", "", "", "builtin", 0, "")
+
+
+def policy(chunks, fade=0.0):
+    said = iter(chunks)
+    made = ChunkPolicy(Wants(), lambda observations: np.array(next(said), float), fade, {})
+    made.reset([start(0), start(1)])
+    return made
+
+
+def row(x=0.0, opened=1.0):
+    return [x, *STAY[1:9], opened]
+
+
+HERE = [0.5, 0, 0.3, 1, 0, 0, 0]
+
+
+def test_a_first_chunk_is_followed():
+    acting = policy([[[row(0.1), row(0.2)]]])
+    assert acting.act(seen([HERE])) == pytest.approx(np.array([[0.1, 0, 0, 0, 0, 0, 1]]), abs=1e-6)
+
+
+def test_older_predictions_are_of_the_same_step_and_frame():
+    """Told 0.1 then 0.2, it stays where it was; then told 0.4: the mean of 0.2, what was said before, and 0.4."""
+    acting = policy([[[row(0.1), row(0.2)]], [[row(0.4), row(0.5)]]])
+    acting.act(seen([HERE]))
+    assert acting.act(seen([HERE]))[0, 0] == pytest.approx(0.3)
+
+
+def test_a_motion_makes_up_for_what_the_last_one_missed():
+    acting = policy([[[row(0.1), row(0.2)]], [[row(0.1), row(0.2)]]])
+    acting.act(seen([HERE]))
+    late = [0.56, *HERE[1:]]  # 0.04 short of where it was to be: before 0.7 was wanted now, and now 0.66
+    assert acting.act(seen([late]))[0, 0] == pytest.approx((0.7 + 0.66) / 2 - 0.56)
+
+
+def test_newer_predictions_weigh_more():
+    acting = policy([[[row(), row(0.0, 0.0)]], [[row(0.4, 1.0), row()]]], fade=np.log(3))  # 3 to 1
+    acting.act(seen([HERE]))
+    action = acting.act(seen([HERE]))[0]
+    assert action[0] == pytest.approx(0.3)
+    assert action[6] == 1.0
+
+
+def test_a_reset_forgets_one_env():
+    acting = policy([[[row(0.2), row(0.2)]] * 2, [[row(0.4), row()]] * 2])
+    acting.act(seen([HERE] * 2, (0, 1)))
+    acting.reset([start(1)])
+    moved = acting.act(seen([HERE] * 2, (0, 1)))[:, 0]
+    assert moved.tolist() == pytest.approx([0.3, 0.4])
+
+
+def test_motions_are_in_the_tcps_frame():
+    turned = [0.5, 0, 0.3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]  # a quarter about z
+    quarter = [0.1, 0, 0, 0, 1, 0, -1, 0, 0, 0.2]  # on by 0.1 along its x, and turned by a quarter about its z
+    action = policy([[[quarter]]]).act(seen([turned]))[0]
+    assert action == pytest.approx([0.1, 0, 0, 0, 0, np.pi / 2, 0], abs=1e-6)

@@ -1,0 +1,62 @@
+"""Which samples a step is of, and how fast it learns, by hand."""
+
+import math
+from collections import Counter
+
+import pytest
+
+from robocas_ms3.baselines.baseline import TrainSettings
+from robocas_ms3.baselines.schedule import Batches, epochs_at, learning_rate
+
+
+def settings(**values):
+    return TrainSettings(**values)
+
+
+def test_an_epoch_has_every_sample_once_and_runs_into_the_next():
+    batches = list(Batches(10, settings(steps=5, batch_size=4)))  # 20 places: two epochs
+    places = [index for batch in batches for index in batch]
+    assert Counter(places[:10]) == Counter(range(10)) == Counter(places[10:])
+    assert places[:10] != places[10:]
+
+
+def test_batches_follow_from_seed_and_step():
+    whole = list(Batches(10, settings(steps=6, batch_size=4)))
+    assert list(Batches(10, settings(steps=6, batch_size=4), first=3)) == whole[3:]
+    assert list(Batches(10, settings(steps=6, batch_size=4, seed=1))) != whole
+
+
+def test_processes_share_a_batch():
+    whole = list(Batches(10, settings(steps=3, batch_size=4)))
+    parts = [list(Batches(10, settings(steps=3, batch_size=4), part=(number, 2))) for number in (0, 1)]
+    assert [sorted(one + other) for one, other in zip(*parts, strict=True)] == [sorted(batch) for batch in whole]
+
+
+def test_cosine_by_hand():
+    chosen = settings(steps=110, warmup_steps=10, learning_rate=1.0, min_learning_rate=0.2)
+    assert learning_rate(0, 99, chosen) == pytest.approx(0.1)
+    assert learning_rate(9, 99, chosen) == pytest.approx(1.0)
+    assert learning_rate(10, 99, chosen) == pytest.approx(1.0)
+    assert learning_rate(60, 99, chosen) == pytest.approx(0.6)  # half way
+    assert learning_rate(110, 99, chosen) == pytest.approx(0.2)
+
+
+def test_restarts_by_hand():
+    """Periods of 2, 4, 8 epochs of 5 steps: restarts after 10 and 30 steps."""
+    chosen = settings(
+        steps=100,
+        batch_size=2,
+        warmup_steps=0,
+        schedule="restarts",
+        restart_epochs=2,
+        learning_rate=1.0,
+        min_learning_rate=0.1,
+    )
+    assert epochs_at(10, 10, chosen) == 2
+    for step, expected in ((0, 1.0), (5, 0.55), (10, 1.0), (20, 0.55), (30, 1.0), (50, 0.55)):
+        assert learning_rate(step, 10, chosen) == pytest.approx(expected)
+    assert learning_rate(9, 10, chosen) == pytest.approx(0.1 + 0.9 * (1 + math.cos(0.9 * math.pi)) / 2)
+
+
+def test_constant():
+    assert learning_rate(77, 10, settings(steps=100, schedule="constant", learning_rate=0.3, warmup_steps=5)) == 0.3
