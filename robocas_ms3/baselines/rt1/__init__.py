@@ -1,0 +1,34 @@
+"""`rt1`: RT-1 as the paper trains it (Brohan et al. 2022), with the sizes of its training configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from robocas_ms3.baselines.rt1.config import RT1Config
+from robocas_ms3.baselines.rt1.data import RT1Samples
+from robocas_ms3.baselines.rt1.model import RT1Model
+from robocas_ms3.baselines.rt1.policy import RT1Policy
+
+
+class RT1:
+    """See `Baseline`."""
+
+    name, version = "rt1", 1
+    about = "the paper's RT-1: base and gripper camera, language; tokens of actions by a causal transformer"
+    Config = RT1Config
+
+    def data(self, config: RT1Config, folder: Path, split: Literal["train", "val"]) -> RT1Samples:
+        """Samples of a dataset with pictures and embeddings."""
+        return RT1Samples(config, folder, split)
+
+    def model(self, config: RT1Config, facts: dict[str, Any]) -> RT1Model:
+        """The network."""
+        return RT1Model(config, facts)
+
+    def policy(self, config: RT1Config, facts: dict[str, Any], model: RT1Model) -> RT1Policy:
+        """What acts by it."""
+        return RT1Policy(config, facts, model)
+
+
+BASELINE = RT1()

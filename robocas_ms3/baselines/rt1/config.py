@@ -1,0 +1,113 @@
+"""How the `rt1` baseline sees, thinks and is trained; the defaults are those of the paper's RT-1.
+
+They are of RoboCAS-v0's training configuration; what that leaves open, as TokenLearner's bottleneck, is of RT-1 itself
+(Brohan et al. 2022, and its code).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
+from robocas_ms3.evaluation.policy import CAMERAS
+
+_IMAGENET_STD = (0.229, 0.224, 0.225)
+_KERAS_STD = (0.47853944, 0.4732864, 0.47434163)
+"""What EfficientNet's published weights were trained with, and transformers divides by: the roots of the others."""
+
+
+class RT1Train(TrainSettings):
+    """How it is trained; 140 000 steps are the paper's 20 epochs of some 2.8 k episodes of 60 steps.
+
+    A class of its own, so that who changes one of these numbers leaves the others as they are here.
+    """
+
+    steps: int = Field(default=140_000, ge=1)
+    batch_size: int = Field(default=24, ge=1)
+    learning_rate: float = Field(default=1e-4, gt=0)
+    min_learning_rate: float = Field(default=1e-5, ge=0)
+    weight_decay: float = Field(default=0.01, ge=0)
+    warmup_steps: int = Field(default=0, ge=0)
+    schedule: Literal["cosine", "constant", "restarts"] = "restarts"
+    restart_epochs: float = Field(default=20, gt=0)
+    restart_factor: int = Field(default=2, ge=1)
+    clip_norm: float = Field(default=4.0, ge=0)
+    ema: float = Field(default=0.0, ge=0, lt=1)
+    workers: int = Field(default=4, ge=0)
+    check_every: int = Field(default=5000, ge=1)
+    save_every: int = Field(default=2000, ge=1)
+
+
+class RT1Config(BaselineConfig):
+    """Configuration of `rt1`.
+
+    Attributes:
+        cameras: one encoder each; their tokens stand side by side in this order.
+        picture: width and height in pixels that pictures are scaled to, whole.
+        crop_height: rows of a picture that are looked at: any in training, the middle ones later.
+        rate_hz: steps a second that the data has to have, and the policy acts at.
+        frames: steps that are looked back on, the present one included.
+        image_width, image_depth: EfficientNet's coefficients; 1.2 and 1.4 make B3.
+        drop_connect: probability that the last of EfficientNet's blocks is skipped in training; others in proportion.
+        norm_momentum: share of each batch in the running means that EfficientNet's norms act with.
+        image_mean: subtracted from pictures in 0..1, by colour.
+        image_std: divides them; None: ImageNet's, or with ``image_weights`` what these weights were trained with.
+        image_weights: file of EfficientNet's weights, as ``model.safetensors`` of google/efficientnet-b3; None: it
+            learns to see from the demonstrations alone. Only the beginning of a training reads it.
+        token_width: numbers of an image token.
+        image_tokens: of a picture, after TokenLearner.
+        token_bottleneck: width of TokenLearner's hidden layer.
+        width: of the transformer, which in RT-1 is its feed-forward layer's too.
+        layers, heads, key_width: of the transformer.
+        dropout: of the transformer.
+        bins: of each number of an action.
+        terminate_steps: the last so many actions of an episode are to be told as its end.
+        train: see `TrainSettings`.
+    """
+
+    cameras: tuple[str, ...] = ("base_camera", "gripper_camera")
+    picture: tuple[int, int] = (320, 256)
+    crop_height: int = Field(236, ge=32)
+    rate_hz: float = Field(5.0, gt=0)
+    frames: int = Field(6, ge=1)
+    image_width: float = Field(1.2, gt=0)
+    image_depth: float = Field(1.4, gt=0)
+    drop_connect: float = Field(0.2, ge=0, lt=1)
+    norm_momentum: float = Field(0.01, gt=0, le=1)
+    image_mean: tuple[float, float, float] = (0.485, 0.456, 0.406)
+    image_std: tuple[float, float, float] | None = None
+    image_weights: Path | None = None
+    token_width: int = Field(512, ge=1)
+    image_tokens: int = Field(8, ge=1)
+    token_bottleneck: int = Field(64, ge=1)
+    width: int = Field(512, ge=1)
+    layers: int = Field(8, ge=1)
+    heads: int = Field(8, ge=1)
+    key_width: int = Field(128, ge=1)
+    dropout: float = Field(0.1, ge=0, lt=1)
+    bins: int = Field(256, ge=2)
+    terminate_steps: int = Field(1, ge=1)
+    train: RT1Train = RT1Train()
+
+    @model_validator(mode="after")
+    def _check(self) -> RT1Config:
+        """See that pictures can be cropped and divided, and that cameras are there, each once."""
+        if not self.cameras or len(set(self.cameras)) < len(self.cameras) or set(self.cameras) - set(CAMERAS):
+            raise ValueError(f"cameras have to be some of {', '.join(CAMERAS)}, each once")
+        if min(self.picture) < 32:
+            raise ValueError("a picture has to be at least 32 pixels wide and high")
+        if self.crop_height > self.picture[1]:
+            raise ValueError(f"crop_height {self.crop_height} is more than the picture's {self.picture[1]} rows")
+        if min(self.std) <= 0:
+            raise ValueError("image_std has to be above 0")
+        return self
+
+    @property
+    def std(self) -> tuple[float, float, float]:
+        """What pictures in 0..1 are divided by, after the mean is subtracted."""
+        if self.image_std is not None:
+            return self.image_std
+        return _IMAGENET_STD if self.image_weights is None else _KERAS_STD

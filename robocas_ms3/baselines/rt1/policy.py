@@ -1,0 +1,96 @@
+"""`rt1` as a policy."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from robocas_ms3.baselines.rt1.config import RT1Config
+from robocas_ms3.baselines.rt1.model import RT1Model
+from robocas_ms3.evaluation.policy import Observations, Start, Wants
+
+
+class RT1Policy:
+    """Looks at the last six frames, the first one repeated at the start, and does what is likeliest.
+
+    Frames are encoded once and kept as tokens, those of the language of their time. Once it says that an episode ends,
+    it does the action beside that, then holds still with the gripper as it was told last.
+
+    Pictures are asked for as the dataset stores them, and scaled as its samples are: rendering at 320 x 256 would show
+    another field of view than pictures of 640 x 480 scaled to that.
+
+    Args:
+        config: of the network.
+        facts: of the data it was trained on.
+        model: the network, on any device.
+    """
+
+    def __init__(self, config: RT1Config, facts: dict[str, Any], model: RT1Model) -> None:
+        self._config, self._model = config, model.eval()
+        self._frames: dict[int, deque[torch.Tensor]] = {}  # by env, tokens (images, width), the oldest first
+        self._held: dict[int, NDArray[np.float32]] = {}  # by env that has ended, the action that holds still
+        self.wants = Wants(
+            convention="robocas",
+            reference="tcp",
+            rate_hz=facts["rate_hz"],
+            cameras={name: (width, height) for name, (width, height) in facts["cameras"].items()},
+            language="embedding",
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """What a result says of it: what its image encoders began with."""
+        path = self._config.image_weights
+        begun = path.name if path is not None and bool(self._model.from_imagenet) else "from scratch"
+        return {"image_weights": begun}
+
+    def reset(self, starts: list[Start]) -> None:
+        """Forget what these envs showed."""
+        for start in starts:
+            self._frames.pop(start.env, None)
+            self._held.pop(start.env, None)
+
+    def act(self, observations: Observations) -> NDArray[np.floating]:
+        """(E, 7) motions and gripper commands."""
+        envs = observations.envs.tolist()
+        awake = [row for row, env in enumerate(envs) if env not in self._held]
+        actions = np.stack([self._held.get(env, np.zeros(7, np.float32)) for env in envs])
+        if awake:
+            self._look(observations, awake)
+            with torch.inference_mode():
+                tokens = torch.stack([torch.stack(tuple(self._frames[envs[row]])) for row in awake])
+                acted, over = (found.cpu().numpy() for found in self._model.act(tokens))
+            actions[awake] = acted
+            for row, ended in zip(awake, over.tolist(), strict=True):
+                if ended:
+                    self._held[envs[row]] = np.append(np.zeros(6, np.float32), actions[row, 6:])
+        return actions
+
+    def _look(self, observations: Observations, rows: list[int]) -> None:
+        """Encode what some envs show, in one go."""
+        assert observations.embeddings is not None
+        views = [observations.images[name][rows] for name in self._config.cameras]
+        pictures = np.stack([[scaled(shot, self._config.picture) for shot in view] for view in views], axis=1)
+        device = self._model.mean.device
+        seen = torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 1, 4, 2, 3))).to(device)
+        with torch.inference_mode():
+            tokens = self._model.encode(seen, torch.from_numpy(observations.embeddings[rows]).to(device))
+        for row, token in zip(rows, tokens, strict=True):
+            env, count = int(observations.envs[row]), self._config.frames
+            if env not in self._frames:
+                self._frames[env] = deque([token] * count, maxlen=count)
+            else:
+                self._frames[env].append(token)
+
+
+def scaled(picture: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """A picture (H, W, 3) scaled to a width and height as samples of a dataset are: down by areas."""
+    if picture.shape[1::-1] == tuple(size):
+        return picture
+    smaller = size[0] <= picture.shape[1] and size[1] <= picture.shape[0]
+    found: Any = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+    return found

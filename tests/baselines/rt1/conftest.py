@@ -1,0 +1,64 @@
+"""Small networks, and a small dataset, that tests of rt1 share."""
+
+import pytest
+import torch
+from rt1_sizes import SIZES, settle
+from synthetic import RayCaster, made_up_vectors, write_trajectory
+
+from robocas_ms3.baselines.rt1 import BASELINE
+from robocas_ms3.baselines.rt1.config import RT1Config
+from robocas_ms3.datasets.writing.convert import convert
+
+
+@pytest.fixture
+def facts():
+    """As a dataset of 64 x 48 pictures gives them."""
+    cameras = {"base_camera": [64, 48], "gripper_camera": [64, 48]}
+    return {"rate_hz": 5.0, "cameras": cameras, "action_low": [-0.1] * 6, "action_high": [0.1] * 6}
+
+
+@pytest.fixture
+def config():
+    return RT1Config(**SIZES)
+
+
+@pytest.fixture
+def model(config, facts, batch):
+    """With weights that tell pictures and words apart, in place of those at the start, which hardly do."""
+    torch.manual_seed(0)
+    made = BASELINE.model(config, facts)
+    with torch.no_grad():
+        for encoder in made.encoders:
+            for film in [*encoder.films, encoder.film]:
+                film.told.weight.normal_(0, 0.3)
+        made.transformer.leave.weight.normal_(0, 1)
+        settle(made, batch)
+    return made
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    """A dataset of six episodes of seven steps, 64 x 48 pictures, that nobody may change; five are to train on."""
+    made = tmp_path_factory.mktemp("rt1")
+    trajectory = write_trajectory(made / "F.h5", seeds=range(3, 9))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
+        convert(trajectory, made / "dataset", open_source=RayCaster)
+    return made / "dataset"
+
+
+@pytest.fixture
+def batch():
+    """Two samples of six frames, of which the first four of the first are padding."""
+    torch.manual_seed(1)
+    mask = torch.ones(2, 6, dtype=torch.bool)
+    mask[0, :4] = False
+    over = torch.zeros(2, 6, dtype=torch.bool)
+    over[1, 5] = True
+    return {
+        "rgb": torch.randint(0, 256, (2, 6, 2, 3, 48, 64), dtype=torch.uint8),
+        "language": torch.nn.functional.normalize(torch.randn(2, 384), dim=1),
+        "action": torch.cat([torch.rand(2, 6, 6) * 0.2 - 0.1, torch.randint(0, 2, (2, 6, 1))], dim=-1),
+        "mask": mask,
+        "terminate": over,
+    }

@@ -1,0 +1,212 @@
+"""Pictures to tokens: crops, FiLM, TokenLearner, EfficientNet as it is made here, and its weights out of a file."""
+
+import pytest
+import torch
+from rt1_sizes import SIZES, settle
+from safetensors.torch import save_file
+
+from robocas_ms3.baselines.rt1 import BASELINE
+from robocas_ms3.baselines.rt1.config import RT1Config
+from robocas_ms3.baselines.rt1.image import FiLM, ImageEncoder, SkippedBranch, TokenLearner, efficientnet
+from robocas_ms3.baselines.rt1.model import cropped
+from robocas_ms3.errors import TrainingError
+from robocas_ms3.evaluation.policy import describe
+
+
+def rows_of(pictures):
+    """The number of each row of pictures made by `striped`: (N, h)."""
+    return pictures[:, 0, :, 0]
+
+
+def striped(count, height=256, width=4):
+    """Pictures whose rows hold their own number, and whose last column holds 7."""
+    pictures = torch.arange(height, dtype=torch.uint8)[:, None].repeat(count, 3, 1, width)
+    pictures[..., -1] = 7
+    return pictures
+
+
+def test_the_middle_rows_are_looked_at():
+    rows = rows_of(cropped(striped(2), 236, anywhere=False))
+    assert rows.dtype == torch.float32
+    assert rows.tolist() == [list(range(10, 246))] * 2
+
+
+def test_in_training_each_picture_has_its_own_rows():
+    torch.manual_seed(0)
+    seen = cropped(striped(600).view(100, 3, 2, 3, 256, 4), 236, anywhere=True)
+    assert seen.shape == (100, 3, 2, 3, 236, 4)
+    flat = seen.flatten(0, 2)
+    first = rows_of(flat)[:, 0]
+    assert set(first.tolist()) == set(range(21))  # 256 - 236 and none
+    assert torch.equal(rows_of(flat), first[:, None] + torch.arange(236))
+    assert (flat[..., -1] == 7).all()  # columns stay
+    assert torch.equal(flat[:, 0], flat[:, 2])  # colours are cropped together
+    torch.manual_seed(0)
+    assert torch.equal(cropped(striped(600).view(100, 3, 2, 3, 256, 4), 236, anywhere=True), seen)
+
+
+def test_acting_draws_nothing(model, batch):
+    torch.manual_seed(1)
+    first = model.logits(batch)
+    torch.manual_seed(2)
+    assert torch.equal(model.logits(batch), first)
+
+
+def test_film_by_hand():
+    film = FiLM(2)
+    features = torch.ones(1, 2, 1, 3)
+    with torch.no_grad():
+        film.told.bias[:] = torch.tensor([1.0, 0.0, 0.5, -4.0])  # scales, then shifts
+        film.told.weight[3, 0] = 2.0
+    language = torch.zeros(1, 384)
+    language[0, 0] = 10
+    assert film(features, language)[0, :, 0].tolist() == [[2.5] * 3, [17.0] * 3]
+
+
+def test_language_changes_nothing_at_first_and_something_once_learned(config):
+    torch.manual_seed(0)
+    encoder = ImageEncoder(config)
+    pictures, words = torch.randn(2, 3, 40, 64), torch.randn(2, 384)
+    with torch.no_grad():
+        settle(encoder, pictures, words)
+        plain = encoder.features(pictures, torch.zeros(2, 384))
+        assert torch.equal(encoder.features(pictures, words), plain)
+        # so it is transformers' EfficientNet, and the convolution after it
+        wanted = encoder.project(encoder.net(pictures).last_hidden_state)
+        assert torch.allclose(plain, wanted, atol=1e-6)
+        for number in (0, len(encoder.films) - 1):
+            encoder.films[number].told.weight.normal_(0, 0.1)
+            spoken = encoder.features(pictures, words)
+            assert not torch.allclose(spoken, plain, rtol=1e-3)
+            encoder.films[number].told.weight.zero_()
+        encoder.film.told.weight.normal_(0, 0.1)
+        assert not torch.allclose(encoder.features(pictures, words), plain, rtol=1e-3)
+
+
+def test_film_learns_although_it_begins_with_zeros(config):
+    torch.manual_seed(0)
+    encoder = ImageEncoder(config)
+    (encoder(torch.randn(2, 3, 40, 64), torch.randn(2, 384)) * torch.randn(2, 4, 32)).sum().backward()
+    for film in [*encoder.films, encoder.film]:
+        assert film.told.weight.grad is not None
+        assert film.told.weight.grad.abs().sum() > 0
+
+
+def test_token_learner_weighs_places():
+    learner = TokenLearner(2, 3, 2)
+    with torch.no_grad():
+        learner.weigh.weight.zero_()
+        learner.weigh.bias.zero_()
+    features = torch.tensor([[[1.0, 5.0], [3.0, -1.0], [2.0, 2.0]]])
+    assert torch.allclose(learner(features), torch.tensor([[[2.0, 2.0], [2.0, 2.0]]]))  # the mean, for each token
+    with torch.no_grad():
+        # normed, the places are about (-1, 1), (1, -1) and (0, 0); the first hidden one is gelu(100 first)
+        learner.hidden.weight.zero_()
+        learner.hidden.bias.zero_()
+        learner.hidden.weight[0, 0] = 100.0
+        learner.weigh.weight[1, 0] = 1.0
+    found = learner(features)
+    assert torch.allclose(found[0, 0], torch.tensor([2.0, 2.0]))
+    assert torch.allclose(found[0, 1], torch.tensor([3.0, -1.0]), atol=1e-5)  # the second place alone
+
+
+def test_a_branch_is_skipped_for_a_whole_picture():
+    torch.manual_seed(0)
+    skip, branch = SkippedBranch(0.25), torch.randn(400, 2, 2, 2)
+    kept = skip(branch)
+    zero = (kept == 0).flatten(1)
+    assert torch.equal(zero.all(1), zero.any(1))
+    assert 60 <= int(zero.all(1).sum()) <= 140  # 100 of 400, +- 4.6 deviations
+    assert torch.allclose(kept[~zero.all(1)], branch[~zero.all(1)] / 0.75)
+    assert torch.equal(skip.eval()(branch), branch)
+
+
+def test_norms_begin_with_one_and_keep_running_means(config):
+    net = efficientnet(config)
+    norms = [module for module in net.modules() if isinstance(module, torch.nn.BatchNorm2d)]
+    assert {module.momentum for module in norms} == {0.1}
+    assert all((module.weight == 1).all() for module in norms)
+    shares = [block.projection.dropout.share for block in net.encoder.blocks]
+    assert shares == pytest.approx([0.2 * number / 7 for number in range(7)])
+
+
+@pytest.fixture
+def weights(config):
+    """Those of another network of this size, by transformers' names, with those of a classifier."""
+    torch.manual_seed(5)
+    made = {f"efficientnet.{name}": value + 1 for name, value in efficientnet(config).state_dict().items()}
+    return {**made, "classifier.weight": torch.zeros(10, 320)}
+
+
+@pytest.mark.parametrize("prefix", ["efficientnet.", ""])
+@pytest.mark.parametrize("kind", ["safetensors", "bin"])
+def test_both_encoders_begin_with_the_weights_of_a_file(weights, prefix, kind, facts, tmp_path, batch):
+    path = tmp_path / f"b3.{kind}"
+    named = {name.replace("efficientnet.", prefix): value for name, value in weights.items()}
+    save_file(named, path) if kind == "safetensors" else torch.save(named, path)
+    config = RT1Config(**SIZES, image_weights=path)
+    model = BASELINE.model(config, facts)
+    for encoder in model.encoders:
+        for name, value in encoder.net.state_dict().items():
+            assert torch.equal(value, weights[f"efficientnet.{name}"]), name
+    assert describe(BASELINE.policy(config, facts, model))["image_weights"] == path.name
+    model.train()(batch)["loss"].backward()
+
+
+def test_these_weights_want_pictures_divided_as_when_they_were_trained(tmp_path):
+    assert RT1Config().std == (0.229, 0.224, 0.225)
+    assert RT1Config(image_weights=tmp_path).std == pytest.approx([0.229**0.5, 0.224**0.5, 0.225**0.5], abs=1e-5)
+    assert RT1Config(image_weights=tmp_path, image_std=(0.5, 0.5, 0.5)).std == (0.5, 0.5, 0.5)
+
+
+def test_without_a_file_a_network_says_that_it_is_from_scratch(config, facts):
+    assert describe(BASELINE.policy(config, facts, BASELINE.model(config, facts)))["image_weights"] == "from scratch"
+
+
+def test_a_trained_network_needs_the_file_no_more(weights, facts, tmp_path, batch):
+    path = tmp_path / "b3.safetensors"
+    save_file(weights, path)
+    config = RT1Config(**SIZES, image_weights=path)
+    trained = BASELINE.model(config, facts)
+    path.unlink()
+    model = BASELINE.model(config, facts)
+    assert torch.isfinite(model.eval()(batch)["loss"])
+    with pytest.raises(TrainingError, match="image_weights .*b3.safetensors: no such file"):
+        model.train()(batch)
+    model.load_state_dict(trained.state_dict())
+    assert describe(BASELINE.policy(config, facts, model))["image_weights"] == "b3.safetensors"
+    model.train()(batch)  # so an interrupted training goes on
+
+
+def spoilt(weights, path):
+    name = "efficientnet.encoder.blocks.2.depthwise_conv.depthwise_conv.weight"
+    missing = {key: value for key, value in weights.items() if key != name}
+    return {
+        "one missing": (missing, "1 of .* missing .*"),
+        "another shape": ({**weights, name: torch.zeros(3)}, "1 of .* missing or of another shape"),
+        "another network": ({"features.0.weight": torch.zeros(3)}, "not the weights of this network"),
+    }[path]
+
+
+@pytest.mark.parametrize("how", ["one missing", "another shape", "another network"])
+def test_other_weights_are_refused_in_a_line(how, weights, facts, tmp_path):
+    path = tmp_path / "b3.safetensors"
+    tensors, said = spoilt(weights, how)
+    save_file(tensors, path)
+    with pytest.raises(TrainingError, match=said) as caught:
+        BASELINE.model(RT1Config(**SIZES, image_weights=path), facts)
+    assert "\n" not in str(caught.value)
+    assert "b3.safetensors" in str(caught.value)
+    assert "image_width and image_depth" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["b3.safetensors", "b3.bin"])
+def test_what_is_no_file_of_weights_is_refused_in_a_line(name, facts, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(b"not weights at all")
+    with pytest.raises(TrainingError, match="can't be read") as caught:
+        BASELINE.model(RT1Config(**SIZES, image_weights=path), facts)
+    assert "\n" not in str(caught.value)
+    torch.save([1, 2], tmp_path / "list.bin")
+    with pytest.raises(TrainingError, match="no weights .*found list"):
+        BASELINE.model(RT1Config(**SIZES, image_weights=tmp_path / "list.bin"), facts)
