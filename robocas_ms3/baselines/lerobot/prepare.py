@@ -1,0 +1,188 @@
+"""Makes of our LeRobot export the one that policies train on: what the socket shows, and the instruction as numbers.
+
+    python -m robocas_ms3.baselines.lerobot.prepare DATASET OUT [--no-language]
+
+Pictures and episodes stay as they are (videos are hard links). The state is that of `observations`;
+``observation.environment_state`` is the sentence embedding of a frame's instruction, as LeRobot's ACT and diffusion
+policy read no text. Of the actions only ``action`` is left, of the rest LeRobot's own indices.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from robocas_ms3.baselines.lerobot.observations import (
+    ACTION,
+    DIMENSIONS,
+    EMBEDDING,
+    STATE,
+    STATE_NAMES,
+    scaled,
+    state_of,
+)
+from robocas_ms3.datasets.lerobot.schema import FEATURES, INDICES, INFO_FILE, STATS_FILE, TASKS_FILE
+from robocas_ms3.errors import DatasetError, RobocasError
+from robocas_ms3.outputs import check_absent
+
+Embed = Callable[[Sequence[str]], NDArray[np.float32]]
+_DRIVEN = 0.005  # m or rad a step; a base that stands trembles by less
+_WIDTHS = {feature.key: feature.width for feature in FEATURES}
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+
+
+def prepare(source: Path, out: Path, embed: Embed | None) -> None:
+    """Write it; the folder is there when all is written.
+
+    Args:
+        source: of ``robocas convert --to lerobot``.
+        out: to make.
+        embed: texts to (N, 384) of unit length; None: no instruction, which policies then do not know.
+
+    Raises:
+        DatasetError: it is no such dataset, has numbers that are none, or its base drives.
+        OutputExistsError: there is something at ``out``.
+    """
+    check_absent(out)
+    info = _info(source)
+    part = out.with_name(f".{out.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    shutil.copytree(source, part, ignore=_ignored, copy_function=_link)
+    vectors = None if embed is None else scaled(embed(_texts(source)))
+    kept: dict[str, list[NDArray]] = {}
+    for path in sorted((source / "data").rglob("*.parquet")):
+        columns, indices = _columns(path, vectors)
+        table = pa.table({**{key: _rows(values) for key, values in columns.items()}, **indices})
+        _write(table, part / path.relative_to(source))
+        for key, values in columns.items():
+            kept.setdefault(key, []).append(values)
+    for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
+        table = pq.read_table(path)  # LeRobot reads no statistics of episodes, and these are of other columns
+        _write(table.select([name for name in table.column_names if not name.startswith("stats/")]),
+               part / path.relative_to(source))  # fmt: skip
+    _write_meta(source, part, info, {key: np.concatenate(values) for key, values in kept.items()})
+    part.rename(out)
+
+
+def _info(source: Path) -> dict[str, Any]:
+    try:
+        info = json.loads((source / INFO_FILE).read_text(encoding="utf-8"))
+        widths = {key: info["features"][key]["shape"] for key in _WIDTHS}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        fix = "Make one: robocas convert F.h5 --to lerobot --out DIR"
+        raise DatasetError("no LeRobot dataset of ours", where=source, found=repr(error), fix=fix) from error
+    if widths != {key: [width] for key, width in _WIDTHS.items()}:
+        raise DatasetError("another LeRobot dataset's columns", where=source, expected=_WIDTHS, found=widths)
+    if not any(key.startswith("observation.images.") for key in info["features"]):
+        raise DatasetError("no pictures", where=source, expected="a camera at least")
+    return info
+
+
+def _columns(path: Path, vectors: NDArray | None) -> tuple[dict[str, NDArray], dict[str, pa.ChunkedArray]]:
+    """The numbers (N, D) of a file by key, and the columns that stay as they are."""
+    table = pq.read_table(path)
+    said = {key: _numbers(table, key) for key in (STATE, ACTION, "action.base")}
+    for key, values in said.items():
+        if not np.isfinite(values).all():
+            row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+            raise DatasetError("a number that is none", where=f"{path}: {key}, row {row}", found=values[row].tolist())
+    if np.abs(said["action.base"]).max(initial=0) > _DRIVEN:
+        fix = "Train on a configuration without base_motion."
+        raise DatasetError("the base drives, which 7 numbers of an action leave out", where=path, fix=fix)
+    state = said[STATE]
+    found = {STATE: state_of(state[:, :3], state[:, 3:7], state[:, 7:14], state[:, 14:15]), ACTION: said[ACTION]}
+    if vectors is not None:
+        found[EMBEDDING] = vectors[table["task_index"].to_numpy()]
+    return found, {key: table[key] for key in INDICES}
+
+
+def _numbers(table: pa.Table, key: str) -> NDArray[np.float32]:
+    flat = table[key].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    return flat.astype(np.float32).reshape(len(table), _WIDTHS[key])
+
+
+def _rows(values: NDArray[np.float32]) -> pa.FixedSizeListArray:
+    return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
+
+
+def _texts(source: Path) -> list[str]:
+    table = pq.read_table(source / TASKS_FILE).to_pydict()
+    numbers, texts = table["task_index"], table["__index_level_0__"]
+    return [texts[numbers.index(number)] for number in range(len(numbers))]
+
+
+def _write_meta(source: Path, part: Path, info: dict[str, Any], columns: dict[str, NDArray]) -> None:
+    names = {STATE: list(STATE_NAMES), EMBEDDING: [f"e{number}" for number in range(DIMENSIONS)]}
+    names[ACTION] = info["features"][ACTION]["names"]
+    features = {
+        key: {"dtype": "float32", "shape": [values.shape[1]], "names": names[key]} for key, values in columns.items()
+    }
+    features |= {
+        key: said for key, said in info["features"].items() if key.startswith("observation.images.") or key in INDICES
+    }
+    stats = json.loads((source / STATS_FILE).read_text(encoding="utf-8"))
+    stats = {key: said for key, said in stats.items() if key in features} | {
+        key: _stats(values.astype(np.float64)) for key, values in columns.items()
+    }
+    (part / INFO_FILE).write_text(json.dumps({**info, "features": features}, indent=2), encoding="utf-8")
+    (part / STATS_FILE).write_text(json.dumps(stats, indent=2), encoding="utf-8")
+
+
+def _stats(values: NDArray[np.float64]) -> dict[str, list]:
+    found = {name: getattr(values, name)(axis=0).tolist() for name in ("min", "max", "mean", "std")}
+    rows = dict(zip(_QUANTILES, np.quantile(values, list(_QUANTILES.values()), axis=0).tolist(), strict=True))
+    return {**found, "count": [len(values)], **rows}
+
+
+def _write(table: pa.Table, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(table, path)
+
+
+def _ignored(_folder: str, names: list[str]) -> set[str]:
+    """What is written anew, or is of no use to LeRobot."""
+    return set(names) & {"data", "episodes", "robocas", "depth", ".parts"}
+
+
+def _link(source: str, target: str) -> None:
+    try:
+        if source.endswith(".mp4"):
+            return os.link(source, target)
+    except OSError:  # another disk, or one without links
+        pass
+    shutil.copyfile(source, target)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the command; gives the exit code."""
+    parser = argparse.ArgumentParser(description="Make a LeRobot export fit for LeRobot's policies on our socket.")
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--no-language", action="store_true", help="leave the instruction out")
+    cfg = parser.parse_args(words)
+    try:
+        embed = None
+        if not cfg.no_language:
+            from robocas_ms3.language.embed import TextEmbedder
+
+            embed = TextEmbedder()
+        prepare(cfg.dataset, cfg.out, embed)
+    except RobocasError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

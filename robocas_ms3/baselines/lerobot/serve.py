@@ -1,0 +1,110 @@
+"""Serves a LeRobot checkpoint to ``robocas eval``; runs in LeRobot's environment, see scripts/serve_lerobot.sh.
+
+    python -m robocas_ms3.baselines.lerobot.serve RUN [--port 8000] [--play N] [--device cpu]
+
+Of this package it imports what talks over the socket and nothing that simulates; besides LeRobot it needs msgpack,
+websockets, pydantic, scipy, PyYAML and platformdirs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.baselines.lerobot.policy import LeRobotPolicy
+from robocas_ms3.datasets.lerobot.schema import checksum
+from robocas_ms3.errors import EvaluationError, RobocasError
+from robocas_ms3.evaluation.remote.server import PolicyServer
+
+CHECKPOINT = "train/checkpoints/last/pretrained_model"
+INFO = "dataset/meta/info.json"
+"""In a folder of scripts/train_lerobot.sh."""
+
+
+def open_checkpoint(checkpoint: Path, rate_hz: float, device: str, play: int | None) -> LeRobotPolicy:
+    """Load what ``lerobot-train`` wrote.
+
+    Args:
+        checkpoint: folder ``pretrained_model``.
+        rate_hz: frames a second of the dataset.
+        device: of torch.
+        play: of a chunk, actions that are played before it is asked again; None: as it was trained.
+
+    Raises:
+        EvaluationError: there is none, or it plays no such number of actions.
+    """
+    if not (checkpoint / "config.json").is_file():
+        fix = "Train first: bash scripts/train_lerobot.sh act DATASET RUN"
+        raise EvaluationError("no checkpoint of LeRobot", where=checkpoint, expected="config.json", fix=fix)
+    from lerobot.configs.policies import PreTrainedConfig  # pyright: ignore[reportMissingImports]
+    from lerobot.policies.factory import (  # pyright: ignore[reportMissingImports]
+        get_policy_class,
+        make_pre_post_processors,
+    )
+
+    config: Any = PreTrainedConfig.from_pretrained(checkpoint)
+    config.device = device
+    if play is not None:
+        config.n_action_steps = play
+        try:
+            config.__post_init__()
+        except (ValueError, NotImplementedError) as error:
+            raise EvaluationError("can't play so many", where="--play", found=f"{play}: {error}") from error
+    model = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
+    model.eval()
+    # In the checkpoint the device is that of the training.
+    overrides = {"device_processor": {"device": device}}
+    before, after = make_pre_post_processors(config, checkpoint, preprocessor_overrides=overrides)
+    inputs = {key: tuple(feature.shape) for key, feature in config.input_features.items()}
+    about = {
+        "lerobot": version("lerobot"),
+        "type": config.type,
+        "weights": checksum(checkpoint / "model.safetensors"),  # so that a result is not gone on with by another run's
+        "n_action_steps": config.n_action_steps,
+    }
+    return LeRobotPolicy(model, before, after, inputs, rate_hz, about)
+
+
+def rate_of(info: Path) -> float:
+    """Frames a second of a dataset.
+
+    Raises:
+        EvaluationError: it does not say.
+    """
+    try:
+        return float(json.loads(info.read_text(encoding="utf-8"))["fps"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise EvaluationError("no rate known", where=info, found=repr(error), fix="Pass --rate HZ.") from error
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the command; gives the exit code."""
+    parser = argparse.ArgumentParser(description="Serve a LeRobot checkpoint over the policy socket.")
+    parser.add_argument("run", type=Path, help="folder of train_lerobot.sh, or a checkpoint's pretrained_model")
+    parser.add_argument("--host", default="127.0.0.1", help="there is no password: keep to loopback, and tunnel")
+    parser.add_argument("--port", type=int, default=8000)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--play", type=int, help="actions of a chunk that are played; default: as trained")
+    parser.add_argument("--rate", type=float, help="actions a second; default: the dataset's in the run's folder")
+    cfg = parser.parse_args(words)
+    try:
+        alone = (cfg.run / "config.json").is_file()
+        checkpoint = cfg.run if alone else cfg.run / CHECKPOINT
+        rate_hz = cfg.rate if cfg.rate is not None else rate_of(cfg.run / INFO)
+        policy = open_checkpoint(checkpoint, rate_hz, cfg.device, cfg.play)
+        PolicyServer(policy, cfg.host, cfg.port).run(lambda url: print(f"{checkpoint} at {url}", flush=True))
+    except RobocasError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,165 @@
+"""LeRobot policies around a stub model: what they are shown, queues of envs, what is refused. LeRobot is not needed."""
+
+from collections import deque
+
+import numpy as np
+import pytest
+import torch
+
+from robocas_ms3.baselines.lerobot.observations import EMBEDDING, STATE, scaled, state_of
+from robocas_ms3.baselines.lerobot.policy import LeRobotPolicy
+from robocas_ms3.baselines.lerobot.serve import main, open_checkpoint, rate_of
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.policy import Observations, Start, describe
+
+INPUTS = {STATE: (17,), "observation.images.base_camera": (3, 2, 4), EMBEDDING: (384,)}
+HALF = float(np.sqrt(0.5))
+
+
+class Chunks(torch.nn.Module):
+    """Plays chunks of three, as LeRobot's ACT does: width of the gripper when asked, how many are left, noise."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+        self.ensembler = Ensembler()
+        self.seen = []
+        self.reset()
+
+    def reset(self):
+        self._queue = deque(maxlen=3)
+        self.ensembler.reset()
+
+    def select_action(self, batch):
+        self.seen.append(batch)
+        self.ensembler.count += 1
+        if not self._queue:
+            width = float(batch[STATE][0, -1])
+            self._queue.extend(torch.tensor([[width, left, float(torch.rand(())), 0, 0, 0, 1]]) for left in (2, 1, 0))
+        action = self._queue.popleft()
+        action[0, 3] = self.ensembler.count
+        return action
+
+
+class Ensembler:
+    def reset(self):
+        self.count = 0
+
+
+def before(item):
+    return {key: value[None] if isinstance(value, torch.Tensor) else value for key, value in item.items()}
+
+
+def made(model=None, inputs=None):
+    return LeRobotPolicy(model or Chunks(), before, lambda action: 2 * action, inputs or INPUTS, 5.0)
+
+
+def a_start(env, seed=0):
+    return Start(env, 0, "pick", "a.yaml", "a.npy", "builtin", seed, "take it")
+
+
+def shown(widths):
+    """Widths of grippers by env."""
+    count = len(widths)
+    tcp = np.tile(np.array([0.1, 0.2, 0.3, HALF, 0, 0, HALF], np.float32), (count, 1))  # 90 deg about z
+    pictures = np.zeros((count, 2, 4, 3), np.uint8)
+    pictures[:, 0, 1] = 255, 0, 51
+    return Observations(
+        envs=np.array(list(widths)),
+        instructions=["take it"] * count,
+        embeddings=np.tile(np.eye(384, dtype=np.float32)[:1], (count, 1)),
+        images={"base_camera": pictures},
+        depths={},
+        qpos=np.tile(np.arange(12, dtype=np.float32), (count, 1)),
+        tcp_in_base=tcp,
+        gripper_width=np.array(list(widths.values()), np.float32)[:, None],
+        state=None,
+    )
+
+
+def test_what_it_wants_follows_from_the_checkpoint():
+    wants = made().wants
+    assert (wants.convention, wants.reference, wants.rate_hz, wants.language) == ("robocas", "tcp", 5.0, "embedding")
+    assert wants.cameras == {"base_camera": (4, 2)}
+    assert made(inputs={STATE: (17,)}).wants.language == "text"
+    policy = LeRobotPolicy(Chunks(), before, before, INPUTS, 5.0, {"weights": "abc"})
+    assert describe(policy)["weights"] == "abc"
+
+
+@pytest.mark.parametrize("key, shape", [(STATE, (18,)), (EMBEDDING, (7,)), ("observation.images.wrist", (3, 2, 4))])
+def test_a_policy_of_another_dataset_is_refused(key, shape):
+    with pytest.raises(EvaluationError, match=f"{key}: a policy of another dataset"):
+        made(inputs={**INPUTS, key: shape})
+
+
+def test_an_observation_is_an_item_of_the_dataset():
+    model = Chunks()
+    policy = made(model)
+    policy.reset([a_start(0)])
+    policy.act(shown({0: 0.07}))
+    seen = model.seen[0]  # the list is shared by copies
+    expected = [0.1, 0.2, 0.3, 0, 1, 0, -1, 0, 0, 3, 4, 5, 6, 7, 8, 9, 0.07]  # x axis is y's, y axis is -x's
+    np.testing.assert_allclose(seen[STATE][0], expected, atol=1e-6)
+    assert seen["observation.images.base_camera"].shape == (1, 3, 2, 4)
+    np.testing.assert_allclose(seen["observation.images.base_camera"][0, :, 0, 1], [1, 0, 0.2])
+    assert seen[EMBEDDING][0, 0] == pytest.approx(19.5959, abs=1e-4)  # sqrt(384)
+    assert seen["task"] == "take it"
+    assert set(made_without_embedding(model)) == {STATE, "task"}
+
+
+def made_without_embedding(model):
+    policy = made(model, {STATE: (17,)})
+    policy.reset([a_start(0)])
+    policy.act(shown({0: 0.07}))
+    return model.seen[-1]
+
+
+def test_envs_play_chunks_of_their_own():
+    policy = made()
+    policy.reset([a_start(0), a_start(5)])
+    assert policy.act(shown({0: 1, 5: 50}))[:, :2].tolist() == [[2, 4], [100, 4]]
+    policy.reset([a_start(5)])  # begins anew while env 0 goes on with its chunk
+    assert policy.act(shown({0: 2, 5: 60}))[:, :2].tolist() == [[2, 2], [120, 4]]
+    assert policy.act(shown({5: 61}))[:, :2].tolist() == [[120, 2]]
+    actions = policy.act(shown({0: 3, 5: 62}))
+    assert actions[:, :2].tolist() == [[2, 0], [120, 0]]
+    assert actions[:, 3].tolist() == [6, 6]  # three of each: nor is what is reset in place shared
+    assert policy.act(shown({0: 4}))[0, 0] == 8  # the next chunk
+
+
+def test_weights_are_shared():
+    model = Chunks()
+    policy = made(model)
+    policy.reset([a_start(0)])
+    assert policy._models[0].weight is model.weight
+
+
+def test_noise_is_the_episode_s_own():
+    def noise(policy, env, others=()):
+        return policy.act(shown({**dict.fromkeys(others, 1.0), env: 1.0}))[-1, 2]
+
+    alone, beside = made(), made()
+    alone.reset([a_start(0, seed=7)])
+    beside.reset([a_start(1, seed=8), a_start(2, seed=7)])
+    first = noise(alone, 0)
+    assert noise(beside, 2, others=[1]) == first
+    assert noise(beside, 1) != first
+
+
+def test_a_quaternion_s_sign_does_not_matter():
+    parts = np.zeros((1, 3)), np.array([[0.1, 0.2, 0.3, 0.4]]), np.zeros((1, 7)), np.zeros((1, 1))
+    np.testing.assert_array_equal(state_of(*parts), state_of(parts[0], -parts[1], *parts[2:]))
+    assert np.sqrt(np.mean(scaled(np.full((1, 384), 384**-0.5)) ** 2)) == pytest.approx(1)
+
+
+def test_what_is_no_run_is_one_line(tmp_path, capsys):
+    with pytest.raises(EvaluationError, match="no checkpoint of LeRobot"):
+        open_checkpoint(tmp_path, 5, "cpu", None)
+    (tmp_path / "info.json").write_text('{"fps": 5}')
+    assert rate_of(tmp_path / "info.json") == 5
+    with pytest.raises(EvaluationError, match=r"Pass --rate HZ"):
+        rate_of(tmp_path / "nothing.json")
+    assert main([str(tmp_path), "--rate", "5"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "train_lerobot.sh" in said

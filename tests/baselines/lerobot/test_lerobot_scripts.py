@@ -1,0 +1,32 @@
+"""The scripts around LeRobot's environment, as far as they go without it."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
+
+
+def test_both_make_one_environment():
+    """They share a folder, and whichever found other packages in it would make it anew."""
+    lists = [
+        re.search(r"(?i)^packages=\((.*?)\)", (SCRIPTS / name).read_text(), re.MULTILINE)
+        for name in ("check_lerobot.sh", "lerobot_environment.sh")
+    ]
+    assert lists[0] and lists[1]
+    assert lists[0][1] == lists[1][1]
+
+
+@pytest.mark.parametrize(
+    "name, words", [("train_lerobot.sh", []), ("train_lerobot.sh", ["act", "nowhere", "out"]), ("serve_lerobot.sh", [])]
+)
+def test_wrong_words_are_told_how(tmp_path, name, words):
+    done = subprocess.run(
+        ["bash", SCRIPTS / name, *words], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 2
+    assert f"bash scripts/{name}" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
