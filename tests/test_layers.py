@@ -42,6 +42,7 @@ LAYERS = (
     ("plans",),
     ("evaluation",),
     ("viewer",),
+    ("baselines",),
     ("doctor",),
     ("cli",),
 )

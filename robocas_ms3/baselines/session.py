@@ -110,7 +110,8 @@ def _config(
     baseline: Baseline, changes: Mapping[str, Any] | None, before: RunRecord | None, out: Path
 ) -> BaselineConfig:
     if before is None:
-        return parse(baseline.Config, dict(changes or {}), TrainingError, where=baseline.name, about="no configuration")
+        default = baseline.Config().model_dump(mode="json")
+        return parse(baseline.Config, merged(default, changes or {}), TrainingError, where=baseline.name)
     if before.baseline != baseline.name:
         raise TrainingError("a run of another baseline", where=out, expected=baseline.name, found=before.baseline)
     config = parse(baseline.Config, before.config, TrainingError, where=out / RUN)

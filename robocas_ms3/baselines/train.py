@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -87,24 +88,28 @@ class Trainer:
         saved = self.step
         try:
             for batch in self._batches():
-                with uninterrupted():
+                with uninterrupted():  # between two steps everything is as a checkpoint has it
                     self._take(batch)
+                    last = self.step == settings.steps
+                    if last or self.step % settings.log_every == 0:
+                        self._tell(log, "train", self._means(), time.monotonic() - begun)
+                    if self._check is not None and (last or self.step % settings.check_every == 0):
+                        self._tell(log, "val", self._checked(self._check), time.monotonic() - begun)
+                    if last or self.step % settings.save_every == 0:
+                        self._save()
+                        saved = self.step
                 on_step(self.step, settings.steps)
-                last = self.step == settings.steps
-                if last or self.step % settings.log_every == 0:
-                    self._tell(log, "train", self._means(), time.monotonic() - begun)
-                if self._check is not None and (last or self.step % settings.check_every == 0):
-                    self._tell(log, "val", self._checked(self._check), time.monotonic() - begun)
-                if last or self.step % settings.save_every == 0:
-                    self._save()
-                    saved = self.step
         except KeyboardInterrupt:
             if self.step > saved:
                 self._save()
             raise
-        finally:
+        except BaseException:
             if log:
-                log.close()
+                with suppress(OSError):  # what went wrong is known
+                    log.close()
+            raise
+        if log:
+            log.close()
 
     def parameters(self) -> Iterator[torch.nn.Parameter]:
         """Of the network."""
@@ -260,6 +265,7 @@ def _loader(samples: Any, batches: Batches, workers: int) -> DataLoader:
         collate_fn=_as_it_is,
         num_workers=workers,
         persistent_workers=workers > 0,
+        generator=torch.Generator(),  # it draws a seed when it begins, as a run that goes on does once more
         multiprocessing_context="forkserver" if workers else None,
     )
 

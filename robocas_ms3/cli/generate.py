@@ -67,6 +67,11 @@ class Generate:
     """Undo what fails by forking the process, where that is safe. The episodes are the same without, only slower."""
     keep_recoveries: bool = False
     """Leave failed attempts in the episode, as one continuous motion, instead of undoing them."""
+    after_policy: Maybe[str] = None
+    """Have a policy act first, as in the evaluation (its --policy): the scripted one takes over from where it is, and
+    only that is recorded. Scenes in which nothing is left to be done count as seeds given up."""
+    after_steps: tuple[int, int] = (5, 60)
+    """Least and most of its steps, of which it has a random number in each scene."""
     resume: bool = False
     """Go on with an interrupted run, or add episodes to a finished one."""
     overwrite: bool = False
@@ -112,7 +117,15 @@ def run(cfg: Generate) -> int:
         *cfg.noise,
         planner=cfg.planner,
         robot=cfg.robot,
+        after_policy=cfg.after_policy or "",
+        after_steps=cfg.after_steps,
     )
+    players = None
+    if settings.after_policy:
+        from robocas_ms3.evaluation.acting import Players, check_acting
+
+        check_acting(settings)
+        players = Players(settings)
     with bar("episodes recorded") as shown:
 
         def on_result(result: EpisodeResult) -> None:
@@ -134,6 +147,7 @@ def run(cfg: Generate) -> int:
             overwrite=cfg.overwrite,
             on_start=partial(shown.start, cfg.episodes),
             on_result=on_result,
+            players=players,
         )
         shown.at(cfg.episodes, cfg.episodes)  # some of them may have been there beyond a seed that was not
     seconds = ", ".join(f"{part} {value:.2f}" for part, value in summary.mean_seconds.items())

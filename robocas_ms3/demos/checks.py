@@ -32,8 +32,17 @@ def check_limits(episode_seconds: float, memory_gb: float) -> None:
     check_number("memory_gb", memory_gb, 0.1)
 
 
-def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int, jobs: int) -> None:
+def check_arguments(
+    settings: EpisodeSettings, *, episodes: int, first_seed: int, jobs: int, acts_first: bool = False
+) -> None:
     """Check what a run is asked for, before anything is written.
+
+    Args:
+        settings: of the episodes.
+        episodes: how many.
+        first_seed: of their scenes.
+        jobs: worker processes.
+        acts_first: whether there is something that has ``settings.after_policy`` act.
 
     Raises:
         RobocasError: a number is out of its range, the task can't run the configuration, or there is no such planner,
@@ -63,6 +72,11 @@ def check_arguments(settings: EpisodeSettings, *, episodes: int, first_seed: int
             expected=f"a divisor of {settings.control_freq}, or 0 for no trial",
             found=settings.replay_rate,
         )
+    least, most = settings.after_steps
+    check_number("after_steps", least, 1)
+    check_number("after_steps", most, least)
+    if bool(settings.after_policy) != acts_first:
+        raise RobocasError("a policy that acts first and what has it act go together", where="after_policy")
     BACKENDS.find(settings.planner, where="planner")
     robot = find_robot(settings.robot)
     config = load_config_of(TASKS[settings.task], settings.config)
@@ -84,7 +98,7 @@ def check_same_run(path: Path, run: dict[str, Any]) -> None:
     before = load_json(path)
     if isinstance(before.get("settings"), dict):  # a setting that is newer than the output had its default then
         defaults = {one.name: one.default for one in fields(EpisodeSettings) if one.default is not MISSING}
-        before["settings"] = {**defaults, **before["settings"]}
+        before["settings"] = {**json.loads(json.dumps(defaults)), **before["settings"]}
     if isinstance(before.get("versions"), dict):  # outputs that are older have none
         now, fix = run.get("versions", {}), "Install those, or choose another --out."
         what = "this machine has other versions than this output was begun with"

@@ -14,6 +14,7 @@ from robocas_ms3.planning.backends import DEFAULT
 from robocas_ms3.planning.seconds import Seconds
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
 
+AFTER_STEPS = 5, 60
 NOISY = "noisy_"  # begins the reasons of attempts that failed for noise alone
 
 
@@ -38,6 +39,8 @@ class EpisodeSettings:
         layouts: where layouts come from, see ``RoboCASEnv``.
         planner: name of the motion planner.
         robot: name of the robot.
+        after_policy: name of a policy that acts first; the scripted one takes over from it (`takeover`). Empty: none.
+        after_steps: least and most steps for which it acts.
     """
 
     task: str
@@ -54,6 +57,8 @@ class EpisodeSettings:
     layouts: str = "auto"
     planner: str = DEFAULT
     robot: str = DEFAULT_ROBOT
+    after_policy: str = ""
+    after_steps: tuple[int, int] = AFTER_STEPS
 
 
 @dataclass

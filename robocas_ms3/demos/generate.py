@@ -14,6 +14,7 @@ import numpy as np
 from robocas_ms3.demos.checks import check_arguments, check_same_run
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_stage, failed_attempts
+from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.errors import DatasetError, RobocasError
 from robocas_ms3.files import flush_to_disk, make_folder, write_json
@@ -27,7 +28,7 @@ from robocas_ms3.outputs import (
     while_there,
 )
 from robocas_ms3.planning.seconds import Seconds
-from robocas_ms3.processes import Limits
+from robocas_ms3.processes import Limits, Worker
 from robocas_ms3.recordings.entries import read_json, reason
 from robocas_ms3.recordings.merging import merge
 from robocas_ms3.recordings.stored import open_trajectory
@@ -78,6 +79,7 @@ def generate(
     overwrite: bool = False,
     on_start: Callable[[int], None] = lambda there: None,
     on_result: Callable[[EpisodeResult], None] = lambda result: None,
+    players: Callable[[], Worker[int, Takeover]] | None = None,
 ) -> Summary:
     """Generate episodes of consecutive seeds until there are enough.
 
@@ -100,6 +102,7 @@ def generate(
         on_start: called once arguments, configuration, pack and output turned out right, with how many of the episodes
             are there.
         on_result: called for each seed that was not dealt with before, in order.
+        players: opens what has ``settings.after_policy`` act in the scene of a seed, in a process (is pickled).
 
     Raises:
         OutputExistsError: ``out`` has content and neither flag is set, or what was made by another command.
@@ -107,7 +110,7 @@ def generate(
             settings or versions, or another process writes there; far too many seeds fail.
     """
     check_one_way("generate", resume=resume, overwrite=overwrite)
-    check_arguments(settings, episodes=episodes, first_seed=first_seed, jobs=jobs)
+    check_arguments(settings, episodes=episodes, first_seed=first_seed, jobs=jobs, acts_first=players is not None)
     if overwrite:
         check_overwrite(out, (RUN,), "made by `robocas generate`")
     check_run(out / RUN, "settings", "generate")
@@ -118,7 +121,7 @@ def generate(
         make_folder(out)
         write_json(out / RUN, run)
         with while_there(out / RUN):
-            return _generate_in(out, settings, episodes, first_seed, jobs, fork, limits, on_start, on_result)
+            return _generate_in(out, settings, episodes, first_seed, jobs, fork, limits, on_start, on_result, players)
 
 
 def _only_begun(out: Path) -> bool:
@@ -138,6 +141,7 @@ def _generate_in(
     limits: Limits | None,
     on_start: Callable[[int], None],
     on_result: Callable[[EpisodeResult], None],
+    players: Callable[[], Worker[int, Takeover]] | None,
 ) -> Summary:
     shards, ledger = make_folder(out / "episodes"), Ledger(out / FAILURES_FILE)
     earlier = _finished(out, shards, ledger)
@@ -147,7 +151,8 @@ def _generate_in(
     results: list[EpisodeResult] = []
     good = 0
     try:
-        with closing(generate_seeds(settings, missing, shards, jobs, fork=fork, limits=limits)) as new:
+        made = generate_seeds(settings, missing, shards, jobs, fork=fork, limits=limits, players=players)
+        with closing(made) as new:
             for seed in count(first_seed):
                 if good >= episodes:
                     break

@@ -18,6 +18,7 @@ from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.forking import say_once, why_not_fork
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.demos.resimulation import Resimulation
+from robocas_ms3.demos.takeover import Takeover, complete
 from robocas_ms3.demos.trials import Trials
 from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.extensions import load
@@ -87,23 +88,33 @@ class EpisodeGenerator:
             say_once(reason)
             self._fork = False
 
-    def generate(self, seed: int, folder: Path, name: str) -> EpisodeResult:
+    def generate(self, seed: int, folder: Path, name: str, takeover: Takeover | None = None) -> EpisodeResult:
         """Make the episode of a seed, as ``folder/name.h5`` and ``.json``; no files where every attempt failed.
 
         The same seed and versions give the same episode, whatever was generated before.
+
+        Args:
+            seed: of the scene.
+            folder: where the files go.
+            name: of the files.
+            takeover: where another policy was in this scene; the episode begins there.
         """
         recorder = EpisodeRecorder(self.env, folder, name)
         executor = Executor(recorder, seed)
         result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=self.settings.max_attempts)
-        attempts = _Attempts(self, recorder, executor, result)
+        attempts = _Attempts(self, recorder, executor, result, takeover)
         executor.rehearse = attempts.rehearse
         try:
+            if takeover is not None:
+                takeover.check()
             if self.settings.keep_recoveries:
                 attempts.make_in_one_motion()
             else:
                 attempts.make_from_resets(ForkedBranches(result) if self._fork else Resimulation(result))
         except LayoutError as error:
             result.failed(PlanningFailed("layout", error.what))
+        except EpisodeLost as error:  # of a takeover; those of attempts are dealt with there
+            result.failed(error)
         result.attempts = len(result.failures) + result.success
         return result
 
@@ -122,6 +133,7 @@ class _Attempts:
     recorder: EpisodeRecorder
     executor: Executor
     result: EpisodeResult
+    takeover: Takeover | None
 
     def make_from_resets(self, decisions: ForkedBranches | Resimulation) -> None:
         """Attempt after attempt, each from the reset; within them decisions are made otherwise."""
@@ -130,7 +142,7 @@ class _Attempts:
 
             def attempt(number: int = number) -> None:
                 self._reset()
-                self.generator.policy(self._arm(decisions, number))
+                self._play(self._arm(decisions, number))
                 self._finish([])
 
             if decisions.run(attempt):
@@ -146,7 +158,10 @@ class _Attempts:
             first = len(executor.actions)
             arm = self._arm(decisions, len(result.failures))
             try:
-                self.generator.policy(arm)
+                if first:
+                    self.generator.policy(arm)
+                else:
+                    self._play(arm)
                 self._finish(recoveries)
                 return
             except PlanningFailed as error:
@@ -165,11 +180,21 @@ class _Attempts:
     def _arm(self, decisions: Decisions, number: int) -> Arm:
         return Arm(self.generator.planner, self.generator.reachability, self.executor, decisions, (number,))
 
+    def _play(self, arm: Arm) -> None:
+        if self.takeover is None:
+            self.generator.policy(arm)
+        else:
+            complete(arm, self.generator.policy)
+
     def _reset(self) -> None:
         self.executor.reset()
-        if self.generator.trials is not None:
-            with self.executor.seconds.spent_on("reset"):
-                self.generator.trials.reset(self.executor.seed)
+        with self.executor.seconds.spent_on("reset"):
+            if self.takeover is not None:
+                self.recorder.begin_at(self.takeover.state)
+                self.executor.info = self.executor.base_env.get_info()
+                self.executor.gripper = self.takeover.gripper
+            if self.generator.trials is not None:
+                self.generator.trials.reset(self.executor.seed, self.takeover)
 
     @property
     def _noisy(self) -> bool:
@@ -204,6 +229,7 @@ class _Attempts:
         executor, settings, tried = self.executor, self.generator.settings, self.generator.trials is not None
         env = executor.base_env
         target = env.target_asset().asset
+        executor.segments[0].first = 0  # what freed the way to it is part of it
         bounds = [part.first for part in executor.segments] + [len(executor.actions)]
         said, layout = env.instruction(), env.layout()
         assert layout is not None  # there was a reset
@@ -225,4 +251,5 @@ class _Attempts:
             "failed_attempts": [f"{failure.stage}: {failure.reason}" for failure in self.result.failures],
             "noisy_trials": None if not tried else settings.noisy_trials if self._noisy else 0,
             "recoveries": recoveries,
+            **({"takeover": self.takeover.as_json()} if self.takeover else {}),
         }

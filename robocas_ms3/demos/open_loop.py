@@ -112,6 +112,16 @@ class OpenLoop:
         """(3,) m, where the TCP is, in the arm's base frame."""
         return self.env.agent.tcp_in_arm_base.p[0].numpy().copy()
 
+    def begin_at(self, state: dict[str, Any], gripper: float) -> None:
+        """Go on from another state of the scene that was reset.
+
+        Args:
+            state: as ``set_state_dict`` takes it, without targets of controllers.
+            gripper: what it was told last, -1 closed or 1 open.
+        """
+        self.env.set_state_dict(state)
+        self._gripper = gripper
+
     def step(self, action: NDArray[np.floating]) -> None:
         """Play one action (7,), see `motion.stored_actions`."""
         wanted = np.asarray(action, dtype=np.float64)

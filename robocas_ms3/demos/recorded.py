@@ -12,7 +12,7 @@ from mani_skill.trajectory.utils import dict_to_list_of_dicts
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.entries import read_reset
+from robocas_ms3.recordings.entries import read_reset, was_taken_over
 from robocas_ms3.recordings.stored import (
     BODIES,
     check_bodies,
@@ -37,6 +37,7 @@ class Recorded:
         control_mode: of the actions.
         actions: (S, A).
         states: S + 1, each as ``set_state_dict`` takes it.
+        taken_over: whether it begins at the first of them, to which the seed alone does not lead.
     """
 
     where: str
@@ -45,6 +46,7 @@ class Recorded:
     control_mode: str
     actions: NDArray[np.float32]
     states: list[dict[str, Any]]
+    taken_over: bool
 
     @classmethod
     def read(cls, trajectory: Path, episode: dict[str, Any]) -> Recorded:
@@ -76,7 +78,7 @@ class Recorded:
                 )
             check_finite(rows, f"{where}, {name}")
         check_bodies(states, where)
-        return cls(where, seed, options, mode, actions, dict_to_list_of_dicts(states))
+        return cls(where, seed, options, mode, actions, dict_to_list_of_dicts(states), was_taken_over(episode))
 
     def check_fits(self, env: RoboCASEnv) -> None:
         """See that an environment, reset for this episode, is such a one as it was recorded in.

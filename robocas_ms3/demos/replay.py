@@ -158,7 +158,9 @@ def _replay_one(env: gym.Env, trajectory: Path, episode: dict[str, Any], use_env
     _, info = env.reset(seed=recorded.seed, options=recorded.options)
     recorded.check_fits(base_env)
     converted = base_env.control_mode != recorded.control_mode
-    if use_env_states:
+    if isinstance(env, EpisodeRecorder) and recorded.taken_over:
+        env.begin_at(recorded.states[0])
+    elif use_env_states or recorded.taken_over:
         base_env.set_state_dict(recorded.states[0])
     for action, state in zip(recorded.actions, recorded.states[1:], strict=True):
         *_, info = env.step(convert_action(action, base_env) if converted else action)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.demos.episode import NOISY
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
+from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.errors import EpisodeLost
 from robocas_ms3.recordings.motion import Motion, sample_states
 
@@ -37,10 +38,12 @@ class Trials:
         self._robot = worlds[0].env.robot_spec
         self._seed, self._played = 0, 0
 
-    def reset(self, seed: int) -> None:
-        """Build the episode's scene in each world."""
+    def reset(self, seed: int, takeover: Takeover | None = None) -> None:
+        """Build the episode's scene in each world, as it was taken over, if it was."""
         for world in self._worlds:
             world.reset(seed)
+            if takeover is not None:
+                world.begin_at(takeover.state, takeover.gripper)
         self._seed, self._played = seed, 0
 
     def follow(

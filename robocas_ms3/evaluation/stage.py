@@ -57,7 +57,7 @@ def make_env(
         reward_mode="none",
         sim_config={"control_freq": rate_of(protocol, wants)},
         max_episode_steps=10**9,  # the protocol's rules end episodes
-        **{**_looks(wants, renders="render_mode" in kwargs), **kwargs},
+        **{**looks(wants, renders="render_mode" in kwargs), **kwargs},
     )
 
 
@@ -82,8 +82,8 @@ def start_of(protocol: LoadedProtocol, episode: Episode) -> Start:
     )
 
 
-def _looks(wants: Wants, *, renders: bool) -> dict[str, Any]:
-    """Arguments of an environment that shows what a policy wants to see."""
+def looks(wants: Wants, *, renders: bool = False) -> dict[str, Any]:
+    """Arguments of an environment that shows what a policy wants to see, and perhaps renders for others."""
     if not wants.cameras:
         return {"obs_mode": "state_dict", **({} if renders else {"render_backend": "none"})}
     modes = ["rgb", *(["depth"] if wants.depth else []), *(["state_dict"] if wants.state else [])]

@@ -67,6 +67,11 @@ class PolicyStepping(gym.Wrapper):
         self._told[rows], self._width_change[rows] = True, 0.0
         return obs, {**info, **self._happened(info)}
 
+    @property
+    def told_open(self) -> bool:
+        """Whether the first env's gripper was told to be open last."""
+        return bool(self._told[0])
+
     def get_info(self) -> dict[str, Any]:
         """What infos hold, such as workers share."""
         info = self._base.get_info()

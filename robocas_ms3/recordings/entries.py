@@ -27,6 +27,7 @@ class Entry:
         control_steps: S.
         instruction: what the robot was told.
         subgoals: ranges over the actions 0..S-1.
+        taken_over: whether it begins where another policy was, to which the seed alone does not lead.
     """
 
     episode_id: int
@@ -36,6 +37,7 @@ class Entry:
     control_steps: int
     instruction: str
     subgoals: list[SubGoal]
+    taken_over: bool
 
 
 def read_entry(episode: Mapping[str, Any], where: object) -> Entry:
@@ -56,6 +58,7 @@ def read_entry(episode: Mapping[str, Any], where: object) -> Entry:
             control_steps=episode["elapsed_steps"] if "elapsed_steps" in episode else goals[-1].last + 1,
             instruction=said["instruction"],
             subgoals=goals,
+            taken_over=was_taken_over(episode),
         )
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise DatasetError("the JSON's entry is incomplete", where=where, found=reason(error)) from error
@@ -68,6 +71,12 @@ def read_entry(episode: Mapping[str, Any], where: object) -> Entry:
         if not sound:
             raise DatasetError("the JSON's entry is wrong", where=f"{where}, {key}", expected=expected)
     return entry
+
+
+def was_taken_over(episode: Mapping[str, Any]) -> bool:
+    """Whether an episode begins where another policy was, by the JSON's entry or ``scene.json``'s ``recorded``."""
+    said = episode.get("robocas", episode.get("recorded"))
+    return isinstance(said, Mapping) and said.get("takeover") is not None
 
 
 def read_reset(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str, Any]]:

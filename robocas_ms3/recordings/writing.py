@@ -54,6 +54,12 @@ class EpisodeRecorder(gym.Wrapper):
         self._keep(observation)
         return observation, info
 
+    def begin_at(self, state: dict[str, Any]) -> None:
+        """Begin anew from a state of the scene that was reset, as ``set_state_dict`` takes it."""
+        self._base_env.set_state_dict(state)
+        self._steps = _Steps()
+        self._keep(self._base_env.get_obs())
+
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Step the environment and keep what came of it."""
         observation, reward, terminated, truncated, info = self.env.step(action)

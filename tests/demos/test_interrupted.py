@@ -49,7 +49,7 @@ def made(monkeypatch):
     """Seeds that were generated, in the order in which they were."""
     seeds_made = []
 
-    def make(settings, seeds, folder, jobs, *, fork, limits):
+    def make(settings, seeds, folder, jobs, *, fork, limits, players):
         for seed in seeds:
             seeds_made.append(seed)
             if seed != HOPELESS:

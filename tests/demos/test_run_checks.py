@@ -1,7 +1,7 @@
 """A wrong argument is one line, before anything is written or a bar is shown."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import h5py
 import pytest
@@ -74,7 +74,7 @@ def begun(out, *, ledger=""):
 def hopeless(monkeypatch):
     """Every seed is given up."""
 
-    def give_up(settings, seeds, folder, jobs, *, fork, limits):
+    def give_up(settings, seeds, folder, jobs, *, fork, limits, players):
         for seed in seeds:
             yield EpisodeResult(seed, success=False, failures=[Failure(seed, 0, "reach", "far", 0.0)])
 
@@ -209,3 +209,18 @@ def test_a_trajectory_of_something_else_is_not_gone_on_with(tmp_path, change):
     path.with_suffix(".json").write_text(json.dumps({**content, "episodes": [episode]}))
     with pytest.raises(DatasetError, match=r"trajectory.json: this is not of `robocas generate`.*--overwrite"):
         _recorded(path, {})
+
+
+def test_a_policy_that_acts_first_needs_something_that_has_it_act(tmp_path):
+    with pytest.raises(RobocasError, match="go together"):
+        generate(replace(SETTINGS, after_policy="random"), tmp_path / "out", episodes=1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_output_that_is_older_than_the_steps_of_a_policy_goes_on(tmp_path):
+    path, now = tmp_path / "run.json", asdict(SETTINGS)
+    older = {name: value for name, value in now.items() if not name.startswith("after_")}
+    path.write_text(json.dumps({"settings": older}))
+    check_same_run(path, {"settings": now})
+    with pytest.raises(RobocasError, match="settings differ"):
+        check_same_run(path, {"settings": asdict(replace(SETTINGS, after_steps=(5, 61)))})

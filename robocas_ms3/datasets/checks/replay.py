@@ -15,7 +15,7 @@ from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.tolerant import first_line
 from robocas_ms3.demos.open_loop import OpenLoop
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.recordings.entries import read_reset_options
+from robocas_ms3.recordings.entries import read_reset_options, was_taken_over
 from robocas_ms3.recordings.environment import read_env
 from robocas_ms3.recordings.seeds import one_seed
 
@@ -170,6 +170,8 @@ def _not_playable(episode: Episode) -> str:
         return "its scene.json does not say how to build the scene"
     if scene.get("success") is False:
         return "it was recorded without success"
+    if was_taken_over(scene):
+        return "it begins where another policy was, to which its seed does not lead"
     if len(episode.arrays["ee_pos"]) < 2:
         return "it has no actions"
     if not all(np.isfinite(episode.arrays[key]).all() for key in ("rel_pos", "rel_orn", "ee_pos", "base_pos")):

@@ -81,7 +81,8 @@ class EnvFrames:
                 raise DatasetError(
                     "the seed builds another scene", where=where, expected=sorted(theirs), found=sorted(mine), fix=fix
                 )
-        for name, states in recording.states.get("actors", {}).items():
+        placed = {} if recording.taken_over else recording.states.get("actors", {})
+        for name, states in placed.items():
             distance = float(np.linalg.norm(built["actors"][name][0, :3].cpu().numpy() - states[0, :3]))
             if distance > _SAME_PLACE:
                 raise DatasetError(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
-from robocas_ms3.recordings.entries import read_json, read_reset
+from robocas_ms3.recordings.entries import read_json, read_reset, was_taken_over
 from robocas_ms3.recordings.environment import read_env
 from robocas_ms3.recordings.stored import open_episode, open_trajectory, read_actions
 
@@ -34,6 +34,9 @@ class ReplayPolicy:
             raise EvaluationError(
                 "can't be played here", where=trajectory, expected="pd_joint_pos", found=env.control_mode
             )
+        if any(map(was_taken_over, data["episodes"])):
+            what, fix = "episodes that begin where another policy was", "Use robocas replay, which begins there too."
+            raise EvaluationError(what, where=trajectory, expected="episodes that begin with a reset", fix=fix)
         self._trajectory = trajectory
         self._episodes = {
             read_reset(one, f"{trajectory}, traj_{one['episode_id']}")[0]: one["episode_id"] for one in data["episodes"]

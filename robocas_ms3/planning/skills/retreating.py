@@ -53,11 +53,16 @@ def back_out(arm: Arm) -> None:
         if arm.env.task_config.target.approach == "top" and tcp[2, 2] < POINTS_DOWN:
             motion = arm.plan_rise(arm.scene.tcp_in_base, BACK_OUT_RISE, stage="recover")
         else:
-            motion = _plan_back_out(arm, [moved_back(tcp, distance) for distance in BACK_OUT])
+            motion = plan_back_out(arm, [moved_back(tcp, distance) for distance in BACK_OUT])
     arm.follow(motion)
 
 
-def _plan_back_out(arm: Arm, goals: list[Array]) -> Trajectory:
+def plan_back_out(arm: Arm, goals: list[Array]) -> Trajectory:
+    """Plan a straight line, free of all but the target, to the first of several TCP poses that one leads to.
+
+    Raises:
+        PlanningFailed: there is no such line.
+    """
     try:
         return plan_step_back(arm, arm.at, goals, only_free=True)
     except PlanningFailed:

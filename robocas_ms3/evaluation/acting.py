@@ -1,0 +1,154 @@
+"""A policy acts for a while, and leaves its state to the scripted one: where demonstrations of DAgger begin.
+
+It acts as in `PROTOCOL`: upstream's steps at 5 Hz, its rules of what a policy may want, in scenes of any configuration.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+import tempfile
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from robocas_ms3.benchmark import TASKS
+from robocas_ms3.config import load_task_config, shipped_configs
+from robocas_ms3.datasets.writing.render import require_renderer
+from robocas_ms3.demos.episode import EpisodeSettings
+from robocas_ms3.demos.takeover import Takeover
+from robocas_ms3.errors import LayoutError
+from robocas_ms3.evaluation.policies import open_policy
+from robocas_ms3.evaluation.policy import Policy, Start, Wants
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.rollout import Rollouts, Rules
+from robocas_ms3.evaluation.stage import looks
+from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, control_mode
+from robocas_ms3.processes import use_one_torch_thread
+from robocas_ms3.tasks.vector import NumpyVectorEnv, RoboCASVectorEnv
+
+PROTOCOL = "paper-v1"
+_STEPS = 410  # stream of an episode's seed
+_log = logging.getLogger(__name__)
+
+
+def steps_of(seed: int, after_steps: tuple[int, int]) -> int:
+    """For how many steps a policy acts in the scene of a seed: uniform, both ends included."""
+    return int(np.random.default_rng([seed, _STEPS]).integers(after_steps[0], after_steps[1] + 1))
+
+
+def check_acting(settings: EpisodeSettings) -> None:
+    """See that the policy named there can act; it is made once for that.
+
+    Raises:
+        RobocasError: there is no such policy, it speaks another way, or wants to see where nothing can be rendered.
+    """
+    with open_policy(settings.after_policy) as policy:
+        load_protocol(PROTOCOL).rules.refuse(policy.wants)
+        if policy.wants.cameras:
+            require_renderer()
+
+
+@dataclass(frozen=True)
+class Players:
+    """Opens a player: one environment and one policy of its own (`processes.Worker`).
+
+    Attributes:
+        settings: of the demonstrations.
+    """
+
+    settings: EpisodeSettings
+
+    def __call__(self) -> Player:
+        """Open it."""
+        if multiprocessing.parent_process():
+            use_one_torch_thread()
+        return Player(self.settings)
+
+
+class Player:
+    """Has a policy act in scenes, one after the other.
+
+    Args:
+        settings: of the demonstrations.
+    """
+
+    def __init__(self, settings: EpisodeSettings) -> None:
+        self._settings, self._open = settings, ExitStack()
+        self._policy: Policy = self._open.enter_context(open_policy(settings.after_policy))
+        self._env = _make_env(settings, self._policy.wants)
+        self._base: Any = self._env.unwrapped
+        vector = RoboCASVectorEnv(self._env, auto_reset=False, ignore_terminations=True, record_metrics=False)
+        self._vector = NumpyVectorEnv(vector)
+        self._config = self._file_of(settings.config)
+
+    def do(self, seed: int) -> Takeover:
+        """What the policy leaves in the scene of a seed."""
+        settings, steps = self._settings, steps_of(seed, self._settings.after_steps)
+        rules = Rules(steps, ends_on=("success", "fail"))
+        rollouts = Rollouts(self._vector, self._policy, rules, 1 / UPSTREAM_HZ, refill=False)
+        try:
+            self._vector.reset(seed=[seed])
+            (played,) = rollouts.play([self._start(seed)])
+        except LayoutError:
+            return Takeover(seed, settings.after_policy, 0, {}, 1.0, "no_layout")
+        if played.error:
+            _log.warning("seed %d: %s", seed, played.error)
+        refused = "policy_failed" if played.error else _over(played.at_end)
+        state = {kind: _of_one_env(of) for kind, of in self._base.get_state_dict().items() if kind != "controller"}
+        gripper = 1.0 if self._env.told_open else -1.0
+        return Takeover(seed, settings.after_policy, played.steps, state, gripper, refused)
+
+    def close(self) -> None:
+        """Close environment and policy."""
+        self._env.close()
+        self._open.close()
+
+    def _start(self, seed: int) -> Start:
+        settings = self._settings
+        words = self._base.instruction().text
+        return Start(
+            -1, 0, settings.task, self._config, settings.layouts, settings.pack, seed, words, robot=settings.robot
+        )
+
+    def _file_of(self, config: str | dict[str, Any]) -> str:
+        """A configuration as a file, which policies are told of."""
+        if isinstance(config, str):
+            return str(shipped_configs()[config])
+        folder = self._open.enter_context(tempfile.TemporaryDirectory(prefix="robocas-config-"))
+        path = Path(folder) / "config.yaml"
+        path.write_text(json.dumps(load_task_config(config).model_dump(mode="json")), encoding="utf-8")
+        return str(path)
+
+
+def _make_env(settings: EpisodeSettings, wants: Wants) -> PolicyStepping:
+    """One env in this process, as `stage.make_env` makes many in others."""
+    env = gym.make(
+        TASKS[settings.task].env_id,
+        config=settings.config,
+        layouts=settings.layouts,
+        pack=settings.pack,
+        robot_uids=settings.robot,
+        control_mode=control_mode(wants.convention),
+        reward_mode="none",
+        sim_backend="physx_cpu",
+        sim_config={"control_freq": UPSTREAM_HZ},
+        max_episode_steps=10**9,
+        **looks(wants),
+    )
+    return PolicyStepping(env, wants.convention, wants.reference, "upstream")
+
+
+def _over(at_end: dict[str, bool]) -> str:
+    """Why nothing is left to do; empty: something is."""
+    return next((what for flag, what in (("success", "succeeded"), ("fail", "failed")) if at_end[flag]), "")
+
+
+def _of_one_env(node: Any) -> Any:
+    """Nested tensors (1, ...) as arrays of the same shape."""
+    return {key: _of_one_env(value) for key, value in node.items()} if isinstance(node, dict) else node.cpu().numpy()

@@ -1,0 +1,220 @@
+"""Runs: begun, broken off and gone on with to the bit, refused where they are of something else."""
+
+import csv
+import json
+import shutil
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from robocas_ms3.baselines.policy import RunPolicy
+from robocas_ms3.baselines.session import Said, merged, train_run
+from robocas_ms3.errors import OutputExistsError, TrainingError
+from robocas_ms3.evaluation.policies import make_policy
+
+
+def stop_at(step, error):
+    def look(done, of):
+        if done == step:
+            raise error
+
+    return Said(step=look)
+
+
+def lines(folder):
+    """Lines of the log, but for the clock's column."""
+    with (folder / "metrics.csv").open() as file:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+
+
+def assert_same(one, other):
+    for name in ("weights.safetensors", "checkpoint.safetensors"):
+        first, second = load_file(one / name), load_file(other / name)
+        assert first.keys() == second.keys()
+        assert all(torch.equal(first[key], second[key]) for key in first), name
+    assert lines(one) == lines(other)
+
+
+@pytest.fixture
+def whole(made_up, data, tmp_path):
+    train_run("made-up", data, tmp_path / "whole", device="cpu")
+    return tmp_path / "whole"
+
+
+def test_a_run_leaves_what_it_says(whole):
+    assert {path.name for path in whole.iterdir()} == {
+        *("run.json", "metrics.csv", "tensorboard", "checkpoint.safetensors", "weights.safetensors")
+    }
+    run = json.loads((whole / "run.json").read_text())
+    assert (run["baseline"], run["data"]["episodes"], run["data"]["samples"]) == ("made-up", 3, 30)
+    assert run["config"]["train"]["steps"] == 40 and run["facts"] == {"inputs": 3}
+    assert {"torch", "numpy", "robocas-ms3"} <= run["versions"].keys()
+    rows = lines(whole)
+    assert [row["step"] for row in rows if row["split"] == "train"] == [str(step) for step in range(4, 41, 4)]
+    assert [row["step"] for row in rows if row["split"] == "val"] == ["20", "40"]
+    assert float(rows[-1]["loss"]) < float(rows[0]["loss"])
+    assert float(rows[0]["double"]) == pytest.approx(2 * float(rows[0]["loss"]), rel=1e-4)
+    assert list((whole / "tensorboard").iterdir())
+
+
+@pytest.mark.parametrize("step", [1, 17, 20, 39])
+def test_ctrl_c_loses_nothing(whole, data, tmp_path, step):
+    out = tmp_path / "again"
+    with pytest.raises(KeyboardInterrupt):
+        train_run("made-up", data, out, device="cpu", said=stop_at(step, KeyboardInterrupt()))
+    train_run("made-up", data, out, device="cpu", resume=True)
+    assert_same(whole, out)
+
+
+@pytest.mark.parametrize("step", [5, 17, 31])
+def test_a_crash_loses_what_came_after_the_last_checkpoint(whole, data, tmp_path, step):
+    out = tmp_path / "again"
+    with pytest.raises(RuntimeError):
+        train_run("made-up", data, out, device="cpu", said=stop_at(step, RuntimeError("gone")))
+    done = []
+    train_run("made-up", data, out, device="cpu", resume=True, said=Said(step=lambda at, of: done.append(at)))
+    assert done[0] == step // 10 * 10
+    assert_same(whole, out)
+
+
+def test_what_is_done_is_done(whole, data):
+    before = (whole / "weights.safetensors").read_bytes()
+    train_run("made-up", data, whole, device="cpu", resume=True)
+    assert (whole / "weights.safetensors").read_bytes() == before
+
+
+def test_seeds_differ(whole, data, tmp_path):
+    train_run("made-up", data, tmp_path / "other", {"train": {"seed": 1}}, device="cpu")
+    first, second = (load_file(folder / "weights.safetensors") for folder in (whole, tmp_path / "other"))
+    assert not torch.equal(first["net.0.weight"], second["net.0.weight"])
+
+
+def test_options_leave_the_other_defaults(made_up, data, tmp_path):
+    record = train_run("made-up", data, tmp_path / "run", {"train": {"steps": 3}}, device="cpu")
+    assert record.config["train"]["steps"] == 3
+    assert record.config["train"]["batch_size"] == 4  # the baseline's, not TrainSettings'
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"widht": 3}, "width"), ({"train": {"steps": 0}}, "train.steps"), ({"width": "wide"}, "width")],
+)
+def test_wrong_options(made_up, data, tmp_path, changes, message):
+    with pytest.raises(TrainingError, match=message):
+        train_run("made-up", data, tmp_path / "run", changes, device="cpu")
+    assert not (tmp_path / "run").exists()
+
+
+def test_no_such_baseline(data, tmp_path):
+    with pytest.raises(TrainingError, match="no such baseline.*small"):
+        train_run("smal", data, tmp_path / "run")
+
+
+def test_no_data(made_up, tmp_path):
+    with pytest.raises(TrainingError, match="no dataset here"):
+        train_run("made-up", tmp_path / "none.h5", tmp_path / "run", device="cpu")
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_there_is_kept(whole, data):
+    before = (whole / "run.json").read_bytes()
+    with pytest.raises(OutputExistsError, match="--resume to go on"):
+        train_run("made-up", data, whole, device="cpu")
+    with pytest.raises(TrainingError, match="exclude each other"):
+        train_run("made-up", data, whole, device="cpu", resume=True, overwrite=True)
+    assert (whole / "run.json").read_bytes() == before
+
+
+def test_what_is_none_of_ours_is_not_replaced(made_up, data, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("x")
+    with pytest.raises(OutputExistsError, match="not a run of robocas train"):
+        train_run("made-up", data, tmp_path / "mine", device="cpu", overwrite=True)
+    assert (tmp_path / "mine" / "thesis.tex").exists()
+
+
+def test_overwrite_begins_anew(whole, data):
+    train_run("made-up", data, whole, {"train": {"steps": 4}}, device="cpu", overwrite=True)
+    assert len(lines(whole)) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda run, data: data.write_text("others"), "a run on another dataset"),
+        (lambda run, data: _say(run, baseline="rt1"), "a run of another baseline"),
+        (lambda run, data: _say(run, version=0), "a run of another version"),
+        (lambda run, data: (run / "run.json").write_text("{"), "not readable"),
+        (lambda run, data: (run / "checkpoint.safetensors").write_bytes(b"x"), "can't be read"),
+    ],
+)
+def test_a_run_of_something_else_is_not_gone_on_with(whole, data, change, message):
+    change(whole, data)
+    with pytest.raises(TrainingError, match=message):
+        train_run("made-up", data, whole, device="cpu", resume=True)
+    assert (whole / "weights.safetensors").is_file()
+
+
+def test_other_options_do_not_go_on(whole, data):
+    with pytest.raises(TrainingError, match="goes on as it was begun"):
+        train_run("made-up", data, whole, {"width": 5}, device="cpu", resume=True)
+
+
+def test_a_loss_that_is_no_number_ends_the_run_and_keeps_the_last_checkpoint(made_up, data, tmp_path):
+    with pytest.raises(TrainingError, match="the loss is no number any more.*learning_rate"):
+        train_run("made-up", data, tmp_path / "run", {"broken_at": 7}, device="cpu")
+    weights = tmp_path / "run" / "weights.safetensors"
+    assert not weights.exists() or all(tensor.isfinite().all() for tensor in load_file(weights).values())
+
+
+def test_a_folder_that_goes_is_missed(made_up, data, tmp_path):
+    out = tmp_path / "run"
+
+    def remove(done, of):
+        if done == 5:
+            shutil.rmtree(out)
+
+    with pytest.raises(TrainingError, match="the output folder is gone"):
+        train_run("made-up", data, out, device="cpu", said=Said(step=remove))
+
+
+def test_without_validation(made_up, data, tmp_path):
+    data.write_text("few")
+    notes = []
+    train_run("made-up", data, tmp_path / "run", device="cpu", said=Said(note=notes.append))
+    assert any("too few" in note for note in notes)
+    assert {row["split"] for row in lines(tmp_path / "run")} == {"train"}
+
+
+def test_a_run_is_a_policy(whole):
+    policy = make_policy(str(whole))
+    assert isinstance(policy, RunPolicy)
+    about = policy.describe()
+    assert (about["baseline"], about["steps"], about["data"]["samples"]) == ("made-up", 40, 30)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda run: (run / "weights.safetensors").unlink(), "no such file.*--resume"),
+        (lambda run: _say(run, version=2), "another version"),
+        (lambda run: _say(run, config={"widht": 1}), "width"),
+        (lambda run: _say(run, facts={"inputs": 5}), "has in another shape net.0.weight"),
+        (lambda run: _say(run, baseline="smal"), "no such baseline"),
+        (lambda run: (run / "run.json").write_text('{"protocol_hash": 1}'), "no run of robocas train"),
+    ],
+)
+def test_a_run_that_is_no_policy(whole, change, message):
+    change(whole)
+    with pytest.raises(TrainingError, match=message):
+        make_policy(str(whole))
+
+
+def test_nested_values():
+    assert merged({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 4}, "e": 5}) == {"a": {"b": 4, "c": 2}, "d": 3, "e": 5}
+
+
+def _say(run, **values):
+    path = run / "run.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
