@@ -59,7 +59,7 @@ def load(path: Path, expected: Mapping[str, str]) -> tuple[dict[str, torch.Tenso
         raise TrainingError("can't be read", where=path, found=error, fix=_HINT) from error
 
 
-def put_in(model: torch.nn.Module, tensors: Mapping[str, torch.Tensor], where: Path) -> None:
+def put_in(model: torch.nn.Module, tensors: Mapping[str, torch.Tensor], where: object) -> None:
     """Give a model its weights.
 
     Raises:

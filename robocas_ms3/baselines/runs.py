@@ -52,6 +52,7 @@ class RunRecord(StrictModel):
         data: it was trained on.
         versions: of packages.
         device, precision: it was trained on and in; another may round otherwise.
+        start: the run whose weights it began with: its folder's name and its data's hash; empty: none.
     """
 
     kind: Literal["robocas training run"] = "robocas training run"
@@ -63,6 +64,7 @@ class RunRecord(StrictModel):
     versions: dict[str, str]
     device: str
     precision: str
+    start: str = ""
 
 
 def read_run(folder: Path) -> RunRecord:

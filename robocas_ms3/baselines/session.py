@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Samples
-from robocas_ms3.baselines.runs import RUN, DataRecord, RunRecord, hash_of, read_run, write_run
+from robocas_ms3.baselines.runs import RUN, WEIGHTS, DataRecord, RunRecord, hash_of, read_run, write_run
 from robocas_ms3.baselines.table import find_baseline
 from robocas_ms3.errors import DatasetError, TrainingError
 from robocas_ms3.files import make_folder
@@ -39,6 +39,7 @@ def train_run(
     out: Path,
     changes: Mapping[str, Any] | None = None,
     *,
+    start: Path | None = None,
     device: str = "auto",
     resume: bool = False,
     overwrite: bool = False,
@@ -51,6 +52,7 @@ def train_run(
         data: dataset.
         out: folder of the run.
         changes: of its configuration, nested as that is; for a run that goes on they may be left out.
+        start: folder of a run whose weights to begin with, such as one on less data; scales stay those of that run.
         device: ``auto``, ``cpu`` or ``cuda``.
         resume: whether to go on with a run that is there.
         overwrite: whether to replace one.
@@ -66,6 +68,7 @@ def train_run(
     baseline, said = find_baseline(name), said or Said()
     before = read_run(out) if resume and (out / RUN).is_file() else None
     config = _config(baseline, changes, before, out)
+    weights, begun_with = _weights(baseline, start) if start is not None else (None, "")
     check_run(out / RUN, "baseline", "train")
     from robocas_ms3.baselines.train import Trainer, make_accelerator
 
@@ -91,8 +94,11 @@ def train_run(
             versions=_versions(),
             device=str(accelerator.device.type),
             precision=str(accelerator.mixed_precision),
+            start=begun_with,
         )
-        trainer = Trainer(baseline, config, samples, check, out, record, accelerator, resume=resume, on_note=said.note)
+        trainer = Trainer(
+            baseline, config, samples, check, out, record, accelerator, resume=resume, start=weights, on_note=said.note
+        )
         if accelerator.is_main_process and before is None:
             make_folder(out)
             write_run(out, record)
@@ -121,6 +127,20 @@ def _config(
             fix = "Leave these options out, or train anew with --overwrite."
             raise TrainingError("a run goes on as it was begun", where=out, fix=fix)
     return config
+
+
+def _weights(baseline: Baseline, start: Path) -> tuple[dict[str, Any], str]:
+    """Weights of another run, and which that was.
+
+    Raises:
+        TrainingError: it is of another baseline or version, or has none.
+    """
+    from robocas_ms3.baselines import checkpoints
+
+    record = read_run(start)
+    expected = {"baseline": baseline.name, "version": str(baseline.version)}
+    weights, _ = checkpoints.load(start / WEIGHTS, expected)
+    return weights, f"{start.resolve().name}, {record.data.hash}"
 
 
 def _check_same(before: RunRecord, baseline: Baseline, hashed: str, out: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ class Trainer:
         record: that.
         accelerator: see `make_accelerator`.
         resume: whether to go on from the folder's checkpoint, if it has one.
+        start: weights to begin with; None: random ones.
         on_note: called with a line when there is something to say.
     """
 
@@ -53,13 +54,17 @@ class Trainer:
         accelerator: Accelerator,
         *,
         resume: bool = False,
+        start: Mapping[str, torch.Tensor] | None = None,
         on_note: Callable[[str], None] = lambda text: None,
     ) -> None:
         self.settings, self._samples, self._check = config.train, samples, check
         self._folder, self._note, self._accelerator = folder, on_note, accelerator
         self._about = {"baseline": record.baseline, "version": str(record.version), "dataset": record.data.hash}
         torch.manual_seed(self.settings.seed)
-        model = baseline.model(config, record.facts).to(accelerator.device)
+        model = baseline.model(config, record.facts)
+        if start is not None:
+            checkpoints.put_in(model, start, record.start)
+        model = model.to(accelerator.device)
         self._average = AveragedModel(model, multi_avg_fn=self._mix) if self.settings.ema else None
         optimizer = torch.optim.AdamW(_groups(model, self.settings.weight_decay), lr=1.0, betas=_BETAS)
         self.step = 0

@@ -40,6 +40,8 @@ class Train:
     """Samples a step; train.batch_size."""
     seed: Maybe[int] = None
     """Of everything random; train.seed."""
+    start: Maybe[Path] = None
+    """Folder of a run whose weights to begin with, such as one on less data. Default: random weights."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where it computes. Auto: a GPU if there is one."""
     resume: bool = False
@@ -67,6 +69,7 @@ def main(cfg: Train) -> int:
                 cfg.data,
                 out,
                 changes_of(cfg),
+                start=cfg.start,
                 device=cfg.device,
                 resume=cfg.resume,
                 overwrite=cfg.overwrite,

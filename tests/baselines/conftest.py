@@ -1,11 +1,13 @@
-"""A baseline that learns nothing worth knowing, in milliseconds."""
+"""A baseline that learns nothing worth knowing, in milliseconds; and a small dataset for those that do."""
 
 import numpy as np
 import pytest
 import torch
+from synthetic import RayCaster, made_up_vectors, write_trajectory
 
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
 from robocas_ms3.baselines.table import BASELINES
+from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.evaluation.policy import Wants
 
@@ -87,3 +89,14 @@ def data(tmp_path):
     path = tmp_path / "data.h5"
     path.write_text("demonstrations")
     return path
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    """A dataset of six episodes of seven steps, 64 x 48 pictures, that nobody may change; five are to train on."""
+    made = tmp_path_factory.mktemp("baselines")
+    trajectory = write_trajectory(made / "F.h5", seeds=range(3, 9))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
+        convert(trajectory, made / "dataset", open_source=RayCaster)
+    return made / "dataset"

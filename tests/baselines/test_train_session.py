@@ -156,6 +156,20 @@ def test_a_run_of_something_else_is_not_gone_on_with(whole, data, change, messag
     assert (whole / "weights.safetensors").is_file()
 
 
+def test_a_run_may_begin_with_anothers_weights(whole, data, tmp_path):
+    data.write_text("more")
+    changes = {"train": {"steps": 1, "learning_rate": 1e-9, "ema": 0}}
+    record = train_run("made-up", data, tmp_path / "next", changes, start=whole, device="cpu")
+    first, second = (load_file(folder / "weights.safetensors") for folder in (whole, tmp_path / "next"))
+    assert all(torch.allclose(first[key], second[key], atol=1e-6) for key in first)
+    assert record.start.startswith("whole, ")
+    with pytest.raises(TrainingError, match="no run of robocas train"):
+        train_run("made-up", data, tmp_path / "other", start=tmp_path, device="cpu")
+    with pytest.raises(TrainingError, match="not the weights of this model"):
+        train_run("made-up", data, tmp_path / "other", {"width": 5}, start=whole, device="cpu")
+    assert not (tmp_path / "other").exists()
+
+
 def test_other_options_do_not_go_on(whole, data):
     with pytest.raises(TrainingError, match="goes on as it was begun"):
         train_run("made-up", data, whole, {"width": 5}, device="cpu", resume=True)

@@ -1,13 +1,11 @@
-"""Small networks, and a small dataset, that tests of rt1 share."""
+"""Small networks that tests of rt1 share."""
 
 import pytest
 import torch
 from rt1_sizes import SIZES, settle
-from synthetic import RayCaster, made_up_vectors, write_trajectory
 
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
-from robocas_ms3.datasets.writing.convert import convert
 
 
 @pytest.fixture
@@ -34,17 +32,6 @@ def model(config, facts, batch):
         made.transformer.leave.weight.normal_(0, 1)
         settle(made, batch)
     return made
-
-
-@pytest.fixture(scope="session")
-def folder(tmp_path_factory):
-    """A dataset of six episodes of seven steps, 64 x 48 pictures, that nobody may change; five are to train on."""
-    made = tmp_path_factory.mktemp("rt1")
-    trajectory = write_trajectory(made / "F.h5", seeds=range(3, 9))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-        convert(trajectory, made / "dataset", open_source=RayCaster)
-    return made / "dataset"
 
 
 @pytest.fixture

@@ -1,0 +1,40 @@
+#!/usr/bin/env bash
+# From nothing to a score: records demonstrations, converts them, trains `small`, and evaluates it on all episodes of paper-v1.
+#
+#   bash scripts/reproduce_small.sh pick|select|search [FOLDER]
+#
+# What is there already is gone on with: an interrupted call is simply made again. docs/baselines.md has what comes out.
+#
+# EPISODES, SEED, STEPS   how many demonstrations, the first one's seed, steps of training
+# JOBS                    processes that record, convert and evaluate (default: one a core)
+# ROBOCAS                 the command (default: that of the checkout's virtual environment)
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+fail() { printf 'reproduce_small: error: %s\n' "$*" >&2; exit 2; }
+
+task=${1:-}
+case $task in  # upstream runs select in pick's scenes; it learns among goods in columns
+    pick) config=pick_upstream_eval played=pick ;;
+    select) config=select_upstream played=pick ;;
+    search) config=search_upstream_eval played=search ;;
+    *) fail "which task? bash scripts/reproduce_small.sh pick|select|search [FOLDER]" ;;
+esac
+out=${2:-reproduced/$task}
+episodes=${EPISODES:-800} seed=${SEED:-510000} steps=${STEPS:-16000}
+jobs=${JOBS:-$(nproc)}
+robocas=${ROBOCAS:-.venv/bin/robocas}
+command -v "$robocas" >/dev/null || fail "$robocas: no such command; bash scripts/setup.sh makes it"
+
+timed() {
+    local begun=$SECONDS
+    "$@"
+    printf 'reproduce_small: %s: %d min\n' "$2" $(((SECONDS - begun + 30) / 60))
+}
+
+mkdir -p "$out"
+timed "$robocas" generate "$task" --config "$config" -n "$episodes" --seed "$seed" --jobs "$jobs" --out "$out/demos" --resume
+timed "$robocas" convert "$out/demos/trajectory.h5" --out "$out/data" --size 256 192 --no-depth --no-video \
+    --cameras base_camera gripper_camera --jobs "$jobs" --resume
+timed "$robocas" train small --data "$out/data" --out "$out/run" --steps "$steps" --resume
+timed "$robocas" eval "$played" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs" --resume

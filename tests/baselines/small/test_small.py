@@ -1,0 +1,180 @@
+"""`small`: what it sees of a dataset, that it learns that by heart, and what does not suit it."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from robocas_ms3.baselines.chunks import decode
+from robocas_ms3.baselines.small import BASELINE
+from robocas_ms3.baselines.small.config import SmallConfig, View
+from robocas_ms3.baselines.small.data import looked_at
+from robocas_ms3.baselines.small.model import shifted
+from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.evaluation.policy import Observations, Start
+from robocas_ms3.poses import to_wxyz
+
+VIEW = View(rendered=(64, 48), size=(64, 48))
+TINY = dict(
+    views={"base_camera": VIEW, "gripper_camera": VIEW},
+    chunk=3,
+    channels=8,
+    width=32,
+    heads=2,
+    layers=1,
+    dropout=0.0,
+    shift=0,
+    brightness=0.0,
+)
+
+
+@pytest.fixture(scope="module")
+def samples(folder):
+    return BASELINE.data(SmallConfig(**TINY), folder, "train")
+
+
+@pytest.fixture(scope="module")
+def learned(samples):
+    """A tiny network that has seen five episodes 250 times."""
+    torch.manual_seed(0)
+    config = SmallConfig(**TINY)
+    model = BASELINE.model(config, samples.facts)
+    optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 250)
+    batch = samples.__getitems__(list(range(len(samples))))
+    for _ in range(250):
+        optimizer.zero_grad()
+        model(batch)["loss"].backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+        schedule.step()
+    return model.eval()
+
+
+def test_five_episodes_are_learned(learned, samples):
+    """To 5 mm of motion, which is some 20 mm a step, and to every command."""
+    batch = samples.__getitems__(list(range(len(samples))))
+    with torch.inference_mode():
+        found = learned(batch)
+        chunk = learned.act(batch)
+    assert found["loss"] < 0.25
+    assert found["first_mm"] < 5
+    assert ((chunk[..., 9] > 0.5) == (batch["chunk"][..., 9] > 0.5)).float().mean() >= 0.95
+
+
+def test_a_policy_goes_where_it_was_shown(learned, samples, folder):
+    policy = BASELINE.policy(learned.config, samples.facts, learned)
+    assert (policy.wants.rate_hz, policy.wants.reference) == (5.0, "tcp")
+    assert policy.wants.cameras == {"base_camera": (64, 48), "gripper_camera": (64, 48)}
+    source = open_source(folder)
+    number = source.split("train")[0]
+    episode, arrays = source.episode(number), source.episode(number).arrays
+    poses = np.concatenate([arrays["ee_pos"], np.roll(arrays["ee_orn"], 1, axis=1)], axis=1)
+    policy.reset([Start(0, 0, "pick", "", "", "builtin", 0, "")])
+    for step in range(3):
+        action = policy.act(observed(episode, arrays, poses, step))[0]
+        assert np.abs(action[:3] - arrays["rel_pos"][step]).max() < 0.008
+        assert (action[6] > 0.5) == bool(arrays["gripper_status"][step + 1])
+
+
+def observed(episode, arrays, poses, step):
+    return Observations(
+        envs=np.array([0]),
+        instructions=[""],
+        embeddings=arrays["language_embedding"][None],
+        images={name: episode.rgb(name, step)[None] for name in ("base_camera", "gripper_camera")},
+        depths={},
+        qpos=np.zeros((1, 12), np.float32),
+        tcp_in_base=poses[step : step + 1].astype(np.float32),
+        gripper_width=arrays["gripper_width"].reshape(-1, 1)[step : step + 1],
+        state=None,
+    )
+
+
+def test_samples_are_the_datasets(samples, folder):
+    source = open_source(folder)
+    numbers = source.split("train")
+    assert (samples.episodes, len(samples)) == (5, 35)
+    arrays = source.episode(numbers[2]).arrays
+    batch = samples.__getitems__([2 * 7 + 4])
+    expected = looked_at(source.episode(numbers[2]).rgb("gripper_camera", 4), VIEW)
+    assert np.array_equal(batch["gripper_camera"][0].numpy(), expected)
+    assert batch["state"][0, :3].tolist() == pytest.approx(arrays["ee_pos"][4].tolist())
+    assert batch["state"][0, 9].item() == pytest.approx(float(arrays["gripper_width"][4]) / 0.08)
+    assert batch["words"][0].tolist() == arrays["language_embedding"].tolist()
+    here = np.eye(4)
+    here[:3, 3] = arrays["ee_pos"][4]
+    turn = batch["state"][0, 3:9].numpy().astype(np.float64)
+    here[:3, :3] = np.stack([turn[:3], turn[3:], np.cross(turn[:3], turn[3:])], axis=1)
+    ahead, _ = decode(batch["chunk"][0].numpy(), here)
+    assert np.allclose(ahead[0, :3, 3], arrays["ee_pos"][5], atol=1e-5)
+    wxyz = to_wxyz(ahead[:1])[0, 3:]
+    assert abs(wxyz @ np.roll(arrays["ee_orn"][5], 1)) == pytest.approx(1, abs=1e-5)
+
+
+def test_without_language_words_say_nothing(folder):
+    config = SmallConfig(**TINY, language=False)
+    samples = BASELINE.data(config, folder, "val")
+    assert not samples.__getitems__([0])["words"].any()
+    assert BASELINE.policy(config, samples.facts, BASELINE.model(config, samples.facts)).wants.language == "none"
+
+
+def test_a_part_is_cut_and_scaled():
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[24:, 32:] = 200
+    view = View(rendered=(64, 48), part=(0.5, 0.5, 1.0, 1.0), size=(16, 16))
+    assert (looked_at(picture, view) == 200).all()
+    assert looked_at(picture, view).shape == (16, 16, 3)
+    larger = np.repeat(np.repeat(picture, 2, 0), 2, 1)
+    assert (looked_at(larger, view) == 200).all()  # scaled to what is rendered first
+
+
+def test_shifts_move_pictures_as_a_whole():
+    torch.manual_seed(0)
+    picture = torch.arange(6 * 8, dtype=torch.uint8).reshape(1, 6, 8, 1)
+    inner = {
+        tuple((shifted(picture, 1)[0, 1:-1, 1:-1, 0].long() - picture[0, 1:-1, 1:-1, 0].long()).unique().tolist())
+        for _ in range(60)
+    }
+    assert inner == {(8 * down + right,) for down in (-1, 0, 1) for right in (-1, 0, 1)}
+
+
+def _forget(folder, what):
+    path = folder / "conversion.json"
+    said = json.loads(path.read_text())
+    if what == "embeddings":
+        said["embeddings"] = False
+    else:
+        said["cameras"] = [camera for camera in said["cameras"] if camera != what]
+    path.write_text(json.dumps(said))
+
+
+def _not_a_number(folder):
+    path = sorted(folder.glob("episode_*/episode_info.npz"))[1]
+    arrays = dict(np.load(path))
+    arrays["ee_pos"][2, 1] = np.nan
+    np.savez(path, **arrays)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda folder: _forget(folder, "embeddings"), "there are no embeddings here"),
+        (lambda folder: _forget(folder, "gripper_camera"), "no such camera"),
+        (_not_a_number, "not a number"),
+        (lambda folder: next(folder.glob("*/base_camera/rgb/0003.png")).unlink(), "0003.png"),
+    ],
+)
+def test_data_that_does_not_suit_it(folder, tmp_path, spoil, message):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    spoil(copy)
+    with pytest.raises(DatasetError, match=message):
+        BASELINE.data(SmallConfig(**TINY), copy, "train")
+
+
+def test_pictures_that_are_too_small(folder):
+    with pytest.raises(DatasetError, match="robocas convert --size 256 192"):
+        BASELINE.data(SmallConfig(), folder, "train")
