@@ -23,6 +23,7 @@ from robocas_ms3.datasets.training.sample_arrays import check_holds
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw
 
+_LEAST_WORD = 0.01  # deviation of a number of an embedding; all are 0.05 or so
 _KEYS = ("ee_pos", "ee_orn", "gripper_width", "gripper_status")
 
 
@@ -75,6 +76,7 @@ class SmallSamples:
             "rate_hz": source.rate_hz,
             "chunk": spread(self._chunks[..., :9].numpy()),
             "keys": spread(self._keys.numpy()),
+            "words": _spread_of_words(self._words.numpy()),
         }
 
     def __len__(self) -> int:
@@ -110,6 +112,14 @@ class SmallSamples:
             with closing(episode.frames(camera, "rgb", 0, length)) as pictures:
                 for row, picture in enumerate(pictures, start=first):
                     self._pictures[camera][row] = torch.from_numpy(looked_at(picture, view, source.root))
+
+
+def _spread_of_words(words: NDArray[np.floating]) -> dict[str, Any]:
+    """Arguments of a `Scale` of embeddings (N, 384).
+
+    Instructions of a task differ in a name: a hundredth of what they have in common, and all that matters.
+    """
+    return {"mean": words.mean(0).tolist(), "deviation": np.maximum(words.std(0), _LEAST_WORD).tolist()}
 
 
 def state_of(poses: NDArray[np.floating], widths: NDArray[np.floating]) -> NDArray[np.float32]:

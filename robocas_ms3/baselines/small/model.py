@@ -73,6 +73,7 @@ class SmallModel(nn.Module):
         super().__init__()
         self.config, width = config, config.width
         self.chunk_scale, self.key_scale = Scale(**facts["chunk"]), Scale(**facts["keys"])
+        self.word_scale = Scale(**facts["words"])
         self.words = nn.Sequential(nn.Linear(_WORDS, width), nn.ReLU(), nn.Dropout(config.dropout))
         self.state = nn.Sequential(nn.Linear(_STATE, width), nn.ReLU(), nn.Linear(width, width))
         self.eyes = nn.ModuleDict(
@@ -87,7 +88,7 @@ class SmallModel(nn.Module):
 
     def predict(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
         """Chunks (B, K, 10), normalised but for the logits of the commands, and normalised key poses (B, 9)."""
-        words = self.words(batch["words"])
+        words = self.words(self.word_scale(batch["words"]).clamp(-3, 3))
         state = self.state(batch["state"])
         seen = [eye(self._picture(batch[camera]), words) for camera, eye in self.eyes.items()]
         memory = torch.cat([*seen, words[:, None], state[:, None]], dim=1)
