@@ -16,6 +16,7 @@ DISTRIBUTIONS = metadata.packages_distributions()
 BROUGHT = {
     "mplib": "mani_skill pins it",
     "transformers": "sentence-transformers is made of it",
+    "lerobot": "its own environment imports what imports it",
     "vla_eval": "only it uses the benchmark that imports it",
 }
 
@@ -43,6 +44,7 @@ def third_party(path: Path) -> set[str]:
 
 EXTRAS = {  # files that may import what an extra brings
     "robocas_ms3/baselines/": "train",
+    "robocas_ms3/baselines/lerobot/": "lerobot",
     "robocas_ms3/language/": "language",
     "robocas_ms3/datasets/lerobot/": "lerobot",
     "robocas_ms3/datasets/statistics/plots.py": "plots",

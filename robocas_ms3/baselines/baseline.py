@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -12,7 +13,9 @@ from robocas_ms3.evaluation.policy import Policy
 from robocas_ms3.strict import StrictModel
 
 Precision = Literal["auto", "fp32", "bf16"]
+Split = Literal["train", "val"]
 Batch = dict[str, torch.Tensor]
+OnRead = Callable[[int, int], None]
 
 
 class TrainSettings(StrictModel):
@@ -95,11 +98,17 @@ class Baseline(Protocol):
     about: str
     Config: type[BaselineConfig]
 
-    def data(self, config: Any, folder: Path, split: Literal["train", "val"]) -> Samples:
-        """Samples of a dataset's split; None of ``val`` where it has none.
+    def data(self, config: Any, folder: Path, split: Split, on_read: OnRead) -> Samples:
+        """Samples of a dataset's split.
+
+        Args:
+            config: of the baseline.
+            folder: the dataset, a file or a folder.
+            split: of it.
+            on_read: called with how many episodes were read, and how many will be, by what reads them now.
 
         Raises:
-            DatasetError: it does not hold what the baseline is trained with.
+            DatasetError: it does not hold what the baseline is trained with, or the split holds no episodes.
         """
         ...
 

@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Samples
+from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, OnRead, Samples
 from robocas_ms3.baselines.runs import RUN, WEIGHTS, DataRecord, RunRecord, hash_of, read_run, write_run
 from robocas_ms3.baselines.table import find_baseline
 from robocas_ms3.errors import DatasetError, TrainingError
@@ -26,10 +26,12 @@ class Said:
 
     Attributes:
         note: a line for people.
+        read: episodes read, and how many will be.
         step: steps done, and all.
     """
 
     note: Callable[[str], None] = field(default=lambda text: None)
+    read: OnRead = field(default=lambda done, of: None)
     step: Callable[[int, int], None] = field(default=lambda done, of: None)
 
 
@@ -78,12 +80,12 @@ def train_run(
             stack.enter_context(locked_folder(out))
             if overwrite:
                 check_overwrite(out, [RUN], "a run of robocas train")
-            claim_output(out, overwrite=overwrite and before is None, resume=resume)
+            claim_output(out, resume=resume or overwrite)  # what is replaced stays until there is something instead
         hashed = hash_of(data)
         if before is not None:
             _check_same(before, baseline, hashed, out)
         said.note(f"reading {data}")
-        samples = baseline.data(config, data, "train")
+        samples = baseline.data(config, data, "train", said.read)
         check = _validation(baseline, config, data, said)
         record = before or RunRecord(
             baseline=name,
@@ -100,6 +102,7 @@ def train_run(
             baseline, config, samples, check, out, record, accelerator, resume=resume, start=weights, on_note=said.note
         )
         if accelerator.is_main_process and before is None:
+            claim_output(out, overwrite=overwrite, resume=True)
             make_folder(out)
             write_run(out, record)
         accelerator.wait_for_everyone()
@@ -164,7 +167,7 @@ def _check_same(before: RunRecord, baseline: Baseline, hashed: str, out: Path) -
 
 def _validation(baseline: Baseline, config: BaselineConfig, data: Path, said: Said) -> Samples | None:
     try:
-        return baseline.data(config, data, "val")
+        return baseline.data(config, data, "val", said.read)
     except DatasetError as error:
         if "split" not in error.what:
             raise

@@ -61,8 +61,13 @@ def main(cfg: Train) -> int:
 
     data = cfg.data.resolve()
     out = cfg.out or Path("runs") / f"{cfg.baseline}-{data.parent.name if data.is_file() else data.name}"
-    with bar("steps trained") as shown:
-        said = Said(note=shown.note, step=shown.at)
+    with bar("episodes read", transient=True) as reading, bar("steps trained") as stepping:
+
+        def step(done: int, of: int) -> None:
+            reading.stop()  # a terminal has room for one
+            stepping.at(done, of)
+
+        said = Said(stepping.note, reading.at, step)
         try:
             train_run(
                 cfg.baseline,

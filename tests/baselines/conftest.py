@@ -66,7 +66,7 @@ class MadeUpPolicy:
 class MadeUp:
     name, version, about, Config = "made-up", 1, "for tests", MadeUpConfig
 
-    def data(self, config, folder, split):
+    def data(self, config, folder, split, on_read):
         if split == "val" and folder.read_text() == "few":
             raise DatasetError("this split holds no episodes", where=folder)
         return MadeUpSamples(config.broken_at if split == "train" else -1)

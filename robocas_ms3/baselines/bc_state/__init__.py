@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from robocas_ms3.baselines.baseline import OnRead, Split
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.bc_state.data import StateSamples, inputs
 from robocas_ms3.baselines.bc_state.model import BcStateModel
@@ -25,9 +26,9 @@ class BcState:
     about = "what only a simulator knows; chunks of poses by residual layers"
     Config = BcStateConfig
 
-    def data(self, config: BcStateConfig, folder: Path, split: Literal["train", "val"]) -> StateSamples:
+    def data(self, config: BcStateConfig, folder: Path, split: Split, on_read: OnRead) -> StateSamples:
         """Samples of a ``trajectory.h5``."""
-        return StateSamples(config, folder, split)
+        return StateSamples(config, folder, split, on_read)
 
     def model(self, config: BcStateConfig, facts: dict[str, Any]) -> BcStateModel:
         """The network."""

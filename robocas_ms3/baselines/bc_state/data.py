@@ -6,13 +6,13 @@ That takes some minutes for a thousand episodes; what came of it is kept among t
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.baselines.baseline import Batch
+from robocas_ms3.baselines.baseline import Batch, OnRead, Split
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.chunks import encode, next_keys, spread
 from robocas_ms3.baselines.runs import hash_of
@@ -36,13 +36,16 @@ class StateSamples:
         config: what is predicted.
         path: ``trajectory.h5``.
         split: of its seeds, as a conversion has them.
+        on_read: see `Baseline.data`.
 
     Raises:
         DatasetError: it is no trajectory file, or its scenes hold different numbers of things.
     """
 
-    def __init__(self, config: BcStateConfig, path: Path, split: Literal["train", "val"]) -> None:
-        told = _told(path, config.rate_hz)
+    def __init__(
+        self, config: BcStateConfig, path: Path, split: Split, on_read: OnRead = lambda done, of: None
+    ) -> None:
+        told = _told(path, config.rate_hz, on_read)
         seeds = told["seeds"].tolist()
         sides = split_by_seed({number: seed for number, seed in enumerate(seeds)})
         numbers = sides[0 if split == "train" else 1]
@@ -87,7 +90,7 @@ def _joined(parts: list[NDArray[np.float32]]) -> torch.Tensor:
     return torch.from_numpy(np.concatenate(parts))
 
 
-def _told(path: Path, rate_hz: float) -> dict[str, NDArray[Any]]:
+def _told(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]:
     """What is kept of a trajectory file, or what it says now."""
     if path.is_dir() or path.suffix != ".h5":
         fix = "Name the trajectory.h5 of robocas generate."
@@ -99,19 +102,20 @@ def _told(path: Path, rate_hz: float) -> dict[str, NDArray[Any]]:
                 return dict(arrays)
         except (OSError, ValueError, KeyError, EOFError):
             kept.unlink()  # damaged: it is made anew
-    told = _ask(path, rate_hz)
+    told = _ask(path, rate_hz, on_read)
     with replacing(kept) as tmp:
         np.savez(tmp, **told)  # pyright: ignore[reportArgumentType]  (its stub takes no mapping)
     return told
 
 
-def _ask(path: Path, rate_hz: float) -> dict[str, NDArray[Any]]:
+def _ask(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]:
     parts: dict[str, list[NDArray[Any]]] = {name: [] for name in ("told", "poses", "opened", "widths")}
     lengths, seeds, env = [], [], None
     with TrajectoryFile(path) as file:
         stride = sample_stride(file.control_freq, rate_hz)
         try:
             for index, entry in enumerate(file.episodes):
+                on_read(index, len(file.episodes))
                 if not entry.get("success", True):
                     continue
                 recording = file.recording(index)

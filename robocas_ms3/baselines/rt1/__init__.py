@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+from robocas_ms3.baselines.baseline import OnRead, Split
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.data import RT1Samples
 from robocas_ms3.baselines.rt1.model import RT1Model
@@ -18,8 +19,8 @@ class RT1:
     about = "the paper's RT-1: base and gripper camera, language; tokens of actions by a causal transformer"
     Config = RT1Config
 
-    def data(self, config: RT1Config, folder: Path, split: Literal["train", "val"]) -> RT1Samples:
-        """Samples of a dataset with pictures and embeddings."""
+    def data(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead) -> RT1Samples:
+        """Samples of a dataset with pictures and embeddings, which are read when they are asked for."""
         return RT1Samples(config, folder, split)
 
     def model(self, config: RT1Config, facts: dict[str, Any]) -> RT1Model:

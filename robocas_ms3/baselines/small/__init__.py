@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+from robocas_ms3.baselines.baseline import OnRead, Split
 from robocas_ms3.baselines.chunk_policy import ChunkPolicy
 from robocas_ms3.baselines.small.config import SmallConfig
 from robocas_ms3.baselines.small.data import SmallSamples
@@ -19,9 +20,9 @@ class Small:
     about = "base and gripper camera, language; chunks of poses by a small transformer"
     Config = SmallConfig
 
-    def data(self, config: SmallConfig, folder: Path, split: Literal["train", "val"]) -> SmallSamples:
+    def data(self, config: SmallConfig, folder: Path, split: Split, on_read: OnRead) -> SmallSamples:
         """Samples of a dataset with pictures and embeddings."""
-        return SmallSamples(config, folder, split)
+        return SmallSamples(config, folder, split, on_read)
 
     def model(self, config: SmallConfig, facts: dict[str, Any]) -> SmallModel:
         """The network."""

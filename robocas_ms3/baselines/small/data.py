@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
+import psutil
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.baselines.baseline import Batch
+from robocas_ms3.baselines.baseline import Batch, OnRead, Split
 from robocas_ms3.baselines.chunks import encode, next_keys, spread
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.datasets.formats import open_source
@@ -34,18 +34,19 @@ class SmallSamples:
         config: what is looked at and predicted.
         path: of the dataset.
         split: of it.
-        on_episode: called with the number of episodes after each that was read.
+        on_read: see `Baseline.data`.
 
     Raises:
-        DatasetError: the dataset lacks a camera or embeddings, is damaged, or its pictures are smaller than asked for.
+        DatasetError: the dataset lacks a camera or embeddings, is damaged, its pictures are smaller than asked for, or
+            all of them are more than memory holds.
     """
 
     def __init__(
         self,
         config: SmallConfig,
         path: Path,
-        split: Literal["train", "val"],
-        on_episode: Callable[[int], None] = lambda count: None,
+        split: Split,
+        on_read: OnRead = lambda done, of: None,
     ) -> None:
         source = open_source(path)
         check_holds(source, list(config.views), depth=False, embedding=config.language)
@@ -56,6 +57,7 @@ class SmallSamples:
             raise DatasetError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
         first = np.concatenate([[0], np.cumsum([source.lengths[number] for number in numbers])])
         count = int(first[-1])
+        _check_room(config, count, path)
         self._pictures = {
             camera: torch.empty((count, view.size[1], view.size[0], 3), dtype=torch.uint8)
             for camera, view in config.views.items()
@@ -70,8 +72,8 @@ class SmallSamples:
             self._read(config, source, numbers[place], place, int(first[place]))
 
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            for _ in pool.map(read, range(len(numbers))):
-                on_episode(len(numbers))
+            for done, _ in enumerate(pool.map(read, range(len(numbers))), start=1):
+                on_read(done, len(numbers))
         self.facts: dict[str, Any] = {
             "rate_hz": source.rate_hz,
             "chunk": spread(self._chunks[..., :9].numpy()),
@@ -112,6 +114,19 @@ class SmallSamples:
             with closing(episode.frames(camera, "rgb", 0, length)) as pictures:
                 for row, picture in enumerate(pictures, start=first):
                     self._pictures[camera][row] = torch.from_numpy(looked_at(picture, view, source.root))
+
+
+def _check_room(config: SmallConfig, count: int, path: Path) -> None:
+    needed = count * sum(3 * view.size[0] * view.size[1] for view in config.views.values())
+    free = psutil.virtual_memory().available
+    if needed > 0.9 * free:
+        raise DatasetError(
+            "more pictures than memory holds",
+            where=path,
+            expected=f"{needed / 1e9:.1f} GB",
+            found=f"{free / 1e9:.1f} GB free",
+            fix="Choose smaller views, or fewer episodes (robocas split).",
+        )
 
 
 def _spread_of_words(words: NDArray[np.floating]) -> dict[str, Any]:

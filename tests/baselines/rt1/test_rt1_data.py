@@ -19,7 +19,7 @@ from robocas_ms3.strict import parse
 
 @pytest.fixture(scope="module")
 def samples(folder):
-    return BASELINE.data(RT1Config(**SIZES), folder, "train")
+    return BASELINE.data(RT1Config(**SIZES), folder, "train", lambda done, of: None)
 
 
 def test_a_batch(samples, folder):
@@ -44,7 +44,7 @@ def test_a_batch(samples, folder):
 
 
 def test_more_than_one_action_may_be_told_as_the_end(folder):
-    samples = BASELINE.data(RT1Config(**SIZES, terminate_steps=2), folder, "train")
+    samples = BASELINE.data(RT1Config(**SIZES, terminate_steps=2), folder, "train", lambda done, of: None)
     assert samples.__getitems__([5])["terminate"].int().tolist() == [[0, 0, 0, 0, 1, 1]]
     assert samples.__getitems__([4])["terminate"].int().tolist() == [[0, 0, 0, 0, 0, 1]]
 
@@ -68,7 +68,9 @@ def test_workers_read_the_same(samples):
 
 @pytest.mark.parametrize("size", [(40, 34), (80, 60), (64, 48), (80, 40)])
 def test_policies_scale_pictures_as_samples_are_scaled(folder, size):
-    samples = BASELINE.data(RT1Config(**{**SIZES, "picture": size, "crop_height": 32}), folder, "train")
+    samples = BASELINE.data(
+        RT1Config(**{**SIZES, "picture": size, "crop_height": 32}), folder, "train", lambda done, of: None
+    )
     source = open_source(folder)
     shot = source.episode(source.split("train")[0]).rgb("base_camera", 0)
     assert shot.shape == (48, 64, 3)
@@ -76,7 +78,7 @@ def test_policies_scale_pictures_as_samples_are_scaled(folder, size):
 
 
 def test_validation_has_episodes_of_its_own(folder):
-    assert BASELINE.data(RT1Config(**SIZES), folder, "val").episodes == 1
+    assert BASELINE.data(RT1Config(**SIZES), folder, "val", lambda done, of: None).episodes == 1
 
 
 def changed(folder, tmp_path, **settings):
@@ -98,14 +100,16 @@ def changed(folder, tmp_path, **settings):
 def test_other_datasets_are_refused_in_a_line(settings, said, folder, tmp_path):
     copy = changed(folder, tmp_path, **settings)
     with pytest.raises(DatasetError, match=said) as caught:
-        BASELINE.data(RT1Config(**SIZES), copy, "train")
+        BASELINE.data(RT1Config(**SIZES), copy, "train", lambda done, of: None)
     assert "\n" not in str(caught.value)
     assert str(copy) in str(caught.value)
 
 
 def test_another_rate_may_be_asked_for(folder, tmp_path):
     copy = changed(folder, tmp_path, rate_hz=10.0)
-    assert BASELINE.data(RT1Config(**SIZES, rate_hz=10.0), copy, "train").facts["rate_hz"] == 10.0
+    assert (
+        BASELINE.data(RT1Config(**SIZES, rate_hz=10.0), copy, "train", lambda done, of: None).facts["rate_hz"] == 10.0
+    )
 
 
 def test_no_validation_is_said_as_trainers_expect_it(folder, tmp_path):
@@ -113,13 +117,13 @@ def test_no_validation_is_said_as_trainers_expect_it(folder, tmp_path):
     path = copy / "data_info.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "val_eps": []}))
     with pytest.raises(DatasetError, match="split holds no episodes"):
-        BASELINE.data(RT1Config(**SIZES), copy, "val")
+        BASELINE.data(RT1Config(**SIZES), copy, "val", lambda done, of: None)
 
 
 @pytest.mark.parametrize("key", ["rel_pos", "language_embedding"])
 def test_nan_in_data_is_named(key, folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "dataset")
-    samples = BASELINE.data(RT1Config(**SIZES), copy, "train")
+    samples = BASELINE.data(RT1Config(**SIZES), copy, "train", lambda done, of: None)
     number = open_source(copy).split("train")[0]
     path = copy / f"episode_{number:07d}" / "episode_info.npz"
     arrays = dict(np.load(path))

@@ -26,7 +26,7 @@ STEPS = 110
 def test_five_episodes_are_learned(folder):
     """At least 95 % of action tokens, as policies act; then the policy does what was shown, half a bin off."""
     config = RT1Config(**SMALL)
-    samples = BASELINE.data(config, folder, "train")
+    samples = BASELINE.data(config, folder, "train", lambda done, of: None)
     torch.manual_seed(0)
     model = BASELINE.model(config, samples.facts)
     batch = samples.__getitems__(list(range(len(samples))))

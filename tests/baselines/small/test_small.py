@@ -33,7 +33,7 @@ TINY = dict(
 
 @pytest.fixture(scope="module")
 def samples(folder):
-    return BASELINE.data(SmallConfig(**TINY), folder, "train")
+    return BASELINE.data(SmallConfig(**TINY), folder, "train", lambda done, of: None)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_samples_are_the_datasets(samples, folder):
 
 def test_without_language_words_say_nothing(folder):
     config = SmallConfig(**TINY, language=False)
-    samples = BASELINE.data(config, folder, "val")
+    samples = BASELINE.data(config, folder, "val", lambda done, of: None)
     assert not samples.__getitems__([0])["words"].any()
     assert BASELINE.policy(config, samples.facts, BASELINE.model(config, samples.facts)).wants.language == "none"
 
@@ -172,9 +172,9 @@ def test_data_that_does_not_suit_it(folder, tmp_path, spoil, message):
     copy = shutil.copytree(folder, tmp_path / "copy")
     spoil(copy)
     with pytest.raises(DatasetError, match=message):
-        BASELINE.data(SmallConfig(**TINY), copy, "train")
+        BASELINE.data(SmallConfig(**TINY), copy, "train", lambda done, of: None)
 
 
 def test_pictures_that_are_too_small(folder):
     with pytest.raises(DatasetError, match="robocas convert --size 256 192"):
-        BASELINE.data(SmallConfig(), folder, "train")
+        BASELINE.data(SmallConfig(), folder, "train", lambda done, of: None)
