@@ -1,4 +1,4 @@
-"""Draws what several runs of examples/ppo.py have learned. Writes a JPEG.
+"""Draws what several runs of `robocas train ppo` have learned. Writes a JPEG.
 
 Run: python benchmarks/learning_curve.py out/ppo_1 out/ppo_2 out/ppo_3 [--out docs/images/ppo.jpg]
 """
@@ -19,7 +19,7 @@ COLOURS = ("#2f6fa8", "#e08a2e", "#4f9a6a", "#9a5fa8", "#7a7a7a")
 @dataclass
 class Args:
     runs: tyro.conf.Positional[list[Path]]
-    """Folders with a progress.csv each."""
+    """Folders with a metrics.csv each."""
     out: Path = Path("docs/images/ppo.jpg")
 
 
@@ -29,8 +29,8 @@ def main(args: Args) -> None:
         FigureCanvasAgg(figure)
         left, middle, right = figure.subplots(1, 3)
         for run, colour in zip(args.runs, COLOURS, strict=False):
-            found = read(run / "progress.csv")
-            steps = found["steps"] / 1000
+            found = read(run / "metrics.csv")
+            steps = found["step"] / 1000
             left.plot(steps, found["return"], color=colour)
             middle.plot(steps, 100 * found["held"], color=colour)
             right.plot(found["seconds"] / 60, 100 * found["held"], color=colour, label=run.name)
@@ -46,10 +46,11 @@ def main(args: Args) -> None:
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """The columns of a progress.csv."""
+    """What a metrics.csv says of training, by column."""
     with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+        rows = [row for row in csv.DictReader(file) if row["split"] == "train"]
+    names = ("step", "seconds", "return", "held")
+    return {name: np.array([float(row[name]) for row in rows]) for name in names}
 
 
 if __name__ == "__main__":

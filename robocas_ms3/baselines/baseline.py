@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -65,6 +65,34 @@ class BaselineConfig(StrictModel):
     train: TrainSettings = TrainSettings()
 
 
+class TrialSettings(StrictModel):
+    """How a baseline that learns by trying is trained.
+
+    Attributes:
+        steps: of all environments together; as many more as the last update has.
+        batch_size: steps between updates, of all environments together.
+        learning_rate: of the optimiser.
+        clip_norm: of the gradient; 0: it is not clipped.
+        seed: of everything random but the environments.
+        precision: of the forward pass.
+        save_every: steps between checkpoints.
+    """
+
+    steps: int = Field(default=100_000, ge=1)
+    batch_size: int = Field(default=512, ge=2)
+    learning_rate: float = Field(default=7e-4, gt=0)
+    clip_norm: float = Field(default=0.5, ge=0)
+    seed: int = Field(default=0, ge=0)
+    precision: Literal["fp32"] = "fp32"
+    save_every: int = Field(default=5000, ge=1)
+
+
+class TrialConfig(StrictModel):
+    """What the configuration of a baseline that learns by trying has at least."""
+
+    train: TrialSettings = TrialSettings()
+
+
 class Samples(Protocol):
     """Training samples, map-style.
 
@@ -83,19 +111,67 @@ class Samples(Protocol):
         ...
 
 
-class Baseline(Protocol):
+class Trials(Protocol):
+    """What a baseline learns in that learns by trying.
+
+    Attributes:
+        name: for people.
+        hash: of the scenes.
+        facts: JSON values that the model and the policy need to know.
+        episodes: how many different ones there are.
+    """
+
+    name: str
+    hash: str
+    facts: dict[str, Any]
+    episodes: int
+
+    def __len__(self) -> int:
+        """Steps to be taken."""
+        ...
+
+    def close(self) -> None:
+        """End what they run in."""
+        ...
+
+
+class Training(Protocol):
+    """A run that takes the steps that are left, and keeps checkpoints, weights and metrics in its folder."""
+
+    def parameters(self) -> Iterator[torch.nn.Parameter]:
+        """Of the network."""
+        ...
+
+    def train(self, on_step: Callable[[int, int], None]) -> None:
+        """Take all steps that are left; what there is to call with the steps done and all steps."""
+        ...
+
+
+class _Kind(Protocol):
     """A kind of policy that can be trained.
 
     Attributes:
         name: as the command line has it.
         version: of its weights and inputs; another one can't be gone on with.
         about: a line for people.
-        Config: form of its configuration.
     """
 
     name: str
     version: int
     about: str
+
+    def policy(self, config: Any, facts: dict[str, Any], model: Any) -> Policy:
+        """What acts by a trained network."""
+        ...
+
+
+class Baseline(_Kind, Protocol):
+    """One that learns from data.
+
+    Attributes:
+        Config: form of its configuration.
+    """
+
     Config: type[BaselineConfig]
 
     def data(self, config: Any, folder: Path, split: Split, on_read: OnRead) -> Samples:
@@ -116,6 +192,20 @@ class Baseline(Protocol):
         """The network; its ``forward(batch)`` gives means over the batch by name, ``loss`` among them."""
         ...
 
-    def policy(self, config: Any, facts: dict[str, Any], model: torch.nn.Module) -> Policy:
-        """What acts by a trained network."""
+
+class TrialBaseline(_Kind, Protocol):
+    """One that learns by trying, with a trainer of its own.
+
+    Attributes:
+        Config: form of its configuration.
+        trials: (configuration, ``cpu`` or ``cuda``) to what it learns in.
+        training: (configuration, trials, run's folder, ``run.json``, accelerator, resume=, on_note=) to a `Training`.
+    """
+
+    Config: type[TrialConfig]
+    trials: Callable[..., Trials]
+    training: Callable[..., Training]
+
+    def model(self, config: Any, facts: dict[str, Any]) -> torch.nn.Module:
+        """The network."""
         ...

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, OnRead, Samples
+from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, OnRead, Samples, Training
 from robocas_ms3.baselines.runs import RUN, WEIGHTS, DataRecord, RunRecord, hash_of, read_run, write_run
 from robocas_ms3.baselines.table import find_baseline
 from robocas_ms3.errors import DatasetError, TrainingError
@@ -37,7 +37,7 @@ class Said:
 
 def train_run(
     name: str,
-    data: Path,
+    data: Path | None,
     out: Path,
     changes: Mapping[str, Any] | None = None,
     *,
@@ -51,7 +51,7 @@ def train_run(
 
     Args:
         name: of the baseline.
-        data: dataset.
+        data: dataset; None for a baseline that learns by trying.
         out: folder of the run.
         changes: of its configuration, nested as that is; for a run that goes on they may be left out.
         start: folder of a run whose weights to begin with, such as one on less data; scales stay those of that run.
@@ -68,6 +68,8 @@ def train_run(
     """
     check_one_way("train", resume=resume, overwrite=overwrite, error=TrainingError)
     baseline, said = find_baseline(name), said or Said()
+    trier: Any = baseline if hasattr(baseline, "trials") else None  # a `TrialBaseline`
+    _check_data(baseline, data, by_trial=trier is not None)
     before = read_run(out) if resume and (out / RUN).is_file() else None
     config = _config(baseline, changes, before, out)
     weights, begun_with = _weights(baseline, start) if start is not None else (None, "")
@@ -81,38 +83,59 @@ def train_run(
             if overwrite:
                 check_overwrite(out, [RUN], "a run of robocas train")
             claim_output(out, resume=resume or overwrite)  # what is replaced stays until there is something instead
-        hashed = hash_of(data)
+        samples: Any = None
+        if trier is not None:
+            samples = stack.enter_context(closing(trier.trials(config, accelerator.device.type)))
+        hashed = samples.hash if data is None else hash_of(data)
         if before is not None:
             _check_same(before, baseline, hashed, out)
-        said.note(f"reading {data}")
-        samples = baseline.data(config, data, "train", said.read)
-        check = _validation(baseline, config, data, said)
+        check = None
+        if data is not None:
+            said.note(f"reading {data}")
+            samples = baseline.data(config, data, "train", said.read)
+            check = _validation(baseline, config, data, said)
         record = before or RunRecord(
             baseline=name,
             version=baseline.version,
             config=config.model_dump(mode="json"),
             facts=samples.facts,
-            data=DataRecord(name=data.name, hash=hashed, episodes=samples.episodes, samples=len(samples)),
+            data=DataRecord(
+                name=samples.name if data is None else data.name,
+                hash=hashed,
+                episodes=samples.episodes,
+                samples=len(samples),
+            ),
             versions=_versions(),
             device=str(accelerator.device.type),
             precision=str(accelerator.mixed_precision),
             start=begun_with,
         )
-        trainer = Trainer(
-            baseline, config, samples, check, out, record, accelerator, resume=resume, start=weights, on_note=said.note
-        )
+        more: dict[str, Any] = {"resume": resume, "start": weights, "on_note": said.note}
+        if trier is not None:
+            trainer: Training = trier.training(config, samples, out, record, accelerator, **more)
+        else:
+            trainer = Trainer(baseline, config, samples, check, out, record, accelerator, **more)
         if accelerator.is_main_process and before is None:
             claim_output(out, overwrite=overwrite, resume=True)
             make_folder(out)
             write_run(out, record)
         accelerator.wait_for_everyone()
         count = sum(parameter.numel() for parameter in trainer.parameters())
+        of = f"{len(samples)} steps in {samples.episodes} layouts" if trier else ""
         said.note(
-            f"{name}: {count / 1e6:.2f} M parameters, {len(samples)} samples of {samples.episodes} episodes, "
+            f"{name}: {count / 1e6:.2f} M parameters, "
+            f"{of or f'{len(samples)} samples of {samples.episodes} episodes'}, "
             f"{accelerator.device.type}, {'bf16' if accelerator.mixed_precision == 'bf16' else 'fp32'}"
         )
         trainer.train(said.step)
     return record
+
+
+def _check_data(baseline: Baseline, data: Path | None, *, by_trial: bool) -> None:
+    if data is None and not by_trial:
+        raise TrainingError("on what?", where="--data", expected="a dataset's folder or a trajectory.h5")
+    if data is not None and by_trial:
+        raise TrainingError(f"{baseline.name} learns by trying, of no data", where="--data", fix="Leave it out.")
 
 
 def _config(

@@ -25,7 +25,7 @@ BASELINES: Table[Callable[[], Baseline]] = Table(
     "baseline",
     GROUP,
     Callable,
-    {"small": _builtin("small"), "bc-state": _builtin("bc_state"), "rt1": _builtin("rt1")},
+    {"small": _builtin("small"), "bc-state": _builtin("bc_state"), "rt1": _builtin("rt1"), "ppo": _builtin("ppo")},
 )
 """By name, what gives it."""
 

@@ -17,8 +17,8 @@ class ServePolicy:
     """
 
     policy: Annotated[str, tyro.conf.Positional]
-    """As robocas eval has it: scripted, random, still, replay:TRAJECTORY.h5, a folder of robocas train, or module:Class of
-    your own."""
+    """As robocas eval has it: scripted, random, still, replay:TRAJECTORY.h5, a folder of robocas train, or
+    module:Class of your own."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0: all of this machine's."""
     port: int = 8000

@@ -19,17 +19,18 @@ class Train:
     - small: base and gripper camera, language; made for two processor cores
     - bc-state: what only a simulator knows, from the trajectory.h5 of `robocas generate`
     - rt1: the paper's RT-1
+    - ppo: learns by trying, without --data, from dense rewards and what only a simulator knows (docs/rl.md)
 
     docs/baselines.md says what they are, what they cost and what they reach. Several GPUs:
     `accelerate launch -m robocas_ms3.cli.main train ...`.
     """
 
     baseline: Annotated[str, tyro.conf.Positional] = "small"
-    """Which: small, bc-state, rt1, or another package's."""
+    """Which: small, bc-state, rt1, ppo, or another package's."""
     data: Maybe[Path] = None
-    """Folder of a dataset, or a trajectory.h5. Needed."""
+    """Folder of a dataset, or a trajectory.h5. Needed, but for ppo."""
     out: Maybe[Path] = None
-    """Folder of the run. Default: runs/BASELINE-DATA."""
+    """Folder of the run. Default: runs/BASELINE-DATA, or runs/BASELINE."""
     config: Maybe[Path] = None
     """YAML file of what differs from the baseline's defaults."""
     set: Annotated[Several[str], tyro.conf.UseAppendAction] = ()
@@ -52,15 +53,10 @@ class Train:
 
 def main(cfg: Train) -> int:
     """Run the command; gives the exit code."""
-    from robocas_ms3.cli.bars import bar, say
-    from robocas_ms3.errors import TrainingError
-
-    if cfg.data is None:
-        raise TrainingError("on what?", where="--data", expected="a dataset's folder or a trajectory.h5")
     from robocas_ms3.baselines.session import Said, train_run
+    from robocas_ms3.cli.bars import bar, say
 
-    data = cfg.data.resolve()
-    out = cfg.out or Path("runs") / f"{cfg.baseline}-{data.parent.name if data.is_file() else data.name}"
+    out = cfg.out or _default_out(cfg)
     with bar("episodes read", transient=True) as reading, bar("steps trained") as stepping:
 
         def step(done: int, of: int) -> None:
@@ -82,8 +78,15 @@ def main(cfg: Train) -> int:
             )
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command with --resume goes on") from None
-    say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol paper-v1")
+    say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if cfg.data else 'P'}")
     return 0
+
+
+def _default_out(cfg: Train) -> Path:
+    if cfg.data is None:
+        return Path("runs") / cfg.baseline
+    data = cfg.data.resolve()
+    return Path("runs") / f"{cfg.baseline}-{data.parent.name if data.is_file() else data.name}"
 
 
 def changes_of(cfg: Train) -> dict[str, Any]:

@@ -62,15 +62,15 @@ def test_read_dataset(recorded, needs_renderer, tmp_path):
 
 
 def test_ppo_in_a_shortened_form(tmp_path):
-    small = ["--updates", 2, "--envs", 2, "--workers", 1, "--batch", 64, "--epochs", 1, "--layouts", 2, "--trials", 2]
-    learned, tried = run("ppo.py", *small, cwd=tmp_path)
-    assert learned.startswith("128 steps, ")
-    assert tried.startswith("without noise, in 2 layouts that are new to it: held ")
-    with (tmp_path / "out/ppo/progress.csv").open() as file:
+    small = ["--steps", 128, "--envs", 2, "--workers", 1, "--batch", 64, "--layouts", 2, "--trials", 2]
+    begun, tried = run("ppo.py", *small, cwd=tmp_path)
+    assert begun.startswith("ppo: 0.05 M parameters, 128 steps in 2 layouts")
+    assert tried.startswith("without noise, in 2 layouts that are new to it: return ")
+    with (tmp_path / "out/ppo/metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["steps"] for row in rows] == ["64", "128"]
+    assert [(row["step"], row["split"]) for row in rows] == [("64", "train"), ("128", "train"), ("128", "val")]
     assert 0 < float(rows[-1]["return"]) < 20
-    assert (tmp_path / "out/ppo/policy.pt").stat().st_size > 10_000
+    assert (tmp_path / "out/ppo/weights.safetensors").stat().st_size > 10_000
 
 
 def test_missing_arguments_are_a_line(tmp_path):

@@ -1,0 +1,89 @@
+"""What the policy's numbers mean: the same where it learns and where it is measured."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.baselines.ppo import BASELINE
+from robocas_ms3.baselines.ppo.agent import Agent
+from robocas_ms3.baselines.ppo.config import PpoConfig
+from robocas_ms3.baselines.ppo.trials import arm_action
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.actions import CONVENTIONS
+from robocas_ms3.evaluation.policy import Observations
+from robocas_ms3.evaluation.stepping import control_mode
+from robocas_ms3.robots.ee_deltas import to_ee_delta_action
+
+FACTS = {"observed": 12 + 7 + 1 + 4, "acted": 5, "rate_hz": 5}
+
+
+def observations(count, state=4):
+    def zeros(size):
+        return np.zeros((count, size), np.float32)
+
+    return Observations(
+        envs=np.arange(count),
+        instructions=[""] * count,
+        embeddings=None,
+        images={},
+        depths={},
+        qpos=zeros(12),
+        tcp_in_base=zeros(7),
+        gripper_width=zeros(1),
+        state=zeros(state),
+    )
+
+
+def policy_that_says(numbers):
+    """Whatever it sees."""
+    agent = BASELINE.model(PpoConfig(width=4), FACTS)
+    torch.nn.init.zeros_(agent.actor[-1].weight)
+    agent.actor[-1].bias.data = torch.tensor(numbers)
+    return BASELINE.policy(PpoConfig(width=4), FACTS, agent)
+
+
+def test_five_numbers_are_seven():
+    found = arm_action(torch.tensor([[0.5, -1.0, 2.0, 0.4, 0.1], [0, 0, 0, 0, -0.1]]))
+    torch.testing.assert_close(
+        found, torch.tensor([[0.25, -0.5, 0.5, 0, 0, 0.2, 1.0], [0, 0, 0, 0, 0, 0, -1.0]]), atol=1e-6, rtol=0
+    )
+
+
+def test_motions_are_metres_and_radians():
+    found = policy_that_says([0.5, -1.0, 2.0, 0.4, 0.1]).act(observations(2))
+    assert found.shape == (2, 7)
+    np.testing.assert_allclose(found[1], [0.025, -0.05, 0.05, 0, 0, 0.1, 1], atol=1e-6)
+
+
+def test_the_evaluation_does_what_the_training_did():
+    policy = policy_that_says([0.5, -1.0, 0.3, 0.4, -0.2])
+    assert control_mode(policy.wants.convention) == "pd_ee_delta_pose"
+    motion = CONVENTIONS[policy.wants.convention].read(policy.act(observations(1)))
+    assert isinstance(motion.rotation, Rotation)
+    assert motion.open.tolist() == [False]
+    again = to_ee_delta_action(motion.translation, motion.rotation)
+    learned = arm_action(torch.tensor([[0.5, -1.0, 0.3, 0.4, -0.2]]))
+    np.testing.assert_allclose(again, learned[:, :6].numpy(), atol=1e-6)
+
+
+def test_it_says_what_it_wants():
+    wants = policy_that_says([0.0] * 5).wants
+    assert (wants.reference, wants.rate_hz, wants.state, wants.language) == ("target", 5, True, "none")
+    assert not wants.cameras
+
+
+def test_other_scenes_are_refused():
+    with pytest.raises(EvaluationError, match="other scenes than it was trained in.*24 numbers.*30"):
+        policy_that_says([0.0] * 5).act(observations(1, state=10))
+
+
+def test_what_was_observed_is_what_observations_are_measured_by():
+    agent = Agent(1, 1, 4)
+    agent.see(torch.tensor([[1.0], [3.0]]))
+    agent.see(torch.tensor([[5.0], [7.0]]))
+    assert agent.mean.item() == pytest.approx(4, abs=1e-3)
+    # mean 4, variance 5
+    assert agent.normal(torch.tensor([[4.0], [4 + 5**0.5], [1000.0]])).flatten().tolist() == pytest.approx(
+        [0, 1, 5], abs=1e-3
+    )
