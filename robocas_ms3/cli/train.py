@@ -22,7 +22,7 @@ class Train:
     - ppo: learns by trying, without --data, from dense rewards and what only a simulator knows (docs/rl.md)
 
     docs/baselines.md says what they are, what they cost and what they reach. Several GPUs:
-    `accelerate launch -m robocas_ms3.cli.main train ...`.
+    `accelerate launch --no_python robocas train ...`.
     """
 
     baseline: Annotated[str, tyro.conf.Positional] = "small"

@@ -17,14 +17,17 @@ from numpy.typing import NDArray
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
 from robocas_ms3.baselines.chunks import encode, next_keys, spread
 from robocas_ms3.baselines.small.config import SmallConfig, View
+from robocas_ms3.baselines.small.pointing import cells_of
 from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.schema import CAMERAS
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.datasets.training.sample_arrays import check_holds
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.poses import from_xyzw
+from robocas_ms3.poses import Array, from_xyzw
 
 _LEAST_WORD = 0.01  # deviation of a number of an embedding; all are 0.05 or so
-_KEYS = ("ee_pos", "ee_orn", "gripper_width", "gripper_status")
+_PARENTS = {camera.name: camera.parent for camera in CAMERAS}
+_KEYS = ("ee_pos", "ee_orn", "gripper_width", "gripper_status", "base_pos", "base_orn")
 
 
 class SmallSamples:
@@ -65,6 +68,7 @@ class SmallSamples:
         self._state = torch.empty((count, 10))
         self._chunks = torch.empty((count, config.chunk, 10))
         self._keys = torch.empty((count, 9))
+        self._cells = {camera: torch.empty(count, dtype=torch.int64) for camera in config.views}
         self._words = torch.zeros((len(numbers), 384))
         self._episode = torch.from_numpy(np.repeat(np.arange(len(numbers)), np.diff(first)))
 
@@ -85,10 +89,11 @@ class SmallSamples:
         return len(self._state)
 
     def __getitems__(self, indices: list[int]) -> Batch:
-        """A batch: pictures by camera, ``state``, ``words``, and what is to be predicted: ``chunk``, ``key``."""
+        """A batch: pictures by camera, ``state``, ``words``; to be predicted: ``chunk``, ``key``, ``CAMERA_cell``."""
         rows = torch.tensor(indices)
         return {
             **{camera: pictures[rows] for camera, pictures in self._pictures.items()},
+            **{f"{camera}_cell": cells[rows] for camera, cells in self._cells.items()},
             "state": self._state[rows],
             "words": self._words[self._episode[rows]],
             "chunk": self._chunks[rows],
@@ -107,13 +112,31 @@ class SmallSamples:
         opened, rows = arrays["gripper_status"].reshape(-1), slice(first, first + length)
         self._state[rows] = torch.from_numpy(state_of(poses, arrays["gripper_width"].reshape(-1)))
         self._chunks[rows] = torch.from_numpy(encode(poses, opened, config.chunk))
-        self._keys[rows] = torch.from_numpy(next_keys(poses, opened))
+        keys = next_keys(poses, opened)
+        self._keys[rows] = torch.from_numpy(keys)
         if config.language:
             self._words[place] = torch.from_numpy(arrays["language_embedding"])
         for camera, view in config.views.items():
             with closing(episode.frames(camera, "rgb", 0, length)) as pictures:
+                stored = (0, 0)
                 for row, picture in enumerate(pictures, start=first):
                     self._pictures[camera][row] = torch.from_numpy(looked_at(picture, view, source.root))
+                    stored = picture.shape[1], picture.shape[0]
+            points = _seen_from(_PARENTS[camera], keys, poses, arrays)
+            frame, intrinsic = episode.camera_in_parent(camera), episode.intrinsic(camera)
+            self._cells[camera][rows] = torch.from_numpy(cells_of(points, frame, intrinsic, stored, view))
+
+
+def _seen_from(
+    parent: str, keys: NDArray[np.floating], poses: Array, arrays: dict[str, NDArray[Any]]
+) -> NDArray[np.float64]:
+    """(T, 3) the places of key poses (T, 9) in the frame that a camera is fixed to; poses (T, 4, 4) are the TCP's."""
+    points = np.concatenate([keys[:, :3], np.ones((len(keys), 1))], axis=1)[..., None]
+    if parent != "ee":
+        points = poses @ points
+    if parent == "world":
+        points = from_xyzw(arrays["base_pos"].astype(np.float64), arrays["base_orn"].astype(np.float64)) @ points
+    return points[:, :3, 0].astype(np.float64)
 
 
 def _check_room(config: SmallConfig, count: int, path: Path) -> None:

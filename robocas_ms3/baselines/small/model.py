@@ -2,7 +2,8 @@
 
 Feature maps at a sixteenth of the pictures' size are what its queries look at: one query a step of the chunk, one for
 the next key pose. Language and the arm's state are part of what is looked at; language also tells the nets what to look
-for, by a scale and shift of each channel (FiLM, Perez et al. 2018).
+for, by a scale and shift of each channel (FiLM, Perez et al. 2018). A pointer in each picture finds where the gripper
+will close or open next, and what is there is a token too.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from robocas_ms3.baselines.baseline import Batch
 from robocas_ms3.baselines.chunk_loss import chunk_losses
 from robocas_ms3.baselines.chunks import ROW, Scale
 from robocas_ms3.baselines.small.config import SmallConfig, View
+from robocas_ms3.baselines.small.pointing import CELL, Pointer, pointing_losses
 
 _WORDS, _STATE = 384, 10
 
@@ -42,7 +44,7 @@ class Block(nn.Module):
 
 
 class Eye(nn.Module):
-    """Tokens of a camera's pictures."""
+    """Tokens of a camera's pictures, and where in them the gripper will close or open next (`Pointer`)."""
 
     def __init__(self, view: View, channels: int, width: int, words: int) -> None:
         super().__init__()
@@ -55,15 +57,21 @@ class Eye(nn.Module):
                 Block(2 * channels, 4 * channels, 2, words),
             ]
         )
-        self.project = nn.Conv2d(4 * channels, width, 1)
+        self.project, self.down = nn.Conv2d(4 * channels, width, 1), nn.Conv2d(4 * channels, 2 * channels, 1)
+        self.pointer = Pointer(view, 2 * channels, width)
         self.places = nn.Parameter(torch.randn(view.size[0] * view.size[1] // 256, width) * 0.2)
 
-    def forward(self, pictures: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
-        """(B, h w / 256, width) of pictures (B, 3, h, w) around 0."""
-        seen = F.relu(self.norm(self.stem(pictures)))
-        for block in self.blocks:
-            seen = block(seen, words)
-        return self.project(seen).flatten(2).transpose(1, 2) + self.places
+    def forward(
+        self, pictures: torch.Tensor, words: torch.Tensor, asked: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B, h w / 256 + 1, width), and logits (B, h w / 64), of pictures (B, 3, h, w) around 0."""
+        fine = F.relu(self.norm(self.stem(pictures)))
+        for block in self.blocks[:2]:
+            fine = block(fine, words)
+        coarse = self.blocks[2](fine, words)
+        pointed, logits = self.pointer(fine + F.interpolate(self.down(coarse), scale_factor=2), asked)
+        tokens = self.project(coarse).flatten(2).transpose(1, 2) + self.places
+        return torch.cat([tokens, pointed[:, None]], dim=1), logits
 
 
 class SmallModel(nn.Module):
@@ -86,23 +94,31 @@ class SmallModel(nn.Module):
         self.decoder = nn.TransformerDecoder(layer, config.layers, nn.LayerNorm(width))
         self.out, self.key_out = nn.Linear(width, ROW), nn.Linear(width, 9)
 
-    def predict(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
-        """Chunks (B, K, 10), normalised but for the logits of the commands, and normalised key poses (B, 9)."""
+    def predict(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        """Normalised chunks (B, K, 10) with commands' logits, normalised keys (B, 9), logits of cells by camera."""
         words = self.words(self.word_scale(batch["words"]).clamp(-3, 3))
         state = self.state(batch["state"])
-        seen = [eye(self._picture(batch[camera]), words) for camera, eye in self.eyes.items()]
-        memory = torch.cat([*seen, words[:, None], state[:, None]], dim=1)
-        queries = self.queries + (words + state)[:, None]
+        asked = words + state
+        seen = {camera: eye(self._picture(batch[camera]), words, asked) for camera, eye in self.eyes.items()}
+        memory = torch.cat([*(tokens for tokens, _ in seen.values()), words[:, None], state[:, None]], dim=1)
+        queries = self.queries + asked[:, None]
         thought = self.decoder(queries, memory)
-        return self.out(thought[:, :-1]).float(), self.key_out(thought[:, -1]).float()
+        cells = {camera: logits for camera, (_, logits) in seen.items()}
+        return self.out(thought[:, :-1]).float(), self.key_out(thought[:, -1]).float(), cells
 
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """Losses, see `chunk_losses`."""
-        return chunk_losses(self, batch, *self.predict(batch))
+        """Losses, see `chunk_losses` and `pointing_losses`."""
+        chunk, key, cells = self.predict(batch)
+        found = chunk_losses(self, batch, chunk, key)
+        for camera, view in self.config.views.items():
+            loss, right = pointing_losses(cells[camera], batch[f"{camera}_cell"], view.size[0] // CELL)
+            found["loss"] = found["loss"] + self.config.point_weight * loss
+            found |= {f"{camera}_point": loss, f"{camera}_found": right}
+        return found
 
     def act(self, batch: Batch) -> torch.Tensor:
         """(B, K, 10) chunks: poses as they are, commands as shares, 1 = open."""
-        chunk, _ = self.predict(batch)
+        chunk, _, _ = self.predict(batch)
         return torch.cat([self.chunk_scale.back(chunk[..., :9]), chunk[..., 9:].sigmoid()], dim=-1)
 
     def _picture(self, pictures: torch.Tensor) -> torch.Tensor:
