@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from accelerate import Accelerator
+from accelerate.state import AcceleratorState
 from accelerate.utils import DataLoaderConfiguration
 from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader
@@ -248,6 +249,8 @@ def make_accelerator(device: str, precision: Precision) -> Accelerator:
     cpu = device == "cpu" or not torch.cuda.is_available()
     if cpu:
         _keep_memory()
+    if AcceleratorState._shared_state and AcceleratorState().num_processes == 1:  # of a run before, in this process
+        AcceleratorState._reset_state(reset_partial_state=True)
     if precision == "auto":
         precision = "bf16" if (_cpu_has_bf16() if cpu else torch.cuda.is_bf16_supported()) else "fp32"
     return Accelerator(

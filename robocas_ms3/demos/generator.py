@@ -14,11 +14,12 @@ import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config import load_task_config
 from robocas_ms3.demos.branches import ForkedBranches
+from robocas_ms3.demos.completing import complete
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.forking import say_once, why_not_fork
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
 from robocas_ms3.demos.resimulation import Resimulation
-from robocas_ms3.demos.takeover import Takeover, complete
+from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.demos.trials import Trials
 from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
 from robocas_ms3.extensions import load
@@ -229,7 +230,8 @@ class _Attempts:
         executor, settings, tried = self.executor, self.generator.settings, self.generator.trials is not None
         env = executor.base_env
         target = env.target_asset().asset
-        executor.segments[0].first = 0  # what freed the way to it is part of it
+        if self.takeover is not None:
+            executor.segments[0].first = 0  # what freed the way to it is part of it
         bounds = [part.first for part in executor.segments] + [len(executor.actions)]
         said, layout = env.instruction(), env.layout()
         assert layout is not None  # there was a reset
