@@ -61,8 +61,9 @@ def planar(x: float, y: float, z: float, yaw: float) -> Array:
 
 
 def transform(pose: Array, points: Array) -> Array:
-    """Points (P, 3) moved by a 4x4."""
-    return points @ pose[:3, :3].T + pose[:3, 3]
+    """Points (..., P, 3) moved by a 4x4, or by one each of (..., 4, 4)."""
+    offset = pose[..., None, :3, 3] if pose.ndim > 2 else pose[:3, 3]
+    return points @ pose[..., :3, :3].swapaxes(-1, -2) + offset
 
 
 def wxyz_to_xyzw(quaternions: Array) -> Array:

@@ -43,6 +43,7 @@ class SmallConfig(BaselineConfig):
         keys_weight: weight of the loss of where the gripper will close or open next, beside that of the chunk.
         gripper_weight: weight of the loss of the gripper's commands.
         point_weight: weight of the loss of where that is in the pictures, of each camera (`pointing`).
+        name_weight: weight of the loss of where objects are that other instructions would name, of each camera.
         shift: pixels that pictures are shifted by at most, at random, in training.
         brightness: share that brightness and contrast change by at most, at random, in training.
         fade: how fast older predictions lose weight when it acts, see `ChunkPolicy`.
@@ -63,6 +64,7 @@ class SmallConfig(BaselineConfig):
     keys_weight: float = Field(default=0.5, ge=0)
     gripper_weight: float = Field(default=0.5, ge=0)
     point_weight: float = Field(default=0.1, ge=0)
+    name_weight: float = Field(default=0.1, ge=0)
     shift: int = Field(default=3, ge=0)
     brightness: float = Field(default=0.2, ge=0, lt=1)
     fade: float = Field(default=0.5, ge=0)

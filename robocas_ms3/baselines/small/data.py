@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +19,15 @@ from numpy.typing import NDArray
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
 from robocas_ms3.baselines.chunks import encode, next_keys, spread
 from robocas_ms3.baselines.small.config import SmallConfig, View
-from robocas_ms3.baselines.small.pointing import cells_of
+from robocas_ms3.baselines.small.pointing import places_of
+from robocas_ms3.baselines.small.standing import Standing, seen_from, standing
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.schema import CAMERAS
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.datasets.training.sample_arrays import check_holds
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import Array, from_xyzw
 
 _LEAST_WORD = 0.01  # deviation of a number of an embedding; all are 0.05 or so
-_PARENTS = {camera.name: camera.parent for camera in CAMERAS}
 _KEYS = ("ee_pos", "ee_orn", "gripper_width", "gripper_status", "base_pos", "base_orn")
 
 
@@ -68,16 +69,19 @@ class SmallSamples:
         self._state = torch.empty((count, 10))
         self._chunks = torch.empty((count, config.chunk, 10))
         self._keys = torch.empty((count, 9))
-        self._cells = {camera: torch.empty(count, dtype=torch.int64) for camera in config.views}
+        self._places = {camera: torch.empty((count, 2)) for camera in config.views}
         self._words = torch.zeros((len(numbers), 384))
         self._episode = torch.from_numpy(np.repeat(np.arange(len(numbers)), np.diff(first)))
 
-        def read(place: int) -> None:
-            self._read(config, source, numbers[place], place, int(first[place]))
+        def read(place: int) -> Standing:
+            return self._read(config, source, numbers[place], place, int(first[place]))
 
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            for done, _ in enumerate(pool.map(read, range(len(numbers))), start=1):
+            stood: list[Standing] = []
+            for done, found in enumerate(pool.map(read, range(len(numbers))), start=1):
+                stood.append(found)
                 on_read(done, len(numbers))
+        self._ask(stood)
         self.facts: dict[str, Any] = {
             "rate_hz": source.rate_hz,
             "chunk": spread(self._chunks[..., :9].numpy()),
@@ -89,18 +93,47 @@ class SmallSamples:
         return len(self._state)
 
     def __getitems__(self, indices: list[int]) -> Batch:
-        """A batch: pictures by camera, ``state``, ``words``; to be predicted: ``chunk``, ``key``, ``CAMERA_cell``."""
+        """A batch of B samples.
+
+        Seen are pictures by camera (B, h, w, 3) uint8, ``state`` (B, 10) and ``words`` (B, 384). To be predicted are
+        ``chunk`` (B, K, 10), ``key`` (B, 9), where that is seen, ``CAMERA_place`` (B, 2), and where each of N objects
+        is, ``CAMERA_places`` (B, N, 2), when ``asked`` (B, N, 384) for one of its ``kinds`` (B, N), -1 = not asked for.
+        """
         rows = torch.tensor(indices)
+        episodes = self._episode[rows]
         return {
             **{camera: pictures[rows] for camera, pictures in self._pictures.items()},
-            **{f"{camera}_cell": cells[rows] for camera, cells in self._cells.items()},
+            **{f"{camera}_place": places[rows] for camera, places in self._places.items()},
+            **{f"{camera}_places": places[rows] for camera, places in self._standing.items()},
+            "kinds": self._kinds[episodes],
+            "asked": self._words[self._asked[episodes]],
             "state": self._state[rows],
-            "words": self._words[self._episode[rows]],
+            "words": self._words[episodes],
             "chunk": self._chunks[rows],
             "key": self._keys[rows],
         }
 
-    def _read(self, config: SmallConfig, source: EpisodeSource, number: int, place: int, first: int) -> None:
+    def _ask(self, stood: list[Standing]) -> None:
+        """What can be asked about each episode's objects, in the words of episodes of which they were the target."""
+        most = max(len(one.kinds) for one in stood)
+        names = sorted({one.target for one in stood} - {""})
+        told = {name: [place for place, one in enumerate(stood) if one.target == name] for name in names}
+        self._kinds = torch.full((len(stood), most), -1)
+        self._asked = torch.zeros((len(stood), most), dtype=torch.int64)
+        self._standing = {
+            camera: torch.full((len(self._state), most, 2), torch.nan) for camera in (stood[0].places if stood else ())
+        }
+        first = 0
+        for place, one in enumerate(stood):
+            for column, kind in enumerate(one.kinds):
+                if kind in told:
+                    self._kinds[place, column] = names.index(kind)
+                    self._asked[place, column] = told[kind][(place + column) % len(told[kind])]
+            for camera, places in one.places.items():
+                self._standing[camera][first : first + len(places), : len(one.kinds)] = torch.from_numpy(places)
+            first += one.steps
+
+    def _read(self, config: SmallConfig, source: EpisodeSource, number: int, place: int, first: int) -> Standing:
         episode = source.episode(number)
         arrays = episode.read([*_KEYS, *(["language_embedding"] if config.language else [])])
         length = source.lengths[number]
@@ -113,30 +146,27 @@ class SmallSamples:
         self._state[rows] = torch.from_numpy(state_of(poses, arrays["gripper_width"].reshape(-1)))
         self._chunks[rows] = torch.from_numpy(encode(poses, opened, config.chunk))
         keys = next_keys(poses, opened)
+        at_keys = (poses[:, :3, :3] @ keys[:, :3, None])[..., 0] + poses[:, :3, 3]  # in the arm's base
         self._keys[rows] = torch.from_numpy(keys)
         if config.language:
             self._words[place] = torch.from_numpy(arrays["language_embedding"])
+        looks: dict[str, Callable[[Array], NDArray[np.float32]]] = {}
         for camera, view in config.views.items():
             with closing(episode.frames(camera, "rgb", 0, length)) as pictures:
                 stored = (0, 0)
                 for row, picture in enumerate(pictures, start=first):
                     self._pictures[camera][row] = torch.from_numpy(looked_at(picture, view, source.root))
                     stored = picture.shape[1], picture.shape[0]
-            points = _seen_from(_PARENTS[camera], keys, poses, arrays)
-            frame, intrinsic = episode.camera_in_parent(camera), episode.intrinsic(camera)
-            self._cells[camera][rows] = torch.from_numpy(cells_of(points, frame, intrinsic, stored, view))
-
-
-def _seen_from(
-    parent: str, keys: NDArray[np.floating], poses: Array, arrays: dict[str, NDArray[Any]]
-) -> NDArray[np.float64]:
-    """(T, 3) the places of key poses (T, 9) in the frame that a camera is fixed to; poses (T, 4, 4) are the TCP's."""
-    points = np.concatenate([keys[:, :3], np.ones((len(keys), 1))], axis=1)[..., None]
-    if parent != "ee":
-        points = poses @ points
-    if parent == "world":
-        points = from_xyzw(arrays["base_pos"].astype(np.float64), arrays["base_orn"].astype(np.float64)) @ points
-    return points[:, :3, 0].astype(np.float64)
+            points = seen_from(camera, at_keys[:, None], poses, arrays)[:, 0]
+            looks[camera] = partial(
+                places_of,
+                camera=episode.camera_in_parent(camera),
+                intrinsic=episode.intrinsic(camera),
+                stored=stored,
+                view=view,
+            )
+            self._places[camera][rows] = torch.from_numpy(looks[camera](points))
+        return standing(episode, arrays, poses, looks)
 
 
 def _check_room(config: SmallConfig, count: int, path: Path) -> None:

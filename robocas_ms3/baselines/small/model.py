@@ -1,9 +1,10 @@
 """The network of `small`: a convolutional net a camera, and a transformer that asks them what it needs to know.
 
 Feature maps at a sixteenth of the pictures' size are what its queries look at: one query a step of the chunk, one for
-the next key pose. Language and the arm's state are part of what is looked at; language also tells the nets what to look
-for, by a scale and shift of each channel (FiLM, Perez et al. 2018). A pointer in each picture finds where the gripper
-will close or open next, and what is there is a token too.
+the next key pose. Language and the arm's state are part of what is looked at, and scale and shift its channels (FiLM,
+Perez et al. 2018). Finer maps are what a pointer in each picture looks at, for where the gripper will close or open
+next; what is there goes to each query. These maps do not depend on what is asked, so that in training each picture
+answers for every object in it.
 """
 
 from __future__ import annotations
@@ -18,60 +19,63 @@ from robocas_ms3.baselines.baseline import Batch
 from robocas_ms3.baselines.chunk_loss import chunk_losses
 from robocas_ms3.baselines.chunks import ROW, Scale
 from robocas_ms3.baselines.small.config import SmallConfig, View
-from robocas_ms3.baselines.small.pointing import CELL, Pointer, pointing_losses
+from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, Pointer, cells_of, pointing_losses
 
 _WORDS, _STATE = 384, 10
 
 
 class Block(nn.Module):
-    """A residual block (He et al. 2016) whose channels language scales and shifts."""
+    """A residual block (He et al. 2016)."""
 
-    def __init__(self, inputs: int, outputs: int, stride: int, words: int) -> None:
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
         self.first = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
         self.second = nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False)
         self.norms = nn.ModuleList([nn.GroupNorm(8, outputs), nn.GroupNorm(8, outputs)])
         self.short = nn.Identity() if stride == 1 and inputs == outputs else nn.Conv2d(inputs, outputs, 1, stride)
-        self.film = nn.Linear(words, 2 * outputs)
-        nn.init.zeros_(self.film.weight)
-        nn.init.zeros_(self.film.bias)
 
-    def forward(self, seen: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
-        """(B, C, h, w) of (B, c, H, W) and words (B, W)."""
-        inner = self.norms[1](self.second(F.relu(self.norms[0](self.first(seen)))))
-        scale, shift = self.film(words)[:, :, None, None].chunk(2, dim=1)
-        return F.relu(inner * (1 + scale) + shift + self.short(seen))
+    def forward(self, seen: torch.Tensor) -> torch.Tensor:
+        """(B, C, h, w) of (B, c, H, W)."""
+        inner = F.relu(self.norms[0](self.first(seen)))
+        return F.relu(self.norms[1](self.second(inner)) + self.short(seen))
 
 
 class Eye(nn.Module):
-    """Tokens of a camera's pictures, and where in them the gripper will close or open next (`Pointer`)."""
+    """What a camera's pictures show: tokens, and a finer map for its pointer."""
 
-    def __init__(self, view: View, channels: int, width: int, words: int) -> None:
+    def __init__(self, view: View, channels: int, width: int) -> None:
         super().__init__()
         self.stem = nn.Conv2d(3, channels, 4, 4)
         self.norm = nn.GroupNorm(8, channels)
-        self.blocks = nn.ModuleList(
-            [
-                Block(channels, channels, 1, words),
-                Block(channels, 2 * channels, 2, words),
-                Block(2 * channels, 4 * channels, 2, words),
-            ]
-        )
-        self.project, self.down = nn.Conv2d(4 * channels, width, 1), nn.Conv2d(4 * channels, 2 * channels, 1)
+        self.fine = nn.Sequential(Block(channels, channels, 1), Block(channels, 2 * channels, 2))
+        self.coarse = Block(2 * channels, 4 * channels, 2)
+        self.down = nn.Conv2d(4 * channels, 2 * channels, 1)
         self.pointer = Pointer(view, 2 * channels, width)
+        self.film, self.project = nn.Linear(width, 8 * channels), nn.Conv2d(4 * channels, width, 1)
+        nn.init.zeros_(self.film.weight)
+        nn.init.zeros_(self.film.bias)
+        self.mark = nn.Parameter(torch.randn(width))
+        self._grid = view.size[1] // CELL, view.size[0] // CELL
         self.places = nn.Parameter(torch.randn(view.size[0] * view.size[1] // 256, width) * 0.2)
 
-    def forward(
-        self, pictures: torch.Tensor, words: torch.Tensor, asked: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, h w / 256 + 1, width), and logits (B, h w / 64), of pictures (B, 3, h, w) around 0."""
-        fine = F.relu(self.norm(self.stem(pictures)))
-        for block in self.blocks[:2]:
-            fine = block(fine, words)
-        coarse = self.blocks[2](fine, words)
-        pointed, logits = self.pointer(fine + F.interpolate(self.down(coarse), scale_factor=2), asked)
-        tokens = self.project(coarse).flatten(2).transpose(1, 2) + self.places
-        return torch.cat([tokens, pointed[:, None]], dim=1), logits
+    def forward(self, pictures: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B, 4 channels, h / 16, w / 16) and (B, 2 channels, h / 8, w / 8) maps of pictures (B, 3, h, w) around 0."""
+        fine = self.fine(F.relu(self.norm(self.stem(pictures))))
+        coarse = self.coarse(fine)
+        return coarse, fine + F.interpolate(self.down(coarse), scale_factor=2)
+
+    def tell(self, maps: tuple[torch.Tensor, torch.Tensor], asked: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """What a question (B, width) gets to know of maps.
+
+        Returns:
+            Tokens (B, h w / 256, width), marked where it points; what is there (B, width); cells' logits (B, h w / 64).
+        """
+        coarse, fine = maps
+        pointed, logits = self.pointer(fine, asked)
+        scale, shift = self.film(asked)[:, :, None, None].chunk(2, dim=1)
+        tokens = self.project(F.relu(coarse * (1 + scale) + shift)).flatten(2).transpose(1, 2) + self.places
+        there = 4 * F.avg_pool2d(logits.softmax(dim=1).reshape(-1, 1, *self._grid), 2)
+        return tokens + there.flatten(2).transpose(1, 2) * self.mark, pointed, logits
 
 
 class SmallModel(nn.Module):
@@ -84,9 +88,7 @@ class SmallModel(nn.Module):
         self.word_scale = Scale(**facts["words"])
         self.words = nn.Sequential(nn.Linear(_WORDS, width), nn.ReLU(), nn.Dropout(config.dropout))
         self.state = nn.Sequential(nn.Linear(_STATE, width), nn.ReLU(), nn.Linear(width, width))
-        self.eyes = nn.ModuleDict(
-            {camera: Eye(view, config.channels, width, width) for camera, view in config.views.items()}
-        )
+        self.eyes = nn.ModuleDict({camera: Eye(view, config.channels, width) for camera, view in config.views.items()})
         self.queries = nn.Parameter(torch.randn(config.chunk + 1, width) * 0.2)
         layer = nn.TransformerDecoderLayer(
             width, config.heads, 4 * width, config.dropout, batch_first=True, norm_first=True
@@ -94,37 +96,67 @@ class SmallModel(nn.Module):
         self.decoder = nn.TransformerDecoder(layer, config.layers, nn.LayerNorm(width))
         self.out, self.key_out = nn.Linear(width, ROW), nn.Linear(width, 9)
 
-    def predict(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
-        """Normalised chunks (B, K, 10) with commands' logits, normalised keys (B, 9), logits of cells by camera."""
-        words = self.words(self.word_scale(batch["words"]).clamp(-3, 3))
-        state = self.state(batch["state"])
-        asked = words + state
-        seen = {camera: eye(self._picture(batch[camera]), words, asked) for camera, eye in self.eyes.items()}
-        memory = torch.cat([*(tokens for tokens, _ in seen.values()), words[:, None], state[:, None]], dim=1)
-        queries = self.queries + asked[:, None]
-        thought = self.decoder(queries, memory)
-        cells = {camera: logits for camera, (_, logits) in seen.items()}
-        return self.out(thought[:, :-1]).float(), self.key_out(thought[:, -1]).float(), cells
-
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """Losses, see `chunk_losses` and `pointing_losses`."""
-        chunk, key, cells = self.predict(batch)
+        """Losses, see `chunk_losses` and `pointing_losses`; those of other questions than the instruction's last."""
+        pictures, places = {}, {}
+        for camera in self.config.views:
+            seen = batch[camera]
+            by = self._shifts(seen)
+            pictures[camera] = self._lit(shifted(seen, by) if by is not None else seen)
+            moved = by if by is not None else torch.zeros(1, 2, device=seen.device)
+            places[camera] = (batch[f"{camera}_place"] + moved, batch[f"{camera}_places"] + moved[:, None])
+        maps, state = self._look(pictures), self.state(batch["state"])
+        chunk, key, cells = self._think(maps, self._hear(batch["words"]), state)
         found = chunk_losses(self, batch, chunk, key)
+        asked = self._hear(batch["asked"]) + state[:, None]
+        kinds = batch["kinds"]
+        alike = (kinds[:, :, None] == kinds[:, None, :]) & (kinds >= 0)[:, :, None]
         for camera, view in self.config.views.items():
-            loss, right = pointing_losses(cells[camera], batch[f"{camera}_cell"], view.size[0] // CELL)
-            found["loss"] = found["loss"] + self.config.point_weight * loss
+            columns, (place, others) = view.size[0] // CELL, places[camera]
+            loss, right = pointing_losses(cells[camera], cells_of(place, view)[:, None], columns)
+            eye: Any = self.eyes[camera]
+            logits = eye.pointer.logits(maps[camera][1], asked)
+            standing = cells_of(others, view)[:, None].where(alike, NOWHERE)
+            more, named = pointing_losses(logits, standing, columns)
+            found["loss"] = found["loss"] + self.config.point_weight * loss + self.config.name_weight * more
             found |= {f"{camera}_point": loss, f"{camera}_found": right}
+            found |= {f"{camera}_name": more, f"{camera}_named": named}
         return found
 
     def act(self, batch: Batch) -> torch.Tensor:
         """(B, K, 10) chunks: poses as they are, commands as shares, 1 = open."""
-        chunk, _, _ = self.predict(batch)
+        maps = self._look({camera: self._lit(batch[camera]) for camera in self.config.views})
+        chunk, _, _ = self._think(maps, self._hear(batch["words"]), self.state(batch["state"]))
         return torch.cat([self.chunk_scale.back(chunk[..., :9]), chunk[..., 9:].sigmoid()], dim=-1)
 
-    def _picture(self, pictures: torch.Tensor) -> torch.Tensor:
-        """(B, 3, h, w) around 0 of (B, h, w, 3) uint8; in training shifted and in another light, each its own way."""
-        if self.training and self.config.shift:
-            pictures = shifted(pictures, self.config.shift)
+    def _hear(self, words: torch.Tensor) -> torch.Tensor:
+        return self.words(self.word_scale(words).clamp(-3, 3))
+
+    def _look(self, pictures: Batch) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+        return {camera: eye(pictures[camera]) for camera, eye in self.eyes.items()}
+
+    def _think(
+        self, maps: dict[str, tuple[torch.Tensor, torch.Tensor]], words: torch.Tensor, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+        """Normalised chunks (B, K, 10) with commands' logits, normalised keys (B, 9), logits of cells by camera."""
+        asked = words + state
+        tokens, pointed, cells = {}, {}, {}
+        for camera, of in maps.items():
+            eye: Any = self.eyes[camera]
+            tokens[camera], pointed[camera], cells[camera] = eye.tell(of, asked)
+        memory = torch.cat([*tokens.values(), words[:, None], state[:, None]], dim=1)
+        thought = self.decoder(self.queries + (asked + sum(pointed.values()))[:, None], memory)
+        return self.out(thought[:, :-1]).float(), self.key_out(thought[:, -1]).float(), cells
+
+    def _shifts(self, pictures: torch.Tensor) -> torch.Tensor | None:
+        """(B, 2) pixels right and down that pictures are shifted by in training."""
+        if not (self.training and self.config.shift):
+            return None
+        most = self.config.shift
+        return torch.randint(-most, most + 1, (len(pictures), 2), device=pictures.device)
+
+    def _lit(self, pictures: torch.Tensor) -> torch.Tensor:
+        """(B, 3, h, w) around 0 of (B, h, w, 3) uint8; in training in another light, each its own way."""
         seen = pictures.permute(0, 3, 1, 2).contiguous().float() / 127.5 - 1  # norms are slow where channels are last
         if self.training and self.config.brightness:
             amount = self.config.brightness * (2 * torch.rand(2, len(seen), 1, 1, 1, device=seen.device) - 1)
@@ -132,12 +164,11 @@ class SmallModel(nn.Module):
         return seen
 
 
-def shifted(pictures: torch.Tensor, most: int) -> torch.Tensor:
-    """Pictures (B, h, w, C) shifted by up to ``most`` pixels each way, each its own way; edges go on outwards."""
+def shifted(pictures: torch.Tensor, by: torch.Tensor) -> torch.Tensor:
+    """Pictures (B, h, w, C) shifted by (B, 2) pixels right and down; edges go on outwards."""
     count, height, width, _ = pictures.shape
     device = pictures.device
-    by = torch.randint(-most, most + 1, (2, count, 1), device=device)
-    rows = (by[0] + torch.arange(height, device=device)).clamp(0, height - 1)  # (B, h)
-    columns = (by[1] + torch.arange(width, device=device)).clamp(0, width - 1)
+    rows = (torch.arange(height, device=device) - by[:, 1:]).clamp(0, height - 1)  # (B, h)
+    columns = (torch.arange(width, device=device) - by[:, :1]).clamp(0, width - 1)
     picked = torch.arange(count, device=device)[:, None, None]
     return pictures[picked, rows[:, :, None], columns[:, None, :]]

@@ -1,7 +1,8 @@
-"""Where in a picture the gripper will close or open next: labels for it, and what finds it.
+"""Where in a picture things are that language names: labels, and what finds them.
 
-Demonstrations say it: where the TCP is when the gripper's command changes, seen through a calibrated camera. To find
-that place in a picture is to tell the object that is meant from the others, which a chunk's error hardly rewards until
+Demonstrations say it twice. Where the TCP is when the gripper's command changes next is what the instruction leads to
+now; and until the arm comes near, each object stands where the layout put it, so that a picture answers for all of
+them, by the words of other episodes. To find the object that is meant is what a chunk's error hardly rewards until
 the hand is there.
 """
 
@@ -13,7 +14,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
-from torch.nn import functional as F
 
 from robocas_ms3.baselines.small.config import View
 from robocas_ms3.poses import Array, inverse, transform
@@ -25,27 +25,32 @@ NOWHERE = -1
 _NEAREST = 0.01  # m before the camera
 
 
-def cells_of(
+def places_of(
     points: NDArray[np.floating], camera: Array, intrinsic: Array, stored: tuple[int, int], view: View
-) -> NDArray[np.int64]:
-    """(N,) cells of a view, row by row, in which points lie; `NOWHERE`: in none.
+) -> NDArray[np.float32]:
+    """(..., 2) x and y in pixels of a view at which points are seen, in or out of it; NaN: behind the camera.
 
     Args:
-        points: (N, 3) in the camera's parent, m.
+        points: (..., 3) in the camera's parent, m.
         camera: (4, 4) OpenCV camera frame in that parent.
         intrinsic: (4,) fx, fy, cx, cy of the stored pictures, in pixels.
         stored: width and height of those.
         view: what is looked at of them.
     """
     seen = transform(inverse(camera), np.asarray(points, np.float64))
-    depth = np.maximum(seen[:, 2], _NEAREST)
-    share = (seen[:, :2] / depth[:, None] * intrinsic[:2] + intrinsic[2:]) / np.array(stored)
+    depth = np.maximum(seen[..., 2:], _NEAREST)
+    share = (seen[..., :2] / depth * intrinsic[:2] + intrinsic[2:]) / np.array(stored)
     left, top, right, bottom = np.array(view.box()) / np.tile(view.rendered, 2)
     inside = (share - (left, top)) / (right - left, bottom - top)
-    columns, rows = view.size[0] // CELL, view.size[1] // CELL
-    cell = np.floor(inside * (columns, rows)).clip(-1e6, 1e6).astype(np.int64)
-    there = (inside >= 0).all(1) & (inside < 1).all(1) & (seen[:, 2] > _NEAREST)
-    return np.where(there, cell[:, 1] * columns + cell[:, 0], NOWHERE)
+    return np.where(seen[..., 2:] > _NEAREST, inside * view.size, np.nan).astype(np.float32)
+
+
+def cells_of(places: torch.Tensor, view: View) -> torch.Tensor:
+    """(...) cells of a view, row by row, in which places (..., 2) lie; `NOWHERE`: in none."""
+    size = torch.tensor(view.size, device=places.device)
+    inside = ((places >= 0) & (places < size)).all(dim=-1)  # NaN is not
+    cell = (places.nan_to_num(0.0) / CELL).floor().long()
+    return torch.where(inside, cell[..., 1] * (view.size[0] // CELL) + cell[..., 0], NOWHERE)
 
 
 class Pointer(nn.Module):
@@ -64,34 +69,41 @@ class Pointer(nn.Module):
         columns, rows = view.size[0] // CELL, view.size[1] // CELL
         y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
         self.register_buffer("places", torch.stack([x, y], dim=-1).reshape(-1, 2), persistent=False)
-        self.wanted, self.offered = nn.Linear(width, channels), nn.Conv2d(channels, channels, 1)
+        self.wanted = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, channels))
+        self.offered = nn.Conv2d(channels, channels, 1)
         self.tell = nn.Linear(channels + 2, width)
+
+    def logits(self, seen: torch.Tensor, asked: torch.Tensor) -> torch.Tensor:
+        """(B, Q, h w) of the cells, of maps (B, C, h, w) and questions (B, Q, width)."""
+        offered = self.offered(seen).flatten(2)
+        return torch.einsum("bqc,bcn->bqn", self.wanted(asked), offered).float() / math.sqrt(offered.shape[1])
 
     def forward(self, seen: torch.Tensor, asked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """What is pointed at (B, width), and logits of the cells (B, h w), of maps (B, C, h, w) and (B, width)."""
-        offered = self.offered(seen).flatten(2)
-        wanted = self.wanted(asked)
-        logits = torch.einsum("bc,bcn->bn", wanted, offered).float() / math.sqrt(offered.shape[1])
+        logits = self.logits(seen, asked[:, None])[:, 0]
         share = logits.softmax(dim=1)
         what = torch.einsum("bn,bcn->bc", share, seen.flatten(2).float())
         return self.tell(torch.cat([what, share @ self.places], dim=1)), logits
 
 
 def pointing_losses(logits: torch.Tensor, cells: torch.Tensor, columns: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cross entropy of the cells, and the share found to one cell; of pictures that show the place.
+    """Cross entropy of the cells, and the share found to one cell; means over questions with an answer in the picture.
 
     Args:
-        logits: (B, N).
-        cells: (B,), `NOWHERE` where it is not in the picture.
+        logits: (..., N).
+        cells: (..., I) each of which is a right answer; `NOWHERE` where it is not in the picture.
         columns: of the cells.
     """
     shown = cells != NOWHERE
-    count = shown.sum().clamp(min=1)
-    loss = F.cross_entropy(logits, cells, ignore_index=NOWHERE, reduction="sum") / count
+    asked = shown.any(dim=-1)
+    count = asked.sum().clamp(min=1)
+    share = logits.log_softmax(dim=-1).gather(-1, cells.clamp(min=0)).masked_fill(~shown, -torch.inf)
+    right = torch.where(asked[..., None], share, 0.0).logsumexp(dim=-1)  # of one or the other
+    loss = -(right * asked).sum() / count
     with torch.no_grad():
-        found = logits.argmax(dim=1)
+        found = logits.argmax(dim=-1, keepdim=True)
         off = torch.maximum(
             (found % columns - cells % columns).abs(),
             (found // columns - cells // columns).abs(),
         )
-        return loss, ((off <= 1) & shown).sum() / count
+        return loss, ((off <= 1) & shown).any(dim=-1).sum() / count

@@ -133,13 +133,25 @@ def test_a_part_is_cut_and_scaled():
 
 
 def test_shifts_move_pictures_as_a_whole():
+    picture = torch.arange(6 * 8, dtype=torch.uint8).reshape(1, 6, 8, 1).repeat(2, 1, 1, 1)
+    moved = shifted(picture, torch.tensor([[2, 0], [-1, 3]]))
+    assert moved[0, :, 2:, 0].equal(picture[0, :, :-2, 0]) and moved[0, :, 0].equal(picture[0, :, 0])  # right
+    assert moved[1, 3:, :-1, 0].equal(picture[1, :-3, 1:, 0])  # down and left
+
+
+def test_what_is_to_be_found_moves_with_a_picture(samples):
+    """Shifted by two cells at most, a picture's answers are where its pixels are."""
     torch.manual_seed(0)
-    picture = torch.arange(6 * 8, dtype=torch.uint8).reshape(1, 6, 8, 1)
-    inner = {
-        tuple((shifted(picture, 1)[0, 1:-1, 1:-1, 0].long() - picture[0, 1:-1, 1:-1, 0].long()).unique().tolist())
-        for _ in range(60)
-    }
-    assert inner == {(8 * down + right,) for down in (-1, 0, 1) for right in (-1, 0, 1)}
+    model = BASELINE.model(SmallConfig(**{**TINY, "shift": 16}), samples.facts).train()
+    batch = samples.__getitems__([0] * 64)
+    by = model._shifts(batch["base_camera"])
+    assert by.min() == -16 and by.max() == 16
+    marked = torch.zeros_like(batch["base_camera"])
+    x, y = batch["base_camera_place"][0].long().tolist()
+    marked[:, y, x] = 255
+    for picture, (right, down) in zip(shifted(marked, by), by.tolist(), strict=True):
+        there = 0 <= x + right < 64 and 0 <= y + down < 48
+        assert not there or picture[y + down, x + right].tolist() == [255, 255, 255]
 
 
 def _forget(folder, what):

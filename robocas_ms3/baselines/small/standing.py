@@ -1,0 +1,89 @@
+"""Where the objects of a scene are seen as long as they stand where the layout put them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets.schema import CAMERAS, SCENE_FILE
+from robocas_ms3.datasets.sources.protocol import SourceEpisode
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.poses import Array, from_xyzw, inverse, transform
+
+NEAR = 0.12
+"""m from TCP to an object's origin at which it may be touched; from then on nothing is known to stand still."""
+_PARENTS = {camera.name: camera.parent for camera in CAMERAS}
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Objects of an episode.
+
+    Attributes:
+        steps: of it.
+        target: kind (asset) of the one that is meant; empty: not known.
+        kinds: of each of N objects.
+        places: (T, N, 2) in pixels of the view of each camera; NaN: behind it, or not known any more.
+    """
+
+    steps: int
+    target: str = ""
+    kinds: list[str] = field(default_factory=list)
+    places: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+
+
+def standing(
+    episode: SourceEpisode,
+    arrays: Mapping[str, NDArray[Any]],
+    tcp_in_base: Array,
+    looks: Mapping[str, Callable[[Array], NDArray[np.float32]]],
+) -> Standing:
+    """Where an episode's objects are seen; nothing is known of them where its scene does not tell.
+
+    Args:
+        episode: with its scene.
+        arrays: its ``base_pos``, ``base_orn`` and ``gripper_status``.
+        tcp_in_base: (T, 4, 4).
+        looks: by camera, (T, N, 3) in its parent to (T, N, 2) in pixels.
+
+    Raises:
+        DatasetError: what is said of the scene is damaged.
+    """
+    steps = len(tcp_in_base)
+    try:
+        layout, target = episode.layout, episode.scene.get("target") or {}
+        meant, known = str(target.get("asset_id") or ""), layout.get("poses")
+        if not known:
+            nothing = np.full((steps, 0, 2), np.nan, np.float32)
+            return Standing(steps, meant, [], dict.fromkeys(looks, nothing))
+        there = np.array(layout.get("present") or [True] * len(known), bool)
+        points = np.array(known, np.float64).reshape(-1, 7)[there, :3]
+        kinds = [name for name, present in zip(layout["object_ids"], there, strict=True) if present]
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+        where = f"{episode.where}/{SCENE_FILE}"
+        raise DatasetError("this description of a scene is damaged", where=where, found=error) from error
+    in_base = transform(inverse(_base(arrays)), points[None])
+    far = np.linalg.norm(in_base - tcp_in_base[:, None, :3, 3], axis=-1).min(axis=1) > NEAR
+    opened = arrays["gripper_status"].reshape(-1)
+    still = np.logical_and.accumulate(far & (opened == opened[0]))
+    places = {camera: look(seen_from(camera, in_base, tcp_in_base, arrays)) for camera, look in looks.items()}
+    for seen in places.values():
+        seen[~still] = np.nan
+    return Standing(steps, meant, kinds, places)
+
+
+def seen_from(camera: str, points: Array, tcp_in_base: Array, arrays: Mapping[str, NDArray[Any]]) -> Array:
+    """(T, N, 3) points in the arm's base, in the frame that a camera is fixed to; ``tcp_in_base`` is (T, 4, 4)."""
+    parent = _PARENTS[camera]
+    if parent == "ee":
+        return transform(inverse(tcp_in_base), points)
+    return transform(_base(arrays), points) if parent == "world" else points
+
+
+def _base(arrays: Mapping[str, NDArray[Any]]) -> Array:
+    """(T, 4, 4) the arm's base in the world."""
+    return from_xyzw(arrays["base_pos"].astype(np.float64), arrays["base_orn"].astype(np.float64))

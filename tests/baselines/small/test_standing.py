@@ -1,0 +1,67 @@
+"""Where objects are seen as long as nothing has touched them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robocas_ms3.baselines.small.standing import NEAR, seen_from, standing
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.poses import from_parts
+
+STEPS = 5
+BASE = [2.0, 1.0, 0.5]  # of the arm in the world, turned by 90 degrees about z
+ARRAYS = {
+    "base_pos": np.tile(np.float32(BASE), (STEPS, 1)),
+    "base_orn": np.tile(np.float32([0, 0, np.sqrt(0.5), np.sqrt(0.5)]), (STEPS, 1)),
+    "gripper_status": np.array([True] * STEPS),
+}
+LAYOUT = {
+    "object_ids": ["apple", "pear", "lemon"],
+    "poses": [[2, 2, 0.5, 1, 0, 0, 0], [9, 9, 9, 1, 0, 0, 0], [1, 1, 1, 1, 0, 0, 0]],
+    "present": [True, False, True],
+}
+LOOKS = {camera: lambda points: points[..., :2].astype(np.float32) for camera in ("base_camera", "gripper_camera")}
+
+
+def episode(layout=LAYOUT, target="lemon"):
+    return SimpleNamespace(where="here", layout=layout, scene={"target": {"asset_id": target}})
+
+
+def tcp(heights):
+    """Over the apple, fingers down: x of the TCP is x of the base, y and z are turned round."""
+    return from_parts([[1, 0, height] for height in heights], np.diag([1.0, -1, -1]))
+
+
+def test_where_they_are_by_hand():
+    found = standing(episode(), ARRAYS, tcp([1, 0.9, 0.8, 0.7, 0.6]), LOOKS)
+    assert (found.steps, found.target, found.kinds) == (STEPS, "lemon", ["apple", "lemon"])
+    in_base = [[1, 0], [0, 1]]  # a metre ahead of the arm; a metre to its left, and half a metre up
+    assert found.places["base_camera"] == pytest.approx(np.tile(np.float32(in_base), (STEPS, 1, 1)), abs=1e-6)
+    in_tcp = [[0, 0], [-1, -1]]
+    assert found.places["gripper_camera"] == pytest.approx(np.tile(np.float32(in_tcp), (STEPS, 1, 1)), abs=1e-6)
+
+
+def test_what_may_have_been_touched_is_not_known_any_more():
+    near = standing(episode(), ARRAYS, tcp([1, 2 * NEAR, NEAR / 2, 2 * NEAR, 1]), LOOKS).places["base_camera"]
+    assert np.isnan(near).all((1, 2)).tolist() == [False, False, True, True, True]
+    closed = {**ARRAYS, "gripper_status": np.array([True, True, True, False, True])}
+    held = standing(episode(), closed, tcp([1] * STEPS), LOOKS).places["gripper_camera"]
+    assert np.isnan(held).all((1, 2)).tolist() == [False, False, False, True, True]
+
+
+def test_a_camera_in_the_world():
+    points = np.zeros((STEPS, 1, 3))
+    assert seen_from("static_camera", points, tcp([1] * STEPS), ARRAYS)[0, 0].tolist() == pytest.approx(BASE)
+
+
+@pytest.mark.parametrize("layout", [{}, {"object_ids": ["apple"], "present": [True]}])
+def test_nothing_is_known_where_no_scene_tells(layout):
+    found = standing(episode(layout), ARRAYS, tcp([1] * STEPS), LOOKS)
+    assert (found.kinds, found.places["base_camera"].shape) == ([], (STEPS, 0, 2))
+
+
+@pytest.mark.parametrize("layout", [{"poses": [[1, 2]]}, {**LAYOUT, "present": [True]}, {"poses": LAYOUT["poses"]}])
+def test_damage(layout):
+    with pytest.raises(DatasetError, match="scene.json: this description of a scene is damaged"):
+        standing(episode(layout), ARRAYS, tcp([1] * STEPS), LOOKS)

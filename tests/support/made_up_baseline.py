@@ -1,0 +1,105 @@
+"""A baseline that learns nothing worth knowing, in milliseconds.
+
+`python made_up_baseline.py DATA OUT` trains it in several processes, as RANK and WORLD_SIZE say: a run without a break,
+and one that crashes and goes on.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
+from robocas_ms3.baselines.session import Said, train_run
+from robocas_ms3.baselines.table import BASELINES
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.evaluation.policy import Wants
+
+
+class MadeUpConfig(BaselineConfig):
+    width: int = 4
+    broken_at: int = -1  # sample whose target is no number
+    steep_at: int = -1  # sample whose loss is a number, and whose gradient is none
+    train: TrainSettings = TrainSettings(
+        steps=40, batch_size=4, log_every=4, check_every=20, save_every=10, warmup_steps=3, ema=0.9, precision="fp32"
+    )
+
+
+class MadeUpSamples:
+    episodes = 3
+
+    def __init__(self, broken_at, steep_at):
+        rng = np.random.default_rng(0)
+        self.x = torch.from_numpy(rng.normal(size=(30, 3)).astype(np.float32))
+        self.y = self.x.sum(1, keepdim=True)
+        if broken_at >= 0:
+            self.y[broken_at] = torch.nan
+        self.steep = torch.arange(30) == steep_at
+        self.facts = {"inputs": 3}
+
+    def __len__(self):
+        return len(self.x)
+
+    def __getitems__(self, indices):
+        return {"x": self.x[indices], "y": self.y[indices], "steep": self.steep[indices]}
+
+
+class MadeUpModel(torch.nn.Module):
+    def __init__(self, config, facts):
+        super().__init__()
+        layers = torch.nn.Linear(facts["inputs"], config.width), torch.nn.Linear(config.width, 1)
+        self.net = torch.nn.Sequential(layers[0], torch.nn.Dropout(0.3), layers[1])  # random, so that a resume has to
+        # have the generator's state too
+
+    def forward(self, batch):
+        error = (self.net(batch["x"]) - batch["y"]).square().mean()
+        if batch["steep"].any():
+            error = error + (0 * self.net[0].weight).sum().sqrt()
+        return {"loss": error, "double": 2 * error.detach()}
+
+
+class MadeUpPolicy:
+    wants = Wants(language="none")
+
+    def __init__(self, model):
+        self.model = model
+
+    def reset(self, starts):
+        pass
+
+    def act(self, observations):
+        return np.zeros((len(observations.envs), 7))
+
+
+class MadeUp:
+    name, version, about, Config = "made-up", 1, "for tests", MadeUpConfig
+
+    def data(self, config, folder, split, on_read):
+        if split == "val" and folder.read_text() == "few":
+            raise DatasetError("this split holds no episodes", where=folder)
+        return MadeUpSamples(*((config.broken_at, config.steep_at) if split == "train" else (-1, -1)))
+
+    def model(self, config, facts):
+        return MadeUpModel(config, facts)
+
+    def policy(self, config, facts, model):
+        return MadeUpPolicy(model)
+
+
+def crash_at(step):
+    def look(done, of):
+        if done == step:
+            raise RuntimeError("gone")
+
+    return Said(step=look)
+
+
+if __name__ == "__main__":
+    BASELINES.builtin["made-up"] = MadeUp
+    data, out = map(Path, sys.argv[1:])
+    train_run("made-up", data, out / "whole", device="cpu")
+    try:
+        train_run("made-up", data, out / "again", device="cpu", said=crash_at(17))
+    except RuntimeError:
+        train_run("made-up", data, out / "again", device="cpu", resume=True)
