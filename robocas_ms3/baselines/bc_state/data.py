@@ -5,6 +5,8 @@ That takes some minutes for a thousand episodes; what came of it is kept among t
 
 from __future__ import annotations
 
+import hashlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +15,24 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
+from robocas_ms3.baselines.bases import check_stands
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.chunks import encode, next_keys, spread
 from robocas_ms3.baselines.runs import hash_of
 from robocas_ms3.baselines.small.data import state_of
 from robocas_ms3.datasets.sources.split import split_by_seed
+from robocas_ms3.documents import DAMAGED
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.evaluation.policy import privileged
 from robocas_ms3.files import replacing
 from robocas_ms3.paths import cache_dir
 from robocas_ms3.recordings.motion import sample_states, sample_stride
 from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.recordings.versions import versions
+from robocas_ms3.robots.description import RobotDescription
 
-_VERSION = 1  # of what is kept
+_VERSION = 2  # of what is kept
+_PACKAGES = ("robocas-ms3", "mani_skill", "sapien")
 _LEAST = 1e-2  # deviation; what hardly ever changes says little, and must not be blown up
 
 
@@ -39,7 +46,7 @@ class StateSamples:
         on_read: see `Baseline.data`.
 
     Raises:
-        DatasetError: it is no trajectory file, or its scenes hold different numbers of things.
+        DatasetError: it is no trajectory file, its scenes hold different numbers of things, or its base drives.
     """
 
     def __init__(
@@ -95,17 +102,24 @@ def _told(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]
     if path.is_dir() or path.suffix != ".h5":
         fix = "Name the trajectory.h5 of robocas generate."
         raise DatasetError("bc-state learns from recorded states", where=path, expected="a trajectory.h5", fix=fix)
-    kept = cache_dir() / "bc-state" / f"{hash_of(path)[:32]}-{rate_hz:g}-{_VERSION}.npz"
+    kept = _kept(path, rate_hz)
     if kept.is_file():
-        try:
-            with np.load(kept) as arrays:
-                return dict(arrays)
-        except (OSError, ValueError, KeyError, EOFError):
-            kept.unlink()  # damaged: it is made anew
+        with suppress(*DAMAGED), np.load(kept) as arrays:  # what is damaged is made anew
+            return dict(arrays)
     told = _ask(path, rate_hz, on_read)
     with replacing(kept) as tmp:
         np.savez(tmp, **told)  # pyright: ignore[reportArgumentType]  (its stub takes no mapping)
     return told
+
+
+def _kept(path: Path, rate_hz: float) -> Path:
+    """Where it is kept, named by all that it follows from; runs that make it at once write the same."""
+    digest = hashlib.sha256(f"{_VERSION} {rate_hz!r}\n".encode())
+    for file in (path, path.with_suffix(".json")):  # states; environment, seeds, options of resets
+        digest.update(f"{hash_of(file) if file.is_file() else None}\n".encode())
+    for package in _PACKAGES:
+        digest.update(f"{package} {versions()[package]}\n".encode())
+    return cache_dir() / "bc-state" / f"{digest.hexdigest()[:32]}.npz"
 
 
 def _ask(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]:
@@ -119,11 +133,13 @@ def _ask(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]
                 if not entry.get("success", True):
                     continue
                 recording = file.recording(index)
+                samples = sample_states(recording.control_steps, stride)
+                motion = recording.motion(samples)
+                driven = np.diff(motion.qpos[:, RobotDescription.base_slice], axis=0)
+                check_stands(driven, f"{path}, episode {recording.episode_id}")
                 if env is None:
                     env = file.env.make(obs_mode="state_dict", render_backend="none", reward_mode="none")
                 env.reset(seed=recording.seed, options=dict(recording.reset_options))
-                samples = sample_states(recording.control_steps, stride)
-                motion = recording.motion(samples)
                 base: Any = env.unwrapped
                 rows = [_row(base, recording.state(int(sample))) for sample in samples]
                 if parts["told"] and parts["told"][0].shape[1] != len(rows[0]):

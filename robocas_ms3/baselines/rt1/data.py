@@ -8,6 +8,7 @@ from typing import Any, Literal
 import torch
 
 from robocas_ms3.baselines.baseline import Batch
+from robocas_ms3.baselines.bases import check_bases
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
@@ -37,12 +38,14 @@ class RT1Samples(torch.utils.data.Dataset):
         split: of it.
 
     Raises:
-        DatasetError: it lacks embeddings or a camera, is of another rate, has no such split, or is damaged.
+        DatasetError: it lacks embeddings or a camera, is of another rate, has no such split, is damaged, or its base
+            drives.
     """
 
     def __init__(self, config: RT1Config, folder: Path, split: Literal["train", "val"]) -> None:
         source = open_source(folder)
         _check(source, config)
+        check_bases(source, source.split(split))
         self._data = RoboCASDataset(
             folder,
             split=split,

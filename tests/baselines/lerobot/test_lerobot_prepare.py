@@ -119,6 +119,17 @@ def test_numbers_that_nothing_can_be_learnt_from(source, tmp_path, key, value, m
     assert not (tmp_path / "out").exists()
 
 
+def test_a_base_that_drives_slowly(source, tmp_path):
+    spoiled = tmp_path / "spoiled"
+    shutil.copytree(source, spoiled)
+    table = pq.read_table(spoiled / DATA)
+    values = np.full_like(numbers(spoiled / DATA, "action.base"), 0.004, dtype=np.float32)
+    column = pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
+    pq.write_table(table.set_column(table.column_names.index("action.base"), "action.base", column), spoiled / DATA)
+    with pytest.raises(DatasetError, match="the base drives"):
+        prepare(spoiled, tmp_path / "out", embed)
+
+
 def test_what_is_no_dataset_is_one_line(tmp_path, capsys):
     assert main([str(tmp_path), str(tmp_path / "out"), "--no-language"]) == 1
     said = capsys.readouterr().err

@@ -1,0 +1,46 @@
+"""Whether the mobile base stands: the 7 numbers of an action say where the arm goes, and not how its base drives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets.sources.protocol import EpisodeSource
+from robocas_ms3.errors import DatasetError
+
+_DRIVEN = 0.005  # m or rad; a base that stands trembles by less than a tenth of a mm
+
+
+def check_stands(motion: NDArray[np.floating], where: object) -> None:
+    """See that the base stands throughout an episode.
+
+    Args:
+        motion: (T, 3) its ``rel_agv_pose``: x and y in m and yaw in rad, from step to step.
+        where: it is, for messages.
+
+    Raises:
+        DatasetError: it drives, in one step or slowly.
+    """
+    away = np.cumsum(motion, axis=0, dtype=np.float64)
+    furthest = float(np.abs(np.concatenate([motion, away])).max(initial=0))
+    if not furthest <= _DRIVEN:  # nor where it is no number
+        raise DatasetError(
+            "the base drives, which 7 numbers of an action leave out",
+            where=where,
+            expected=f"at most {_DRIVEN:g} m or rad away from where it began",
+            found=f"{furthest:.3g}",
+            fix="Train on a configuration without base_motion.",
+        )
+
+
+def check_bases(source: EpisodeSource, numbers: Sequence[int]) -> None:
+    """See that the base stands in some of a dataset's episodes.
+
+    Raises:
+        DatasetError: it drives in one of them, or that is not known.
+    """
+    for number in numbers:
+        motion = source.episode(number).read(["rel_agv_pose"])["rel_agv_pose"]
+        check_stands(motion, f"{source.root}, episode {number}")

@@ -1,0 +1,63 @@
+"""Datasets whose mobile base drives are refused; one that trembles stands."""
+
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+from rt1_sizes import SIZES
+from synthetic import write_trajectory
+
+from robocas_ms3.baselines.bases import check_stands
+from robocas_ms3.baselines.bc_state.config import BcStateConfig
+from robocas_ms3.baselines.bc_state.data import StateSamples
+from robocas_ms3.baselines.rt1 import BASELINE as RT1
+from robocas_ms3.baselines.rt1.config import RT1Config
+from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.errors import DatasetError
+
+
+def test_a_base_that_trembles_stands():
+    motion = np.zeros((200, 3), np.float32)
+    motion[::2], motion[1::2] = 1e-4, -1e-4
+    check_stands(motion, "here")
+    check_stands(motion[:0], "here")
+
+
+@pytest.mark.parametrize("column", [0, 1, 2])
+@pytest.mark.parametrize("rows", [[0.02, 0, 0], [0.02, -0.02, 0], [0.002] * 10, [-0.002] * 10, [0, np.nan, 0]])
+def test_a_base_that_drives_at_once_or_slowly(column, rows):
+    motion = np.zeros((len(rows), 3))
+    motion[:, column] = rows
+    with pytest.raises(DatasetError, match="here: the base drives, which 7 numbers.*without base_motion"):
+        check_stands(motion, "here")
+
+
+def driven(folder, tmp_path, side):
+    """The dataset, in which one episode's base drives half a metre."""
+    copy = shutil.copytree(folder, tmp_path / "dataset")
+    number = open_source(copy).split(side)[0]
+    path = copy / f"episode_{number:07d}" / "episode_info.npz"
+    arrays = dict(np.load(path))
+    arrays["agv_pose"][:, 0] += np.linspace(0, 0.5, len(arrays["agv_pose"]), dtype=np.float32)
+    arrays["rel_agv_pose"][:-1] = np.diff(arrays["agv_pose"], axis=0)
+    np.savez(path, **arrays)
+    return copy, number
+
+
+@pytest.mark.parametrize("side", ["train", "val"])
+def test_rt1_refuses_it(folder, tmp_path, side):
+    copy, number = driven(folder, tmp_path, side)
+    with pytest.raises(DatasetError, match=f"episode {number}: the base drives"):
+        RT1.data(RT1Config(**SIZES), copy, side, lambda done, of: None)
+
+
+def test_bc_state_refuses_it_before_it_makes_an_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
+    path = write_trajectory(tmp_path / "F.h5")
+    with h5py.File(path, "r+") as file:
+        states = file["traj_0/env_states/articulations/robocas_mobile_panda"]
+        states[:, 13] = np.linspace(0, 0.5, len(states))
+    with pytest.raises(DatasetError, match="F.h5, episode 0: the base drives"):
+        StateSamples(BcStateConfig(), path, "train")
+    assert not (tmp_path / "cache" / "bc-state").exists()
