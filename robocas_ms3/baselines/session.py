@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, OnRead, Samples, Training
-from robocas_ms3.baselines.runs import RUN, WEIGHTS, DataRecord, RunRecord, hash_of, read_run, write_run
+from robocas_ms3.baselines.runs import CHECKPOINT, RUN, WEIGHTS, DataRecord, RunRecord, hash_of, read_run, write_run
 from robocas_ms3.baselines.table import find_baseline
 from robocas_ms3.errors import DatasetError, TrainingError
 from robocas_ms3.files import make_folder
@@ -71,8 +71,10 @@ def train_run(
     trier: Any = baseline if hasattr(baseline, "trials") else None  # a `TrialBaseline`
     _check_data(baseline, data, by_trial=trier is not None)
     before = read_run(out) if resume and (out / RUN).is_file() else None
+    if before is not None:
+        _check_kind(before, baseline, out)
     config = _config(baseline, changes, before, out)
-    weights, begun_with = _weights(baseline, start) if start is not None else (None, "")
+    weights, begun_with = _weights(baseline, start, before, out)
     check_run(out / RUN, "baseline", "train")
     from robocas_ms3.baselines.train import Trainer, make_accelerator
 
@@ -88,7 +90,7 @@ def train_run(
             samples = stack.enter_context(closing(trier.trials(config, accelerator.device.type)))
         hashed = samples.hash if data is None else hash_of(data)
         if before is not None:
-            _check_same(before, baseline, hashed, out)
+            _check_same_data(before, hashed, out)
         check = None
         if data is not None:
             said.note(f"reading {data}")
@@ -144,8 +146,6 @@ def _config(
     if before is None:
         default = baseline.Config().model_dump(mode="json")
         return parse(baseline.Config, merged(default, changes or {}), TrainingError, where=baseline.name)
-    if before.baseline != baseline.name:
-        raise TrainingError("a run of another baseline", where=out, expected=baseline.name, found=before.baseline)
     config = parse(baseline.Config, before.config, TrainingError, where=out / RUN)
     if changes:
         wanted = parse(baseline.Config, merged(before.config, changes), TrainingError, where=baseline.name)
@@ -155,21 +155,44 @@ def _config(
     return config
 
 
-def _weights(baseline: Baseline, start: Path) -> tuple[dict[str, Any], str]:
-    """Weights of another run, and which that was.
+def _weights(
+    baseline: Baseline, start: Path | None, before: RunRecord | None, out: Path
+) -> tuple[dict[str, Any] | None, str]:
+    """Weights of another run that are to begin with, where there are any, and which run that is.
 
     Raises:
-        TrainingError: it is of another baseline or version, or has none.
+        TrainingError: it is of another baseline or version, or has none; or the run that goes on began with others.
     """
     from robocas_ms3.baselines import checkpoints
 
+    begun = before is not None and (out / CHECKPOINT).is_file()
+    if start is None:
+        if before is not None and before.start and not begun:
+            what = "this run had no checkpoint yet, and begins with another's weights"
+            raise TrainingError(what, where=out, expected=before.start, fix="Name that run by --start again.")
+        return None, ""
     record = read_run(start)
+    name = f"{start.resolve().name}, {record.data.hash}"
+    if before is not None and before.start != name:
+        fix = "Leave --start out, or train anew with --overwrite."
+        raise TrainingError(
+            "a run goes on from what it began with",
+            where=out,
+            expected=before.start or "no --start",
+            found=name,
+            fix=fix,
+        )
+    if begun:
+        return None, name
     expected = {"baseline": baseline.name, "version": str(baseline.version)}
     weights, _ = checkpoints.load(start / WEIGHTS, expected)
-    return weights, f"{start.resolve().name}, {record.data.hash}"
+    return weights, name
 
 
-def _check_same(before: RunRecord, baseline: Baseline, hashed: str, out: Path) -> None:
+def _check_kind(before: RunRecord, baseline: Baseline, out: Path) -> None:
+    """See that a run is of a baseline, before its configuration is read, which another version may have otherwise."""
+    if before.baseline != baseline.name:
+        raise TrainingError("a run of another baseline", where=out, expected=baseline.name, found=before.baseline)
     if before.version != baseline.version:
         raise TrainingError(
             f"a run of another version of {baseline.name}",
@@ -178,6 +201,9 @@ def _check_same(before: RunRecord, baseline: Baseline, hashed: str, out: Path) -
             found=before.version,
             fix="Train anew with --overwrite.",
         )
+
+
+def _check_same_data(before: RunRecord, hashed: str, out: Path) -> None:
     if before.data.hash != hashed:
         raise TrainingError(
             "a run on another dataset",

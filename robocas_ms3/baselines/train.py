@@ -72,6 +72,7 @@ class Trainer:
         optimizer = torch.optim.AdamW(_groups(model, self.settings.weight_decay), lr=1.0, betas=_BETAS)
         self.step = 0
         self._sums: dict[str, torch.Tensor] = {}
+        self._norms = torch.zeros((), dtype=torch.float64, device=accelerator.device)  # of all gradients, summed up
         if resume and (folder / CHECKPOINT).is_file():
             self._go_on(model, optimizer)
         else:
@@ -86,8 +87,8 @@ class Trainer:
             on_step: called with the steps done and all steps.
 
         Raises:
-            TrainingError: the loss is no number any more, or somebody removed the folder.
-            KeyboardInterrupt: Ctrl-C; what was done is kept.
+            TrainingError: the loss or the gradient is no number any more, or somebody removed the folder.
+            KeyboardInterrupt: Ctrl-C; what was done is kept, of several processes up to the last checkpoint.
         """
         settings = self.settings
         log = MetricsLog(self._folder, self.step) if self._accelerator.is_main_process else None
@@ -108,7 +109,7 @@ class Trainer:
                         saved = self.step
                 on_step(self.step, settings.steps)
         except KeyboardInterrupt:
-            if self.step > saved:
+            if self.step > saved and self._accelerator.num_processes == 1:  # several may be at different steps
                 self._save()
             raise
         except BaseException:
@@ -139,8 +140,10 @@ class Trainer:
         with self._accelerator.autocast():
             found = self._model(batch)
         self._accelerator.backward(found["loss"])
-        if self.settings.clip_norm:
-            self._accelerator.clip_grad_norm_(self._model.parameters(), self.settings.clip_norm)
+        norm: Any = self._accelerator.clip_grad_norm_(self._model.parameters(), self.settings.clip_norm or math.inf)
+        if norm.device.type == "cpu":  # a GPU would have to be waited for: its are looked at before they are saved
+            self._check_numbers(self.step + 1, loss=found["loss"].detach(), gradient=norm)
+        self._norms += norm.detach()
         self._optimizer.step()
         self._optimizer.zero_grad()
         self.step += 1
@@ -160,13 +163,17 @@ class Trainer:
         count = float(self._sums.pop("", torch.ones(())))
         means = {name: float(value) / count for name, value in self._sums.items()}
         self._sums = {}
-        if not math.isfinite(means["loss"]):
-            raise TrainingError(
-                "the loss is no number any more",
-                where=f"{self._folder}, step {self.step}",
-                fix="Lower train.learning_rate; --resume goes on from the last checkpoint.",
-            )
+        self._check_numbers(self.step, loss=means["loss"], gradient=self._norms)
         return means
+
+    def _check_numbers(self, step: int, **values: torch.Tensor | float) -> None:
+        for name, value in values.items():
+            if not math.isfinite(value):
+                raise TrainingError(
+                    f"the {name} is no number any more",
+                    where=f"{self._folder}, step {step}",
+                    fix="Lower train.learning_rate; --resume goes on from the last checkpoint.",
+                )
 
     @torch.no_grad()
     def _checked(self, samples: Samples) -> dict[str, float]:
@@ -200,7 +207,8 @@ class Trainer:
             self._note(f"step {self.step}, epoch {about['epoch']:.1f}, validation: {said}")
 
     def _save(self) -> None:
-        if any(not torch.isfinite(value) for value in self._sums.values()):
+        random = self._random_states()  # for which all processes have to come here
+        if any(not torch.isfinite(value) for value in (*self._sums.values(), self._norms)):
             return  # the next line of the log ends the run, and the last good checkpoint stays
         tensors = {f"model.{name}": value for name, value in self._bare.state_dict().items()}
         if self._average is not None:
@@ -208,9 +216,7 @@ class Trainer:
         optimizer = checkpoints.optimizer_tensors(self._optimizer)
         tensors |= {f"optimizer.{name}": value for name, value in optimizer.items()}
         tensors |= {f"sums.{name}": value for name, value in self._sums.items()}
-        tensors["random.cpu"] = torch.get_rng_state()
-        if self._accelerator.device.type == "cuda":
-            tensors["random.cuda"] = torch.cuda.get_rng_state()
+        tensors |= {f"random.{name}": state for name, state in random.items()}
         if not self._accelerator.is_main_process:
             return
         check_there(self._folder / "run.json", TrainingError)
@@ -218,6 +224,30 @@ class Trainer:
             checkpoints.save(self._folder / CHECKPOINT, tensors, {**self._about, "step": str(self.step)})
             acting = self._average.module if self._average is not None else self._bare
             checkpoints.save(self._folder / WEIGHTS, acting.state_dict(), {**self._about, "step": str(self.step)})
+
+    def _random_states(self) -> dict[str, torch.Tensor]:
+        """States of the generators by ``cpu`` or ``cuda`` and number of the process, in each of them."""
+        own, device = {"cpu": torch.get_rng_state()}, self._accelerator.device
+        if device.type == "cuda":
+            own["cuda"] = torch.cuda.get_rng_state()
+        gathered: dict[str, Any] = {
+            kind: self._accelerator.gather(state[None].to(device)) for kind, state in own.items()
+        }
+        return {f"{kind}.{number}": state for kind, rows in gathered.items() for number, state in enumerate(rows)}
+
+    def _set_random(self, states: dict[str, torch.Tensor], where: Path) -> None:
+        if "cpu" in states:  # as checkpoints had them when one process alone kept its own
+            states = {f"{kind}.0": state for kind, state in states.items()}
+        begun, now = sum(name.startswith("cpu.") for name in states), self._accelerator.num_processes
+        if begun != now:
+            fix = f"accelerate launch --num_processes {begun}, or train anew with --overwrite."
+            raise TrainingError(
+                "a run goes on in as many processes as it began", where=where, expected=begun, found=now, fix=fix
+            )
+        number = self._accelerator.process_index
+        torch.set_rng_state(states[f"cpu.{number}"])
+        if f"cuda.{number}" in states and self._accelerator.device.type == "cuda":
+            torch.cuda.set_rng_state(states[f"cuda.{number}"])
 
     def _go_on(self, model: torch.nn.Module, optimizer: torch.optim.Optimizer) -> None:
         path = self._folder / CHECKPOINT
@@ -228,9 +258,7 @@ class Trainer:
         checkpoints.put_in_optimizer(optimizer, checkpoints.part(tensors, "optimizer."))
         device = self._accelerator.device
         self._sums = {k: v.to(device if k else "cpu") for k, v in checkpoints.part(tensors, "sums.").items()}
-        torch.set_rng_state(tensors["random.cpu"])
-        if "random.cuda" in tensors and device.type == "cuda":
-            torch.cuda.set_rng_state(tensors["random.cuda"])
+        self._set_random(checkpoints.part(tensors, "random."), path)
         self.step = int(about["step"])
 
 

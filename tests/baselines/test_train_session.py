@@ -2,14 +2,22 @@
 
 import csv
 import json
+import os
 import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
 
+import made_up_baseline
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.session import Said, merged, train_run
+from robocas_ms3.baselines.train import Trainer
 from robocas_ms3.errors import OutputExistsError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
@@ -170,6 +178,38 @@ def test_a_run_may_begin_with_anothers_weights(whole, data, tmp_path):
     assert not (tmp_path / "other").exists()
 
 
+def test_a_run_goes_on_from_what_it_began_with(whole, data, tmp_path):
+    other = shutil.copytree(whole, tmp_path / "other")
+    out, few = tmp_path / "next", {"train": {"steps": 12}}
+    with pytest.raises(RuntimeError):
+        train_run("made-up", data, out, few, start=whole, device="cpu", said=stop_at(11, RuntimeError("gone")))
+    with pytest.raises(TrainingError, match="goes on from what it began with.*expected whole,.*found other,"):
+        train_run("made-up", data, out, start=other, device="cpu", resume=True)
+    with pytest.raises(TrainingError, match="goes on from what it began with.*expected no --start"):
+        train_run("made-up", data, whole, start=other, device="cpu", resume=True)
+    train_run("made-up", data, out, start=whole, device="cpu", resume=True)
+    train_run("made-up", data, out, device="cpu", resume=True)
+    train_run("made-up", data, tmp_path / "unbroken", few, start=whole, device="cpu")
+    assert_same(tmp_path / "unbroken", out)
+
+
+def test_a_run_that_had_no_checkpoint_begins_with_the_same_weights(whole, data, tmp_path):
+    out, few = tmp_path / "next", {"train": {"steps": 12}}
+    with pytest.raises(RuntimeError):
+        train_run("made-up", data, out, few, start=whole, device="cpu", said=stop_at(3, RuntimeError("gone")))
+    with pytest.raises(TrainingError, match="begins with another's weights.*expected whole,.*--start again"):
+        train_run("made-up", data, out, device="cpu", resume=True)
+    train_run("made-up", data, out, start=whole, device="cpu", resume=True)
+    train_run("made-up", data, tmp_path / "unbroken", few, start=whole, device="cpu")
+    assert_same(tmp_path / "unbroken", out)
+
+
+def test_another_version_is_said_before_what_it_has_otherwise(whole, data):
+    _say(whole, version=0, config={"depth": 3})
+    with pytest.raises(TrainingError, match="a run of another version of made-up"):
+        train_run("made-up", data, whole, device="cpu", resume=True)
+
+
 def test_other_options_do_not_go_on(whole, data):
     with pytest.raises(TrainingError, match="goes on as it was begun"):
         train_run("made-up", data, whole, {"width": 5}, device="cpu", resume=True)
@@ -180,6 +220,28 @@ def test_a_loss_that_is_no_number_ends_the_run_and_keeps_the_last_checkpoint(mad
         train_run("made-up", data, tmp_path / "run", {"broken_at": 7}, device="cpu")
     weights = tmp_path / "run" / "weights.safetensors"
     assert not weights.exists() or all(tensor.isfinite().all() for tensor in load_file(weights).values())
+
+
+@pytest.mark.parametrize("clip_norm", [0.0, 1.0])
+def test_a_gradient_that_is_no_number_is_not_followed(made_up, data, tmp_path, clip_norm):
+    changes = {"steep_at": 7, "train": {"save_every": 1, "clip_norm": clip_norm}}
+    done = []
+    with pytest.raises(TrainingError, match=r"step \d+: the gradient is no number any more.*learning_rate"):
+        train_run(
+            "made-up", data, tmp_path / "run", changes, device="cpu", said=Said(step=lambda at, _: done.append(at))
+        )
+    saved = load_file(tmp_path / "run" / "checkpoint.safetensors")
+    assert all(tensor.isfinite().all() for tensor in saved.values())
+    assert saved["optimizer.0.step"] == done[-1] > 0
+
+
+def test_what_is_not_waited_for_is_looked_at_before_it_is_saved(made_up, data, tmp_path, monkeypatch):
+    """As on a GPU, but that the log doesn't end the run either."""
+    monkeypatch.setattr(Trainer, "_check_numbers", lambda self, step, **values: None)
+    changes = {"steep_at": 7, "train": {"save_every": 1, "log_every": 100, "check_every": 100}}
+    train_run("made-up", data, tmp_path / "run", changes, device="cpu")
+    for name in ("checkpoint", "weights"):
+        assert all(tensor.isfinite().all() for tensor in load_file(tmp_path / "run" / f"{name}.safetensors").values())
 
 
 def test_a_folder_that_goes_is_missed(made_up, data, tmp_path):
@@ -223,6 +285,57 @@ def test_a_run_that_is_no_policy(whole, change, message):
     change(whole)
     with pytest.raises(TrainingError, match=message):
         make_policy(str(whole))
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """Runs of two processes, see `made_up_baseline`, and their data."""
+    out = tmp_path_factory.mktemp("shared")
+    (out / "data.h5").write_text("demonstrations")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    world = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2"}
+    words = [sys.executable, made_up_baseline.__file__, str(out / "data.h5"), str(out)]
+    env = {**os.environ, **world, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
+    processes = [
+        subprocess.Popen(words, env={**env, "RANK": rank, "LOCAL_RANK": rank}, stderr=subprocess.PIPE, text=True)
+        for rank in "01"
+    ]
+    try:
+        said = [process.communicate(timeout=300)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    assert [process.returncode for process in processes] == [0, 0], said
+    return out
+
+
+@pytest.mark.slow
+def test_each_process_goes_on_with_its_own_random_state(shared):
+    assert_same(shared / "whole", shared / "again")
+    saved = load_file(shared / "again" / "checkpoint.safetensors")
+    assert not torch.equal(saved["random.cpu.0"], saved["random.cpu.1"])
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_in_as_many_processes(made_up, shared):
+    with pytest.raises(TrainingError, match="as many processes as it began.*expected 2, found 1.*num_processes 2"):
+        train_run("made-up", shared / "data.h5", shared / "whole", device="cpu", resume=True)
+
+
+def test_a_checkpoint_of_before_processes_had_numbers(whole, data, tmp_path):
+    out = tmp_path / "older"
+    with pytest.raises(KeyboardInterrupt):
+        train_run("made-up", data, out, device="cpu", said=stop_at(17, KeyboardInterrupt()))
+    path = out / "checkpoint.safetensors"
+    with safe_open(path, "pt") as file:
+        about = file.metadata()
+    tensors = load_file(path)
+    tensors["random.cpu"] = tensors.pop("random.cpu.0")
+    save_file(tensors, path, about)
+    train_run("made-up", data, out, device="cpu", resume=True)
+    assert_same(whole, out)
 
 
 def test_nested_values():
