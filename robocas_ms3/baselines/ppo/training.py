@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -120,9 +121,10 @@ class PpoTraining:
                 log.close()
 
     def _check(self, losses: dict[str, float]) -> None:
-        if not all(abs(value) < float("inf") for value in losses.values()):
+        wrong = [name for name, value in losses.items() if not math.isfinite(value)]
+        if wrong:
             raise TrainingError(
-                "the loss is no number any more",
+                f"the {'gradient' if wrong == ['gradient'] else 'loss'} is no number any more",
                 where=f"{self._folder}, step {self.step}",
                 fix="Lower train.learning_rate; --resume goes on from the last checkpoint.",
             )
@@ -171,7 +173,7 @@ class PpoTraining:
 
 
 def learn(agent: Agent, optimizer: torch.optim.Optimizer, tried: Tried, config: PpoConfig) -> dict[str, float]:
-    """Improve a policy by what was tried; means of its losses: of the value, of the policy, and its entropy."""
+    """Improve a policy by what was tried; means of its losses, of its entropy and of the gradient's norm."""
     agent.see(tried.obs)
     parts = tried.seen, tried.action, tried.log_prob, tried.advantage, tried.returns
     found = []
@@ -186,11 +188,11 @@ def learn(agent: Agent, optimizer: torch.optim.Optimizer, tried: Tried, config: 
             entropy = policy.entropy().sum(-1).mean()
             optimizer.zero_grad()
             (error / 2 - gain - config.entropy * entropy).backward()
-            nn.utils.clip_grad_norm_(agent.parameters(), config.train.clip_norm or float("inf"))
+            norm = nn.utils.clip_grad_norm_(agent.parameters(), config.train.clip_norm or float("inf"))
             optimizer.step()
-            found.append(torch.stack([error, -gain, entropy]).detach())
-    value, gain, entropy = torch.stack(found).mean(dim=0).tolist()
-    return {"value_loss": value, "policy_loss": gain, "entropy": entropy}
+            found.append(torch.stack([error, -gain, entropy, norm]).detach())
+    value, gain, entropy, norm = torch.stack(found).mean(dim=0).tolist()
+    return {"value_loss": value, "policy_loss": gain, "entropy": entropy, "gradient": norm}
 
 
 @torch.inference_mode()

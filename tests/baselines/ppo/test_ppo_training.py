@@ -135,6 +135,25 @@ def test_what_goes_on_is_what_was_there(made_up, tmp_path):
     assert all(torch.equal(before[name], again[name]) for name in before)
 
 
+def test_a_gradient_that_is_no_number_is_not_saved(made_up, monkeypatch, tmp_path):
+    """Not even that of an update's last step, whose losses are numbers."""
+    clip, calls = torch.nn.utils.clip_grad_norm_, []
+
+    def spoil(parameters, most):
+        parameters = list(parameters)
+        calls.append(len(parameters))
+        if len(calls) == 20 * 10 * 4:  # updates, epochs, minibatches: the last of all
+            parameters[0].grad.fill_(torch.nan)
+        return clip(parameters, most)
+
+    monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", spoil)
+    changes = {**SMALL, "train": {**SMALL["train"], "save_every": 64}}
+    with pytest.raises(TrainingError, match="the gradient is no number any more"):
+        train_run("ppo", None, tmp_path / "run", changes, device="cpu")
+    saved = load_file(tmp_path / "run" / "checkpoint.safetensors")
+    assert all(tensor.isfinite().all() for tensor in saved.values())
+
+
 def test_data_is_refused(made_up, tmp_path):
     with pytest.raises(TrainingError, match="ppo learns by trying, of no data. Leave it out"):
         train_run("ppo", tmp_path, tmp_path / "run", SMALL, device="cpu")
