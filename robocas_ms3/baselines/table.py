@@ -3,29 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from robocas_ms3.baselines.baseline import Baseline
 from robocas_ms3.errors import MissingExtraError, TrainingError
 from robocas_ms3.extensions import Table
 from robocas_ms3.strict import nearest
 
+if TYPE_CHECKING:
+    from robocas_ms3.baselines.baseline import Baseline  # which imports torch
+
 GROUP = "robocas_ms3.baselines"
 
 
-def _builtin(folder: str) -> Callable[[], Baseline]:
-    def made() -> Baseline:
-        return import_module(f"robocas_ms3.baselines.{folder}").BASELINE
+@dataclass(frozen=True)
+class Builtin:
+    """Gives a baseline of this package.
 
-    return made
+    Attributes:
+        folder: beside this file.
+        about: its own ``about``, for who does not import it.
+    """
+
+    folder: str
+    about: str
+
+    def __call__(self) -> Baseline:
+        """The baseline."""
+        return import_module(f"robocas_ms3.baselines.{self.folder}").BASELINE
 
 
 BASELINES: Table[Callable[[], Baseline]] = Table(
     "baseline",
     GROUP,
     Callable,
-    {"small": _builtin("small"), "bc-state": _builtin("bc_state"), "rt1": _builtin("rt1"), "ppo": _builtin("ppo")},
+    {
+        "small": Builtin("small", "base and gripper camera, language; chunks of poses by a small transformer"),
+        "bc-state": Builtin("bc_state", "what only a simulator knows; chunks of poses by residual layers"),
+        "rt1": Builtin(
+            "rt1", "the paper's RT-1: base and gripper camera, language; tokens of actions by a causal transformer"
+        ),
+        "ppo": Builtin("ppo", "learns by trying, from dense rewards and what only a simulator knows; no data"),
+    },
 )
 """By name, what gives it."""
 

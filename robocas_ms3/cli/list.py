@@ -1,4 +1,4 @@
-"""``robocas list``: tasks, shipped configurations, robots, policies, asset packs."""
+"""``robocas list``: tasks, shipped configurations, robots, policies, baselines, asset packs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from robocas_ms3.words import count_of
 
 @dataclass
 class List:
-    """List the tasks, the shipped task configurations, the robots, the policies and the asset packs."""
+    """List the tasks, the shipped task configurations, the robots, the policies, the baselines and the asset packs."""
 
     json: bool = False
     """Print a machine-readable list."""
@@ -35,14 +35,15 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     """Gather what there is, verifying every pack.
 
     Returns:
-        ``tasks``, ``configs``, ``robots``, ``policies`` and ``packs``, mappings of plain values. A damaged pack has
-        an ``error`` and no objects; policies of other packages are not imported, so a broken one shows only when it is
-        chosen.
+        ``tasks``, ``configs``, ``robots``, ``policies``, ``baselines`` and ``packs``, mappings of plain values. A
+        damaged pack has an ``error`` and no objects; policies and baselines of other packages are not imported, so a
+        broken one shows only when it is chosen.
 
     Raises:
         ConfigError: a shipped configuration is damaged.
     """
     from robocas_ms3.assets.pack import load_pack, pack_folders
+    from robocas_ms3.baselines.table import BASELINES
     from robocas_ms3.benchmark import TASKS
     from robocas_ms3.config import load_task_config, shipped_configs
     from robocas_ms3.errors import AssetError
@@ -63,6 +64,12 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     policies = [{"name": name, "package": "robocas_ms3", "of": "builtin"} for name in POLICIES.builtin]
     for points in POLICIES.points.values():
         policies += [{"name": point.name, "package": package_of(point), "of": point.value} for point in points]
+    baselines = [
+        {"name": name, "package": "robocas_ms3", "about": getattr(row, "about", "")}
+        for name, row in BASELINES.builtin.items()
+    ]
+    for points in BASELINES.points.values():
+        baselines += [{"name": point.name, "package": package_of(point), "about": ""} for point in points]
     packs = []
     for name, folder in pack_folders().items():
         row: dict[str, Any] = {"name": name, "folder": str(folder), "megabytes": round(_size(folder) / 1e6, 1)}
@@ -71,7 +78,14 @@ def collect() -> dict[str, list[dict[str, Any]]]:
             packs.append(row | {"objects": sorted(pack.objects), "furniture": sorted(pack.furniture), "error": ""})
         except AssetError as error:
             packs.append(row | {"objects": [], "furniture": [], "error": str(error)})
-    return {"tasks": tasks, "configs": configs, "robots": robots, "policies": policies, "packs": packs}
+    return {
+        "tasks": tasks,
+        "configs": configs,
+        "robots": robots,
+        "policies": policies,
+        "baselines": baselines,
+        "packs": packs,
+    }
 
 
 def _size(folder: Path) -> int:
@@ -89,6 +103,7 @@ def _print(found: dict[str, list[dict[str, Any]]]) -> None:
         "configs": ("name", "task", "scene", "description"),
         "robots": ("name", "agent"),
         "policies": ("name", "package", "of"),
+        "baselines": ("name", "package", "about"),
         "packs": ("name", "objects", "furniture", "megabytes", "folder"),
     }
     console = table_console()

@@ -1,7 +1,10 @@
 import json
+import subprocess
+import sys
 
 import pytest
 
+from robocas_ms3.baselines.table import BASELINES
 from robocas_ms3.cli.list import List, collect, main
 from robocas_ms3.config import load_task_config, shipped_configs
 from robocas_ms3.paths import data_dir
@@ -15,6 +18,18 @@ def test_tasks_and_configs_are_listed():
     for name, row in configs.items():
         assert row["description"], f"{name} doesn't say what it is"
         assert row["scene"].startswith(f"{load_task_config(name).objects.count} objects")
+
+
+def test_baselines_are_listed_as_they_say_of_themselves():
+    rows = {row["name"]: row for row in collect()["baselines"]}
+    assert list(rows)[:4] == ["small", "bc-state", "rt1", "ppo"]
+    for name, give in BASELINES.builtin.items():
+        assert rows[name] == {"name": name, "package": "robocas_ms3", "about": give().about}
+
+
+def test_nothing_is_imported_for_a_list():
+    code = "import sys, robocas_ms3.cli.list as it; it.collect(); print({'torch', 'accelerate'} & set(sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout == "set()\n"
 
 
 def test_builtin_pack_is_listed():
