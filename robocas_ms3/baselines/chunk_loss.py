@@ -1,4 +1,7 @@
-"""What chunks are trained by: L1 of normalised poses, cross entropy of the gripper's commands, the next key pose."""
+"""What chunks are trained by: L1 of normalised poses, cross entropy of the gripper's commands, the next key pose.
+
+Poses count by how near they are: a centimetre decides about a grasp, and hardly matters half a metre before it.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,9 @@ from torch.nn import functional as F
 from robocas_ms3.baselines.baseline import Batch
 from robocas_ms3.baselines.chunks import Scale
 
+NEAR = 0.05
+"""m; of what is called near in the log."""
+
 
 class _Weights(Protocol):
     @property
@@ -17,6 +23,9 @@ class _Weights(Protocol):
 
     @property
     def gripper_weight(self) -> float: ...
+
+    @property
+    def near(self) -> float: ...
 
 
 class Predictor(Protocol):
@@ -37,21 +46,33 @@ def chunk_losses(model: Predictor, batch: Batch, chunk: torch.Tensor, key: torch
         key: (B, 9) predicted, normalised.
 
     Returns:
-        ``loss``, its parts, and errors of positions in mm: of the key pose, the first and the last step.
+        ``loss``, its parts, and errors of positions in mm: of the key pose, of one nearer than `NEAR`, of the first
+        and the last step.
     """
     weights: _Weights = model.config
-    motion = F.l1_loss(chunk[..., :9], model.chunk_scale(batch["chunk"][..., :9]))
+    motion = _l1(chunk[..., :9], batch["chunk"][..., :9], model.chunk_scale, weights.near)
     gripper = F.binary_cross_entropy_with_logits(chunk[..., 9], batch["chunk"][..., 9])
-    keys = F.l1_loss(key, model.key_scale(batch["key"]))
+    keys = _l1(key, batch["key"], model.key_scale, weights.near)
     with torch.no_grad():
-        off = (model.key_scale.back(key) - batch["key"])[:, :3].norm(dim=1).mean()
+        off = (model.key_scale.back(key) - batch["key"])[:, :3].norm(dim=1)
+        near = (batch["key"][:, :3].norm(dim=1) < NEAR).float()
         ahead = (model.chunk_scale.back(chunk[..., :9]) - batch["chunk"][..., :9])[..., :3].norm(dim=-1)
     return {
         "loss": motion + weights.gripper_weight * gripper + weights.keys_weight * keys,
         "motion": motion,
         "gripper": gripper,
         "keys": keys,
-        "key_mm": 1000 * off,
+        "key_mm": 1000 * off.mean(),
+        "near_mm": 1000 * (off * near).sum() / near.sum().clamp(min=1),
         "first_mm": 1000 * ahead[:, 0].mean(),
         "last_mm": 1000 * ahead[:, -1].mean(),
     }
+
+
+def _l1(found: torch.Tensor, poses: torch.Tensor, scale: Scale, near: float) -> torch.Tensor:
+    """Mean error of normalised poses (..., 9), weighted by near / (near + distance); near 0: all alike."""
+    error = (found - scale(poses)).abs().mean(dim=-1)
+    if not near:
+        return error.mean()
+    weights = near / (near + poses[..., :3].norm(dim=-1))
+    return (error * weights).sum() / weights.sum()

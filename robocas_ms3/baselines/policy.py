@@ -11,6 +11,14 @@ from robocas_ms3.errors import TrainingError
 from robocas_ms3.evaluation.policy import Observations, Policy, Start, Wants
 from robocas_ms3.strict import parse
 
+SHIPPED = Path(__file__).parents[1] / "data" / "runs"
+"""Runs that come with the package, without what it takes to go on with them."""
+
+
+def shipped_small() -> RunPolicy:
+    """The policy ``small``: trained on pick, see docs/baselines.md."""
+    return RunPolicy(SHIPPED / "small")
+
 
 class RunPolicy:
     """What a run has learned.

@@ -17,7 +17,7 @@ class BcStateConfig(BaselineConfig):
         blocks: residual blocks of two layers each.
         dropout: between them.
         noise: deviation of the noise on what it is told in training, in deviations of that.
-        keys_weight, gripper_weight: see `SmallConfig`.
+        keys_weight, gripper_weight, near: see `SmallConfig`.
         fade: how fast older predictions lose weight when it acts, see `ChunkPolicy`.
         train: see `TrainSettings`.
     """
@@ -30,6 +30,7 @@ class BcStateConfig(BaselineConfig):
     noise: float = Field(default=0.02, ge=0)
     keys_weight: float = Field(default=0.5, ge=0)
     gripper_weight: float = Field(default=0.5, ge=0)
+    near: float = Field(default=0.0, ge=0)
     fade: float = Field(default=0.5, ge=0)
     train: TrainSettings = TrainSettings(
         steps=20_000, batch_size=256, learning_rate=1e-3, weight_decay=0.01, precision="fp32"

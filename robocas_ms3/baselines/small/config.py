@@ -42,6 +42,7 @@ class SmallConfig(BaselineConfig):
         dropout: of the transformer.
         keys_weight: weight of the loss of where the gripper will close or open next, beside that of the chunk.
         gripper_weight: weight of the loss of the gripper's commands.
+        near: m at which a pose counts half as much as one that is reached, see `chunk_losses`; 0: all alike.
         point_weight: weight of the loss of where that is in the pictures, of each camera (`pointing`).
         name_weight: weight of the loss of where objects are that other instructions would name, of each camera.
         shift: pixels that pictures are shifted by at most, at random, in training.
@@ -63,6 +64,7 @@ class SmallConfig(BaselineConfig):
     dropout: float = Field(default=0.1, ge=0, lt=1)
     keys_weight: float = Field(default=0.5, ge=0)
     gripper_weight: float = Field(default=0.5, ge=0)
+    near: float = Field(default=0.05, ge=0)
     point_weight: float = Field(default=0.1, ge=0)
     name_weight: float = Field(default=0.1, ge=0)
     shift: int = Field(default=3, ge=0)

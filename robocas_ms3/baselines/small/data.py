@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
+from robocas_ms3.baselines.bases import check_bases
 from robocas_ms3.baselines.chunks import encode, next_keys, spread
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.pointing import places_of
@@ -59,6 +60,8 @@ class SmallSamples:
         if not numbers:
             fix = "Add episodes: a tenth of them validates."
             raise DatasetError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
+        check_bases(source, numbers)
+        seen = source.episode(numbers[0])
         first = np.concatenate([[0], np.cumsum([source.lengths[number] for number in numbers])])
         count = int(first[-1])
         _check_room(config, count, path)
@@ -84,6 +87,7 @@ class SmallSamples:
         self._ask(stood)
         self.facts: dict[str, Any] = {
             "rate_hz": source.rate_hz,
+            "pictures": {camera: list(seen.rgb(camera, 0).shape[1::-1]) for camera in config.views},
             "chunk": spread(self._chunks[..., :9].numpy()),
             "keys": spread(self._keys.numpy()),
             "words": _spread_of_words(self._words.numpy()),

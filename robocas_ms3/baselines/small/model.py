@@ -3,7 +3,7 @@
 Feature maps at a sixteenth of the pictures' size are what its queries look at: one query a step of the chunk, one for
 the next key pose. Language and the arm's state are part of what is looked at, and scale and shift its channels (FiLM,
 Perez et al. 2018). Finer maps are what a pointer in each picture looks at, for where the gripper will close or open
-next; what is there goes to each query. These maps do not depend on what is asked, so that in training each picture
+next; what is there is a token too. These maps do not depend on what is asked, so that in training each picture
 answers for every object in it.
 """
 
@@ -64,18 +64,20 @@ class Eye(nn.Module):
         coarse = self.coarse(fine)
         return coarse, fine + F.interpolate(self.down(coarse), scale_factor=2)
 
-    def tell(self, maps: tuple[torch.Tensor, torch.Tensor], asked: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def tell(self, maps: tuple[torch.Tensor, torch.Tensor], asked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """What a question (B, width) gets to know of maps.
 
         Returns:
-            Tokens (B, h w / 256, width), marked where it points; what is there (B, width); cells' logits (B, h w / 64).
+            Tokens (B, h w / 256 + 1, width), marked where it points, of which the last is what is there; logits of
+            cells (B, h w / 64).
         """
         coarse, fine = maps
         pointed, logits = self.pointer(fine, asked)
         scale, shift = self.film(asked)[:, :, None, None].chunk(2, dim=1)
         tokens = self.project(F.relu(coarse * (1 + scale) + shift)).flatten(2).transpose(1, 2) + self.places
         there = 4 * F.avg_pool2d(logits.softmax(dim=1).reshape(-1, 1, *self._grid), 2)
-        return tokens + there.flatten(2).transpose(1, 2) * self.mark, pointed, logits
+        tokens = tokens + there.flatten(2).transpose(1, 2) * self.mark
+        return torch.cat([tokens, pointed[:, None]], dim=1), logits
 
 
 class SmallModel(nn.Module):
@@ -108,7 +110,7 @@ class SmallModel(nn.Module):
         maps, state = self._look(pictures), self.state(batch["state"])
         chunk, key, cells = self._think(maps, self._hear(batch["words"]), state)
         found = chunk_losses(self, batch, chunk, key)
-        asked = self._hear(batch["asked"]) + state[:, None]
+        asked = self._hear(batch["asked"]) + state.detach()[:, None]
         kinds = batch["kinds"]
         alike = (kinds[:, :, None] == kinds[:, None, :]) & (kinds >= 0)[:, :, None]
         for camera, view in self.config.views.items():
@@ -140,12 +142,12 @@ class SmallModel(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         """Normalised chunks (B, K, 10) with commands' logits, normalised keys (B, 9), logits of cells by camera."""
         asked = words + state
-        tokens, pointed, cells = {}, {}, {}
+        tokens, cells = {}, {}
         for camera, of in maps.items():
             eye: Any = self.eyes[camera]
-            tokens[camera], pointed[camera], cells[camera] = eye.tell(of, asked)
+            tokens[camera], cells[camera] = eye.tell(of, asked)
         memory = torch.cat([*tokens.values(), words[:, None], state[:, None]], dim=1)
-        thought = self.decoder(self.queries + (asked + sum(pointed.values()))[:, None], memory)
+        thought = self.decoder(self.queries + asked[:, None], memory)
         return self.out(thought[:, :-1]).float(), self.key_out(thought[:, -1]).float(), cells
 
     def _shifts(self, pictures: torch.Tensor) -> torch.Tensor | None:

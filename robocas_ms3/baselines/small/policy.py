@@ -36,7 +36,7 @@ def make_policy(config: SmallConfig, facts: dict[str, Any], model: SmallModel) -
         convention="robocas",
         reference="tcp",
         rate_hz=facts["rate_hz"],
-        cameras={camera: view.rendered for camera, view in config.views.items()},
+        cameras={camera: (width, height) for camera, (width, height) in facts["pictures"].items()},  # as it learned
         language="embedding" if config.language else "none",
     )
     return ChunkPolicy(wants, predict, config.fade, {})

@@ -139,6 +139,15 @@ def test_shifts_move_pictures_as_a_whole():
     assert moved[1, 3:, :-1, 0].equal(picture[1, :-3, 1:, 0])  # down and left
 
 
+def test_it_is_shown_pictures_of_the_size_it_learned_by(folder):
+    """Those of half the size are not the same, rendered or scaled."""
+    half = View(rendered=(32, 24), size=(32, 32))
+    config = SmallConfig(**{**TINY, "views": {"base_camera": half, "gripper_camera": half}})
+    samples = BASELINE.data(config, folder, "val", lambda done, of: None)
+    policy = BASELINE.policy(config, samples.facts, BASELINE.model(config, samples.facts))
+    assert policy.wants.cameras == {"base_camera": (64, 48), "gripper_camera": (64, 48)}
+
+
 def test_what_is_to_be_found_moves_with_a_picture(samples):
     """Shifted by two cells at most, a picture's answers are where its pixels are."""
     torch.manual_seed(0)
