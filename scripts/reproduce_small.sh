@@ -13,15 +13,17 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 fail() { printf 'reproduce_small: error: %s\n' "$*" >&2; exit 2; }
 
+# Each part is task:configuration:percent of the demonstrations. Upstream evaluates select in pick's scenes; in columns it
+# learns to choose among several of a kind, but of these fruits only two stand, so that the others come scattered.
 task=${1:-}
-case $task in  # upstream runs select in pick's scenes; it learns among goods in columns
-    pick) config=pick_upstream_eval played=pick ;;
-    select) config=select_upstream played=pick ;;
-    search) config=search_upstream_eval played=search ;;
+case $task in
+    pick) parts=(pick:pick_upstream_eval:100) played=pick ;;
+    select) parts=(select:select_upstream_eval:30 pick:pick_upstream_eval_alike:70) played=pick ;;
+    search) parts=(search:search_upstream_eval:100) played=search ;;
     *) fail "which task? bash scripts/reproduce_small.sh pick|select|search [FOLDER]" ;;
 esac
 out=${2:-reproduced/$task}
-episodes=${EPISODES:-800} seed=${SEED:-510000} steps=${STEPS:-16000}
+episodes=${EPISODES:-800} seed=${SEED:-510000} steps=${STEPS:-3500}
 jobs=${JOBS:-$(nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 command -v "$robocas" >/dev/null || fail "$robocas: no such command; bash scripts/setup.sh makes it"
@@ -33,8 +35,15 @@ timed() {
 }
 
 mkdir -p "$out"
-timed "$robocas" generate "$task" --config "$config" -n "$episodes" --seed "$seed" --jobs "$jobs" --out "$out/demos" --resume
-timed "$robocas" convert "$out/demos/trajectory.h5" --out "$out/data" --size 256 192 --no-depth --no-video \
-    --cameras base_camera gripper_camera --jobs "$jobs" --resume
+data=()
+for part in "${parts[@]}"; do
+    IFS=: read -r of config percent <<<"$part"
+    timed "$robocas" generate "$of" --config "$config" -n $((episodes * percent / 100)) --seed "$seed" --jobs "$jobs" \
+        --out "$out/demos/$config" --resume
+    timed "$robocas" convert "$out/demos/$config/trajectory.h5" --out "$out/parts/$config" --size 256 192 --no-depth --no-video \
+        --cameras base_camera gripper_camera --jobs "$jobs" --resume
+    data+=("$out/parts/$config")
+done
+timed "$robocas" merge "${data[@]}" --out "$out/data" --resume
 timed "$robocas" train small --data "$out/data" --out "$out/run" --steps "$steps" --resume
 timed "$robocas" eval "$played" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs" --resume
