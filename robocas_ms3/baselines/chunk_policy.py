@@ -20,17 +20,20 @@ class ChunkPolicy:
     """Speaks RoboCAS' seven numbers, relative to where the TCP is.
 
     A step's pose is the mean of what was predicted for it, now and at steps before, weighted by exp(-fade age) (Zhao et
-    al. 2023 weigh the oldest most; at 5 Hz the newest knows more).
+    al. 2023 weigh the oldest most; at 5 Hz the newest knows more). Between two ways to go the mean is none: what lies far
+    from the newest prediction weighs less, by a Gaussian.
 
     Args:
         wants: what it is to be shown.
         predict: (E, K, 10) chunks of what E envs show, see `chunks`.
         fade: how fast older predictions lose weight, a step.
+        agree: deviation of that Gaussian, m; 0: none.
         about: what a result says of it besides.
     """
 
-    def __init__(self, wants: Wants, predict: Predict, fade: float, about: dict[str, Any]) -> None:
-        self.wants, self._predict, self._fade, self._about = wants, predict, fade, about
+    def __init__(self, wants: Wants, predict: Predict, fade: float, agree: float, about: dict[str, Any]) -> None:
+        self.wants, self._predict, self._about = wants, predict, about
+        self._fade, self._agree = fade, agree
         self._plans: dict[int, list[tuple[Array, NDArray[np.float64]]]] = {}  # by env, newest first
 
     def describe(self) -> dict[str, Any]:
@@ -51,9 +54,11 @@ class ChunkPolicy:
 
     def _next(self, env: int, chunk: NDArray[np.floating], here: Array) -> NDArray[np.float64]:
         plans = self._plans[env] = [decode(chunk, here), *self._plans[env]][: len(chunk)]
-        weights = np.exp(-self._fade * np.arange(len(plans)))
-        weights /= weights.sum()
         poses = np.stack([plan[0][age] for age, plan in enumerate(plans)])
+        weights = np.exp(-self._fade * np.arange(len(plans)))
+        if self._agree:
+            weights *= np.exp(-np.square((poses - poses[0])[:, :3, 3] / self._agree).sum(axis=1) / 2)
+        weights /= weights.sum()
         opened = float(weights @ [plan[1][age] for age, plan in enumerate(plans)])
         turn = Rotation.from_matrix(poses[:, :3, :3]).mean(weights)
         now = Rotation.from_matrix(here[:3, :3]).inv()

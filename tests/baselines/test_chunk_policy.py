@@ -28,9 +28,9 @@ def start(env):
     return Start(env, 0, "pick", "", "", "builtin", 0, "")
 
 
-def policy(chunks, fade=0.0):
+def policy(chunks, fade=0.0, agree=0.0):
     said = iter(chunks)
-    made = ChunkPolicy(Wants(), lambda observations: np.array(next(said), float), fade, {})
+    made = ChunkPolicy(Wants(), lambda observations: np.array(next(said), float), fade, agree, {})
     made.reset([start(0), start(1)])
     return made
 
@@ -67,6 +67,15 @@ def test_newer_predictions_weigh_more():
     action = acting.act(seen([HERE]))[0]
     assert action[0] == pytest.approx(0.3)
     assert action[6] == 1.0
+
+
+def test_between_two_ways_it_takes_the_newest():
+    """One deviation off counts exp(-1/2); another object, nothing."""
+    acting = policy([[[row(), row(0.1)]], [[row(0.12), row(-0.4)]], [[row(0.4), row()]]], agree=0.02)
+    acting.act(seen([HERE]))
+    near = np.exp(-0.5)
+    assert acting.act(seen([HERE]))[0, 0] == pytest.approx((0.12 + near * 0.1) / (1 + near))
+    assert acting.act(seen([HERE]))[0, 0] == pytest.approx(0.4)
 
 
 def test_a_reset_forgets_one_env():

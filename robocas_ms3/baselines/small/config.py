@@ -48,6 +48,7 @@ class SmallConfig(BaselineConfig):
         shift: pixels that pictures are shifted by at most, at random, in training.
         brightness: share that brightness and contrast change by at most, at random, in training.
         fade: how fast older predictions lose weight when it acts, see `ChunkPolicy`.
+        agree: see `ChunkPolicy`; 0: older predictions count however far off they are.
         train: see `TrainSettings`.
     """
 
@@ -70,4 +71,5 @@ class SmallConfig(BaselineConfig):
     shift: int = Field(default=3, ge=0)
     brightness: float = Field(default=0.2, ge=0, lt=1)
     fade: float = Field(default=0.5, ge=0)
+    agree: float = Field(default=0.0, ge=0)
     train: TrainSettings = TrainSettings(steps=3_500, batch_size=96, learning_rate=6e-4, weight_decay=0.01)
