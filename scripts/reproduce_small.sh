@@ -18,7 +18,7 @@ fail() { printf 'reproduce_small: error: %s\n' "$*" >&2; exit 2; }
 task=${1:-}
 case $task in
     pick) parts=(pick:pick_upstream_eval:100) played=pick ;;
-    select) parts=(select:select_upstream_eval:30 pick:pick_upstream_eval_alike:70) played=pick ;;
+    select) parts=(select:select_fruits_orderly:30 pick:pick_fruits_alike:70) played=pick ;;
     search) parts=(search:search_upstream_eval:100) played=search ;;
     *) fail "which task? bash scripts/reproduce_small.sh pick|select|search [FOLDER]" ;;
 esac

@@ -20,8 +20,8 @@ class ChunkPolicy:
     """Speaks RoboCAS' seven numbers, relative to where the TCP is.
 
     A step's pose is the mean of what was predicted for it, now and at steps before, weighted by exp(-fade age) (Zhao et
-    al. 2023 weigh the oldest most; at 5 Hz the newest knows more). Between two ways to go the mean is none: what lies far
-    from the newest prediction weighs less, by a Gaussian.
+    al. 2023 weigh the oldest most; at 5 Hz the newest knows more). The mean of two ways to go is none: what lies far from
+    the newest prediction weighs less, by a Gaussian.
 
     Args:
         wants: what it is to be shown.

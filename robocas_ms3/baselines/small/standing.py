@@ -42,7 +42,9 @@ def standing(
     tcp_in_base: Array,
     looks: Mapping[str, Callable[[Array], NDArray[np.float32]]],
 ) -> Standing:
-    """Where an episode's objects are seen; nothing is known of them where its scene does not tell.
+    """Where an episode's objects are seen.
+
+    Nothing is known of them where the scene does not tell, or another policy acted before.
 
     Args:
         episode: with its scene.
@@ -57,7 +59,7 @@ def standing(
     try:
         layout, target = episode.layout, episode.scene.get("target") or {}
         meant, known = str(target.get("asset_id") or ""), layout.get("poses")
-        if not known:
+        if not known or "takeover" in (episode.scene.get("recorded") or {}):  # who acted before has moved them
             nothing = np.full((steps, 0, 2), np.nan, np.float32)
             return Standing(steps, meant, [], dict.fromkeys(looks, nothing))
         there = np.array(layout.get("present") or [True] * len(known), bool)

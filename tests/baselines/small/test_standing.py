@@ -61,6 +61,12 @@ def test_nothing_is_known_where_no_scene_tells(layout):
     assert (found.kinds, found.places["base_camera"].shape) == ([], (STEPS, 0, 2))
 
 
+def test_nothing_is_known_after_another_policy():
+    after = episode()
+    after.scene["recorded"] = {"takeover": {"policy": "small", "policy_steps": 5}}
+    assert standing(after, ARRAYS, tcp([1] * STEPS), LOOKS).kinds == []
+
+
 @pytest.mark.parametrize("layout", [{"poses": [[1, 2]]}, {**LAYOUT, "present": [True]}, {"poses": LAYOUT["poses"]}])
 def test_damage(layout):
     with pytest.raises(DatasetError, match="scene.json: this description of a scene is damaged"):
