@@ -1,0 +1,37 @@
+#!/usr/bin/env bash
+# One round of DAgger on what scripts/reproduce_small.sh has made: where its policy leads, the scripted policy takes over, and the
+# policy learns on from those demonstrations and its own. Evaluates the result on all episodes of paper-v1.
+#
+#   bash scripts/dagger_small.sh pick|search [FOLDER]
+#
+# FOLDER                  that of reproduce_small.sh (default: reproduced/TASK); what is made goes to FOLDER/dagger
+# EPISODES, SEED, STEPS   how many takeovers, the first one's seed, steps of training
+# JOBS, ROBOCAS           as in reproduce_small.sh
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+fail() { printf 'dagger_small: error: %s\n' "$*" >&2; exit 2; }
+
+task=${1:-}
+[[ $task == pick || $task == search ]] || fail "which task? bash scripts/dagger_small.sh pick|search [FOLDER]"
+from=${2:-reproduced/$task}
+out=$from/dagger
+[[ -f $from/run/weights.safetensors ]] || fail "$from: no run; bash scripts/reproduce_small.sh $task $from makes it"
+episodes=${EPISODES:-300} seed=${SEED:-570000} steps=${STEPS:-1500}
+jobs=${JOBS:-$(nproc)}
+robocas=${ROBOCAS:-.venv/bin/robocas}
+
+timed() {
+    local begun=$SECONDS
+    "$@"
+    printf 'dagger_small: %s: %d min\n' "$2" $(((SECONDS - begun + 30) / 60))
+}
+
+mkdir -p "$out"
+timed "$robocas" generate "$task" --config "${task}_upstream_eval" -n "$episodes" --seed "$seed" --jobs "$jobs" \
+    --after-policy "$from/run" --out "$out/demos" --resume
+timed "$robocas" convert "$out/demos/trajectory.h5" --out "$out/parts" --size 256 192 --no-depth --no-video \
+    --cameras base_camera gripper_camera --jobs "$jobs" --resume
+timed "$robocas" merge "$from/data" "$out/parts" --out "$out/data" --resume
+timed "$robocas" train small --data "$out/data" --out "$out/run" --start "$from/run" --steps "$steps" --resume
+timed "$robocas" eval "$task" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs" --resume

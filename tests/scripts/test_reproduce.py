@@ -1,0 +1,77 @@
+"""What the scripts of `small` call are commands that there are, in an order in which each finds its input."""
+
+import importlib.util
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from robocas_ms3.config import shipped_configs
+
+ROOT = Path(__file__).resolve().parents[2]
+STUB = '#!/bin/sh\nprintf "%s\\n" "$*" >> "$CALLS"\n'
+STEPS = {
+    "reproduce_small.sh pick": "generate convert merge train eval",
+    "reproduce_small.sh select": "generate convert generate convert merge train eval",
+    "reproduce_small.sh search": "generate convert merge train eval",
+    "dagger_small.sh pick": "generate convert merge train eval",
+}
+
+
+def mistakes():
+    spec = importlib.util.spec_from_file_location("_pages", ROOT / "tests" / "examples" / "test_pages.py")
+    assert spec is not None and spec.loader is not None
+    pages = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(pages)
+    return pages.mistake
+
+
+def called(tmp_path, script, *more, **settings):
+    stub = tmp_path / "robocas"
+    stub.write_text(STUB)
+    stub.chmod(0o755)
+    env = {**os.environ, "ROBOCAS": str(stub), "CALLS": str(tmp_path / "calls"), "JOBS": "2", **settings}
+    words = ["bash", str(ROOT / "scripts" / script), *more]
+    done = subprocess.run(words, env=env, capture_output=True, text=True, check=False)
+    calls = (tmp_path / "calls").read_text().splitlines() if (tmp_path / "calls").is_file() else []
+    return done, [line.split() for line in calls]
+
+
+@pytest.mark.parametrize("words", STEPS)
+def test_they_call_what_there_is(tmp_path, words):
+    folder = tmp_path / "out"
+    (folder / "run").mkdir(parents=True)
+    (folder / "run" / "weights.safetensors").touch()
+    done, calls = called(tmp_path, *words.split(), str(folder), EPISODES="40")
+    assert done.returncode == 0, done.stderr
+    assert " ".join(call[0] for call in calls) == STEPS[words]
+    mistake, made = mistakes(), {str(folder / "run"), str(folder / "data")}
+    for call in calls:
+        assert not mistake(call), call
+        assert "--resume" in call
+        assert call[0] != "generate" or call[call.index("--config") + 1] in shipped_configs()
+        read = [word.removesuffix("/trajectory.h5") for word in call if word.startswith(str(folder))]
+        out = call[call.index("--out") + 1]
+        read.remove(out)
+        made.add(out)
+        assert set(read) <= made, call
+    counts = [int(call[call.index("-n") + 1]) for call in calls if call[0] == "generate"]
+    assert sum(counts) == 40
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["reproduce_small.sh"], "which task?"),
+        (["reproduce_small.sh", "open_pick"], "which task?"),
+        (
+            ["dagger_small.sh", "pick", "nowhere"],
+            "nowhere: no run; bash scripts/reproduce_small.sh pick",
+        ),
+    ],
+)
+def test_what_they_refuse(tmp_path, words, said):
+    done, calls = called(tmp_path, *words)
+    assert (done.returncode, calls) == (2, [])
+    assert said in done.stderr
