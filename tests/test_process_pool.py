@@ -4,6 +4,8 @@ import errno
 import math
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from functools import partial
@@ -213,3 +215,31 @@ def test_a_process_that_is_too_large_before_it_begins_blames_no_task():
     limits = Limits(memory_gb=0.2)
     with pytest.raises(RobocasError, match=said), Pool(TooLarge, 1, here=False, limits=limits) as pool:
         list(pool.do(["a"]))
+
+
+BUSY = """
+import time
+from tqdm import tqdm
+from robocas_ms3.processes import Pool
+
+class Busy:
+    def do(self, task):
+        list(tqdm([task], disable=False))
+        time.sleep(1000 * task)
+        return task
+
+    def close(self):
+        pass
+
+if __name__ == "__main__":
+    with Pool(Busy, 2) as pool:
+        print(next(iter(pool.do([0, 1, 1]))))
+"""
+
+
+def test_what_is_killed_in_the_end_leaves_nothing_of_the_systems(tmp_path):
+    """As a bar's lock, of which Python would warn when all is done."""
+    (tmp_path / "busy.py").write_text(BUSY)
+    done = subprocess.run([sys.executable, "busy.py"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout == "0\n"
+    assert "leaked" not in done.stderr

@@ -17,6 +17,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Generic, TypeVar
 
 import psutil
+from tqdm import tqdm
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.processes.lives import is_too_large, leave_with, uninterrupted
@@ -223,6 +224,7 @@ def _serve(open_worker: Callable[[], Worker[Any, Any]], pipe: Connection, parent
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     end_with(parent)
     leave_with(parent)
+    tqdm.set_lock(threading.RLock())  # its own is the system's, which a process that is killed leaves behind
     worker: Worker[Any, Any] | None = None
     while True:
         try:

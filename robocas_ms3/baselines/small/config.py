@@ -70,6 +70,6 @@ class SmallConfig(BaselineConfig):
     name_weight: float = Field(default=0.1, ge=0)
     shift: int = Field(default=3, ge=0)
     brightness: float = Field(default=0.2, ge=0, lt=1)
-    fade: float = Field(default=0.5, ge=0)
+    fade: float = Field(default=0.15, ge=0)
     agree: float = Field(default=0.0, ge=0)
     train: TrainSettings = TrainSettings(steps=3_500, batch_size=96, learning_rate=6e-4, weight_decay=0.01)

@@ -1,0 +1,37 @@
+"""The weights that come with the package: small enough to ship, of this version, and the policy `small` by name."""
+
+import json
+
+import numpy as np
+import pytest
+
+from robocas_ms3.baselines.policy import SHIPPED, RunPolicy
+from robocas_ms3.baselines.runs import CHECKPOINT, read_run
+from robocas_ms3.baselines.small import BASELINE
+from robocas_ms3.cli.main import run
+from robocas_ms3.evaluation.policies import make_policy
+
+
+def test_they_are_small_and_of_this_version():
+    record = read_run(SHIPPED / "small")
+    assert (record.baseline, record.version) == ("small", BASELINE.version)
+    assert sum(path.stat().st_size for path in SHIPPED.rglob("*")) < 10e6
+    assert not (SHIPPED / "small" / CHECKPOINT).exists()
+
+
+def test_they_are_a_policy_by_name():
+    policy = make_policy("small")
+    assert isinstance(policy, RunPolicy)
+    assert (policy.wants.convention, policy.wants.rate_hz, policy.wants.language) == ("robocas", 5.0, "embedding")
+    assert policy.describe()["steps"] > 0
+
+
+@pytest.mark.slow
+def test_they_reach_what_is_meant(tmp_path, needs_renderer):
+    """Of four episodes some: which of them depends on how a processor rounds."""
+    words = ["eval", "pick", "--policy", "small", "--protocol", "paper-v1", "--episodes", "4", "--envs", "2"]
+    assert run([*words, "--out", str(tmp_path / "eval")]) == 0
+    played = [json.loads(line) for line in (tmp_path / "eval" / "episodes.jsonl").read_text().splitlines()]
+    assert len(played) == 4 and not any(one["error"] for one in played)
+    assert np.sum([one["flags"]["reached_target"] for one in played]) >= 2
+    assert np.sum([one["success"] for one in played]) >= 1
