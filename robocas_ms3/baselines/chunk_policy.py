@@ -1,8 +1,9 @@
-"""Acts by chunks of poses: asked at every step, it goes where its last few predictions agree to be next."""
+"""Acts by chunks of poses: follows each for some steps, and goes where several predictions agree to be next."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,22 +20,23 @@ Predict = Callable[[Observations], NDArray[np.floating]]
 class ChunkPolicy:
     """Speaks RoboCAS' seven numbers, relative to where the TCP is.
 
-    A step's pose is the mean of what was predicted for it, now and at steps before, weighted by exp(-fade age) (Zhao et
-    al. 2023 weigh the oldest most; at 5 Hz the newest knows more). The mean of two ways to go is none: what lies far from
-    the newest prediction weighs less, by a Gaussian.
+    A chunk is followed for some steps before the next one. Who sees pictures and no speeds takes every rest for the
+    beginning of a motion, which is slow: asked at every step, it would creep, and put off closing the gripper for ever.
+    A step's pose is the mean of what was predicted for it, weighted by exp(-fade age) (Zhao et al. 2023 weigh the
+    oldest most; at 5 Hz the newest knows more).
 
     Args:
         wants: what it is to be shown.
         predict: (E, K, 10) chunks of what E envs show, see `chunks`.
+        play: steps of a chunk before the next one, up to K.
         fade: how fast older predictions lose weight, a step.
-        agree: deviation of that Gaussian, m; 0: none.
         about: what a result says of it besides.
     """
 
-    def __init__(self, wants: Wants, predict: Predict, fade: float, agree: float, about: dict[str, Any]) -> None:
+    def __init__(self, wants: Wants, predict: Predict, play: int, fade: float, about: dict[str, Any]) -> None:
         self.wants, self._predict, self._about = wants, predict, about
-        self._fade, self._agree = fade, agree
-        self._plans: dict[int, list[tuple[Array, NDArray[np.float64]]]] = {}  # by env, newest first
+        self._play, self._fade = play, fade
+        self._plans: dict[int, list[_Plan]] = {}  # by env, newest first
 
     def describe(self) -> dict[str, Any]:
         """What a result says of it besides."""
@@ -47,20 +49,35 @@ class ChunkPolicy:
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """(E, 7) motions."""
-        chunks = self._predict(observations)
         tcp = from_wxyz(observations.tcp_in_base)
-        rows = zip(observations.envs.tolist(), chunks, tcp, strict=True)
-        return np.stack([self._next(env, chunk, here) for env, chunk, here in rows])
+        envs = observations.envs.tolist()
+        for env in envs:
+            self._plans[env] = [plan.older() for plan in self._plans[env] if plan.age + 1 < len(plan.poses)]
+        due = [row for row, env in enumerate(envs) if not self._plans[env] or self._plans[env][0].age >= self._play]
+        if due:
+            for row, chunk in zip(due, self._predict(observations)[due], strict=True):
+                self._plans[envs[row]].insert(0, _Plan(*decode(chunk, tcp[row])))
+        return np.stack([self._next(self._plans[env], here) for env, here in zip(envs, tcp, strict=True)])
 
-    def _next(self, env: int, chunk: NDArray[np.floating], here: Array) -> NDArray[np.float64]:
-        plans = self._plans[env] = [decode(chunk, here), *self._plans[env]][: len(chunk)]
-        poses = np.stack([plan[0][age] for age, plan in enumerate(plans)])
-        weights = np.exp(-self._fade * np.arange(len(plans)))
-        if self._agree:
-            weights *= np.exp(-np.square((poses - poses[0])[:, :3, 3] / self._agree).sum(axis=1) / 2)
+    def _next(self, plans: list[_Plan], here: Array) -> NDArray[np.float64]:
+        weights = np.exp(-self._fade * np.array([plan.age for plan in plans]))
         weights /= weights.sum()
-        opened = float(weights @ [plan[1][age] for age, plan in enumerate(plans)])
+        poses = np.stack([plan.poses[plan.age] for plan in plans])
+        opened = float(weights @ [plan.opened[plan.age] for plan in plans])
         turn = Rotation.from_matrix(poses[:, :3, :3]).mean(weights)
         now = Rotation.from_matrix(here[:3, :3]).inv()
         motion = now.apply(weights @ poses[:, :3, 3] - here[:3, 3])
         return np.array([*motion, *(now * turn).as_euler("xyz"), float(opened > 0.5)])
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A chunk, decoded: (K, 4, 4) poses in the arm's base, (K,) commands, and for how many steps it has been there."""
+
+    poses: Array
+    opened: NDArray[np.float64]
+    age: int = 0
+
+    def older(self) -> _Plan:
+        """The same a step later."""
+        return replace(self, age=self.age + 1)

@@ -28,9 +28,9 @@ def start(env):
     return Start(env, 0, "pick", "", "", "builtin", 0, "")
 
 
-def policy(chunks, fade=0.0, agree=0.0):
+def policy(chunks, fade=0.0):
     said = iter(chunks)
-    made = ChunkPolicy(Wants(), lambda observations: np.array(next(said), float), fade, agree, {})
+    made = ChunkPolicy(Wants(), lambda observations: np.array(next(said), float), 1, fade, {})
     made.reset([start(0), start(1)])
     return made
 
@@ -69,13 +69,29 @@ def test_newer_predictions_weigh_more():
     assert action[6] == 1.0
 
 
-def test_between_two_ways_it_takes_the_newest():
-    """One deviation off counts exp(-1/2); another object, nothing."""
-    acting = policy([[[row(), row(0.1)]], [[row(0.12), row(-0.4)]], [[row(0.4), row()]]], agree=0.02)
-    acting.act(seen([HERE]))
-    near = np.exp(-0.5)
-    assert acting.act(seen([HERE]))[0, 0] == pytest.approx((0.12 + near * 0.1) / (1 + near))
-    assert acting.act(seen([HERE]))[0, 0] == pytest.approx(0.4)
+def test_a_chunk_is_followed_before_the_next():
+    """For two of three steps; then the mean of what it said of the third one, and what the next says of it."""
+    asked = iter([[[row(0.1), row(0.2), row(0.3)]], [[row(0.5), row(), row()]]])
+    acting = ChunkPolicy(Wants(), lambda observations: np.array(next(asked), float), 2, 0.0, {})
+    acting.reset([start(0)])
+    assert [acting.act(seen([HERE]))[0, 0] for _ in range(3)] == pytest.approx([0.1, 0.2, 0.4])
+
+
+def test_envs_are_asked_when_they_are_due():
+    asked = []
+
+    def predict(observations):
+        asked.append(observations.envs.tolist())
+        return np.tile(np.array([row(0.1), row(0.2)]), (len(observations.envs), 1, 1))
+
+    acting = ChunkPolicy(Wants(), predict, 2, 0.0, {})
+    acting.reset([start(0), start(1)])
+    moved = [acting.act(seen([HERE] * 2, (0, 1)))[:, 0].tolist() for _ in range(2)]
+    acting.reset([start(1)])
+    moved.append(acting.act(seen([HERE] * 2, (0, 1)))[:, 0].tolist())
+    moved.append(acting.act(seen([HERE] * 2, (0, 1)))[:, 0].tolist())
+    assert np.array(moved) == pytest.approx(np.array([[0.1, 0.1], [0.2, 0.2], [0.1, 0.1], [0.2, 0.2]]))
+    assert len(asked) == 2
 
 
 def test_a_reset_forgets_one_env():

@@ -48,7 +48,7 @@ class BcState:
                 return model.act(torch.from_numpy(told).to(device)).cpu().numpy()
 
         wants = Wants("robocas", reference="tcp", rate_hz=facts["rate_hz"], state=True, language="none")
-        return ChunkPolicy(wants, predict, config.fade, config.agree, {})
+        return ChunkPolicy(wants, predict, config.play, config.fade, {})
 
 
 BASELINE = BcState()

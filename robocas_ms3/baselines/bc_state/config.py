@@ -18,8 +18,8 @@ class BcStateConfig(BaselineConfig):
         dropout: between them.
         noise: deviation of the noise on what it is told in training, in deviations of that.
         keys_weight, gripper_weight, near: see `SmallConfig`.
+        play: steps of a chunk that it follows before it predicts the next one.
         fade: how fast older predictions lose weight when it acts, see `ChunkPolicy`.
-        agree: see `ChunkPolicy`; 0: older predictions count however far off they are.
         train: see `TrainSettings`.
     """
 
@@ -32,8 +32,8 @@ class BcStateConfig(BaselineConfig):
     keys_weight: float = Field(default=0.5, ge=0)
     gripper_weight: float = Field(default=0.5, ge=0)
     near: float = Field(default=0.0, ge=0)
+    play: int = Field(default=1, ge=1)
     fade: float = Field(default=0.5, ge=0)
-    agree: float = Field(default=0.0, ge=0)
     train: TrainSettings = TrainSettings(
         steps=20_000, batch_size=256, learning_rate=1e-3, weight_decay=0.01, precision="fp32"
     )

@@ -47,8 +47,8 @@ class SmallConfig(BaselineConfig):
         name_weight: weight of the loss of where objects are that other instructions would name, of each camera.
         shift: pixels that pictures are shifted by at most, at random, in training.
         brightness: share that brightness and contrast change by at most, at random, in training.
+        play: steps of a chunk that it follows before it predicts the next one.
         fade: how fast older predictions lose weight when it acts, see `ChunkPolicy`.
-        agree: see `ChunkPolicy`; 0: older predictions count however far off they are.
         train: see `TrainSettings`.
     """
 
@@ -70,6 +70,6 @@ class SmallConfig(BaselineConfig):
     name_weight: float = Field(default=0.1, ge=0)
     shift: int = Field(default=3, ge=0)
     brightness: float = Field(default=0.2, ge=0, lt=1)
+    play: int = Field(default=7, ge=1)
     fade: float = Field(default=0.15, ge=0)
-    agree: float = Field(default=0.0, ge=0)
     train: TrainSettings = TrainSettings(steps=3_500, batch_size=96, learning_rate=6e-4, weight_decay=0.01)
