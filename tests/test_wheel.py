@@ -87,6 +87,8 @@ def test_configs_and_builtin_pack_travel_in_the_wheel(wheel):
     for asset in json.loads(manifest.read_text())["assets"]:
         for file in asset["files"]:
             assert f"robocas_ms3/data/packs/builtin/{asset['id']}/{file}" in names
+    for file in ("run.json", "weights.safetensors"):
+        assert f"robocas_ms3/data/runs/small/{file}" in names
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
     left_out = ("tests/", "scripts/", "task_configs/", "asset_tools/builtin")
     assert not [name for name in names if name.startswith(left_out)]
