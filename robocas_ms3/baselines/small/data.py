@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -84,7 +85,7 @@ class SmallSamples:
             for done, found in enumerate(pool.map(read, range(len(numbers))), start=1):
                 stood.append(found)
                 on_read(done, len(numbers))
-        self._ask(stood)
+        self._ask(stood if config.language else [replace(one, target="") for one in stood])
         self.facts: dict[str, Any] = {
             "rate_hz": source.rate_hz,
             "pictures": {camera: list(seen.rgb(camera, 0).shape[1::-1]) for camera in config.views},
@@ -118,7 +119,10 @@ class SmallSamples:
         }
 
     def _ask(self, stood: list[Standing]) -> None:
-        """What can be asked about each episode's objects, in the words of episodes of which they were the target."""
+        """What can be asked about each episode's objects, in the words of episodes of which they were the target.
+
+        Without targets, as without language, nothing can.
+        """
         most = max(len(one.kinds) for one in stood)
         names = sorted({one.target for one in stood} - {""})
         told = {name: [place for place, one in enumerate(stood) if one.target == name] for name in names}

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from robocas_ms3.baselines.chunks import decode
-from robocas_ms3.baselines.small import BASELINE
+from robocas_ms3.baselines.small import BASELINE, data
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.data import looked_at
 from robocas_ms3.baselines.small.model import shifted
+from robocas_ms3.baselines.small.standing import Standing
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.evaluation.policy import Observations, Start
@@ -113,6 +114,21 @@ def test_samples_are_the_datasets(samples, folder):
     assert np.allclose(ahead[0, :3, 3], arrays["ee_pos"][5], atol=1e-5)
     wxyz = to_wxyz(ahead[:1])[0, 3:]
     assert abs(wxyz @ np.roll(arrays["ee_orn"][5], 1)) == pytest.approx(1, abs=1e-5)
+
+
+def test_without_language_nothing_is_asked_for(folder, monkeypatch):
+    """All questions would be the same, and have other answers."""
+    made = lambda episode, arrays, poses, looks: Standing(  # noqa: E731
+        len(poses), "apple", ["apple", "pear"], {name: np.zeros((len(poses), 2, 2), np.float32) for name in looks}
+    )
+    monkeypatch.setattr(data, "standing", made)
+    kinds = [
+        BASELINE.data(SmallConfig(**TINY, language=language), folder, "val", lambda done, of: None)
+        .__getitems__([0])["kinds"]
+        .tolist()
+        for language in (True, False)
+    ]
+    assert kinds == [[[0, -1]], [[-1, -1]]]
 
 
 def test_without_language_words_say_nothing(folder):
