@@ -189,7 +189,11 @@ class Baseline(_Kind, Protocol):
         ...
 
     def model(self, config: Any, facts: dict[str, Any]) -> torch.nn.Module:
-        """The network; its ``forward(batch)`` gives means over the batch by name, ``loss`` among them."""
+        """The network.
+
+        Its ``forward(batch)`` gives metrics by name: means over the batch (), ``loss`` among them, and for what not all
+        of its samples tell, a sum and how many did (2,).
+        """
         ...
 
 
@@ -209,3 +213,8 @@ class TrialBaseline(_Kind, Protocol):
     def model(self, config: Any, facts: dict[str, Any]) -> torch.nn.Module:
         """The network."""
         ...
+
+
+def mean(counted: torch.Tensor) -> torch.Tensor:
+    """Mean () of a sum and over how many it is (2,); of none it is 0."""
+    return counted[0] / counted[1].clamp(min=1)

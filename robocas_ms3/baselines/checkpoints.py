@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as to_bytes
 
 from robocas_ms3.errors import TrainingError
 from robocas_ms3.files import replacing
@@ -20,19 +20,7 @@ def save(path: Path, tensors: Mapping[str, torch.Tensor], about: Mapping[str, st
     """Write tensors and texts about them; a file that was there stays whole until the new one is."""
     held = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     with replacing(path, sync=True) as tmp:
-        try:
-            save_file(held, tmp, dict(about))
-        except SafetensorError as error:  # it writes by itself, and names no reason in Python's way
-            raise _as_os_error(error) from error
-
-
-def _as_os_error(error: SafetensorError) -> Exception:
-    import errno
-    import re
-
-    found = re.search(r"os error (\d+)", str(error))
-    number = int(found[1]) if found else errno.EIO
-    return OSError(number, str(error))
+        tmp.write_bytes(to_bytes(held, dict(about)))  # safetensors' own file nobody else could read
 
 
 def load(path: Path, expected: Mapping[str, str]) -> tuple[dict[str, torch.Tensor], dict[str, str]]:

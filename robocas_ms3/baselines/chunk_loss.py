@@ -63,7 +63,7 @@ def chunk_losses(model: Predictor, batch: Batch, chunk: torch.Tensor, key: torch
         "gripper": gripper,
         "keys": keys,
         "key_mm": 1000 * off.mean(),
-        "near_mm": 1000 * (off * near).sum() / near.sum().clamp(min=1),
+        "near_mm": torch.stack([1000 * (off * near).sum(), near.sum()]),
         "first_mm": 1000 * ahead[:, 0].mean(),
         "last_mm": 1000 * ahead[:, -1].mean(),
     }

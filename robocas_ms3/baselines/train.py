@@ -18,7 +18,7 @@ from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader
 
 from robocas_ms3.baselines import checkpoints
-from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Batch, Precision, Samples
+from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Batch, Precision, Samples, mean
 from robocas_ms3.baselines.log import MetricsLog
 from robocas_ms3.baselines.runs import CHECKPOINT, WEIGHTS, RunRecord
 from robocas_ms3.baselines.schedule import Batches, epochs_at, learning_rate
@@ -150,9 +150,7 @@ class Trainer:
         if self._average is not None:
             self._average.update_parameters(self._bare)
         for name, value in found.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value.detach().double()
-        count = self._sums.get("", torch.zeros((), dtype=torch.float64))
-        self._sums[""] = count + 1
+            self._sums[name] = self._sums.get(name, 0.0) + _summed(value.detach(), 1)
 
     def _mix(self, average: Any, now: Any, _: Any) -> None:
         """Move an average of the weights on: fast at first, as it begins with what is random."""
@@ -160,8 +158,7 @@ class Trainer:
         torch._foreach_lerp_(average, now, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
 
     def _means(self) -> dict[str, float]:
-        count = float(self._sums.pop("", torch.ones(())))
-        means = {name: float(value) / count for name, value in self._sums.items()}
+        means = _means_of(self._sums)
         self._sums = {}
         self._check_numbers(self.step, loss=means["loss"], gradient=self._norms)
         return means
@@ -181,7 +178,7 @@ class Trainer:
         model = (self._average.module if self._average is not None else self._bare).eval()
         count = min(len(samples), self.settings.check_samples)
         places = torch.linspace(0, len(samples) - 1, count).long().tolist()
-        sums: dict[str, float] = {}
+        sums: dict[str, torch.Tensor] = {}
         size = self.settings.batch_size
         with torch.random.fork_rng(), self._accelerator.autocast():
             torch.manual_seed(self.settings.seed)
@@ -189,8 +186,8 @@ class Trainer:
                 chosen = places[first : first + size]
                 batch = samples.__getitems__(chosen)
                 for name, value in model(_sent(batch, self._accelerator)).items():
-                    sums[name] = sums.get(name, 0.0) + float(value) * len(chosen) / count
-        return sums
+                    sums[name] = _summed(value, len(chosen)) + sums.get(name, 0.0)
+        return _means_of(sums)
 
     def _tell(self, log: MetricsLog | None, split: str, metrics: dict[str, float], seconds: float) -> None:
         if log is None:
@@ -203,12 +200,12 @@ class Trainer:
         }
         log.add(self.step, split, about, metrics)
         if split == "val":
-            said = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
+            said = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items() if math.isfinite(value))
             self._note(f"step {self.step}, epoch {about['epoch']:.1f}, validation: {said}")
 
     def _save(self) -> None:
         random = self._random_states()  # for which all processes have to come here
-        if any(not torch.isfinite(value) for value in (*self._sums.values(), self._norms)):
+        if any(not torch.isfinite(value).all() for value in (*self._sums.values(), self._norms)):
             return  # the next line of the log ends the run, and the last good checkpoint stays
         tensors = {f"model.{name}": value for name, value in self._bare.state_dict().items()}
         if self._average is not None:
@@ -257,7 +254,7 @@ class Trainer:
             checkpoints.put_in(self._average, checkpoints.part(tensors, "average."), path)
         checkpoints.put_in_optimizer(optimizer, checkpoints.part(tensors, "optimizer."))
         device = self._accelerator.device
-        self._sums = {k: v.to(device if k else "cpu") for k, v in checkpoints.part(tensors, "sums.").items()}
+        self._sums = {name: value.to(device) for name, value in checkpoints.part(tensors, "sums.").items()}
         self._set_random(checkpoints.part(tensors, "random."), path)
         self.step = int(about["step"])
 
@@ -300,6 +297,17 @@ def _cpu_has_bf16() -> bool:
     """Whether the processor multiplies bf16 by itself; where it does not, bf16 is slower than fp32."""
     cpu: Any = torch.cpu
     return any(getattr(cpu, name, bool)() for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"))
+
+
+def _summed(metric: torch.Tensor, samples: int) -> torch.Tensor:
+    """(2,) a sum and over how many it is, of a metric of a batch."""
+    metric = metric.double()
+    return metric if metric.ndim else torch.stack([metric * samples, torch.full_like(metric, samples)])
+
+
+def _means_of(sums: Mapping[str, torch.Tensor]) -> dict[str, float]:
+    """NaN of what no sample told."""
+    return {name: float(mean(value)) if value[1] else math.nan for name, value in sums.items()}
 
 
 def _sent(batch: Batch, accelerator: Accelerator) -> Batch:

@@ -45,7 +45,14 @@ def assert_same(one, other):
 
 
 @pytest.fixture
-def whole(made_up, data, tmp_path):
+def usual_umask():
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
+@pytest.fixture
+def whole(usual_umask, made_up, data, tmp_path):
     train_run("made-up", data, tmp_path / "whole", device="cpu")
     return tmp_path / "whole"
 
@@ -64,6 +71,16 @@ def test_a_run_leaves_what_it_says(whole):
     assert float(rows[-1]["loss"]) < float(rows[0]["loss"])
     assert float(rows[0]["double"]) == pytest.approx(2 * float(rows[0]["loss"]), rel=1e-4)
     assert list((whole / "tensorboard").iterdir())
+
+
+def test_what_not_every_sample_tells_is_a_mean_of_those_that_do(whole):
+    x = made_up_baseline.MadeUpSamples(-1, -1).x[:, 0]
+    (last,) = (row for row in lines(whole) if (row["step"], row["split"]) == ("40", "val"))
+    assert float(last["high"]) == pytest.approx(x[x > 0].mean().item(), rel=1e-5)
+
+
+def test_everybody_may_read_a_run(whole):
+    assert {path.stat().st_mode & 0o777 for path in whole.glob("*.safetensors")} == {0o644}
 
 
 @pytest.mark.parametrize("step", [1, 17, 20, 39])

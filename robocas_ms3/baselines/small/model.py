@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from robocas_ms3.baselines.baseline import Batch
+from robocas_ms3.baselines.baseline import Batch, mean
 from robocas_ms3.baselines.chunk_loss import chunk_losses
 from robocas_ms3.baselines.chunks import ROW, Scale
 from robocas_ms3.baselines.small.config import SmallConfig, View
@@ -120,7 +120,8 @@ class SmallModel(nn.Module):
             logits = eye.pointer.logits(maps[camera][1], asked)
             standing = cells_of(others, view)[:, None].where(alike, NOWHERE)
             more, named = pointing_losses(logits, standing, columns)
-            found["loss"] = found["loss"] + self.config.point_weight * loss + self.config.name_weight * more
+            pointing = self.config.point_weight * mean(loss) + self.config.name_weight * mean(more)
+            found["loss"] = found["loss"] + pointing
             found |= {f"{camera}_point": loss, f"{camera}_found": right}
             found |= {f"{camera}_name": more, f"{camera}_named": named}
         return found

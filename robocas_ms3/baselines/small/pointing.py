@@ -87,23 +87,27 @@ class Pointer(nn.Module):
 
 
 def pointing_losses(logits: torch.Tensor, cells: torch.Tensor, columns: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cross entropy of the cells, and the share found to one cell; means over questions with an answer in the picture.
+    """Cross entropy of the cells, and how many were found to one cell.
 
     Args:
         logits: (..., N).
         cells: (..., I) each of which is a right answer; `NOWHERE` where it is not in the picture.
         columns: of the cells.
+
+    Returns:
+        Two (2,): a sum over the questions with an answer in the picture, and how many these are.
     """
     shown = cells != NOWHERE
     asked = shown.any(dim=-1)
-    count = asked.sum().clamp(min=1)
+    count = asked.sum()
     share = logits.log_softmax(dim=-1).gather(-1, cells.clamp(min=0)).masked_fill(~shown, -torch.inf)
     right = torch.where(asked[..., None], share, 0.0).logsumexp(dim=-1)  # of one or the other
-    loss = -(right * asked).sum() / count
+    loss = -(right * asked).sum()
     with torch.no_grad():
         found = logits.argmax(dim=-1, keepdim=True)
         off = torch.maximum(
             (found % columns - cells % columns).abs(),
             (found // columns - cells // columns).abs(),
         )
-        return loss, ((off <= 1) & shown).any(dim=-1).sum() / count
+        close = ((off <= 1) & shown).any(dim=-1).sum()
+    return torch.stack([loss, count]), torch.stack([close, count])
