@@ -17,7 +17,7 @@ task=${1:-}
 from=${2:-reproduced/$task}
 out=$from/dagger
 [[ -f $from/run/weights.safetensors ]] || fail "$from: no run; bash scripts/reproduce_small.sh $task $from makes it"
-episodes=${EPISODES:-300} seed=${SEED:-570000} steps=${STEPS:-1500}
+episodes=${EPISODES:-300} seed=${SEED:-570000} steps=${STEPS:-1800}
 jobs=${JOBS:-$(nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 

@@ -7,6 +7,7 @@
 # --batch_size=64, --policy.dim_model=512 ... With --no-language as the first of them the policy isn't told what to do.
 # An OUT that has a checkpoint goes on from it, to STEPS, with the settings it was begun with.
 #
+#   OUT/asked     what it was begun with: another policy or dataset is refused
 #   OUT/dataset   the dataset as the policy socket shows things (robocas_ms3.baselines.lerobot.prepare)
 #   OUT/train     of lerobot-train; scripts/serve_lerobot.sh OUT serves its last checkpoint
 #
@@ -37,6 +38,17 @@ act) sizes=("${act[@]}") ;;
 diffusion) sizes=("${diffusion[@]}") ;;
 *) usage ;;
 esac
+
+asked="$kind $(sha256sum <"$dataset/meta/info.json" | cut -c 1-16) ${language[*]}"
+if [ -f "$out/asked" ] && [ "$(cat "$out/asked")" != "$asked" ]; then
+    echo "$out: begun as '$(cat "$out/asked")' (policy, dataset, language), not '$asked'. Name another OUT." >&2
+    exit 2
+fi
+if [ -d "$out/dataset" ] && [ ! -f "$out/asked" ]; then
+    echo "$out/dataset: of what, is not said. Remove it, or name another OUT." >&2
+    exit 2
+fi
+echo "$asked" >"$out/asked"
 
 . scripts/lerobot_environment.sh
 export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH}

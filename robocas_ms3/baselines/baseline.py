@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import torch
 from pydantic import Field
@@ -16,6 +16,7 @@ Precision = Literal["auto", "fp32", "bf16"]
 Split = Literal["train", "val"]
 Batch = dict[str, torch.Tensor]
 OnRead = Callable[[int, int], None]
+Share = Annotated[float, Field(ge=0, lt=1)]
 
 
 class TrainSettings(StrictModel):
@@ -27,6 +28,7 @@ class TrainSettings(StrictModel):
         learning_rate: AdamW's, after the warm-up.
         min_learning_rate: what the schedule falls to.
         weight_decay: AdamW's, on matrices and kernels; not on biases and norms.
+        betas: AdamW's, decay of the means of gradients and of their squares.
         warmup_steps: in which the learning rate rises from 0.
         schedule: ``cosine`` falls once over all steps, ``restarts`` again and again, ``constant`` does not.
         restart_epochs, restart_factor: first period of ``restarts`` in epochs, and what each is longer than the last.
@@ -44,6 +46,7 @@ class TrainSettings(StrictModel):
     learning_rate: float = Field(default=1e-3, gt=0)
     min_learning_rate: float = Field(default=0.0, ge=0)
     weight_decay: float = Field(default=1e-4, ge=0)
+    betas: tuple[Share, Share] = (0.9, 0.95)
     warmup_steps: int = Field(default=200, ge=0)
     schedule: Literal["cosine", "constant", "restarts"] = "cosine"
     restart_epochs: float = Field(default=20, gt=0)
@@ -136,7 +139,13 @@ class Trials(Protocol):
 
 
 class Training(Protocol):
-    """A run that takes the steps that are left, and keeps checkpoints, weights and metrics in its folder."""
+    """A run that takes the steps that are left, and keeps checkpoints, weights and metrics in its folder.
+
+    Attributes:
+        step: steps taken.
+    """
+
+    step: int
 
     def parameters(self) -> Iterator[torch.nn.Parameter]:
         """Of the network."""
@@ -213,8 +222,3 @@ class TrialBaseline(_Kind, Protocol):
     def model(self, config: Any, facts: dict[str, Any]) -> torch.nn.Module:
         """The network."""
         ...
-
-
-def mean(counted: torch.Tensor) -> torch.Tensor:
-    """Mean () of a sum and over how many it is (2,); of none it is 0."""
-    return counted[0] / counted[1].clamp(min=1)

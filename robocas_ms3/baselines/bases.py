@@ -1,4 +1,4 @@
-"""Whether the mobile base stands: the 7 numbers of an action say where the arm goes, and not how its base drives."""
+"""Whether the 7 numbers of a dataset's actions say all there is to say, in the frame that policies act in."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.datasets.manage.eef import eef_turn
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.errors import DatasetError
 
@@ -32,6 +33,24 @@ def check_stands(motion: NDArray[np.floating], where: object) -> None:
             expected=f"at most {_DRIVEN:g} m or rad away from where it began",
             found=f"{furthest:.3g}",
             fix="Train on a configuration without base_motion.",
+        )
+
+
+def check_tcp(source: EpisodeSource, number: int) -> None:
+    """See that actions are motions of ManiSkill's TCP, by where an episode's gripper camera is.
+
+    Raises:
+        DatasetError: they are of upstream's, which is turned about its z.
+    """
+    camera = "gripper_camera"
+    turn = eef_turn(source.episode(number).camera_in_parent(camera)) if camera in source.cameras else 0
+    if turn:
+        raise DatasetError(
+            "actions are in another frame than policies act in",
+            where=source.root,
+            expected="ManiSkill's TCP",
+            found=f"one that is turned by {-turn} degrees about z",
+            fix="robocas import-robocas, without --no-turn-eef, makes a dataset of it that is.",
         )
 
 

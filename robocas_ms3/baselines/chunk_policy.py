@@ -14,7 +14,7 @@ from robocas_ms3.baselines.chunks import decode
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.poses import Array, from_wxyz
 
-Predict = Callable[[Observations], NDArray[np.floating]]
+Predict = Callable[[Observations, int], NDArray[np.floating]]
 
 
 class ChunkPolicy:
@@ -27,7 +27,7 @@ class ChunkPolicy:
 
     Args:
         wants: what it is to be shown.
-        predict: (E, K, 10) chunks of what E envs show, see `chunks`.
+        predict: (K, 10) chunk of what one env shows, of observations and its row, see `chunks`.
         play: steps of a chunk before the next one, up to K.
         fade: how fast older predictions lose weight, a step.
         about: what a result says of it besides.
@@ -53,10 +53,10 @@ class ChunkPolicy:
         envs = observations.envs.tolist()
         for env in envs:
             self._plans[env] = [plan.older() for plan in self._plans[env] if plan.age + 1 < len(plan.poses)]
-        due = [row for row, env in enumerate(envs) if not self._plans[env] or self._plans[env][0].age >= self._play]
-        if due:
-            for row, chunk in zip(due, self._predict(observations)[due], strict=True):
-                self._plans[envs[row]].insert(0, _Plan(*decode(chunk, tcp[row])))
+        for row, env in enumerate(envs):
+            if not self._plans[env] or self._plans[env][0].age >= self._play:
+                chunk = self._predict(observations, row)  # by itself: in a batch it would depend on the others' bits
+                self._plans[env].insert(0, _Plan(*decode(chunk, tcp[row])))
         return np.stack([self._next(self._plans[env], here) for env, here in zip(envs, tcp, strict=True)])
 
     def _next(self, plans: list[_Plan], here: Array) -> NDArray[np.float64]:

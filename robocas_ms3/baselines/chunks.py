@@ -19,6 +19,12 @@ ROW = 10
 _FLOOR = np.array([0.004] * 3 + [0.02] * 6)  # m and 1: deviations below that are noise to be left as it is
 
 
+def state_of(poses: NDArray[np.floating], widths: NDArray[np.floating]) -> NDArray[np.float32]:
+    """(N, 10) of poses (N, 4, 4) of the TCP in the arm's base and gripper widths (N,), in m: what the arm feels."""
+    turns = poses[:, :3, :2].swapaxes(1, 2).reshape(len(poses), 6)
+    return np.concatenate([poses[:, :3, 3], turns, widths[:, None] / 0.08], axis=1).astype(np.float32)
+
+
 def encode(poses: NDArray[np.floating], opened: NDArray[Any], steps: int) -> NDArray[np.float32]:
     """Chunks of an episode.
 

@@ -27,11 +27,17 @@ class MetricsLog:
 
         self._path = folder / METRICS
         self._columns: list[str] = []
+        self._had: set[tuple[int, str]] = set()
         self.seconds = 0.0
         """Spent up to ``step`` by those before."""
-        if self._path.is_file():
+        goes_on = self._path.is_file()
+        if goes_on:
             self._cut(step)
-        self._board: Any = SummaryWriter(str(folder / BOARD), purge_step=step + 1 if step else None)
+        self._board: Any = SummaryWriter(str(folder / BOARD), purge_step=step + 1 if goes_on else None)
+
+    def has(self, step: int, split: str) -> bool:
+        """Whether those before wrote that line."""
+        return (step, split) in self._had
 
     def add(self, step: int, split: str, about: Mapping[str, float], metrics: Mapping[str, float]) -> None:
         """Write a line.
@@ -62,10 +68,12 @@ class MetricsLog:
     def _cut(self, step: int) -> None:
         with self._path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
-        kept = [row for row in rows if _number(row.get("step")) <= step]
+        whole = [row for row in rows if None not in row.values()]  # a kill may have cut off the last
+        kept = [row for row in whole if _number(row["step"]) <= step]
+        self._had = {(int(row["step"]), row["split"]) for row in kept}
         self._columns = list(rows[0]) if rows else []
         if kept:
-            self.seconds = _number(kept[-1].get("seconds"), 0.0)
+            self.seconds = _number(kept[-1]["seconds"], 0.0)
         with replacing(self._path) as tmp, tmp.open("w", newline="", encoding="utf-8") as file:
             lines = csv.DictWriter(file, self._columns, extrasaction="ignore", lineterminator="\n")
             if self._columns:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.baselines.runs import RUN, WEIGHTS, RunRecord, read_run
+from robocas_ms3.baselines.runs import RUN, WEIGHTS, RunRecord, hash_of_weights, read_run
 from robocas_ms3.baselines.table import find_baseline
 from robocas_ms3.errors import TrainingError
 from robocas_ms3.evaluation.policy import Observations, Policy, Start, Wants
@@ -53,7 +53,7 @@ class RunPolicy:
         tensors, about = checkpoints.load(folder / WEIGHTS, expected)
         checkpoints.put_in(model, tensors, folder / WEIGHTS)
         self._policy: Policy = baseline.policy(config, record.facts, model.to(chosen).eval())
-        self._about = _about(record, int(about["step"]))
+        self._about = {**_about(record, int(about["step"])), "weights": hash_of_weights(folder)}
 
     @property
     def wants(self) -> Wants:
@@ -81,5 +81,6 @@ def _about(record: RunRecord, step: int) -> dict[str, Any]:
         "steps": step,
         "data": record.data.model_dump(),
         "config": record.config,
+        "start": record.start,
         "trained_with": record.versions,
     }

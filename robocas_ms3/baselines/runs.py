@@ -52,7 +52,8 @@ class RunRecord(StrictModel):
         data: it was trained on.
         versions: of packages.
         device, precision: it was trained on and in; another may round otherwise.
-        start: the run whose weights it began with: its folder's name and its data's hash; empty: none.
+        resumed: lines on where it went on with others of these three.
+        start: the run whose weights it began with: its folder's name and their hash; empty: none.
     """
 
     kind: Literal["robocas training run"] = "robocas training run"
@@ -64,6 +65,7 @@ class RunRecord(StrictModel):
     versions: dict[str, str]
     device: str
     precision: str
+    resumed: list[str] = []
     start: str = ""
 
 
@@ -92,7 +94,9 @@ def write_run(folder: Path, record: RunRecord) -> None:
 
 
 def hash_of(data: Path) -> str:
-    """A hash (SHA-256) of a dataset: of a file its bytes; of a folder its overviews, arrays, and pictures' sizes.
+    """A hash (SHA-256) of a dataset.
+
+    Of a trajectory its bytes and those of the JSON beside it; of a folder its overviews, arrays, and pictures' sizes.
 
     Raises:
         TrainingError: there is nothing.
@@ -100,6 +104,8 @@ def hash_of(data: Path) -> str:
     digest = hashlib.sha256()
     if data.is_file():
         _take(digest, data)
+        if (beside := data.with_suffix(".json")).is_file():
+            _take(digest, beside)
     elif data.is_dir():
         for path in sorted(path for path in data.rglob("*") if path.is_file()):
             name = path.relative_to(data).as_posix()
@@ -110,6 +116,15 @@ def hash_of(data: Path) -> str:
                 _take(digest, path)
     else:
         raise TrainingError("no dataset here", where=data, expected="a dataset's folder or trajectory.h5")
+    return digest.hexdigest()
+
+
+def hash_of_weights(folder: Path) -> str:
+    """A hash (SHA-256) of what a run acts with; empty: there is nothing yet."""
+    path, digest = folder / WEIGHTS, hashlib.sha256()
+    if not path.is_file():
+        return ""
+    _take(digest, path)
     return digest.hexdigest()
 
 

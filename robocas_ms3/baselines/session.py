@@ -5,19 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, OnRead, Samples, Training
-from robocas_ms3.baselines.runs import CHECKPOINT, RUN, WEIGHTS, DataRecord, RunRecord, hash_of, read_run, write_run
-from robocas_ms3.baselines.table import find_baseline
+from robocas_ms3.baselines.begin import (
+    check_kind,
+    check_same_data,
+    config_of,
+    facts_of,
+    find_start,
+    others,
+    precision_of,
+    versions,
+)
+from robocas_ms3.baselines.runs import RUN, DataRecord, RunRecord, hash_of, read_run, write_run
+from robocas_ms3.baselines.table import find_baseline, need_extra
 from robocas_ms3.errors import DatasetError, TrainingError
 from robocas_ms3.files import make_folder
 from robocas_ms3.outputs import check_one_way, check_overwrite, check_run, claim_output, locked_folder
-from robocas_ms3.strict import parse
-
-_PACKAGES = ("robocas-ms3", "torch", "accelerate", "safetensors", "transformers", "numpy")
 
 
 @dataclass
@@ -54,7 +60,8 @@ def train_run(
         data: dataset; None for a baseline that learns by trying.
         out: folder of the run.
         changes: of its configuration, nested as that is; for a run that goes on they may be left out.
-        start: folder of a run whose weights to begin with, such as one on less data; scales stay those of that run.
+        start: folder of a run to begin with, such as one on less data: its weights and scales, and its configuration
+            below ``changes``.
         device: ``auto``, ``cpu`` or ``cuda``.
         resume: whether to go on with a run that is there.
         overwrite: whether to replace one.
@@ -67,30 +74,36 @@ def train_run(
         KeyboardInterrupt: Ctrl-C; ``resume`` goes on.
     """
     check_one_way("train", resume=resume, overwrite=overwrite, error=TrainingError)
+    need_extra("accelerate", "safetensors", "tensorboard", "transformers")
     baseline, said = find_baseline(name), said or Said()
     trier: Any = baseline if hasattr(baseline, "trials") else None  # a `TrialBaseline`
     _check_data(baseline, data, by_trial=trier is not None)
     before = read_run(out) if resume and (out / RUN).is_file() else None
     if before is not None:
-        _check_kind(before, baseline, out)
-    config = _config(baseline, changes, before, out)
-    weights, begun_with = _weights(baseline, start, before, out)
+        check_kind(before, baseline, out)
+    begin = find_start(baseline, start, before, out)
+    config = config_of(baseline, changes, before, begin, out)
     check_run(out / RUN, "baseline", "train")
-    from robocas_ms3.baselines.train import Trainer, make_accelerator
+    from robocas_ms3.baselines.devices import make_accelerator
+    from robocas_ms3.baselines.train import Trainer
 
-    accelerator = make_accelerator(device, config.train.precision)
+    accelerator = make_accelerator(device, precision_of(config, before))
+    if config.train.batch_size < accelerator.num_processes:
+        found = f"{config.train.batch_size} for {accelerator.num_processes} processes"
+        raise TrainingError("a sample a process at least", where="train.batch_size", found=found)
     with ExitStack() as stack:
         if accelerator.is_main_process:
             stack.enter_context(locked_folder(out))
             if overwrite:
                 check_overwrite(out, [RUN], "a run of robocas train")
-            claim_output(out, resume=resume or overwrite)  # what is replaced stays until there is something instead
+            # What is replaced stays until there is something instead.
+            claim_output(out, resume=before is not None or overwrite)
         samples: Any = None
         if trier is not None:
             samples = stack.enter_context(closing(trier.trials(config, accelerator.device.type)))
         hashed = samples.hash if data is None else hash_of(data)
         if before is not None:
-            _check_same_data(before, hashed, out)
+            check_same_data(before, hashed, out)
         check = None
         if data is not None:
             said.note(f"reading {data}")
@@ -100,18 +113,19 @@ def train_run(
             baseline=name,
             version=baseline.version,
             config=config.model_dump(mode="json"),
-            facts=samples.facts,
+            facts=facts_of(samples.facts, begin, data),
             data=DataRecord(
                 name=samples.name if data is None else data.name,
                 hash=hashed,
                 episodes=samples.episodes,
                 samples=len(samples),
             ),
-            versions=_versions(),
+            versions=versions(),
             device=str(accelerator.device.type),
             precision=str(accelerator.mixed_precision),
-            start=begun_with,
+            start=begin.name if begin else "",
         )
+        weights = begin.weights if begin else None
         more: dict[str, Any] = {"resume": resume, "start": weights, "on_note": said.note}
         if trier is not None:
             trainer: Training = trier.training(config, samples, out, record, accelerator, **more)
@@ -120,6 +134,10 @@ def train_run(
         if accelerator.is_main_process and before is None:
             claim_output(out, overwrite=overwrite, resume=True)
             make_folder(out)
+            write_run(out, record)
+        elif accelerator.is_main_process and (changed := others(record, accelerator)):
+            record.resumed.append(f"from step {trainer.step} by {changed}")
+            said.note(f"goes on {record.resumed[-1]}: not what it would be by what it was begun by")
             write_run(out, record)
         accelerator.wait_for_everyone()
         count = sum(parameter.numel() for parameter in trainer.parameters())
@@ -140,80 +158,6 @@ def _check_data(baseline: Baseline, data: Path | None, *, by_trial: bool) -> Non
         raise TrainingError(f"{baseline.name} learns by trying, of no data", where="--data", fix="Leave it out.")
 
 
-def _config(
-    baseline: Baseline, changes: Mapping[str, Any] | None, before: RunRecord | None, out: Path
-) -> BaselineConfig:
-    if before is None:
-        default = baseline.Config().model_dump(mode="json")
-        return parse(baseline.Config, merged(default, changes or {}), TrainingError, where=baseline.name)
-    config = parse(baseline.Config, before.config, TrainingError, where=out / RUN)
-    if changes:
-        wanted = parse(baseline.Config, merged(before.config, changes), TrainingError, where=baseline.name)
-        if wanted != config:
-            fix = "Leave these options out, or train anew with --overwrite."
-            raise TrainingError("a run goes on as it was begun", where=out, fix=fix)
-    return config
-
-
-def _weights(
-    baseline: Baseline, start: Path | None, before: RunRecord | None, out: Path
-) -> tuple[dict[str, Any] | None, str]:
-    """Weights of another run that are to begin with, where there are any, and which run that is.
-
-    Raises:
-        TrainingError: it is of another baseline or version, or has none; or the run that goes on began with others.
-    """
-    from robocas_ms3.baselines import checkpoints
-
-    begun = before is not None and (out / CHECKPOINT).is_file()
-    if start is None:
-        if before is not None and before.start and not begun:
-            what = "this run had no checkpoint yet, and begins with another's weights"
-            raise TrainingError(what, where=out, expected=before.start, fix="Name that run by --start again.")
-        return None, ""
-    record = read_run(start)
-    name = f"{start.resolve().name}, {record.data.hash}"
-    if before is not None and before.start != name:
-        fix = "Leave --start out, or train anew with --overwrite."
-        raise TrainingError(
-            "a run goes on from what it began with",
-            where=out,
-            expected=before.start or "no --start",
-            found=name,
-            fix=fix,
-        )
-    if begun:
-        return None, name
-    expected = {"baseline": baseline.name, "version": str(baseline.version)}
-    weights, _ = checkpoints.load(start / WEIGHTS, expected)
-    return weights, name
-
-
-def _check_kind(before: RunRecord, baseline: Baseline, out: Path) -> None:
-    """See that a run is of a baseline, before its configuration is read, which another version may have otherwise."""
-    if before.baseline != baseline.name:
-        raise TrainingError("a run of another baseline", where=out, expected=baseline.name, found=before.baseline)
-    if before.version != baseline.version:
-        raise TrainingError(
-            f"a run of another version of {baseline.name}",
-            where=out,
-            expected=baseline.version,
-            found=before.version,
-            fix="Train anew with --overwrite.",
-        )
-
-
-def _check_same_data(before: RunRecord, hashed: str, out: Path) -> None:
-    if before.data.hash != hashed:
-        raise TrainingError(
-            "a run on another dataset",
-            where=out,
-            expected=f"{before.data.name}, {before.data.hash[:12]}",
-            found=hashed[:12],
-            fix="Name that one by --data, or choose another --out.",
-        )
-
-
 def _validation(baseline: Baseline, config: BaselineConfig, data: Path, said: Said) -> Samples | None:
     try:
         return baseline.data(config, data, "val", said.read)
@@ -222,22 +166,3 @@ def _validation(baseline: Baseline, config: BaselineConfig, data: Path, said: Sa
             raise
         said.note("no episodes to validate with: there are too few")
         return None
-
-
-def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested mappings, the second one's values first."""
-    result = dict(below)
-    for key, value in above.items():
-        inner = result.get(key)
-        result[key] = merged(inner, value) if isinstance(inner, Mapping) and isinstance(value, Mapping) else value
-    return result
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found

@@ -55,24 +55,24 @@ def find_baseline(name: str, *, where: object = "") -> Baseline:
 
     Raises:
         TrainingError: there is none.
-        MissingExtraError: the ``train`` extra is not installed.
+        MissingExtraError: of the ``train`` extra is not installed what weights are read by.
     """
     if name not in BASELINES:
         known = list(BASELINES)
         expected = f"one of {', '.join(known)}"
         raise TrainingError("no such baseline", where=where or name, expected=expected, fix=nearest(name, known))
-    need_extra()
+    need_extra("safetensors")
     found: Any = BASELINES[name]()
     return found
 
 
-def need_extra() -> None:
-    """See that what baselines are trained with is installed.
+def need_extra(*modules: str) -> None:
+    """See that modules of the ``train`` extra are installed.
 
     Raises:
-        MissingExtraError: it is not.
+        MissingExtraError: one is not.
     """
-    for module in ("accelerate", "safetensors", "tensorboard", "transformers"):
+    for module in modules:
         try:
             import_module(module)
         except ModuleNotFoundError as error:

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 from accelerate import Accelerator
-from accelerate.state import AcceleratorState
-from accelerate.utils import DataLoaderConfiguration
+from accelerate.utils import broadcast_object_list
 from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader
 
 from robocas_ms3.baselines import checkpoints
-from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Batch, Precision, Samples, mean
+from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Batch, Samples
 from robocas_ms3.baselines.log import MetricsLog
+from robocas_ms3.baselines.metrics import means_of, summed
 from robocas_ms3.baselines.runs import CHECKPOINT, WEIGHTS, RunRecord
 from robocas_ms3.baselines.schedule import Batches, epochs_at, learning_rate
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.errors import RobocasError, TrainingError
 from robocas_ms3.outputs import check_there
 from robocas_ms3.processes.lives import uninterrupted
-
-_BETAS = (0.9, 0.95)
-_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of malloc.h
 
 
 class Trainer:
@@ -69,7 +65,7 @@ class Trainer:
             checkpoints.put_in(model, start, record.start)
         model = model.to(accelerator.device)
         self._average = AveragedModel(model, multi_avg_fn=self._mix) if self.settings.ema else None
-        optimizer = torch.optim.AdamW(_groups(model, self.settings.weight_decay), lr=1.0, betas=_BETAS)
+        optimizer = torch.optim.AdamW(_groups(model, self.settings.weight_decay), lr=1.0, betas=self.settings.betas)
         self.step = 0
         self._sums: dict[str, torch.Tensor] = {}
         self._norms = torch.zeros((), dtype=torch.float64, device=accelerator.device)  # of all gradients, summed up
@@ -96,17 +92,19 @@ class Trainer:
         on_step(self.step, settings.steps)
         saved = self.step
         try:
+            (validated,) = broadcast_object_list([log is not None and log.has(self.step, "val")])
+            if not validated:  # it was broken off
+                self._validate(log, begun)
             for batch in self._batches():
                 with uninterrupted():  # between two steps everything is as a checkpoint has it
                     self._take(batch)
                     last = self.step == settings.steps
                     if last or self.step % settings.log_every == 0:
                         self._tell(log, "train", self._means(), time.monotonic() - begun)
-                    if self._check is not None and (last or self.step % settings.check_every == 0):
-                        self._tell(log, "val", self._checked(self._check), time.monotonic() - begun)
                     if last or self.step % settings.save_every == 0:
                         self._save()
                         saved = self.step
+                self._validate(log, begun)
                 on_step(self.step, settings.steps)
         except KeyboardInterrupt:
             if self.step > saved and self._accelerator.num_processes == 1:  # several may be at different steps
@@ -128,9 +126,14 @@ class Trainer:
         accelerator = self._accelerator
         part = (accelerator.process_index, accelerator.num_processes)
         batches = Batches(len(self._samples), self.settings, self.step, part)
-        loader = _loader(self._samples, batches, self.settings.workers)
-        for batch in loader:
-            yield _sent(batch, accelerator)
+        return self._read(self._samples, batches)
+
+    def _read(self, samples: Samples, batches: Iterable[list[int]]) -> Iterator[Batch]:
+        """Batches of indices as they are, on the device."""
+        for batch in _loader(_Reported(samples), batches, self.settings.workers):
+            if isinstance(batch, RobocasError):
+                raise batch
+            yield {name: tensor.to(self._accelerator.device, non_blocking=True) for name, tensor in batch.items()}
 
     def _take(self, batch: Batch) -> None:
         rate = learning_rate(self.step, len(self._samples), self.settings)
@@ -150,7 +153,7 @@ class Trainer:
         if self._average is not None:
             self._average.update_parameters(self._bare)
         for name, value in found.items():
-            self._sums[name] = self._sums.get(name, 0.0) + _summed(value.detach(), 1)
+            self._sums[name] = self._sums.get(name, 0.0) + summed(value, 1)
 
     def _mix(self, average: Any, now: Any, _: Any) -> None:
         """Move an average of the weights on: fast at first, as it begins with what is random."""
@@ -158,7 +161,7 @@ class Trainer:
         torch._foreach_lerp_(average, now, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
 
     def _means(self) -> dict[str, float]:
-        means = _means_of(self._sums)
+        means = means_of(self._of_all(self._sums))
         self._sums = {}
         self._check_numbers(self.step, loss=means["loss"], gradient=self._norms)
         return means
@@ -172,22 +175,38 @@ class Trainer:
                     fix="Lower train.learning_rate; --resume goes on from the last checkpoint.",
                 )
 
+    def _of_all(self, sums: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """The sums of all processes."""
+        if not sums:
+            return {}
+        found: Any = self._accelerator.reduce(torch.stack(list(sums.values())), "sum")
+        return dict(zip(sums, found, strict=True))
+
+    def _validate(self, log: MetricsLog | None, begun: float) -> None:
+        """Where it is time to; an interrupt ends it, and it is made up for."""
+        due = self.step == self.settings.steps or (self.step and self.step % self.settings.check_every == 0)
+        if self._check is not None and due:
+            self._tell(log, "val", self._checked(self._check), time.monotonic() - begun)
+
     @torch.no_grad()
     def _checked(self, samples: Samples) -> dict[str, float]:
         """Means of the validation split, of the average of the weights; changes nothing of what is to come."""
+        accelerator = self._accelerator
         model = (self._average.module if self._average is not None else self._bare).eval()
         count = min(len(samples), self.settings.check_samples)
         places = torch.linspace(0, len(samples) - 1, count).long().tolist()
-        sums: dict[str, torch.Tensor] = {}
+        if count >= accelerator.num_processes:  # else each looks at all
+            places = places[accelerator.process_index :: accelerator.num_processes]
         size = self.settings.batch_size
-        with torch.random.fork_rng(), self._accelerator.autocast():
+        batches = [places[first : first + size] for first in range(0, len(places), size)]
+        sums: dict[str, torch.Tensor] = {}
+        devices = [accelerator.device] if accelerator.device.type == "cuda" else []
+        with torch.random.fork_rng(devices), accelerator.autocast():
             torch.manual_seed(self.settings.seed)
-            for first in range(0, count, size):
-                chosen = places[first : first + size]
-                batch = samples.__getitems__(chosen)
-                for name, value in model(_sent(batch, self._accelerator)).items():
-                    sums[name] = _summed(value, len(chosen)) + sums.get(name, 0.0)
-        return _means_of(sums)
+            for chosen, batch in zip(batches, self._read(samples, batches), strict=True):
+                for name, value in model(batch).items():
+                    sums[name] = summed(value, len(chosen)) + sums.get(name, 0.0)
+        return means_of(self._of_all(sums))
 
     def _tell(self, log: MetricsLog | None, split: str, metrics: dict[str, float], seconds: float) -> None:
         if log is None:
@@ -204,7 +223,7 @@ class Trainer:
             self._note(f"step {self.step}, epoch {about['epoch']:.1f}, validation: {said}")
 
     def _save(self) -> None:
-        random = self._random_states()  # for which all processes have to come here
+        random, sums = self._random_states(), self._of_all(self._sums)  # for which all processes have to come here
         if any(not torch.isfinite(value).all() for value in (*self._sums.values(), self._norms)):
             return  # the next line of the log ends the run, and the last good checkpoint stays
         tensors = {f"model.{name}": value for name, value in self._bare.state_dict().items()}
@@ -212,7 +231,7 @@ class Trainer:
             tensors |= {f"average.{name}": value for name, value in self._average.state_dict().items()}
         optimizer = checkpoints.optimizer_tensors(self._optimizer)
         tensors |= {f"optimizer.{name}": value for name, value in optimizer.items()}
-        tensors |= {f"sums.{name}": value for name, value in self._sums.items()}
+        tensors |= {f"sums.{name}": value for name, value in sums.items()}
         tensors |= {f"random.{name}": state for name, state in random.items()}
         if not self._accelerator.is_main_process:
             return
@@ -254,67 +273,29 @@ class Trainer:
             checkpoints.put_in(self._average, checkpoints.part(tensors, "average."), path)
         checkpoints.put_in_optimizer(optimizer, checkpoints.part(tensors, "optimizer."))
         device = self._accelerator.device
-        self._sums = {name: value.to(device) for name, value in checkpoints.part(tensors, "sums.").items()}
+        mine = float(self._accelerator.is_main_process)  # they are those of all
+        self._sums = {name: mine * value.to(device) for name, value in checkpoints.part(tensors, "sums.").items()}
         self._set_random(checkpoints.part(tensors, "random."), path)
         self.step = int(about["step"])
 
 
-def make_accelerator(device: str, precision: Precision) -> Accelerator:
-    """What a run computes on.
+class _Reported:
+    """Samples whose errors are values: a worker's would come as a traceback's text."""
 
-    Args:
-        device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``.
-        precision: see `TrainSettings`.
+    def __init__(self, samples: Samples) -> None:
+        self._samples = samples
 
-    Raises:
-        TrainingError: there is no GPU.
-    """
-    if device == "cuda" and not torch.cuda.is_available():
-        raise TrainingError("there is no GPU that torch can use", where="--device", found="cuda", fix="--device cpu")
-    cpu = device == "cpu" or not torch.cuda.is_available()
-    if cpu:
-        _keep_memory()
-    if AcceleratorState._shared_state and AcceleratorState().num_processes == 1:  # of a run before, in this process
-        AcceleratorState._reset_state(reset_partial_state=True)
-    if precision == "auto":
-        precision = "bf16" if (_cpu_has_bf16() if cpu else torch.cuda.is_bf16_supported()) else "fp32"
-    return Accelerator(
-        cpu=cpu,
-        mixed_precision="bf16" if precision == "bf16" else "no",
-        dataloader_config=DataLoaderConfiguration(dispatch_batches=False),
-    )
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def __getitems__(self, indices: list[int]) -> Batch | RobocasError:
+        try:
+            return self._samples.__getitems__(indices)
+        except RobocasError as error:
+            return error
 
 
-def _keep_memory() -> None:
-    """Let glibc keep what is freed: else each step asks the system for pages anew, a tenth of its time."""
-    with suppress(OSError, AttributeError):  # another C library
-        libc = ctypes.CDLL(None)
-        libc.mallopt(_M_MMAP_MAX, 0)
-        libc.mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
-
-
-def _cpu_has_bf16() -> bool:
-    """Whether the processor multiplies bf16 by itself; where it does not, bf16 is slower than fp32."""
-    cpu: Any = torch.cpu
-    return any(getattr(cpu, name, bool)() for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"))
-
-
-def _summed(metric: torch.Tensor, samples: int) -> torch.Tensor:
-    """(2,) a sum and over how many it is, of a metric of a batch."""
-    metric = metric.double()
-    return metric if metric.ndim else torch.stack([metric * samples, torch.full_like(metric, samples)])
-
-
-def _means_of(sums: Mapping[str, torch.Tensor]) -> dict[str, float]:
-    """NaN of what no sample told."""
-    return {name: float(mean(value)) if value[1] else math.nan for name, value in sums.items()}
-
-
-def _sent(batch: Batch, accelerator: Accelerator) -> Batch:
-    return {name: tensor.to(accelerator.device, non_blocking=True) for name, tensor in batch.items()}
-
-
-def _loader(samples: Any, batches: Batches, workers: int) -> DataLoader:
+def _loader(samples: Any, batches: Any, workers: int) -> DataLoader:
     return DataLoader(
         samples,
         batch_sampler=batches,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +43,8 @@ class Train:
     seed: Maybe[int] = None
     """Of everything random; train.seed."""
     start: Maybe[Path] = None
-    """Folder of a run whose weights to begin with, such as one on less data. Default: random weights."""
+    """Folder of a run to begin with, such as one on less data: with its weights, and its configuration where no option
+    says otherwise. Default: random weights, the baseline's defaults."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where it computes. Auto: a GPU if there is one."""
     resume: bool = False
@@ -63,7 +65,8 @@ def main(cfg: Train) -> int:
             reading.stop()  # a terminal has room for one
             stepping.at(done, of)
 
-        said = Said(stepping.note, reading.at, step)
+        first = os.environ.get("RANK", "0") == "0"  # of several processes it speaks
+        said = Said(stepping.note, reading.at, step) if first else Said()
         try:
             train_run(
                 cfg.baseline,
@@ -78,7 +81,8 @@ def main(cfg: Train) -> int:
             )
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command with --resume goes on") from None
-    say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if cfg.data else 'P'}")
+    if first:
+        say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if cfg.data else 'P'}")
     return 0
 
 
@@ -91,7 +95,7 @@ def _default_out(cfg: Train) -> Path:
 
 def changes_of(cfg: Train) -> dict[str, Any]:
     """What differs from the defaults, as the file and the options have it; options win."""
-    from robocas_ms3.baselines.session import merged
+    from robocas_ms3.baselines.begin import merged
     from robocas_ms3.documents import load_yaml
     from robocas_ms3.errors import TrainingError
 

@@ -1,6 +1,7 @@
 """Datasets whose mobile base drives are refused; one that trembles stands."""
 
 import shutil
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from rt1_sizes import SIZES
 from synthetic import write_trajectory
 
-from robocas_ms3.baselines.bases import check_stands
+from robocas_ms3.baselines.bases import check_stands, check_tcp
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.bc_state.data import StateSamples
 from robocas_ms3.baselines.rt1 import BASELINE as RT1
@@ -31,6 +32,22 @@ def test_a_base_that_drives_at_once_or_slowly(column, rows):
     motion[:, column] = rows
     with pytest.raises(DatasetError, match="here: the base drives, which 7 numbers.*without base_motion"):
         check_stands(motion, "here")
+
+
+@pytest.mark.parametrize(("camera", "turn"), [((0.05, 0.0), None), ((0.0, 0.05), -90), ((0.0, -0.05), 90)])
+def test_actions_of_a_turned_tcp_are_refused(camera, turn):
+    """ManiSkill's gripper camera is on the x side of its TCP."""
+    pose = np.eye(4)
+    pose[:2, 3] = camera
+    episode = SimpleNamespace(camera_in_parent=lambda name: pose)
+    source = SimpleNamespace(root="here", cameras=["gripper_camera"], episode=lambda number: episode)
+    if turn is None:
+        check_tcp(source, 0)
+        return
+    with pytest.raises(
+        DatasetError, match=f"here: actions are in another frame.*turned by {turn} degrees.*import-robocas"
+    ):
+        check_tcp(source, 0)
 
 
 def driven(folder, tmp_path, side):

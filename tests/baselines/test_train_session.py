@@ -15,10 +15,11 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from robocas_ms3.baselines.begin import merged
 from robocas_ms3.baselines.policy import RunPolicy
-from robocas_ms3.baselines.session import Said, merged, train_run
+from robocas_ms3.baselines.session import Said, train_run
 from robocas_ms3.baselines.train import Trainer
-from robocas_ms3.errors import OutputExistsError, TrainingError
+from robocas_ms3.errors import DatasetError, OutputExistsError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
 
@@ -101,6 +102,24 @@ def test_a_crash_loses_what_came_after_the_last_checkpoint(whole, data, tmp_path
     train_run("made-up", data, out, device="cpu", resume=True, said=Said(step=lambda at, of: done.append(at)))
     assert done[0] == step // 10 * 10
     assert_same(whole, out)
+
+
+@pytest.mark.parametrize("at", [20, 40])
+def test_a_validation_can_be_broken_off_and_is_made_up_for(whole, data, tmp_path, monkeypatch, at):
+    checked = Trainer._checked
+
+    def broken(self, samples):
+        if self.step == at:
+            raise KeyboardInterrupt
+        return checked(self, samples)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "_checked", broken)
+        with pytest.raises(KeyboardInterrupt):
+            train_run("made-up", data, tmp_path / "again", device="cpu")
+    assert (str(at), "val") not in {(row["step"], row["split"]) for row in lines(tmp_path / "again")}
+    train_run("made-up", data, tmp_path / "again", device="cpu", resume=True)
+    assert_same(whole, tmp_path / "again")
 
 
 def test_what_is_done_is_done(whole, data):
@@ -278,6 +297,51 @@ def test_without_validation(made_up, data, tmp_path):
     train_run("made-up", data, tmp_path / "run", device="cpu", said=Said(note=notes.append))
     assert any("too few" in note for note in notes)
     assert {row["split"] for row in lines(tmp_path / "run")} == {"train"}
+
+
+def test_a_worker_says_what_is_wrong_in_a_line(made_up, data, tmp_path):
+    with pytest.raises(DatasetError) as caught:
+        train_run("made-up", data, tmp_path / "run", {"damaged_at": 7, "train": {"workers": 1}}, device="cpu")
+    assert str(caught.value) == "sample 7: damaged. Mend it."
+
+
+def test_what_another_trainer_left_is_no_run_to_go_on_with(made_up, data, tmp_path):
+    log = tmp_path / "run" / "metrics.csv"
+    log.parent.mkdir()
+    log.write_text("epoch,loss\n3,0.5\n")
+    with pytest.raises(OutputExistsError):
+        train_run("made-up", data, log.parent, device="cpu", resume=True)
+    assert log.read_text() == "epoch,loss\n3,0.5\n"
+
+
+def test_to_go_on_elsewhere_is_said_and_kept(whole, data):
+    _say(whole, device="cuda", versions={"torch": "1.0"})
+    notes = []
+    train_run("made-up", data, whole, device="cpu", resume=True, said=Said(note=notes.append))
+    (said,) = json.loads((whole / "run.json").read_text())["resumed"]
+    assert said.startswith("from step 40 by device cpu") and f"torch {torch.__version__}" in said
+    assert any(said in note for note in notes)
+
+
+def test_a_run_begins_as_the_one_it_starts_from_but_for_its_options(made_up, data, tmp_path):
+    changes = {"width": 8, "train": {"steps": 8, "learning_rate": 0.002}}
+    train_run("made-up", data, tmp_path / "first", changes, device="cpu")
+    record = train_run(
+        "made-up", data, tmp_path / "more", {"train": {"steps": 4}}, device="cpu", start=tmp_path / "first"
+    )
+    assert (record.config["width"], record.config["train"]["learning_rate"]) == (8, 0.002)
+    assert record.config["train"]["steps"] == 4
+    assert record.start.startswith("first, ")
+    about = make_policy(str(tmp_path / "more")).describe()
+    assert about["start"] == record.start and len(about["weights"]) == 64
+    assert about["weights"] != make_policy(str(tmp_path / "first")).describe()["weights"]
+
+
+def test_a_run_on_other_pictures_is_not_begun_with(whole, made_up, data, tmp_path, monkeypatch):
+    _say(whole, facts={"inputs": 3, "pictures": {"base_camera": [64, 48]}})
+    with pytest.raises(TrainingError, match="--start is of a run with other pictures"):
+        train_run("made-up", data, tmp_path / "more", device="cpu", start=whole)
+    assert not (tmp_path / "more").exists()
 
 
 def test_a_run_is_a_policy(whole):

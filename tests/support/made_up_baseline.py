@@ -20,6 +20,7 @@ from robocas_ms3.evaluation.policy import Wants
 class MadeUpConfig(BaselineConfig):
     width: int = 4
     broken_at: int = -1  # sample whose target is no number
+    damaged_at: int = -1  # sample that can't be read
     steep_at: int = -1  # sample whose loss is a number, and whose gradient is none
     train: TrainSettings = TrainSettings(
         steps=40, batch_size=4, log_every=4, check_every=20, save_every=10, warmup_steps=3, ema=0.9, precision="fp32"
@@ -29,7 +30,8 @@ class MadeUpConfig(BaselineConfig):
 class MadeUpSamples:
     episodes = 3
 
-    def __init__(self, broken_at, steep_at):
+    def __init__(self, broken_at, steep_at, damaged_at=-1):
+        self.damaged_at = damaged_at
         rng = np.random.default_rng(0)
         self.x = torch.from_numpy(rng.normal(size=(30, 3)).astype(np.float32))
         self.y = self.x.sum(1, keepdim=True)
@@ -42,6 +44,8 @@ class MadeUpSamples:
         return len(self.x)
 
     def __getitems__(self, indices):
+        if self.damaged_at in indices:
+            raise DatasetError("damaged", where=f"sample {self.damaged_at}", fix="Mend it.")
         return {"x": self.x[indices], "y": self.y[indices], "steep": self.steep[indices]}
 
 
@@ -80,7 +84,8 @@ class MadeUp:
     def data(self, config, folder, split, on_read):
         if split == "val" and folder.read_text() == "few":
             raise DatasetError("this split holds no episodes", where=folder)
-        return MadeUpSamples(*((config.broken_at, config.steep_at) if split == "train" else (-1, -1)))
+        bad = config.broken_at, config.steep_at, config.damaged_at
+        return MadeUpSamples(*(bad if split == "train" else (-1, -1)))
 
     def model(self, config, facts):
         return MadeUpModel(config, facts)

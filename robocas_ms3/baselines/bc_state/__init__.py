@@ -38,14 +38,15 @@ class BcState:
         """What acts by it."""
         device, size = next(model.parameters()).device, len(facts["inputs"]["mean"])
 
-        def predict(seen: Observations) -> NDArray[np.floating]:
+        def predict(seen: Observations, row: int) -> NDArray[np.floating]:
             assert seen.state is not None
-            told = inputs(seen.state, from_wxyz(seen.tcp_in_base), seen.gripper_width.reshape(-1))
+            one = slice(row, row + 1)
+            told = inputs(seen.state[one], from_wxyz(seen.tcp_in_base[one]), seen.gripper_width.reshape(-1)[one])
             if told.shape[1] != size:
                 what, fix = "other scenes than it was trained in", "Evaluate it in the task and scenes of its data."
                 raise EvaluationError(what, where="bc-state", expected=f"{size} numbers", found=told.shape[1], fix=fix)
             with torch.inference_mode():
-                return model.act(torch.from_numpy(told).to(device)).cpu().numpy()
+                return model.act(torch.from_numpy(told).to(device))[0].cpu().numpy()
 
         wants = Wants("robocas", reference="tcp", rate_hz=facts["rate_hz"], state=True, language="none")
         return ChunkPolicy(wants, predict, config.play, config.fade, {})

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
 from robocas_ms3.baselines.bases import check_stands
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
-from robocas_ms3.baselines.chunks import encode, next_keys, spread
+from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
 from robocas_ms3.baselines.runs import hash_of
-from robocas_ms3.baselines.small.data import state_of
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.documents import DAMAGED
 from robocas_ms3.errors import DatasetError

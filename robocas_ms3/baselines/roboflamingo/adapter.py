@@ -1,7 +1,8 @@
 """Lets a RoboFlamingo model act as a policy of ours, to be served over the policy socket. NumPy, no torch.
 
 RoboFlamingo's package pins torch 2.0.1, so it is served from its own environment: ``PolicyServer`` and this module need
-numpy, scipy, pydantic, PyYAML, platformdirs, msgpack and websockets beside it. docs/baselines.md has the script.
+numpy, scipy, pydantic, PyYAML, platformdirs, msgpack, websockets and OpenCV beside it. docs/baselines_lerobot.md has
+the script.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +21,8 @@ from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 
 HORIZON = 11  # frames: the paper's appendix, RoboFlamingo
-PICTURES = (320, 256)  # width, height: the paper trains it on the pictures of its RT-1 (evaluation_v0: 320 x 256 each)
+PICTURES = (320, 256)  # width, height: the paper trains it on the pictures of its RT-1
+STORED = (640, 480)  # as datasets hold them: 320 x 256 of these are not what a camera of 320 x 256 sees
 RATE_HZ = 5.0
 _BASE, _GRIPPER = "base_camera", "gripper_camera"
 
@@ -89,7 +92,8 @@ class RoboFlamingoPolicy:
     Args:
         model: that is asked.
         scale: ranges of the dataset that it was trained on, `scale_of`.
-        pictures: (width, height) in pixels.
+        pictures: (width, height) in pixels that the model is shown, whole pictures squeezed.
+        stored: (width, height) in pixels of the dataset that it was trained on.
         rate_hz: actions a second, the dataset's.
     """
 
@@ -98,10 +102,11 @@ class RoboFlamingoPolicy:
         model: WindowModel,
         scale: ActionScale,
         pictures: tuple[int, int] = PICTURES,
+        stored: tuple[int, int] = STORED,
         rate_hz: float = RATE_HZ,
     ) -> None:
-        self._model, self._scale = model, scale
-        cameras = {_BASE: pictures, _GRIPPER: pictures}
+        self._model, self._scale, self._pictures = model, scale, pictures
+        cameras = {_BASE: stored, _GRIPPER: stored}
         self.wants = Wants(convention="robocas", reference="tcp", rate_hz=rate_hz, cameras=cameras)
         self._frames: dict[int, deque[tuple[NDArray[np.uint8], NDArray[np.uint8]]]] = {}
 
@@ -125,7 +130,7 @@ class RoboFlamingoPolicy:
 
     def _act(self, env: int, observations: Observations, row: int) -> NDArray[np.float32]:
         frames, images = self._frames[env], observations.images
-        now = (images[_BASE][row].copy(), images[_GRIPPER][row].copy())
+        now = self._squeezed(images[_BASE][row]), self._squeezed(images[_GRIPPER][row])
         frames.extend([now] if frames else [now] * HORIZON)
         base, gripper = (np.stack(pictures) for pictures in zip(*frames, strict=True))
         action = np.asarray(self._model(base, gripper, observations.instructions[row]), np.float64)
@@ -135,6 +140,13 @@ class RoboFlamingoPolicy:
             expected = f"7 numbers, or {HORIZON} times 7"
             raise EvaluationError("no action of RoboFlamingo", expected=expected, found=action.tolist())
         return self._scale.decode(np.append(np.clip(action[:6], -1, 1), np.clip(action[6:], 0, 1)))
+
+    def _squeezed(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """A picture as the model knows them, in memory of its own: down by areas, as samples of a dataset are."""
+        if picture.shape[1::-1] == self._pictures:
+            return picture.copy()
+        found: Any = cv2.resize(picture, self._pictures, interpolation=cv2.INTER_AREA)
+        return found
 
 
 def scale_of(data_info: Path) -> ActionScale:

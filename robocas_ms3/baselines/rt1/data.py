@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 
 from robocas_ms3.baselines.baseline import Batch
-from robocas_ms3.baselines.bases import check_bases
+from robocas_ms3.baselines.bases import check_bases, check_tcp
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
@@ -45,6 +45,8 @@ class RT1Samples(torch.utils.data.Dataset):
     def __init__(self, config: RT1Config, folder: Path, split: Literal["train", "val"]) -> None:
         source = open_source(folder)
         _check(source, config)
+        for number in source.split(split)[:1]:
+            check_tcp(source, number)
         check_bases(source, source.split(split))
         self._data = RoboCASDataset(
             folder,

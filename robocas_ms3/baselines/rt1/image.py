@@ -9,6 +9,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from robocas_ms3.baselines.rt1.config import RT1Config
+from robocas_ms3.baselines.table import need_extra
 from robocas_ms3.language.embed import DIMENSIONS
 
 _SQUARE_PADDED = (5, 18)
@@ -91,6 +92,7 @@ class ImageEncoder(nn.Module):
 
 def efficientnet(config: RT1Config) -> Any:
     """EfficientNetModel of transformers, with random weights: B3 by default, whose features take 10.7 M parameters."""
+    need_extra("transformers")
     from transformers import EfficientNetConfig, EfficientNetModel
 
     net = EfficientNetModel(

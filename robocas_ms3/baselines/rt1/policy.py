@@ -55,36 +55,31 @@ class RT1Policy:
             self._held.pop(start.env, None)
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """(E, 7) motions and gripper commands."""
-        envs = observations.envs.tolist()
-        awake = [row for row, env in enumerate(envs) if env not in self._held]
-        actions = np.stack([self._held.get(env, np.zeros(7, np.float32)) for env in envs])
-        if awake:
-            self._look(observations, awake)
-            with torch.inference_mode():
-                tokens = torch.stack([torch.stack(tuple(self._frames[envs[row]])) for row in awake])
-                acted, over = (found.cpu().numpy() for found in self._model.act(tokens))
-            actions[awake] = acted
-            for row, ended in zip(awake, over.tolist(), strict=True):
-                if ended:
-                    self._held[envs[row]] = np.append(np.zeros(6, np.float32), actions[row, 6:])
-        return actions
+        """(E, 7) motions and gripper commands, each env by itself: in a batch they would depend on the others' bits."""
+        return np.stack([self._act(observations, row) for row in range(len(observations.envs))])
 
-    def _look(self, observations: Observations, rows: list[int]) -> None:
-        """Encode what some envs show, in one go."""
-        assert observations.embeddings is not None
-        views = [observations.images[name][rows] for name in self._config.cameras]
-        pictures = np.stack([[scaled(shot, self._config.picture) for shot in view] for view in views], axis=1)
-        device = self._model.mean.device
-        seen = torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 1, 4, 2, 3))).to(device)
+    def _act(self, observations: Observations, row: int) -> NDArray[np.floating]:
+        env, count = int(observations.envs[row]), self._config.frames
+        if env in self._held:
+            return self._held[env]
+        token = self._look(observations, row)
+        frames = self._frames.setdefault(env, deque([token] * count, maxlen=count))
+        frames.append(token)
         with torch.inference_mode():
-            tokens = self._model.encode(seen, torch.from_numpy(observations.embeddings[rows]).to(device))
-        for row, token in zip(rows, tokens, strict=True):
-            env, count = int(observations.envs[row]), self._config.frames
-            if env not in self._frames:
-                self._frames[env] = deque([token] * count, maxlen=count)
-            else:
-                self._frames[env].append(token)
+            acted, over = self._model.act(torch.stack(tuple(frames))[None])
+        action = acted[0].cpu().numpy()
+        if over[0]:
+            self._held[env] = np.append(np.zeros(6, np.float32), action[6:])
+        return action
+
+    def _look(self, observations: Observations, row: int) -> torch.Tensor:
+        """(images, token_width) of what an env shows."""
+        assert observations.embeddings is not None
+        views = [scaled(observations.images[name][row], self._config.picture) for name in self._config.cameras]
+        device = self._model.mean.device
+        seen = torch.from_numpy(np.stack(views).transpose(0, 3, 1, 2)[None].copy()).to(device)
+        with torch.inference_mode():
+            return self._model.encode(seen, torch.from_numpy(observations.embeddings[row : row + 1]).to(device))[0]
 
 
 def scaled(picture: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
+from robocas_ms3.evaluation.policy import CAMERAS
 from robocas_ms3.strict import StrictModel
 
 
@@ -20,6 +21,15 @@ class View(StrictModel):
     rendered: tuple[int, int] = (256, 192)
     part: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
     size: tuple[int, int] = (128, 96)
+
+    @model_validator(mode="after")
+    def _check(self) -> View:
+        left, top, right, bottom = self.part
+        if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
+            raise ValueError(f"part {list(self.part)} is none: left < right and top < bottom, in 0..1")
+        if min(self.rendered) < 16 or min(self.size) < 16 or any(number % 16 for number in self.size):
+            raise ValueError("size has to be multiples of 16, and rendered at least 16 pixels")
+        return self
 
     def box(self) -> tuple[int, int, int, int]:
         """Left, top, right, bottom of the part in pixels."""
@@ -73,3 +83,11 @@ class SmallConfig(BaselineConfig):
     play: int = Field(default=7, ge=1)
     fade: float = Field(default=0.15, ge=0)
     train: TrainSettings = TrainSettings(steps=3_500, batch_size=96, learning_rate=6e-4, weight_decay=0.01)
+
+    @model_validator(mode="after")
+    def _check(self) -> SmallConfig:
+        if not self.views or set(self.views) - set(CAMERAS):
+            raise ValueError(f"views have to be of some of {', '.join(CAMERAS)}")
+        if self.width % self.heads:
+            raise ValueError(f"width {self.width} has to be a multiple of heads {self.heads}")
+        return self

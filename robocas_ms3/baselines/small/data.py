@@ -18,8 +18,8 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
-from robocas_ms3.baselines.bases import check_bases
-from robocas_ms3.baselines.chunks import encode, next_keys, spread
+from robocas_ms3.baselines.bases import check_bases, check_tcp
+from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.pointing import places_of
 from robocas_ms3.baselines.small.standing import Standing, seen_from, standing
@@ -61,6 +61,7 @@ class SmallSamples:
         if not numbers:
             fix = "Add episodes: a tenth of them validates."
             raise DatasetError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
+        check_tcp(source, numbers[0])
         check_bases(source, numbers)
         seen = source.episode(numbers[0])
         first = np.concatenate([[0], np.cumsum([source.lengths[number] for number in numbers])])
@@ -196,12 +197,6 @@ def _spread_of_words(words: NDArray[np.floating]) -> dict[str, Any]:
     Instructions of a task differ in a name: a hundredth of what they have in common, and all that matters.
     """
     return {"mean": words.mean(0).tolist(), "deviation": np.maximum(words.std(0), _LEAST_WORD).tolist()}
-
-
-def state_of(poses: NDArray[np.floating], widths: NDArray[np.floating]) -> NDArray[np.float32]:
-    """(N, 10) of poses (N, 4, 4) of the TCP in the arm's base and gripper widths (N,), in m: what the arm feels."""
-    turns = poses[:, :3, :2].swapaxes(1, 2).reshape(len(poses), 6)
-    return np.concatenate([poses[:, :3, 3], turns, widths[:, None] / 0.08], axis=1).astype(np.float32)
 
 
 def looked_at(picture: NDArray[Any], view: View, where: object = "") -> NDArray[Any]:

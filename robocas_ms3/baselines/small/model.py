@@ -15,9 +15,10 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from robocas_ms3.baselines.baseline import Batch, mean
+from robocas_ms3.baselines.baseline import Batch
 from robocas_ms3.baselines.chunk_loss import chunk_losses
 from robocas_ms3.baselines.chunks import ROW, Scale
+from robocas_ms3.baselines.metrics import mean
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, Pointer, cells_of, pointing_losses
 

@@ -9,8 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.chunk_policy import ChunkPolicy
+from robocas_ms3.baselines.chunks import state_of
 from robocas_ms3.baselines.small.config import SmallConfig
-from robocas_ms3.baselines.small.data import looked_at, state_of
+from robocas_ms3.baselines.small.data import looked_at
 from robocas_ms3.baselines.small.model import SmallModel
 from robocas_ms3.evaluation.policy import Observations, Wants
 from robocas_ms3.poses import from_wxyz
@@ -20,17 +21,14 @@ def make_policy(config: SmallConfig, facts: dict[str, Any], model: SmallModel) -
     """A trained network as a policy, on the device that its weights are on."""
     device = next(model.parameters()).device
 
-    def predict(seen: Observations) -> NDArray[np.floating]:
-        count = len(seen.envs)
-        words = seen.embeddings if seen.embeddings is not None else np.zeros((count, 384), np.float32)
-        batch = {
-            camera: torch.from_numpy(np.stack([looked_at(picture, view) for picture in seen.images[camera]]))
-            for camera, view in config.views.items()
-        }
-        state = state_of(from_wxyz(seen.tcp_in_base), seen.gripper_width.reshape(-1))
-        batch |= {"state": torch.from_numpy(state), "words": torch.from_numpy(words)}
+    def predict(seen: Observations, row: int) -> NDArray[np.floating]:
+        words = seen.embeddings[row] if seen.embeddings is not None else np.zeros(384, np.float32)
+        state = state_of(from_wxyz(seen.tcp_in_base[row : row + 1]), seen.gripper_width.reshape(-1)[row : row + 1])
+        shown = {camera: looked_at(seen.images[camera][row], view) for camera, view in config.views.items()}
+        batch = {**shown, "words": words, "state": state[0]}
         with torch.inference_mode():
-            return model.act({name: value.to(device) for name, value in batch.items()}).cpu().numpy()
+            chunks = model.act({name: torch.from_numpy(value)[None].to(device) for name, value in batch.items()})
+        return chunks[0].cpu().numpy()
 
     wants = Wants(
         convention="robocas",

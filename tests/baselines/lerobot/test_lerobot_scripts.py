@@ -19,6 +19,20 @@ def test_both_make_one_environment():
     assert lists[0][1] == lists[1][1]
 
 
+@pytest.mark.parametrize("begun", ["diffusion 0123 ", None])
+def test_an_out_of_something_else_is_not_gone_on_with(tmp_path, begun):
+    (tmp_path / "data" / "meta").mkdir(parents=True)
+    (tmp_path / "data" / "meta" / "info.json").write_text("{}")
+    (tmp_path / "out" / "dataset").mkdir(parents=True)
+    if begun:
+        (tmp_path / "out" / "asked").write_text(begun)
+    words = ["bash", SCRIPTS / "train_lerobot.sh", "act", tmp_path / "data", tmp_path / "out", "40000"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1 and "name another out" in done.stderr.lower()
+    assert [path.name for path in (tmp_path / "out").iterdir() if path.name != "asked"] == ["dataset"]
+
+
 @pytest.mark.parametrize(
     "name, words", [("train_lerobot.sh", []), ("train_lerobot.sh", ["act", "nowhere", "out"]), ("serve_lerobot.sh", [])]
 )

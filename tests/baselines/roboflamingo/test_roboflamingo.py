@@ -75,7 +75,22 @@ def numbers(window):
 def test_what_it_wants():
     wants = RoboFlamingoPolicy(Windows(), SCALE).wants
     assert (wants.convention, wants.reference, wants.rate_hz, wants.language) == ("robocas", "tcp", 5, "text")
-    assert wants.cameras == {"base_camera": (320, 256), "gripper_camera": (320, 256)}
+    assert wants.cameras == {"base_camera": (640, 480), "gripper_camera": (640, 480)}
+
+
+def test_pictures_are_squeezed_whole():
+    """As samples of a dataset are: what is at the edge stays there, at another aspect."""
+    model = Windows()
+    policy = RoboFlamingoPolicy(model, SCALE, pictures=(8, 3), stored=(16, 12))
+    policy.reset([a_start(0)])
+    seen = shown({0: 1})
+    seen.images.update(gripper_camera=np.ones((1, 12, 16, 3), np.uint8))
+    seen.images["base_camera"] = np.ones((1, 12, 16, 3), np.uint8)
+    seen.images["base_camera"][0, :, 8:] = 200
+    policy.act(seen)
+    base = model.seen[0][0][0]
+    assert base.shape == (3, 8, 3)
+    assert (base[:, :4] == 1).all() and (base[:, 4:] == 200).all()
 
 
 def test_the_first_frame_is_repeated_and_eleven_are_kept():

@@ -122,28 +122,28 @@ def test_a_step_encodes_one_frame_an_env(policy, model, seen):
     policy.reset(begin(0, 1, 2))
     for step in range(3):
         policy.act(observations([0, 1, 2], shots[step], words))
-    assert counts == [3, 3, 3]
+    assert counts == [1] * 9
 
 
 def test_after_the_end_an_env_holds_still(policy, model, seen):
     """The action beside the end is still done; others go on, and a new episode wakes."""
     shots, words = seen
-    ends = [[False, False], [False, True], [False], [True, False]]  # of envs that are awake
-    actions = torch.full((2, 7), 0.03)
-    actions[1, 6] = 0.9
+    moving, gripper = [0.03] * 7, [0.03] * 6 + [0.9]
+    said = [(moving, False), (gripper, False)]  # of 4 and 7
+    said += [(moving, False), (gripper, True), (moving, False), (moving, True), (gripper, False)]
 
     def act(tokens):
-        return actions[2 - len(tokens) :], torch.tensor(ends.pop(0))
+        action, over = said.pop(0)
+        return torch.tensor([action]), torch.tensor([over])
 
     model.act = act
     policy.reset(begin(4, 7))
     shown = observations([4, 7], shots[0, :2], words[:2])
-    moving, gripper = [0.03] * 7, [0.03] * 6 + [0.9]
     still = [0.0] * 6 + [0.9]
     assert np.allclose(policy.act(shown), [moving, gripper])
     assert np.allclose(policy.act(shown), [moving, gripper])  # here the second tells its end
-    assert np.allclose(policy.act(shown), [gripper, still])  # the stub's last row is the first env's now
+    assert np.allclose(policy.act(shown), [moving, still])
     policy.reset(begin(7))
     assert np.allclose(policy.act(shown), [moving, gripper])
-    assert ends == []
+    assert said == []
     assert np.allclose(policy.act(observations([4], shots[0, :1], words[:1])), [[0.0] * 6 + [0.03]])  # asks nobody

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from robocas_ms3.baselines.baseline import mean
+from robocas_ms3.baselines.metrics import mean
 from robocas_ms3.baselines.small.config import View
 from robocas_ms3.baselines.small.pointing import NOWHERE, Pointer, cells_of, places_of, pointing_losses
 

@@ -6,12 +6,14 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 
 from robocas_ms3.baselines.chunks import decode
 from robocas_ms3.baselines.small import BASELINE, data
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.data import looked_at
 from robocas_ms3.baselines.small.model import shifted
+from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, pointing_losses
 from robocas_ms3.baselines.small.standing import Standing
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.errors import DatasetError
@@ -164,19 +166,56 @@ def test_it_is_shown_pictures_of_the_size_it_learned_by(folder):
     assert policy.wants.cameras == {"base_camera": (64, 48), "gripper_camera": (64, 48)}
 
 
-def test_what_is_to_be_found_moves_with_a_picture(samples):
-    """Shifted by two cells at most, a picture's answers are where its pixels are."""
+def test_what_is_to_be_found_moves_with_a_picture(samples, monkeypatch):
+    """A picture's answers are asked for where the place's pixel is once it is shifted."""
     torch.manual_seed(0)
     model = BASELINE.model(SmallConfig(**{**TINY, "shift": 16}), samples.facts).train()
     batch = samples.__getitems__([0] * 64)
-    by = model._shifts(batch["base_camera"])
-    assert by.min() == -16 and by.max() == 16
-    marked = torch.zeros_like(batch["base_camera"])
     x, y = batch["base_camera_place"][0].long().tolist()
-    marked[:, y, x] = 255
-    for picture, (right, down) in zip(shifted(marked, by), by.tolist(), strict=True):
-        there = 0 <= x + right < 64 and 0 <= y + down < 48
-        assert not there or picture[y + down, x + right].tolist() == [255, 255, 255]
+    batch["base_camera"] = torch.zeros_like(batch["base_camera"])
+    batch["base_camera"][:, y, x] = 255
+    seen, cells = [], []
+
+    def look(pictures):
+        seen.append(pictures["base_camera"])
+        return looking(pictures)
+
+    def losses(logits, answers, columns):
+        cells.append(answers)
+        return pointing_losses(logits, answers, columns)
+
+    looking = model._look
+    monkeypatch.setattr(model, "_look", look)
+    monkeypatch.setattr("robocas_ms3.baselines.small.model.pointing_losses", losses)
+    model(batch)
+    bright = seen[0][:, 0] > 0  # (64, 48, 64)
+    for picture, cell in zip(bright, cells[0][:, 0].tolist(), strict=True):
+        rows, columns = (np.unique(where // CELL) for where in np.nonzero(picture.numpy()))
+        if cell == NOWHERE:
+            continue  # out of the picture; what shows is the edge going on
+        assert cell in {row * (64 // CELL) + column for row in rows for column in columns}
+    assert len({tuple(one) for one in cells[0].tolist()}) > 8
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"heads": 3, "width": 32}, "multiple of heads"),
+        ({"views": {}}, "views have to be"),
+        ({"views": {"kitchen_camera": VIEW}}, "views have to be"),
+    ],
+)
+def test_networks_that_there_are_not(change, message):
+    with pytest.raises(ValidationError, match=message):
+        SmallConfig(**{**TINY, **change})
+
+
+@pytest.mark.parametrize(
+    "change", [{"size": (100, 96)}, {"part": (0.5, 0, 0.4, 1)}, {"part": (0, 0, 1.2, 1)}, {"rendered": (0, 0)}]
+)
+def test_views_that_there_are_not(change):
+    with pytest.raises(ValidationError):
+        View(**change)
 
 
 def _forget(folder, what):

@@ -1,0 +1,170 @@
+"""What a run begins with, or goes on with: its configuration, another run's weights, and what has to be the same."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.baselines.baseline import Baseline, BaselineConfig
+from robocas_ms3.baselines.runs import CHECKPOINT, RUN, WEIGHTS, RunRecord, hash_of_weights, read_run
+from robocas_ms3.errors import TrainingError
+from robocas_ms3.strict import parse
+
+_SEEN = ("rate_hz", "pictures", "cameras")
+"""Facts that a run shares with the one it begins with."""
+_PACKAGES = ("robocas-ms3", "torch", "accelerate", "safetensors", "transformers", "numpy")
+
+
+@dataclass(frozen=True)
+class Start:
+    """The run that another one begins with.
+
+    Attributes:
+        record: of it.
+        name: of its folder, with a hash of its weights.
+        weights: its own; None where the other one has a checkpoint already.
+    """
+
+    record: RunRecord
+    name: str
+    weights: dict[str, Any] | None
+
+
+def find_start(baseline: Baseline, start: Path | None, before: RunRecord | None, out: Path) -> Start | None:
+    """The run to begin with, where there is one.
+
+    Raises:
+        TrainingError: it is of another baseline or version, or has no weights; or what goes on began with others.
+    """
+    from robocas_ms3.baselines import checkpoints
+
+    begun = before is not None and (out / CHECKPOINT).is_file()
+    if start is None:
+        if before is not None and before.start and not begun:
+            what = "this run had no checkpoint yet, and begins with another's weights"
+            raise TrainingError(what, where=out, expected=before.start, fix="Name that run by --start again.")
+        return None
+    record = read_run(start)
+    name = f"{start.resolve().name}, {hash_of_weights(start)[:12]}"
+    if before is not None and before.start != name:
+        fix = "Leave --start out, or train anew with --overwrite."
+        raise TrainingError(
+            "a run goes on from what it began with",
+            where=out,
+            expected=before.start or "no --start",
+            found=name,
+            fix=fix,
+        )
+    expected = {"baseline": baseline.name, "version": str(baseline.version)}
+    return Start(record, name, None if begun else checkpoints.load(start / WEIGHTS, expected)[0])
+
+
+def config_of(
+    baseline: Baseline, changes: Mapping[str, Any] | None, before: RunRecord | None, begin: Start | None, out: Path
+) -> BaselineConfig:
+    """The configuration of a run: as it was begun, or as the run that it begins with, or the defaults, and ``changes``.
+
+    Raises:
+        TrainingError: it is wrong, or a run that goes on would have another one.
+    """
+    if before is None:
+        below = begin.record.config if begin else baseline.Config().model_dump(mode="json")
+        return parse(baseline.Config, merged(below, changes or {}), TrainingError, where=baseline.name)
+    config = parse(baseline.Config, before.config, TrainingError, where=out / RUN)
+    if changes:
+        wanted = parse(baseline.Config, merged(before.config, changes), TrainingError, where=baseline.name)
+        if wanted != config:
+            fix = "Leave these options out, or train anew with --overwrite."
+            raise TrainingError("a run goes on as it was begun", where=out, fix=fix)
+    return config
+
+
+def precision_of(config: BaselineConfig, before: RunRecord | None) -> Any:
+    """A run goes on in what it was begun in, whatever is fast here."""
+    if before is None or config.train.precision != "auto":
+        return config.train.precision
+    return "bf16" if before.precision == "bf16" else "fp32"
+
+
+def facts_of(own: dict[str, Any], begin: Start | None, data: Path | None) -> dict[str, Any]:
+    """What a network and its policy know of the data; the scales are those that its weights were learned by.
+
+    Raises:
+        TrainingError: the run that it begins with saw something else.
+    """
+    if begin is None:
+        return own
+    for key in _SEEN:
+        if own.get(key) != begin.record.facts.get(key):
+            raise TrainingError(
+                f"--start is of a run with other {key}",
+                where=data or begin.name,
+                expected=begin.record.facts.get(key),
+                found=own.get(key),
+                fix="Convert the data as it was for that run, or begin without it.",
+            )
+    return begin.record.facts
+
+
+def others(record: RunRecord, accelerator: Any) -> str:
+    """By what else than it was begun by a run goes on, which does not give the same to the bit; empty: nothing else."""
+    now = {
+        "device": str(accelerator.device.type),
+        "precision": str(accelerator.mixed_precision),
+        **versions(),
+    }
+    before = {"device": record.device, "precision": record.precision, **record.versions}
+    return ", ".join(f"{name} {value}" for name, value in now.items() if before.get(name) != value)
+
+
+def check_kind(before: RunRecord, baseline: Baseline, out: Path) -> None:
+    """See that a run is of a baseline, before its configuration is read, which another version may have otherwise."""
+    if before.baseline != baseline.name:
+        raise TrainingError("a run of another baseline", where=out, expected=baseline.name, found=before.baseline)
+    if before.version != baseline.version:
+        raise TrainingError(
+            f"a run of another version of {baseline.name}",
+            where=out,
+            expected=baseline.version,
+            found=before.version,
+            fix="Train anew with --overwrite.",
+        )
+
+
+def check_same_data(before: RunRecord, hashed: str, out: Path) -> None:
+    """See that a run goes on with the data that it was begun with.
+
+    Raises:
+        TrainingError: it is other data.
+    """
+    if before.data.hash != hashed:
+        raise TrainingError(
+            "a run on another dataset",
+            where=out,
+            expected=f"{before.data.name}, {before.data.hash[:12]}",
+            found=hashed[:12],
+            fix="Name that one by --data, or choose another --out.",
+        )
+
+
+def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested mappings, the second one's values first."""
+    result = dict(below)
+    for key, value in above.items():
+        inner = result.get(key)
+        result[key] = merged(inner, value) if isinstance(inner, Mapping) and isinstance(value, Mapping) else value
+    return result
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that results depend on, of those that are installed."""
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found

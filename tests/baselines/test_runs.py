@@ -1,0 +1,40 @@
+"""What a run keeps of its data and its weights."""
+
+import pytest
+
+from robocas_ms3.baselines.runs import WEIGHTS, hash_of, hash_of_weights
+from robocas_ms3.errors import TrainingError
+
+
+def test_a_trajectory_is_both_of_its_files(tmp_path):
+    path = tmp_path / "trajectory.h5"
+    path.write_text("states")
+    alone = hash_of(path)
+    path.with_suffix(".json").write_text("seeds")
+    assert hash_of(path) != alone
+    path.with_suffix(".json").write_text("other seeds")
+    assert len({alone, hash_of(path)}) == 2
+
+
+def test_a_folder_is_its_arrays_and_sizes_of_pictures(tmp_path):
+    for name, text in (("data_info.json", "{}"), ("episode_0/rgb/0.png", "abc"), ("preview/0.png", "a")):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    before = hash_of(tmp_path)
+    (tmp_path / "preview/0.png").write_text("bcd")
+    assert hash_of(tmp_path) == before
+    (tmp_path / "episode_0/rgb/0.png").write_text("abcd")
+    longer = hash_of(tmp_path)
+    (tmp_path / "data_info.json").write_text("[]")
+    assert len({before, longer, hash_of(tmp_path)}) == 3
+
+
+def test_nothing_is_no_dataset(tmp_path):
+    with pytest.raises(TrainingError, match="no dataset here"):
+        hash_of(tmp_path / "nowhere")
+
+
+def test_weights(tmp_path):
+    assert hash_of_weights(tmp_path) == ""
+    (tmp_path / WEIGHTS).write_bytes(b"")
+    assert hash_of_weights(tmp_path) == "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"  # of nothing
