@@ -1,0 +1,59 @@
+"""Training on a device in a precision, broken off and gone on with, and what comes of it acting."""
+
+import json
+
+import numpy as np
+import pytest
+from rt1_sizes import SIZES
+
+from robocas_ms3.baselines.policy import RunPolicy
+from robocas_ms3.baselines.session import Said, train_run
+from robocas_ms3.evaluation.policy import Observations, Start
+
+VIEW = {"rendered": [64, 48], "size": [64, 48]}
+CHANGES = {
+    "small": {"views": {"base_camera": VIEW, "gripper_camera": VIEW}, "channels": 8, "width": 32, "heads": 2},
+    "rt1": SIZES,
+}
+TRAIN = {"steps": 6, "batch_size": 4, "log_every": 2, "check_every": 3, "save_every": 2, "workers": 0}
+
+
+def stop_at(step):
+    def look(done, of):
+        if done == step:
+            raise KeyboardInterrupt
+
+    return Said(step=look)
+
+
+def check(dataset, tmp_path, name, precision, device):
+    out = tmp_path / "run"
+    changes = {**CHANGES[name], "train": {**TRAIN, "precision": precision}}
+    with pytest.raises(KeyboardInterrupt):
+        train_run(name, dataset, out, changes, device=device, said=stop_at(3))
+    record = train_run(name, dataset, out, device=device, resume=True)
+    assert (record.device, record.resumed) == (device, [])
+    rows = (out / "metrics.csv").read_text().splitlines()
+    assert [row.split(",")[:2] for row in rows[1:]] == [
+        [step, split] for step, split in (("2", "train"), ("3", "val"), ("4", "train"), ("6", "train"), ("6", "val"))
+    ]
+    policy = RunPolicy(out, device)
+    policy.reset([Start(0, 0, "pick", "", "", "builtin", 0, ""), Start(1, 0, "pick", "", "", "builtin", 0, "")])
+    sizes = {camera: size for camera, size in policy.wants.cameras.items()}
+    nothing = np.zeros((2, 12), np.float32)
+    here = np.tile(np.array([0.5, 0, 0.3, 1, 0, 0, 0], np.float32), (2, 1))
+    seen = Observations(
+        envs=np.arange(2),
+        instructions=["", ""],
+        embeddings=np.ones((2, 384), np.float32),
+        images={camera: np.zeros((2, height, width, 3), np.uint8) for camera, (width, height) in sizes.items()},
+        depths={},
+        qpos=nothing,
+        tcp_in_base=here,
+        gripper_width=nothing[:, :1],
+        state=None,
+    )
+    acted = policy.act(seen)
+    assert acted.shape == (2, 7) and np.isfinite(acted).all()
+    assert np.array_equal(acted[0], acted[1])
+    assert json.loads((out / "run.json").read_text())["precision"] == ("bf16" if precision == "bf16" else "no")
