@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from pydantic import Field, model_validator
+from typing import Any
+
+from pydantic import Field, field_validator, model_validator
 
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
 from robocas_ms3.evaluation.policy import CAMERAS
@@ -42,8 +44,8 @@ class SmallConfig(BaselineConfig):
     """Configuration of `small`.
 
     Attributes:
-        views: by camera. The base camera sees the room from behind the arm: what can be reached lies in the lower
-            middle of its picture.
+        views: by camera; null leaves one out. The base camera sees the room from behind the arm: what can be reached lies
+            in the lower middle of its picture.
         language: whether it is told what to do.
         chunk: steps it predicts, at the dataset's rate.
         channels: of the first feature maps.
@@ -83,6 +85,13 @@ class SmallConfig(BaselineConfig):
     play: int = Field(default=7, ge=1)
     fade: float = Field(default=0.15, ge=0)
     train: TrainSettings = TrainSettings(steps=3_500, batch_size=96, learning_rate=6e-4, weight_decay=0.01)
+
+    @field_validator("views", mode="before")
+    @classmethod
+    def _left_out(cls, views: Any) -> Any:
+        if not isinstance(views, dict):
+            return views
+        return {camera: view for camera, view in views.items() if view is not None}
 
     @model_validator(mode="after")
     def _check(self) -> SmallConfig:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 
+from robocas_ms3.baselines.begin import merged
 from robocas_ms3.baselines.chunks import decode
 from robocas_ms3.baselines.small import BASELINE, data
 from robocas_ms3.baselines.small.config import SmallConfig, View
@@ -16,9 +17,10 @@ from robocas_ms3.baselines.small.model import shifted
 from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, pointing_losses
 from robocas_ms3.baselines.small.standing import Standing
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.errors import DatasetError, TrainingError
 from robocas_ms3.evaluation.policy import Observations, Start
 from robocas_ms3.poses import to_wxyz
+from robocas_ms3.strict import parse
 
 VIEW = View(rendered=(64, 48), size=(64, 48))
 TINY = dict(
@@ -208,6 +210,16 @@ def test_what_is_to_be_found_moves_with_a_picture(samples, monkeypatch):
 def test_networks_that_there_are_not(change, message):
     with pytest.raises(ValidationError, match=message):
         SmallConfig(**{**TINY, **change})
+
+
+def test_a_camera_may_be_left_out(folder):
+    """As `--set views.gripper_camera=null` says it, above the defaults."""
+    config = parse(SmallConfig, merged(TINY, {"views": {"gripper_camera": None}}), TrainingError, where="small")
+    assert list(config.views) == ["base_camera"]
+    samples = BASELINE.data(config, folder, "val", lambda done, of: None)
+    model = BASELINE.model(config, samples.facts)
+    assert torch.isfinite(model(samples.__getitems__([0, 1]))["loss"])
+    assert BASELINE.policy(config, samples.facts, model).wants.cameras == {"base_camera": (64, 48)}
 
 
 @pytest.mark.parametrize(
