@@ -44,8 +44,8 @@ class SmallConfig(BaselineConfig):
     """Configuration of `small`.
 
     Attributes:
-        views: by camera; null leaves one out. The base camera sees the room from behind the arm: what can be reached lies
-            in the lower middle of its picture.
+        views: by camera; null leaves one out. The base camera sees the room from behind the arm: what can be reached
+            lies in the lower middle of its picture.
         language: whether it is told what to do.
         chunk: steps it predicts, at the dataset's rate.
         channels: of the first feature maps.
