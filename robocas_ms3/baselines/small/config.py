@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Annotated
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
 from robocas_ms3.evaluation.policy import CAMERAS
@@ -40,6 +40,12 @@ class View(StrictModel):
         return round(left * width), round(top * height), round(right * width), round(bottom * height)
 
 
+if TYPE_CHECKING:
+    Views = dict[str, View]
+else:  # null above a default's leaves that camera out
+    Views = Annotated[dict[str, View | None], AfterValidator(lambda views: {k: v for k, v in views.items() if v})]
+
+
 class SmallConfig(BaselineConfig):
     """Configuration of `small`.
 
@@ -64,7 +70,7 @@ class SmallConfig(BaselineConfig):
         train: see `TrainSettings`.
     """
 
-    views: dict[str, View] = {
+    views: Views = {
         "base_camera": View(part=(0.17, 0.5, 0.8, 1.0), size=(160, 96)),
         "gripper_camera": View(),
     }
@@ -85,13 +91,6 @@ class SmallConfig(BaselineConfig):
     play: int = Field(default=7, ge=1)
     fade: float = Field(default=0.15, ge=0)
     train: TrainSettings = TrainSettings(steps=3_500, batch_size=96, learning_rate=6e-4, weight_decay=0.01)
-
-    @field_validator("views", mode="before")
-    @classmethod
-    def _left_out(cls, views: Any) -> Any:
-        if not isinstance(views, dict):
-            return views
-        return {camera: view for camera, view in views.items() if view is not None}
 
     @model_validator(mode="after")
     def _check(self) -> SmallConfig:
