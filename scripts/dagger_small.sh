@@ -19,8 +19,6 @@ out=$from/dagger
 [[ -f $from/run/weights.safetensors ]] || fail "$from: no run; bash scripts/reproduce_small.sh $task $from makes it"
 episodes=${EPISODES:-300} seed=${SEED:-570000} steps=${STEPS:-1800}
 jobs=${JOBS:-$(nproc)}
-size=(256 192)
-[[ $task == pick ]] || size=(512 384)
 robocas=${ROBOCAS:-.venv/bin/robocas}
 
 timed() {
@@ -32,7 +30,7 @@ timed() {
 mkdir -p "$out"
 timed "$robocas" generate "$task" --config "${task}_upstream_eval" -n "$episodes" --seed "$seed" --jobs "$jobs" \
     --after-policy "$from/run" --out "$out/demos" --resume
-timed "$robocas" convert "$out/demos/trajectory.h5" --out "$out/parts" --size "${size[@]}" --no-depth --no-video \
+timed "$robocas" convert "$out/demos/trajectory.h5" --out "$out/parts" --size 512 384 --no-depth --no-video \
     --cameras base_camera gripper_camera --jobs "$jobs" --resume
 timed "$robocas" merge "$from/data" "$out/parts" --out "$out/data" --resume
 timed "$robocas" train small --data "$out/data" --out "$out/run" --start "$from/run" --steps "$steps" --resume

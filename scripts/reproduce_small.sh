@@ -17,13 +17,12 @@ fail() { printf 'reproduce_small: error: %s\n' "$*" >&2; exit 2; }
 # learns to choose among several of a kind, but of these fruits only two stand, so that the others come scattered. A search
 # ends in a pick from the heap: what is at hand there is shorter to record than what has to be cleared.
 task=${1:-}
-attempts=20 size=(256 192) changes=()
+attempts=20
 case $task in
     pick) parts=(pick:pick_upstream_eval:100) played=pick ;;
     select) parts=(select:select_fruits_orderly:30 pick:pick_fruits_alike:70) played=pick ;;
-    search) # one heap in ten takes half of the time, unless it is given up early; objects are small in the base picture
-        parts=(search:search_upstream_eval:35 pick:pick_heap:65) played=search attempts=3
-        size=(512 384) changes=(--config scripts/small_search.yaml) ;;
+    search) # one heap in ten takes half of the time, unless it is given up early
+        parts=(search:search_upstream_eval:35 pick:pick_heap:65) played=search attempts=3 ;;
     *) fail "which task? bash scripts/reproduce_small.sh pick|select|search [FOLDER]" ;;
 esac
 out=${2:-reproduced/$task}
@@ -44,10 +43,10 @@ for part in "${parts[@]}"; do
     IFS=: read -r of config percent <<<"$part"
     timed "$robocas" generate "$of" --config "$config" -n $((episodes * percent / 100)) --seed "$seed" --jobs "$jobs" \
         --max-attempts "$attempts" --out "$out/demos/$config" --resume
-    timed "$robocas" convert "$out/demos/$config/trajectory.h5" --out "$out/parts/$config" --size "${size[@]}" --no-depth --no-video \
+    timed "$robocas" convert "$out/demos/$config/trajectory.h5" --out "$out/parts/$config" --size 512 384 --no-depth --no-video \
         --cameras base_camera gripper_camera --jobs "$jobs" --resume
     data+=("$out/parts/$config")
 done
 timed "$robocas" merge "${data[@]}" --out "$out/data" --resume
-timed "$robocas" train small --data "$out/data" --out "$out/run" --steps "$steps" "${changes[@]}" --resume
+timed "$robocas" train small --data "$out/data" --out "$out/run" --steps "$steps" --resume
 timed "$robocas" eval "$played" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs" --resume

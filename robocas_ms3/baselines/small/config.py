@@ -20,7 +20,7 @@ class View(StrictModel):
         size: width and height that this part is scaled to, in pixels; multiples of 16.
     """
 
-    rendered: tuple[int, int] = (256, 192)
+    rendered: tuple[int, int] = (512, 384)
     part: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
     size: tuple[int, int] = (128, 96)
 
@@ -51,7 +51,7 @@ class SmallConfig(BaselineConfig):
 
     Attributes:
         views: by camera; null leaves one out. The base camera sees the room from behind the arm: what can be reached
-            lies in the lower middle of its picture.
+            lies in the lower middle of its picture, objects of upstream's scenes in a fiftieth of it.
         language: whether it is told what to do.
         chunk: steps it predicts, at the dataset's rate.
         channels: of the first feature maps.
@@ -71,7 +71,7 @@ class SmallConfig(BaselineConfig):
     """
 
     views: Views = {
-        "base_camera": View(part=(0.17, 0.5, 0.8, 1.0), size=(160, 96)),
+        "base_camera": View(part=(0.30, 0.60, 0.62, 0.90), size=(160, 112)),
         "gripper_camera": View(),
     }
     language: bool = True

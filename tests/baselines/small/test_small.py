@@ -265,5 +265,5 @@ def test_data_that_does_not_suit_it(folder, tmp_path, spoil, message):
 
 
 def test_pictures_that_are_too_small(folder):
-    with pytest.raises(DatasetError, match="robocas convert --size 256 192"):
+    with pytest.raises(DatasetError, match="robocas convert --size 512 384"):
         BASELINE.data(SmallConfig(), folder, "train", lambda done, of: None)
