@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -30,10 +31,11 @@ class MetricsLog:
         self._had: set[tuple[int, str]] = set()
         self.seconds = 0.0
         """Spent up to ``step`` by those before."""
-        goes_on = self._path.is_file()
-        if goes_on:
+        if self._path.is_file():
             self._cut(step)
-        self._board: Any = SummaryWriter(str(folder / BOARD), purge_step=step + 1 if goes_on else None)
+        if not step:
+            shutil.rmtree(folder / BOARD, ignore_errors=True)
+        self._board: Any = SummaryWriter(str(folder / BOARD), purge_step=step + 1 if step else None)
 
     def has(self, step: int, split: str) -> bool:
         """Whether those before wrote that line."""

@@ -27,7 +27,7 @@ def test_a_line_that_was_cut_off_is_none(tmp_path):
 
 
 def test_a_run_without_a_checkpoint_begins_its_curves_anew(tmp_path):
-    """What TensorBoard has of before is purged."""
+    """What TensorBoard has of before goes."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     for loss in (5.0, 1.0):

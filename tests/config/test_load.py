@@ -85,7 +85,7 @@ def test_broken_yaml_and_missing_files_are_errors(tmp_path):
     with pytest.raises(ConfigError, match="not valid YAML"):
         load_task_config(file)
     with pytest.raises(ConfigError, match="no such task configuration.*pick_table_scattered"):
-        load_task_config("pick_chair")
+        load_task_config("pick_table_scatered")
 
 
 def test_a_loaded_configuration_survives_a_round_trip():
