@@ -1,17 +1,35 @@
 """A made-up baseline, and a small dataset for real ones."""
 
+from pathlib import Path
+
 import pytest
+import yaml
 from made_up_baseline import MadeUp
 from synthetic import RayCaster, made_up_vectors, write_trajectory
 
 from robocas_ms3.baselines.table import BASELINES
+from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.writing.convert import convert
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
 def made_up(monkeypatch):
     monkeypatch.setitem(BASELINES.builtin, "made-up", MadeUp)
     return MadeUp
+
+
+@pytest.fixture(scope="session")
+def short(tmp_path_factory):
+    """A protocol: three episodes of paper-v1, 60 steps each."""
+    made = tmp_path_factory.mktemp("protocol")
+    plan = yaml.safe_load((ROOT / "scripts" / "protocols" / "paper-v1.yaml").read_text())
+    plan["rules"] |= {"name": "short", "max_steps": 60}
+    plan["parts"] = [{"config": "pick_upstream_eval", "count": 3, "first_seed": 130000}]
+    (made / "plan.yaml").write_text(yaml.safe_dump(plan))
+    assert run(["eval", "freeze", str(made / "plan.yaml"), "--out", str(made / "short")]) == 0
+    return str(made / "short")
 
 
 @pytest.fixture

@@ -48,12 +48,12 @@ def test_bc_state(demos, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_small(demos, tmp_path, needs_renderer):
+def test_small(demos, short, tmp_path, needs_renderer):
     words = ["convert", str(demos), "--out", str(tmp_path / "data"), "--size", "64", "48", "--no-depth", "--no-video"]
     assert run([*words, "--cameras", "base_camera", "gripper_camera"]) == 0
     words = ["train", "small", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), "--steps", "3", *TINY]
     assert run(words) == 0
-    words = ["eval", "pick", "--policy", str(tmp_path / "run"), "--protocol", "paper-v1", "--episodes", "1"]
+    words = ["eval", "pick", "--policy", str(tmp_path / "run"), "--protocol", short, "--episodes", "1"]
     assert run([*words, "--out", str(tmp_path / "eval"), "--envs", "1"]) == 0
     [outcome] = played(tmp_path / "eval")
     assert outcome["error"] == "" and outcome["steps"] > 0

@@ -1,18 +1,14 @@
 """The weights that come with the package: small enough to ship, of this version, and the policy `small` by name."""
 
 import json
-from pathlib import Path
 
 import pytest
-import yaml
 
 from robocas_ms3.baselines.policy import SHIPPED, RunPolicy
 from robocas_ms3.baselines.runs import CHECKPOINT, read_run
 from robocas_ms3.baselines.small import BASELINE
 from robocas_ms3.cli.main import run
 from robocas_ms3.evaluation.policies import make_policy
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_they_are_small_and_of_this_version():
@@ -30,14 +26,9 @@ def test_they_are_a_policy_by_name():
 
 
 @pytest.mark.slow
-def test_they_reach_what_is_meant(tmp_path, needs_renderer):
+def test_they_reach_what_is_meant(short, tmp_path, needs_renderer):
     """Of three objects one at least: which of them depends on how a processor rounds."""
-    plan = yaml.safe_load((ROOT / "scripts" / "protocols" / "paper-v1.yaml").read_text())
-    plan["rules"] |= {"name": "short", "max_steps": 60}
-    plan["parts"] = [{"config": "pick_upstream_eval", "count": 3, "first_seed": 130000}]
-    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(plan))
-    assert run(["eval", "freeze", str(tmp_path / "plan.yaml"), "--out", str(tmp_path / "short")]) == 0
-    words = ["eval", "--policy", "small", "--protocol", str(tmp_path / "short"), "--envs", "2"]
+    words = ["eval", "--policy", "small", "--protocol", short, "--envs", "2"]
     assert run([*words, "--out", str(tmp_path / "eval")]) == 0
     played = [json.loads(line) for line in (tmp_path / "eval" / "episodes.jsonl").read_text().splitlines()]
     assert len(played) == 3 and not any(one["error"] for one in played)
