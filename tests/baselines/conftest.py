@@ -5,11 +5,10 @@ from pathlib import Path
 import pytest
 import yaml
 from made_up_baseline import MadeUp
-from synthetic import RayCaster, made_up_vectors, write_trajectory
+from made_up_dataset import made_up_dataset
 
 from robocas_ms3.baselines.table import BASELINES
 from robocas_ms3.cli.main import run
-from robocas_ms3.datasets.writing.convert import convert
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -42,9 +41,4 @@ def data(tmp_path):
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
     """A dataset of six episodes of seven steps, 64 x 48 pictures, that nobody may change; five are to train on."""
-    made = tmp_path_factory.mktemp("baselines")
-    trajectory = write_trajectory(made / "F.h5", seeds=range(3, 9))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-        convert(trajectory, made / "dataset", open_source=RayCaster)
-    return made / "dataset"
+    return made_up_dataset(tmp_path_factory.mktemp("baselines"))

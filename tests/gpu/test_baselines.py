@@ -3,9 +3,7 @@
 import devices
 import pytest
 import torch
-from synthetic import RayCaster, made_up_vectors, write_trajectory
-
-from robocas_ms3.datasets.writing.convert import convert
+from made_up_dataset import made_up_dataset
 
 pytestmark = [
     pytest.mark.gpu,
@@ -15,12 +13,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    made = tmp_path_factory.mktemp("gpu")
-    trajectory = write_trajectory(made / "F.h5", seeds=range(3, 9))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
-        convert(trajectory, made / "dataset", open_source=RayCaster)
-    return made / "dataset"
+    return made_up_dataset(tmp_path_factory.mktemp("gpu"))
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])

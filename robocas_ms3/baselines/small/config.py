@@ -51,7 +51,7 @@ class SmallConfig(BaselineConfig):
 
     Attributes:
         views: by camera; null leaves one out. The base camera sees the room from behind the arm: what can be reached
-            lies in the lower middle of its picture, objects of upstream's scenes in a fiftieth of it.
+            lies in the lower middle of its picture, objects of upstream's scenes in a thirtieth of it.
         language: whether it is told what to do.
         chunk: steps it predicts, at the dataset's rate.
         channels: of the first feature maps.

@@ -1,0 +1,17 @@
+"""A dataset that baselines can learn by heart."""
+
+from pathlib import Path
+
+import pytest
+from synthetic import RayCaster, made_up_vectors, write_trajectory
+
+from robocas_ms3.datasets.writing.convert import convert
+
+
+def made_up_dataset(folder: Path) -> Path:
+    """Six episodes of seven steps, 64 x 48 pictures, made-up embeddings; five are to train on."""
+    trajectory = write_trajectory(folder / "F.h5", seeds=range(3, 9))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("robocas_ms3.datasets.writing.convert.embed_texts", made_up_vectors)
+        convert(trajectory, folder / "dataset", open_source=RayCaster)
+    return folder / "dataset"
