@@ -1,5 +1,6 @@
 """A made-up baseline, and a small dataset for real ones."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import yaml
 from made_up_baseline import MadeUp
 from made_up_dataset import made_up_dataset
 
+from robocas_ms3.baselines.session import train_run
 from robocas_ms3.baselines.table import BASELINES
 from robocas_ms3.cli.main import run
 
@@ -36,6 +38,19 @@ def data(tmp_path):
     path = tmp_path / "data.h5"
     path.write_text("demonstrations")
     return path
+
+
+@pytest.fixture
+def usual_umask():
+    before = os.umask(0o022)
+    yield
+    os.umask(before)
+
+
+@pytest.fixture
+def whole(usual_umask, made_up, data, tmp_path):
+    train_run("made-up", data, tmp_path / "whole", device="cpu")
+    return tmp_path / "whole"
 
 
 @pytest.fixture(scope="session")

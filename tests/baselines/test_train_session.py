@@ -1,6 +1,5 @@
 """Runs: begun, broken off and gone on with to the bit, refused where they are of something else."""
 
-import csv
 import json
 import os
 import shutil
@@ -12,50 +11,15 @@ from pathlib import Path
 import made_up_baseline
 import pytest
 import torch
+from made_up_runs import assert_same, lines, say, stop_at
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from robocas_ms3.baselines.begin import merged
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.session import Said, train_run
 from robocas_ms3.baselines.train import Trainer
 from robocas_ms3.errors import DatasetError, OutputExistsError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
-
-
-def stop_at(step, error):
-    def look(done, of):
-        if done == step:
-            raise error
-
-    return Said(step=look)
-
-
-def lines(folder):
-    """Lines of the log, but for the clock's column."""
-    with (folder / "metrics.csv").open() as file:
-        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
-
-
-def assert_same(one, other):
-    for name in ("weights.safetensors", "checkpoint.safetensors"):
-        first, second = load_file(one / name), load_file(other / name)
-        assert first.keys() == second.keys()
-        assert all(torch.equal(first[key], second[key]) for key in first), name
-    assert lines(one) == lines(other)
-
-
-@pytest.fixture
-def usual_umask():
-    before = os.umask(0o022)
-    yield
-    os.umask(before)
-
-
-@pytest.fixture
-def whole(usual_umask, made_up, data, tmp_path):
-    train_run("made-up", data, tmp_path / "whole", device="cpu")
-    return tmp_path / "whole"
 
 
 def test_a_run_leaves_what_it_says(whole):
@@ -134,22 +98,6 @@ def test_seeds_differ(whole, data, tmp_path):
     assert not torch.equal(first["net.0.weight"], second["net.0.weight"])
 
 
-def test_options_leave_the_other_defaults(made_up, data, tmp_path):
-    record = train_run("made-up", data, tmp_path / "run", {"train": {"steps": 3}}, device="cpu")
-    assert record.config["train"]["steps"] == 3
-    assert record.config["train"]["batch_size"] == 4  # the baseline's, not TrainSettings'
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [({"widht": 3}, "width"), ({"train": {"steps": 0}}, "train.steps"), ({"width": "wide"}, "width")],
-)
-def test_wrong_options(made_up, data, tmp_path, changes, message):
-    with pytest.raises(TrainingError, match=message):
-        train_run("made-up", data, tmp_path / "run", changes, device="cpu")
-    assert not (tmp_path / "run").exists()
-
-
 def test_no_such_baseline(data, tmp_path):
     with pytest.raises(TrainingError, match="no such baseline.*small"):
         train_run("smal", data, tmp_path / "run")
@@ -181,74 +129,6 @@ def test_what_is_none_of_ours_is_not_replaced(made_up, data, tmp_path):
 def test_overwrite_begins_anew(whole, data):
     train_run("made-up", data, whole, {"train": {"steps": 4}}, device="cpu", overwrite=True)
     assert len(lines(whole)) == 2
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda run, data: data.write_text("others"), "a run on another dataset"),
-        (lambda run, data: _say(run, baseline="rt1"), "a run of another baseline"),
-        (lambda run, data: _say(run, version=0), "a run of another version"),
-        (lambda run, data: (run / "run.json").write_text("{"), "not readable"),
-        (lambda run, data: (run / "checkpoint.safetensors").write_bytes(b"x"), "can't be read"),
-    ],
-)
-def test_a_run_of_something_else_is_not_gone_on_with(whole, data, change, message):
-    change(whole, data)
-    with pytest.raises(TrainingError, match=message):
-        train_run("made-up", data, whole, device="cpu", resume=True)
-    assert (whole / "weights.safetensors").is_file()
-
-
-def test_a_run_may_begin_with_anothers_weights(whole, data, tmp_path):
-    data.write_text("more")
-    changes = {"train": {"steps": 1, "learning_rate": 1e-9, "ema": 0}}
-    record = train_run("made-up", data, tmp_path / "next", changes, start=whole, device="cpu")
-    first, second = (load_file(folder / "weights.safetensors") for folder in (whole, tmp_path / "next"))
-    assert all(torch.allclose(first[key], second[key], atol=1e-6) for key in first)
-    assert record.start.startswith("whole, ")
-    with pytest.raises(TrainingError, match="no run of robocas train"):
-        train_run("made-up", data, tmp_path / "other", start=tmp_path, device="cpu")
-    with pytest.raises(TrainingError, match="not the weights of this model"):
-        train_run("made-up", data, tmp_path / "other", {"width": 5}, start=whole, device="cpu")
-    assert not (tmp_path / "other").exists()
-
-
-def test_a_run_goes_on_from_what_it_began_with(whole, data, tmp_path):
-    other = shutil.copytree(whole, tmp_path / "other")
-    out, few = tmp_path / "next", {"train": {"steps": 12}}
-    with pytest.raises(RuntimeError):
-        train_run("made-up", data, out, few, start=whole, device="cpu", said=stop_at(11, RuntimeError("gone")))
-    with pytest.raises(TrainingError, match="goes on from what it began with.*expected whole,.*found other,"):
-        train_run("made-up", data, out, start=other, device="cpu", resume=True)
-    with pytest.raises(TrainingError, match="goes on from what it began with.*expected no --start"):
-        train_run("made-up", data, whole, start=other, device="cpu", resume=True)
-    train_run("made-up", data, out, start=whole, device="cpu", resume=True)
-    train_run("made-up", data, out, device="cpu", resume=True)
-    train_run("made-up", data, tmp_path / "unbroken", few, start=whole, device="cpu")
-    assert_same(tmp_path / "unbroken", out)
-
-
-def test_a_run_that_had_no_checkpoint_begins_with_the_same_weights(whole, data, tmp_path):
-    out, few = tmp_path / "next", {"train": {"steps": 12}}
-    with pytest.raises(RuntimeError):
-        train_run("made-up", data, out, few, start=whole, device="cpu", said=stop_at(3, RuntimeError("gone")))
-    with pytest.raises(TrainingError, match="begins with another's weights.*expected whole,.*--start again"):
-        train_run("made-up", data, out, device="cpu", resume=True)
-    train_run("made-up", data, out, start=whole, device="cpu", resume=True)
-    train_run("made-up", data, tmp_path / "unbroken", few, start=whole, device="cpu")
-    assert_same(tmp_path / "unbroken", out)
-
-
-def test_another_version_is_said_before_what_it_has_otherwise(whole, data):
-    _say(whole, version=0, config={"depth": 3})
-    with pytest.raises(TrainingError, match="a run of another version of made-up"):
-        train_run("made-up", data, whole, device="cpu", resume=True)
-
-
-def test_other_options_do_not_go_on(whole, data):
-    with pytest.raises(TrainingError, match="goes on as it was begun"):
-        train_run("made-up", data, whole, {"width": 5}, device="cpu", resume=True)
 
 
 def test_a_loss_that_is_no_number_ends_the_run_and_keeps_the_last_checkpoint(made_up, data, tmp_path):
@@ -314,36 +194,6 @@ def test_what_another_trainer_left_is_no_run_to_go_on_with(made_up, data, tmp_pa
     assert log.read_text() == "epoch,loss\n3,0.5\n"
 
 
-def test_to_go_on_elsewhere_is_said_and_kept(whole, data):
-    _say(whole, device="cuda", versions={"torch": "1.0"})
-    notes = []
-    train_run("made-up", data, whole, device="cpu", resume=True, said=Said(note=notes.append))
-    (said,) = json.loads((whole / "run.json").read_text())["resumed"]
-    assert said.startswith("from step 40 by device cpu") and f"torch {torch.__version__}" in said
-    assert any(said in note for note in notes)
-
-
-def test_a_run_begins_as_the_one_it_starts_from_but_for_its_options(made_up, data, tmp_path):
-    changes = {"width": 8, "train": {"steps": 8, "learning_rate": 0.002}}
-    train_run("made-up", data, tmp_path / "first", changes, device="cpu")
-    record = train_run(
-        "made-up", data, tmp_path / "more", {"train": {"steps": 4}}, device="cpu", start=tmp_path / "first"
-    )
-    assert (record.config["width"], record.config["train"]["learning_rate"]) == (8, 0.002)
-    assert record.config["train"]["steps"] == 4
-    assert record.start.startswith("first, ")
-    about = make_policy(str(tmp_path / "more")).describe()
-    assert about["start"] == record.start and len(about["weights"]) == 64
-    assert about["weights"] != make_policy(str(tmp_path / "first")).describe()["weights"]
-
-
-def test_a_run_on_other_pictures_is_not_begun_with(whole, made_up, data, tmp_path, monkeypatch):
-    _say(whole, facts={"inputs": 3, "pictures": {"base_camera": [64, 48]}})
-    with pytest.raises(TrainingError, match="--start is of a run with other pictures"):
-        train_run("made-up", data, tmp_path / "more", device="cpu", start=whole)
-    assert not (tmp_path / "more").exists()
-
-
 def test_a_run_is_a_policy(whole):
     policy = make_policy(str(whole))
     assert isinstance(policy, RunPolicy)
@@ -355,10 +205,10 @@ def test_a_run_is_a_policy(whole):
     ("change", "message"),
     [
         (lambda run: (run / "weights.safetensors").unlink(), "no such file.*--resume"),
-        (lambda run: _say(run, version=2), "another version"),
-        (lambda run: _say(run, config={"widht": 1}), "width"),
-        (lambda run: _say(run, facts={"inputs": 5}), "has in another shape net.0.weight"),
-        (lambda run: _say(run, baseline="smal"), "no such baseline"),
+        (lambda run: say(run, version=2), "another version"),
+        (lambda run: say(run, config={"widht": 1}), "width"),
+        (lambda run: say(run, facts={"inputs": 5}), "has in another shape net.0.weight"),
+        (lambda run: say(run, baseline="smal"), "no such baseline"),
         (lambda run: (run / "run.json").write_text('{"protocol_hash": 1}'), "no run of robocas train"),
     ],
 )
@@ -417,12 +267,3 @@ def test_a_checkpoint_of_before_processes_had_numbers(whole, data, tmp_path):
     save_file(tensors, path, about)
     train_run("made-up", data, out, device="cpu", resume=True)
     assert_same(whole, out)
-
-
-def test_nested_values():
-    assert merged({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 4}, "e": 5}) == {"a": {"b": 4, "c": 2}, "d": 3, "e": 5}
-
-
-def _say(run, **values):
-    path = run / "run.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
