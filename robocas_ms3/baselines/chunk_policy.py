@@ -26,7 +26,7 @@ class ChunkPolicy:
     oldest most; at 5 Hz the newest knows more).
 
     Args:
-        wants: what it is to be shown.
+        wants: what it is to be shown; of pictures those that a new chunk begins with.
         predict: (K, 10) chunk of what one env shows, of observations and its row, see `chunks`.
         play: steps of a chunk before the next one, up to K.
         fade: how fast older predictions lose weight, a step.
@@ -34,7 +34,7 @@ class ChunkPolicy:
     """
 
     def __init__(self, wants: Wants, predict: Predict, play: int, fade: float, about: dict[str, Any]) -> None:
-        self.wants, self._predict, self._about = wants, predict, about
+        self.wants, self._predict, self._about = replace(wants, look_every=play), predict, about
         self._play, self._fade = play, fade
         self._plans: dict[int, list[_Plan]] = {}  # by env, newest first
 

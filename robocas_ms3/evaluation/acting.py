@@ -141,7 +141,7 @@ def _make_env(settings: EpisodeSettings, wants: Wants) -> PolicyStepping:
         max_episode_steps=10**9,
         **looks(wants),
     )
-    return PolicyStepping(env, wants.convention, wants.reference, "upstream")
+    return PolicyStepping(env, wants.convention, wants.reference, "upstream", look_every=wants.look_every)
 
 
 def _over(at_end: dict[str, bool]) -> str:

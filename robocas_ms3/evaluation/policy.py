@@ -30,6 +30,8 @@ class Wants:
         depth: whether pictures come with depth.
         state: whether it is told what only a simulator knows (docs/rl.md).
         language: how it is told what to do.
+        look_every: it looks at pictures before its first step, and again after so many; those between are black, as
+            rendering them is most of what an evaluation costs.
     """
 
     convention: str = "robocas"
@@ -39,6 +41,7 @@ class Wants:
     depth: bool = False
     state: bool = False
     language: Language = "text"
+    look_every: int = 1
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -51,6 +54,10 @@ class Wants:
                 raise EvaluationError(
                     "a policy can't want that", where=name, expected=f"one of {known}", found=repr(value)
                 )
+        if self.look_every < 1:
+            raise EvaluationError(
+                "a policy can't want that", where="look_every", expected="1 or more", found=self.look_every
+            )
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ def make_env(
         convention=wants.convention,
         reference=wants.reference,
         stepping=protocol.rules.stepping,
+        look_every=wants.look_every,
         weld=weld,
     )
     return make_vec(

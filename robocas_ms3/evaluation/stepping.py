@@ -36,11 +36,19 @@ class PolicyStepping(gym.Wrapper):
         reference: what motions are relative to.
         stepping: ``timed``: a step is one control step. ``upstream``: a step moves the gripper until it stands, then
             the TCP, on a straight line, until it is there or 0.4 s are over. Envs of a batch that are there wait.
+        look_every: policy steps from one look at pictures to the next (`policy.Wants`); others are black.
         weld: whether what is lifted is welded to the hand (`weld`); one env on a CPU.
     """
 
     def __init__(
-        self, env: gym.Env, convention: str, reference: Reference, stepping: Stepping, *, weld: bool = False
+        self,
+        env: gym.Env,
+        convention: str,
+        reference: Reference,
+        stepping: Stepping,
+        *,
+        look_every: int = 1,
+        weld: bool = False,
     ) -> None:
         super().__init__(env)
         self._convention, self._reference, self._stepping = CONVENTIONS[convention], reference, stepping
@@ -55,6 +63,7 @@ class PolicyStepping(gym.Wrapper):
         self._weld = Weld(self._base) if weld else None
         self._told = np.ones(count, dtype=bool)  # whether each gripper was told to be open last
         self._width_change = np.zeros(count)  # m in the last control step
+        self._look_every, self._steps = look_every, np.zeros(count, dtype=np.int64)  # steps by env
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Reset; see ``BaseEnv``."""
@@ -64,7 +73,7 @@ class PolicyStepping(gym.Wrapper):
         envs = (kwargs.get("options") or {}).get("env_idx", slice(None))
         self._tracker.reset(envs)
         rows = envs if isinstance(envs, slice) else np.asarray(torch.as_tensor(envs).cpu())
-        self._told[rows], self._width_change[rows] = True, 0.0
+        self._told[rows], self._width_change[rows], self._steps[rows] = True, 0.0, 0
         return obs, {**info, **self._happened(info)}
 
     @property
@@ -90,17 +99,25 @@ class PolicyStepping(gym.Wrapper):
         actions = actions.reshape(self._base.num_envs, self._convention.size)
         if not np.isfinite(actions).all():
             raise EvaluationError("an action is not finite", where="action", found=actions.tolist())
-        if self._convention.read is None:
-            self._told = actions[:, 7] > 0
-            result = self._control(actions)
-        else:
-            motion = self._convention.read(actions)
-            result = self._timed(motion) if self._stepping == "timed" else self._upstream(motion)
+        self._base.looks = False  # not before the last of its control steps, and not after each of these
+        try:
+            obs, *others, info = self._act(actions)
+        finally:
+            self._base.looks = True
+        self._steps += 1
+        if (self._steps % self._look_every == 0).any() and "sensor_data" in obs:
+            obs = self._base.get_obs(info)
         if self._weld and not self._told[0]:
             self._weld.look()
-        *others, info = result
         self._tracker.end_step()
-        return (*others, {**info, **self._happened(info)})
+        return (obs, *others, {**info, **self._happened(info)})
+
+    def _act(self, actions: np.ndarray) -> tuple:
+        if self._convention.read is None:
+            self._told = actions[:, 7] > 0
+            return self._control(actions)
+        motion = self._convention.read(actions)
+        return self._timed(motion) if self._stepping == "timed" else self._upstream(motion)
 
     def _happened(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         """What an info says besides, or otherwise."""

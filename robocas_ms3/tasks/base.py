@@ -15,7 +15,14 @@ from robocas_ms3.tasks.scene import SceneEnv
 
 
 class RoboCASEnv(SceneEnv):
-    """Base of the RoboCAS environments; see `SceneEnv` for its arguments."""
+    """Base of the RoboCAS environments; see `SceneEnv` for its arguments.
+
+    Attributes:
+        looks: whether an observation shows what the cameras see; otherwise its pictures are black, and nothing is
+            rendered.
+    """
+
+    looks = True
 
     # ------------------------------------------------------------------ state
 
@@ -128,6 +135,13 @@ class RoboCASEnv(SceneEnv):
         """``tcp_pose`` (N, 7) in the world; before it, in state modes, what only a simulator knows."""
         told = self.obs_mode_struct.state or self.obs_mode_struct.state_dict
         return {**(self._privileged() if told else {}), "tcp_pose": as_tensor(self.tcp_in_world())}
+
+    def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
+        """Pictures by camera and kind; see ``BaseEnv``."""
+        if self.looks:
+            return super()._get_obs_sensor_data(apply_texture_transforms)
+        last = self._last_obs["sensor_data"]
+        return {camera: {kind: torch.zeros_like(of) for kind, of in kinds.items()} for camera, kinds in last.items()}
 
     def _privileged(self) -> dict[str, torch.Tensor]:
         """What only a simulator knows, (N, D) each; see docs/rl.md."""

@@ -140,3 +140,35 @@ def test_an_action_that_is_no_number_is_refused():
     with pytest.raises(EvaluationError, match="not finite"):
         env.step(np.full(7, np.nan))
     env.close()
+
+
+def test_pictures_are_rendered_when_the_policy_looks(monkeypatch):
+    """Once an action of several control steps, and with ``look_every=2`` after every other action; black in between."""
+    env = gym.make(
+        "RoboCASPick-v1",
+        obs_mode="rgb",
+        reward_mode="none",
+        control_mode="pd_ee_delta_pose",
+        sim_config={"control_freq": 5},
+        sensor_configs={"width": 32, "height": 24},
+        max_episode_steps=10_000,
+    )
+    base: Any = env.unwrapped
+    rendered, capture = [], base.capture_sensor_data
+    monkeypatch.setattr(base, "capture_sensor_data", lambda: (rendered.append(1), capture()))
+    for every, looks in ((1, [1, 1, 1]), (2, [0, 1, 0])):
+        stepped = PolicyStepping(env, "robocas", "tcp", "upstream", look_every=every)
+        for _ in range(2):  # a reset begins to count anew
+            obs, _ = stepped.reset(seed=3)
+            assert obs["sensor_data"]["base_camera"]["rgb"].any()
+            for expected in looks:
+                rendered.clear()
+                obs, *_, info = stepped.step(along(0.08))
+                assert len(rendered) == expected
+                seen = {name: pictures["rgb"] for name, pictures in obs["sensor_data"].items()}
+                assert {tuple(rgb.shape) for rgb in seen.values()} == {(1, 24, 32, 3)}
+                assert [bool(rgb.any()) for rgb in seen.values()] == [bool(expected)] * len(seen)
+                now = base.get_obs()["sensor_data"]["base_camera"]["rgb"]
+                assert not expected or torch.equal(seen["base_camera"], now)
+            assert int(info["elapsed_steps"]) > len(looks)
+    env.close()
