@@ -49,7 +49,7 @@ class BcState:
                 return model.act(torch.from_numpy(told).to(device))[0].cpu().numpy()
 
         wants = Wants("robocas", reference="tcp", rate_hz=facts["rate_hz"], state=True, language="none")
-        return ChunkPolicy(wants, predict, config.play, config.fade, {})
+        return ChunkPolicy(wants, predict, min(config.play, config.chunk), config.fade, {})
 
 
 BASELINE = BcState()

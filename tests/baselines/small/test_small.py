@@ -168,6 +168,24 @@ def test_it_is_shown_pictures_of_the_size_it_learned_by(folder):
     assert policy.wants.cameras == {"base_camera": (64, 48), "gripper_camera": (64, 48)}
 
 
+@pytest.mark.parametrize(("chunk", "play", "looks"), [(8, 3, 3), (4, 7, 4)])
+def test_it_looks_when_it_predicts(folder, monkeypatch, chunk, play, looks):
+    """After as many steps as it follows a chunk for, which are no more than a chunk has."""
+    config = SmallConfig(**{**TINY, "chunk": chunk, "play": play})
+    facts = BASELINE.data(config, folder, "val", lambda done, of: None).facts
+    policy = BASELINE.policy(config, facts, BASELINE.model(config, facts))
+    assert policy.wants.look_every == looks
+    episode = open_source(folder).episode(open_source(folder).split("train")[0])
+    poses = np.concatenate([episode.arrays["ee_pos"], np.roll(episode.arrays["ee_orn"], 1, axis=1)], axis=1)
+    predicted, predict = [], policy._predict
+    monkeypatch.setattr(policy, "_predict", lambda *seen: (predicted.append(1), predict(*seen))[1])
+    policy.reset([Start(0, 0, "pick", "", "", "builtin", 0, "")])
+    for step in range(7):
+        predicted.clear()
+        policy.act(observed(episode, episode.arrays, poses, step))
+        assert len(predicted) == (step % looks == 0)
+
+
 def test_what_is_to_be_found_moves_with_a_picture(samples, monkeypatch):
     """A picture's answers are asked for where the place's pixel is once it is shifted."""
     torch.manual_seed(0)
