@@ -63,6 +63,8 @@ class SmallConfig(BaselineConfig):
         near: m at which a pose counts half as much as one that is reached, see `chunk_losses`; 0: all alike.
         point_weight: weight of the loss of where that is in the pictures, of each camera (`pointing`).
         name_weight: weight of the loss of where objects are that other instructions would name, of each camera.
+        lift: whether what is pointed at is located by the cameras' calibration (`lifting`).
+        lift_weight: weight of the loss of that, of each camera.
         shift: pixels that pictures are shifted by at most, at random, in training.
         brightness: share that brightness and contrast change by at most, at random, in training.
         play: steps of a chunk that it follows before it predicts the next one.
@@ -86,6 +88,8 @@ class SmallConfig(BaselineConfig):
     near: float = Field(default=0.2, ge=0)
     point_weight: float = Field(default=0.1, ge=0)
     name_weight: float = Field(default=0.1, ge=0)
+    lift: bool = True
+    lift_weight: float = Field(default=0.1, ge=0)
     shift: int = Field(default=3, ge=0)
     brightness: float = Field(default=0.2, ge=0, lt=1)
     play: int = Field(default=7, ge=1)

@@ -22,13 +22,14 @@ from robocas_ms3.baselines.bases import check_bases, check_tcp
 from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.pointing import places_of
-from robocas_ms3.baselines.small.standing import Standing, seen_from, standing
+from robocas_ms3.baselines.small.standing import Standing, calibration, looks_alike, seen_from, standing
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.datasets.training.sample_arrays import check_holds
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import Array, from_xyzw
 
+_LEAST_HEIGHT = 0.01  # m
 _LEAST_WORD = 0.01  # deviation of a number of an embedding; all are 0.05 or so
 _KEYS = ("ee_pos", "ee_orn", "gripper_width", "gripper_status", "base_pos", "base_orn")
 
@@ -64,6 +65,12 @@ class SmallSamples:
         check_tcp(source, numbers[0])
         check_bases(source, numbers)
         seen = source.episode(numbers[0])
+        first_pictures = {camera: seen.rgb(camera, 0) for camera in config.views}
+        sizes = {camera: (picture.shape[1], picture.shape[0]) for camera, picture in first_pictures.items()}
+        bases = seen.read(["base_pos", "base_orn"])
+        self._cameras = {
+            camera: calibration(seen, camera, bases, sizes[camera], view) for camera, view in config.views.items()
+        }
         first = np.concatenate([[0], np.cumsum([source.lengths[number] for number in numbers])])
         count = int(first[-1])
         _check_room(config, count, path)
@@ -89,9 +96,11 @@ class SmallSamples:
         self._ask(stood if config.language else [replace(one, target="") for one in stood])
         self.facts: dict[str, Any] = {
             "rate_hz": source.rate_hz,
-            "pictures": {camera: list(seen.rgb(camera, 0).shape[1::-1]) for camera in config.views},
+            "pictures": {camera: list(size) for camera, size in sizes.items()},
             "chunk": spread(self._chunks[..., :9].numpy()),
             "keys": spread(self._keys.numpy()),
+            "cameras": self._cameras,
+            "heights": _spread_of_heights(self._state.numpy(), self._keys.numpy()),
             "words": _spread_of_words(self._words.numpy()),
         }
 
@@ -166,6 +175,7 @@ class SmallSamples:
                 for row, picture in enumerate(pictures, start=first):
                     self._pictures[camera][row] = torch.from_numpy(looked_at(picture, view, source.root))
                     stored = picture.shape[1], picture.shape[0]
+            self._check(config, camera, calibration(episode, camera, arrays, stored, view), episode.where)
             points = seen_from(camera, at_keys[:, None], poses, arrays)[:, 0]
             looks[camera] = partial(
                 places_of,
@@ -176,6 +186,18 @@ class SmallSamples:
             )
             self._places[camera][rows] = torch.from_numpy(looks[camera](points))
         return standing(episode, arrays, poses, looks)
+
+    def _check(self, config: SmallConfig, camera: str, found: dict[str, Any], where: object) -> None:
+        """See that a camera looks in all episodes as in the first."""
+        first = self._cameras[camera]
+        if config.lift and not looks_alike(first, found):
+            raise DatasetError(
+                "a camera looks another way than in other episodes, or is fixed in the world and the arm is not",
+                where=f"{where}, {camera}",
+                expected=first["mount"],
+                found=found["mount"],
+                fix="Train with --set lift=false, or on episodes of one calibration.",
+            )
 
 
 def _check_room(config: SmallConfig, count: int, path: Path) -> None:
@@ -189,6 +211,14 @@ def _check_room(config: SmallConfig, count: int, path: Path) -> None:
             found=f"{free / 1e9:.1f} GB free",
             fix="Choose smaller views, or fewer episodes (robocas split).",
         )
+
+
+def _spread_of_heights(state: NDArray[np.floating], keys: NDArray[np.floating]) -> dict[str, float]:
+    """Mean and deviation of the heights of key poses (N, 9) in the arm's base, m, where the arm feels (N, 10)."""
+    x, y = state[:, 3:6], state[:, 6:9]
+    axes = np.stack([x[:, 2], y[:, 2], np.cross(x, y)[:, 2]], axis=1)  # the last row of the TCP's turn
+    heights = (axes * keys[:, :3]).sum(axis=1) + state[:, 2]
+    return {"mean": float(heights.mean()), "deviation": max(float(heights.std()), _LEAST_HEIGHT)}
 
 
 def _spread_of_words(words: NDArray[np.floating]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ answers for every object in it.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import nn
@@ -20,9 +20,12 @@ from robocas_ms3.baselines.chunk_loss import chunk_losses
 from robocas_ms3.baselines.chunks import ROW, Scale
 from robocas_ms3.baselines.metrics import mean
 from robocas_ms3.baselines.small.config import SmallConfig, View
+from robocas_ms3.baselines.small.lifting import SAID, Lift, tcp_of
 from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, Pointer, cells_of, pointing_losses
 
 _WORDS, _STATE = 384, 10
+Maps = dict[str, tuple[torch.Tensor, torch.Tensor]]
+"""By camera what `Eye` makes of pictures."""
 
 
 class Block(nn.Module):
@@ -81,6 +84,24 @@ class Eye(nn.Module):
         return torch.cat([tokens, pointed[:, None]], dim=1), logits
 
 
+class Thought(NamedTuple):
+    """What comes of a look.
+
+    Attributes:
+        chunk: (B, K, 10) normalised, with commands' logits.
+        key: (B, 9) normalised.
+        state: (B, width) what the arm feels.
+        cells: logits (B, h w / 64) of where it points, by camera.
+        lifted: points of that, by camera, see `Lift`; empty without.
+    """
+
+    chunk: torch.Tensor
+    key: torch.Tensor
+    state: torch.Tensor
+    cells: dict[str, torch.Tensor]
+    lifted: dict[str, dict[str, torch.Tensor]]
+
+
 class SmallModel(nn.Module):
     """See the module; predicts chunks (B, K, 10) and key poses (B, 9)."""
 
@@ -97,26 +118,38 @@ class SmallModel(nn.Module):
             width, config.heads, 4 * width, config.dropout, batch_first=True, norm_first=True
         )
         self.decoder = nn.TransformerDecoder(layer, config.layers, nn.LayerNorm(width))
+        self.lifts = nn.ModuleDict()
+        if config.lift:
+            heights = facts["heights"]["mean"], facts["heights"]["deviation"]
+            for camera, view in config.views.items():
+                of = facts["cameras"][camera]
+                self.lifts[camera] = Lift(view, of, heights, 2 * config.channels, width)
+            self.aim = nn.Sequential(nn.Linear(SAID * len(config.views), width), nn.ReLU(), nn.Linear(width, width))
         self.out, self.key_out = nn.Linear(width, ROW), nn.Linear(width, 9)
 
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
         """Losses, see `chunk_losses` and `pointing_losses`; those of other questions than the instruction's last."""
-        pictures, places = {}, {}
+        pictures, places, moves = {}, {}, {}
         for camera in self.config.views:
             seen = batch[camera]
             by = self._shifts(seen)
             pictures[camera] = self._lit(shifted(seen, by) if by is not None else seen)
-            moved = by if by is not None else torch.zeros(1, 2, device=seen.device)
+            moved = moves[camera] = by if by is not None else torch.zeros(1, 2, device=seen.device)
             places[camera] = (batch[f"{camera}_place"] + moved, batch[f"{camera}_places"] + moved[:, None])
-        maps, state = self._look(pictures), self.state(batch["state"])
-        chunk, key, cells = self._think(maps, self._hear(batch["words"]), state)
-        found = chunk_losses(self, batch, chunk, key)
-        asked = self._hear(batch["asked"]) + state.detach()[:, None]
+        maps, felt = self._look(pictures), batch["state"]
+        came = self._think(maps, self._hear(batch["words"]), felt, moves)
+        found = chunk_losses(self, batch, came.chunk, came.key)
+        for camera, lift in self.lifts.items():
+            own: Any = lift
+            loss, off = own.losses(came.lifted[camera], batch["key"], places[camera][0], tcp_of(felt))
+            found["loss"] = found["loss"] + self.config.lift_weight * loss
+            found[f"{camera}_lift_mm"] = off
+        asked = self._hear(batch["asked"]) + came.state.detach()[:, None]
         kinds = batch["kinds"]
         alike = (kinds[:, :, None] == kinds[:, None, :]) & (kinds >= 0)[:, :, None]
         for camera, view in self.config.views.items():
             columns, (place, others) = view.size[0] // CELL, places[camera]
-            loss, right = pointing_losses(cells[camera], cells_of(place, view)[:, None], columns)
+            loss, right = pointing_losses(came.cells[camera], cells_of(place, view)[:, None], columns)
             eye: Any = self.eyes[camera]
             logits = eye.pointer.logits(maps[camera][1], asked)
             standing = cells_of(others, view)[:, None].where(alike, NOWHERE)
@@ -130,27 +163,32 @@ class SmallModel(nn.Module):
     def act(self, batch: Batch) -> torch.Tensor:
         """(B, K, 10) chunks: poses as they are, commands as shares, 1 = open."""
         maps = self._look({camera: self._lit(batch[camera]) for camera in self.config.views})
-        chunk, _, _ = self._think(maps, self._hear(batch["words"]), self.state(batch["state"]))
+        still = dict.fromkeys(maps, torch.zeros(1, 2, device=batch["state"].device))
+        chunk = self._think(maps, self._hear(batch["words"]), batch["state"], still).chunk
         return torch.cat([self.chunk_scale.back(chunk[..., :9]), chunk[..., 9:].sigmoid()], dim=-1)
 
     def _hear(self, words: torch.Tensor) -> torch.Tensor:
         return self.words(self.word_scale(words).clamp(-3, 3))
 
-    def _look(self, pictures: Batch) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    def _look(self, pictures: Batch) -> Maps:
         return {camera: eye(pictures[camera]) for camera, eye in self.eyes.items()}
 
-    def _think(
-        self, maps: dict[str, tuple[torch.Tensor, torch.Tensor]], words: torch.Tensor, state: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
-        """Normalised chunks (B, K, 10) with commands' logits, normalised keys (B, 9), logits of cells by camera."""
+    def _think(self, maps: Maps, words: torch.Tensor, felt: torch.Tensor, moves: Batch) -> Thought:
+        """What comes of maps, words (B, width) and what the arm feels (B, 10), of pictures shifted by ``moves``."""
+        state = self.state(felt)
         asked = words + state
-        tokens, cells = {}, {}
+        tokens, cells, lifted = {}, {}, {}
         for camera, of in maps.items():
             eye: Any = self.eyes[camera]
             tokens[camera], cells[camera] = eye.tell(of, asked)
+        aims = asked
+        if self.config.lift:
+            for camera, lift in self.lifts.items():
+                lifted[camera] = lift(maps[camera][1], asked, cells[camera], tcp_of(felt), moves[camera])
+            aims = asked + self.aim(torch.cat([of["said"] for of in lifted.values()], dim=1))
         memory = torch.cat([*tokens.values(), words[:, None], state[:, None]], dim=1)
-        thought = self.decoder(self.queries + asked[:, None], memory)
-        return self.out(thought[:, :-1]).float(), self.key_out(thought[:, -1]).float(), cells
+        thought = self.decoder(self.queries + aims[:, None], memory)
+        return Thought(self.out(thought[:, :-1]).float(), self.key_out(thought[:, -1]).float(), state, cells, lifted)
 
     def _shifts(self, pictures: torch.Tensor) -> torch.Tensor | None:
         """(B, 2) pixels right and down that pictures are shifted by in training."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.baselines.small.config import View
 from robocas_ms3.datasets.schema import CAMERAS, SCENE_FILE
 from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.errors import DatasetError
@@ -76,6 +77,26 @@ def standing(
     for seen in places.values():
         seen[~still] = np.nan
     return Standing(steps, meant, kinds, places)
+
+
+def calibration(
+    episode: SourceEpisode, camera: str, arrays: Mapping[str, NDArray[Any]], stored: tuple[int, int], view: View
+) -> dict[str, Any]:
+    """How a camera looks, see `lifting.Lift`; of one that is fixed in the world where the arm's base stands first."""
+    mount, parent = episode.camera_in_parent(camera), _PARENTS[camera]
+    if parent == "world":
+        mount = inverse(_base(arrays))[0] @ mount
+    left, top, right, bottom = np.array(view.box()) / np.tile(view.rendered, 2)
+    scale, intrinsic = np.array(view.size) / (right - left, bottom - top), episode.intrinsic(camera)
+    focal, middle = intrinsic[:2] / stored * scale, (intrinsic[2:] / stored - (left, top)) * scale
+    return {"on_hand": parent == "ee", "mount": mount.tolist(), "intrinsic": [*focal.tolist(), *middle.tolist()]}
+
+
+def looks_alike(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether calibrations are the same, to a mm, a mrad and a hundredth of a pixel."""
+    return all(
+        np.allclose(one[key], other[key], rtol=0, atol=atol) for key, atol in (("mount", 1e-3), ("intrinsic", 1e-2))
+    )
 
 
 def seen_from(camera: str, points: Array, tcp_in_base: Array, arrays: Mapping[str, NDArray[Any]]) -> Array:

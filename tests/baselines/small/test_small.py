@@ -282,6 +282,18 @@ def test_data_that_does_not_suit_it(folder, tmp_path, spoil, message):
         BASELINE.data(SmallConfig(**TINY), copy, "train", lambda done, of: None)
 
 
+def test_a_camera_that_looks_elsewhere_in_one_episode(folder, tmp_path):
+    """How it looks is learned once; without that it may look as it likes."""
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    path = sorted(copy.glob("episode_*/base_camera/cam_pos_wrt_arm_base.npy"))[2]
+    moved = np.load(path)
+    moved[0, 3] += 0.002
+    np.save(path, moved)
+    with pytest.raises(DatasetError, match="a camera looks another way"):
+        BASELINE.data(SmallConfig(**TINY), copy, "train", lambda done, of: None)
+    assert len(BASELINE.data(SmallConfig(**TINY, lift=False), copy, "train", lambda done, of: None)) == 35
+
+
 def test_pictures_that_are_too_small(folder):
     with pytest.raises(DatasetError, match="robocas convert --size 512 384"):
         BASELINE.data(SmallConfig(), folder, "train", lambda done, of: None)
