@@ -112,7 +112,8 @@ class SmallSamples:
 
         Seen are pictures by camera (B, h, w, 3) uint8, ``state`` (B, 10) and ``words`` (B, 384). To be predicted are
         ``chunk`` (B, K, 10), ``key`` (B, 9), where that is seen, ``CAMERA_place`` (B, 2), and where each of N objects
-        is, ``CAMERA_places`` (B, N, 2), when ``asked`` (B, N, 384) for one of its ``kinds`` (B, N), -1 = not asked for.
+        is, ``CAMERA_places`` (B, N, 2) and ``heights`` (B, N) in the arm's base, when ``asked`` (B, N, 384) for one of
+        its ``kinds`` (B, N), -1 = not asked for.
         """
         rows = torch.tensor(indices)
         episodes = self._episode[rows]
@@ -121,6 +122,7 @@ class SmallSamples:
             **{f"{camera}_place": places[rows] for camera, places in self._places.items()},
             **{f"{camera}_places": places[rows] for camera, places in self._standing.items()},
             "kinds": self._kinds[episodes],
+            "heights": self._heights[episodes],
             "asked": self._words[self._asked[episodes]],
             "state": self._state[rows],
             "words": self._words[episodes],
@@ -138,11 +140,13 @@ class SmallSamples:
         told = {name: [place for place, one in enumerate(stood) if one.target == name] for name in names}
         self._kinds = torch.full((len(stood), most), -1)
         self._asked = torch.zeros((len(stood), most), dtype=torch.int64)
+        self._heights = torch.full((len(stood), most), torch.nan)
         self._standing = {
             camera: torch.full((len(self._state), most, 2), torch.nan) for camera in (stood[0].places if stood else ())
         }
         first = 0
         for place, one in enumerate(stood):
+            self._heights[place, : len(one.kinds)] = torch.from_numpy(one.points[:, 2]).float()
             for column, kind in enumerate(one.kinds):
                 if kind in told:
                     self._kinds[place, column] = names.index(kind)

@@ -19,6 +19,8 @@ from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, cells_of
 
 SAID = 7
 """Numbers that are said of a point: coarse and fine coordinates, and how sure the pointer is."""
+FAR = 0.15
+"""m; what is nearer is in the log."""
 _FINE, _COARSE = 0.05, 0.3  # m
 _FURTHEST = 2.0  # m along a ray
 _LEVEL = 0.03  # of a ray's direction: less steep ones are as if they were that steep
@@ -54,7 +56,7 @@ class Lift(nn.Module):
 
     def forward(
         self, fine: torch.Tensor, asked: torch.Tensor, logits: torch.Tensor, tcp: torch.Tensor, by: torch.Tensor
-    ) -> dict[str, torch.Tensor]:
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """What is found, by maps (B, C, h, w), questions (B, width), and a pointer's logits (B, h w) of them.
 
         Args:
@@ -62,19 +64,17 @@ class Lift(nn.Module):
             by: (B, 2) pixels that the pictures were shifted by.
 
         Returns:
-            ``points`` (B, 3) in the TCP's frame, m; ``heights`` (B,) in the arm's base, normalised; ``offsets``
-            (B, 2, h w) of places from the middles of the cells, in cells; ``said`` (B, `SAID`), which learns nothing
-            from who reads it.
+            Points (B, 3) in the TCP's frame, m; what is said of them (B, `SAID`). Neither teaches the pointer anything.
         """
-        share, cell = logits.softmax(dim=1).max(dim=1)
-        offsets = self.offsets(fine).flatten(2).float()
-        rows = torch.arange(len(cell), device=cell.device)
-        heights = self.height(torch.cat([fine.flatten(2)[rows, :, cell], asked.detach()], dim=1))[:, 0].float()
         with torch.no_grad():
-            places = self.middles[cell] + CELL * offsets[rows, :, cell] - by
+            share, cell = logits.softmax(dim=1).max(dim=1)
+            rows = torch.arange(len(cell), device=cell.device)
+            what = fine.flatten(2)[rows, :, cell]
+            places = self.middles[cell] + CELL * self.offsets(fine).flatten(2)[rows, :, cell].float() - by
+            heights = self.height(torch.cat([what, asked], dim=1))[:, 0].float()
             points = self._lifted(places, heights * self._heights[1] + self._heights[0], tcp)
             said = torch.cat([(points / _COARSE).clamp(-3, 3), (points / _FINE).clamp(-3, 3), share[:, None]], dim=1)
-        return {"points": points, "heights": heights, "offsets": offsets, "said": said}
+        return points, said
 
     def _lifted(self, places: torch.Tensor, heights: torch.Tensor, tcp: torch.Tensor) -> torch.Tensor:
         flat = (places - self.intrinsic[2:]) / self.intrinsic[:2]
@@ -85,31 +85,29 @@ class Lift(nn.Module):
         far = ((heights - start[:, 2]) / ray[:, 2].clamp(max=-_LEVEL)).clamp(0, _FURTHEST)
         return _turned(tcp[:, :3, :3].transpose(1, 2), start + far[:, None] * ray - tcp[:, :3, 3])
 
-    def losses(
-        self, found: dict[str, torch.Tensor], key: torch.Tensor, place: torch.Tensor, tcp: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Errors where the key pose (B, 9) is seen, at places (B, 2) of the pictures.
-
-        Returns:
-            A loss; and of what is nearer than 15 cm the sum of errors in mm and their number (2,).
-        """
-        cell = cells_of(place, self._view)
-        shown = cell != NOWHERE
-        rows, at = torch.arange(len(cell), device=cell.device), cell.clamp(min=0)
-        meant = (place.nan_to_num(0.0) - self.middles[at]) / CELL
-        offset = (found["offsets"][rows, :, at] - meant).abs().sum(dim=1)
-        height = _turned(tcp[:, :3, :3], key[:, :3])[:, 2] + tcp[:, 2, 3]
-        wrong = (found["heights"] * self._heights[1] + self._heights[0] - height).abs() / _FINE
-        loss = torch.stack([((offset + wrong) * shown).sum(), shown.sum()])
-        with torch.no_grad():
-            near = shown & (key[:, :3].norm(dim=1) < 0.15)
-            off = (found["points"] - key[:, :3]).norm(dim=1)
-        return mean(loss), torch.stack([1000 * (off * near).sum(), near.sum()])
+    def loss(
+        self, fine: torch.Tensor, asked: torch.Tensor, places: torch.Tensor, heights: torch.Tensor
+    ) -> torch.Tensor:
+        """Error where places (B, Q, 2) and heights (B, Q), in the arm's base, are known and seen, of Q questions."""
+        cells = cells_of(places, self._view)
+        shown, at = cells != NOWHERE, cells.clamp(min=0)
+        offsets = self.offsets(fine).flatten(2).float().gather(2, at[:, None].expand(-1, 2, -1)).transpose(1, 2)
+        meant = (places.nan_to_num(0.0) - self.middles[at]) / CELL
+        what = fine.flatten(2).transpose(1, 2).gather(1, at[..., None].expand(-1, -1, fine.shape[1]))
+        found = self.height(torch.cat([what, asked.detach()], dim=2))[..., 0].float()
+        low = found * self._heights[1] + self._heights[0] - heights.nan_to_num(0.0)
+        wrong = (offsets - meant).abs().sum(dim=-1) + low.abs() / _FINE
+        return mean(torch.stack([(wrong * shown).sum(), shown.sum()]))
 
 
 def _turned(turns: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
     """Vectors (B, 3) turned by (B, 3, 3) or (3, 3); not as a product of matrices, which bf16 would round to 4 mm."""
     return (turns * vectors[:, None]).sum(dim=-1)
+
+
+def heights_of(points: torch.Tensor, tcp: torch.Tensor) -> torch.Tensor:
+    """(B,) in the arm's base, of points (B, 3) in the TCP's frame."""
+    return _turned(tcp[:, :3, :3], points)[:, 2] + tcp[:, 2, 3]
 
 
 def tcp_of(state: torch.Tensor) -> torch.Tensor:

@@ -20,7 +20,7 @@ from robocas_ms3.baselines.chunk_loss import chunk_losses
 from robocas_ms3.baselines.chunks import ROW, Scale
 from robocas_ms3.baselines.metrics import mean
 from robocas_ms3.baselines.small.config import SmallConfig, View
-from robocas_ms3.baselines.small.lifting import SAID, Lift, tcp_of
+from robocas_ms3.baselines.small.lifting import FAR, SAID, Lift, heights_of, tcp_of
 from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, Pointer, cells_of, pointing_losses
 
 _WORDS, _STATE = 384, 10
@@ -47,7 +47,7 @@ class Block(nn.Module):
 class Eye(nn.Module):
     """What a camera's pictures show: tokens, and a finer map for its pointer."""
 
-    def __init__(self, view: View, channels: int, width: int) -> None:
+    def __init__(self, view: View, channels: int, width: int, *, lifts: bool) -> None:
         super().__init__()
         self.stem = nn.Conv2d(3, channels, 4, 4)
         self.norm = nn.GroupNorm(8, channels)
@@ -55,6 +55,8 @@ class Eye(nn.Module):
         self.coarse = Block(2 * channels, 4 * channels, 2)
         self.down = nn.Conv2d(4 * channels, 2 * channels, 1)
         self.pointer = Pointer(view, 2 * channels, width)
+        if lifts:
+            self.namer = Pointer(view, 2 * channels, width)
         self.film, self.project = nn.Linear(width, 8 * channels), nn.Conv2d(4 * channels, width, 1)
         nn.init.zeros_(self.film.weight)
         nn.init.zeros_(self.film.bias)
@@ -91,15 +93,17 @@ class Thought(NamedTuple):
         chunk: (B, K, 10) normalised, with commands' logits.
         key: (B, 9) normalised.
         state: (B, width) what the arm feels.
+        asked: (B, width) and what it was told.
         cells: logits (B, h w / 64) of where it points, by camera.
-        lifted: points of that, by camera, see `Lift`; empty without.
+        points: (B, 3) of that in the TCP's frame, m, by camera; empty without `lifting`.
     """
 
     chunk: torch.Tensor
     key: torch.Tensor
     state: torch.Tensor
+    asked: torch.Tensor
     cells: dict[str, torch.Tensor]
-    lifted: dict[str, dict[str, torch.Tensor]]
+    points: dict[str, torch.Tensor]
 
 
 class SmallModel(nn.Module):
@@ -112,19 +116,22 @@ class SmallModel(nn.Module):
         self.word_scale = Scale(**facts["words"])
         self.words = nn.Sequential(nn.Linear(_WORDS, width), nn.ReLU(), nn.Dropout(config.dropout))
         self.state = nn.Sequential(nn.Linear(_STATE, width), nn.ReLU(), nn.Linear(width, width))
-        self.eyes = nn.ModuleDict({camera: Eye(view, config.channels, width) for camera, view in config.views.items()})
+        self.eyes = nn.ModuleDict(
+            {camera: Eye(view, config.channels, width, lifts=config.lift) for camera, view in config.views.items()}
+        )
         self.queries = nn.Parameter(torch.randn(config.chunk + 1, width) * 0.2)
         layer = nn.TransformerDecoderLayer(
             width, config.heads, 4 * width, config.dropout, batch_first=True, norm_first=True
         )
         self.decoder = nn.TransformerDecoder(layer, config.layers, nn.LayerNorm(width))
-        self.lifts = nn.ModuleDict()
         if config.lift:
+            self.lifts = nn.ModuleDict()  # of where the gripper will close or open next
+            self.stands = nn.ModuleDict()  # of where the object stands
             heights = facts["heights"]["mean"], facts["heights"]["deviation"]
             for camera, view in config.views.items():
-                of = facts["cameras"][camera]
-                self.lifts[camera] = Lift(view, of, heights, 2 * config.channels, width)
-            self.aim = nn.Sequential(nn.Linear(SAID * len(config.views), width), nn.ReLU(), nn.Linear(width, width))
+                for of in (self.lifts, self.stands):
+                    of[camera] = Lift(view, facts["cameras"][camera], heights, 2 * config.channels, width)
+            self.aim = nn.Sequential(nn.Linear(2 * SAID * len(config.views), width), nn.ReLU(), nn.Linear(width, width))
         self.out, self.key_out = nn.Linear(width, ROW), nn.Linear(width, 9)
 
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
@@ -137,28 +144,53 @@ class SmallModel(nn.Module):
             moved = moves[camera] = by if by is not None else torch.zeros(1, 2, device=seen.device)
             places[camera] = (batch[f"{camera}_place"] + moved, batch[f"{camera}_places"] + moved[:, None])
         maps, felt = self._look(pictures), batch["state"]
-        came = self._think(maps, self._hear(batch["words"]), felt, moves)
+        words, asked = self._hear(batch["words"]), self._hear(batch["asked"])
+        came = self._think(maps, words, felt, moves)
         found = chunk_losses(self, batch, came.chunk, came.key)
-        for camera, lift in self.lifts.items():
-            own: Any = lift
-            loss, off = own.losses(came.lifted[camera], batch["key"], places[camera][0], tcp_of(felt))
-            found["loss"] = found["loss"] + self.config.lift_weight * loss
-            found[f"{camera}_lift_mm"] = off
-        asked = self._hear(batch["asked"]) + came.state.detach()[:, None]
         kinds = batch["kinds"]
         alike = (kinds[:, :, None] == kinds[:, None, :]) & (kinds >= 0)[:, :, None]
         for camera, view in self.config.views.items():
             columns, (place, others) = view.size[0] // CELL, places[camera]
             loss, right = pointing_losses(came.cells[camera], cells_of(place, view)[:, None], columns)
             eye: Any = self.eyes[camera]
-            logits = eye.pointer.logits(maps[camera][1], asked)
+            fine = maps[camera][1]
+            if self.config.lift:
+                logits = eye.namer.logits(fine, asked)
+            else:
+                logits = eye.pointer.logits(fine, asked + came.state.detach()[:, None])
             standing = cells_of(others, view)[:, None].where(alike, NOWHERE)
             more, named = pointing_losses(logits, standing, columns)
             pointing = self.config.point_weight * mean(loss) + self.config.name_weight * mean(more)
             found["loss"] = found["loss"] + pointing
             found |= {f"{camera}_point": loss, f"{camera}_found": right}
             found |= {f"{camera}_name": more, f"{camera}_named": named}
+            if self.config.lift:
+                found |= self._locating(batch, camera, fine, came, asked, places[camera])
+                found["loss"] = found["loss"] + self.config.lift_weight * found[f"{camera}_lift"]
         return found
+
+    def _locating(
+        self,
+        batch: Batch,
+        camera: str,
+        fine: torch.Tensor,
+        came: Thought,
+        asked: torch.Tensor,
+        places: tuple[torch.Tensor, torch.Tensor],
+    ) -> dict[str, torch.Tensor]:
+        """Losses of where a camera says that things are, and its error of what is next where that is near, in mm."""
+        lift: Any = self.lifts[camera]
+        stands: Any = self.stands[camera]
+        next_height = heights_of(batch["key"][:, :3], tcp_of(batch["state"]))
+        own = lift.loss(fine, came.asked[:, None], places[0][:, None], next_height[:, None])
+        known = batch["kinds"] >= 0
+        others = places[1].where(known[..., None], torch.nan)
+        error = (came.points[camera] - batch["key"][:, :3]).norm(dim=1)
+        near = (batch["key"][:, :3].norm(dim=1) < FAR) & (cells_of(places[0], self.config.views[camera]) != NOWHERE)
+        return {
+            f"{camera}_lift": own + stands.loss(fine, asked, others, batch["heights"]),
+            f"{camera}_lift_mm": torch.stack([1000 * (error * near).sum(), near.sum()]),
+        }
 
     def act(self, batch: Batch) -> torch.Tensor:
         """(B, K, 10) chunks: poses as they are, commands as shares, 1 = open."""
@@ -176,19 +208,23 @@ class SmallModel(nn.Module):
     def _think(self, maps: Maps, words: torch.Tensor, felt: torch.Tensor, moves: Batch) -> Thought:
         """What comes of maps, words (B, width) and what the arm feels (B, 10), of pictures shifted by ``moves``."""
         state = self.state(felt)
-        asked = words + state
-        tokens, cells, lifted = {}, {}, {}
+        aims = asked = words + state
+        tokens, cells, points, said = {}, {}, {}, []
         for camera, of in maps.items():
             eye: Any = self.eyes[camera]
             tokens[camera], cells[camera] = eye.tell(of, asked)
-        aims = asked
+            if self.config.lift:
+                named = eye.namer.logits(of[1], words[:, None])[:, 0]
+                where, by = tcp_of(felt), moves[camera]
+                points[camera], key = self.lifts[camera](of[1], asked, cells[camera], where, by)
+                _, stands = self.stands[camera](of[1], words, named, where, by)
+                said += [key, stands]
         if self.config.lift:
-            for camera, lift in self.lifts.items():
-                lifted[camera] = lift(maps[camera][1], asked, cells[camera], tcp_of(felt), moves[camera])
-            aims = asked + self.aim(torch.cat([of["said"] for of in lifted.values()], dim=1))
+            aims = asked + self.aim(torch.cat(said, dim=1))
         memory = torch.cat([*tokens.values(), words[:, None], state[:, None]], dim=1)
         thought = self.decoder(self.queries + aims[:, None], memory)
-        return Thought(self.out(thought[:, :-1]).float(), self.key_out(thought[:, -1]).float(), state, cells, lifted)
+        chunk, next_key = self.out(thought[:, :-1]).float(), self.key_out(thought[:, -1]).float()
+        return Thought(chunk, next_key, state, asked, cells, points)
 
     def _shifts(self, pictures: torch.Tensor) -> torch.Tensor | None:
         """(B, 2) pixels right and down that pictures are shifted by in training."""

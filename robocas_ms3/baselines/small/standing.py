@@ -1,4 +1,7 @@
-"""Where the objects of a scene are seen as long as they stand where the layout put them."""
+"""Where the objects of a scene are seen as long as they stand where the layout put them.
+
+That is until the gripper is told something else: the scripted policy comes to what it grasps on a way that is free.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,6 @@ from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import Array, from_xyzw, inverse, transform
 
-NEAR = 0.12
-"""m from TCP to an object's origin at which it may be touched; from then on nothing is known to stand still."""
 _PARENTS = {camera.name: camera.parent for camera in CAMERAS}
 
 
@@ -29,12 +30,14 @@ class Standing:
         target: kind (asset) of the one that is meant; empty: not known.
         kinds: of each of N objects.
         places: (T, N, 2) in pixels of the view of each camera; NaN: behind it, or not known any more.
+        points: (N, 3) where they stand in the arm's base, m.
     """
 
     steps: int
     target: str = ""
     kinds: list[str] = field(default_factory=list)
     places: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    points: NDArray[np.floating] = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 def standing(
@@ -62,7 +65,7 @@ def standing(
         meant, known = str(target.get("asset_id") or ""), layout.get("poses")
         if not known or "takeover" in (episode.scene.get("recorded") or {}):  # who acted before has moved them
             nothing = np.full((steps, 0, 2), np.nan, np.float32)
-            return Standing(steps, meant, [], dict.fromkeys(looks, nothing))
+            return Standing(steps, meant, places=dict.fromkeys(looks, nothing))
         there = np.array(layout.get("present") or [True] * len(known), bool)
         points = np.array(known, np.float64).reshape(-1, 7)[there, :3]
         kinds = [name for name, present in zip(layout["object_ids"], there, strict=True) if present]
@@ -70,13 +73,12 @@ def standing(
         where = f"{episode.where}/{SCENE_FILE}"
         raise DatasetError("this description of a scene is damaged", where=where, found=error) from error
     in_base = transform(inverse(_base(arrays)), points[None])
-    far = np.linalg.norm(in_base - tcp_in_base[:, None, :3, 3], axis=-1).min(axis=1) > NEAR
     opened = arrays["gripper_status"].reshape(-1)
-    still = np.logical_and.accumulate(far & (opened == opened[0]))
+    still = np.logical_and.accumulate(opened == opened[0])
     places = {camera: look(seen_from(camera, in_base, tcp_in_base, arrays)) for camera, look in looks.items()}
     for seen in places.values():
         seen[~still] = np.nan
-    return Standing(steps, meant, kinds, places)
+    return Standing(steps, meant, kinds, places, in_base[0])
 
 
 def calibration(

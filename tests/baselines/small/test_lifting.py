@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.chunks import state_of
 from robocas_ms3.baselines.small.config import View
-from robocas_ms3.baselines.small.lifting import SAID, Lift, tcp_of
-from robocas_ms3.baselines.small.pointing import NOWHERE, places_of
+from robocas_ms3.baselines.small.lifting import SAID, Lift, heights_of, tcp_of
+from robocas_ms3.baselines.small.pointing import places_of
 from robocas_ms3.poses import from_parts, inverse, transform
 
 VIEW = View(rendered=(64, 48), size=(64, 48))
@@ -76,21 +76,27 @@ def test_it_reads_the_cell_that_is_pointed_at_and_takes_back_the_shift():
         own.height[2].bias.fill_(0.2)
     logits = torch.full((1, 48), -9.0)
     logits[0, 3] = 9.0
-    found = own(torch.zeros(1, 4, 6, 8), torch.zeros(1, 8), logits, tcp, torch.tensor([[2, 0]]))
+    points, said = own(torch.zeros(1, 4, 6, 8), torch.zeros(1, 8), logits, tcp, torch.tensor([[2, 0]]))
     x, y = 3 * 8 + 4 + 2 - 2, 4  # the middle, a quarter of 8, and the shift that is taken back
-    assert found["points"][0].tolist() == pytest.approx([(x - 32) / 32 * 0.8, (24 - y) / 32 * 0.8, 0.2], abs=1e-5)
-    assert found["said"].shape == (1, SAID) and found["said"][0, -1] > 0.99 and not found["said"].requires_grad
+    assert points[0].tolist() == pytest.approx([(x - 32) / 32 * 0.8, (24 - y) / 32 * 0.8, 0.2], abs=1e-5)
+    assert said.shape == (1, SAID) and said[0, -1] > 0.99 and not said.requires_grad
 
 
-def test_losses_are_those_of_what_is_seen():
-    """Of two keys one is seen: at 10 px right of a cell's corner, so 6 of its middle; its height is 5 cm off."""
+def test_a_loss_is_of_what_is_seen():
+    """Of two things one is seen: 14 px from the edge, so 2 of its cell's middle, and 5 cm above what is said."""
     own = lift()
-    key = torch.zeros(2, 9)
-    key[:, 2] = 0.05
-    found = {"offsets": torch.zeros(2, 2, 48), "heights": torch.zeros(2), "points": torch.zeros(2, 3)}
-    place = torch.tensor([[14.0, 4.0], [-5.0, 4.0]])
-    loss, off = own.losses(found, key, place, torch.eye(4).expand(2, 4, 4))
-    assert float(loss) == pytest.approx(2 / 8 + 1)  # cells, and in units of 5 cm
-    assert off.tolist() == pytest.approx([50, 1])
-    nothing, none = own.losses(found, key, torch.full((2, 2), float(NOWHERE)), torch.eye(4).expand(2, 4, 4))
-    assert float(nothing) == 0 and none.tolist() == [0, 0]
+    with torch.no_grad():
+        for layer in (own.offsets, own.height[2]):
+            layer.weight.zero_()
+            layer.bias.zero_()
+    fine, asked = torch.zeros(1, 4, 6, 8), torch.zeros(1, 2, 8)
+    places, heights = torch.tensor([[[14.0, 4.0], [-5.0, 4.0]]]), torch.tensor([[0.05, 7.0]])
+    assert own.loss(fine, asked, places, heights).item() == pytest.approx(2 / 8 + 1)  # in cells, and in 5 cm
+    assert own.loss(fine, asked, torch.full((1, 2, 2), torch.nan), heights).item() == 0
+
+
+def test_heights_are_in_the_base():
+    tcp = torch.from_numpy(turned()).float()
+    assert float(heights_of(torch.zeros(1, 3), tcp)) == pytest.approx(float(tcp[0, 2, 3]))
+    above = tcp[:, :3, :3].transpose(1, 2) @ torch.tensor([0.0, 0.0, 0.1])
+    assert float(heights_of(above, tcp)) == pytest.approx(float(tcp[0, 2, 3]) + 0.1)

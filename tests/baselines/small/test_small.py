@@ -122,9 +122,11 @@ def test_samples_are_the_datasets(samples, folder):
 
 def test_without_language_nothing_is_asked_for(folder, monkeypatch):
     """All questions would be the same, and have other answers."""
-    made = lambda episode, arrays, poses, looks: Standing(  # noqa: E731
-        len(poses), "apple", ["apple", "pear"], {name: np.zeros((len(poses), 2, 2), np.float32) for name in looks}
-    )
+
+    def made(episode, arrays, poses, looks):
+        nowhere = {name: np.zeros((len(poses), 2, 2), np.float32) for name in looks}
+        return Standing(len(poses), "apple", ["apple", "pear"], nowhere, np.zeros((2, 3)))
+
     monkeypatch.setattr(data, "standing", made)
     kinds = [
         BASELINE.data(SmallConfig(**TINY, language=language), folder, "val", lambda done, of: None)
