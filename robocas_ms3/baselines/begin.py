@@ -13,7 +13,7 @@ from robocas_ms3.baselines.runs import CHECKPOINT, RUN, WEIGHTS, RunRecord, hash
 from robocas_ms3.errors import TrainingError
 from robocas_ms3.strict import parse
 
-_SEEN = ("rate_hz", "pictures", "cameras")
+_SEEN = ("rate_hz", "pictures", "cameras", "calibration")
 """Facts that a run shares with the one it begins with."""
 _PACKAGES = ("robocas-ms3", "torch", "accelerate", "safetensors", "transformers", "numpy")
 
@@ -89,6 +89,17 @@ def precision_of(config: BaselineConfig, before: RunRecord | None) -> Any:
     return "bf16" if before.precision == "bf16" else "fp32"
 
 
+def _alike(one: Any, other: Any) -> bool:
+    """Whether JSON values are the same, numbers to a thousandth: a camera is not to the bit where it was before."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(_alike(one[key], other[key]) for key in one)
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_alike, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return abs(one - other) <= 1e-3
+    return one == other
+
+
 def facts_of(own: dict[str, Any], begin: Start | None, data: Path | None) -> dict[str, Any]:
     """What a network and its policy know of the data; the scales are those that its weights were learned by.
 
@@ -98,7 +109,7 @@ def facts_of(own: dict[str, Any], begin: Start | None, data: Path | None) -> dic
     if begin is None:
         return own
     for key in _SEEN:
-        if own.get(key) != begin.record.facts.get(key):
+        if not _alike(own.get(key), begin.record.facts.get(key)):
             raise TrainingError(
                 f"--start is of a run with other {key}",
                 where=data or begin.name,

@@ -16,7 +16,7 @@ from robocas_ms3.baselines.small.policy import make_policy
 class Small:
     """See `Baseline`."""
 
-    name, version = "small", 2
+    name, version = "small", 3
     about = "base and gripper camera, language; chunks of poses by a small transformer"
     Config = SmallConfig
 

@@ -68,7 +68,7 @@ class SmallSamples:
         first_pictures = {camera: seen.rgb(camera, 0) for camera in config.views}
         sizes = {camera: (picture.shape[1], picture.shape[0]) for camera, picture in first_pictures.items()}
         bases = seen.read(["base_pos", "base_orn"])
-        self._cameras = {
+        self._calibration = {
             camera: calibration(seen, camera, bases, sizes[camera], view) for camera, view in config.views.items()
         }
         first = np.concatenate([[0], np.cumsum([source.lengths[number] for number in numbers])])
@@ -99,7 +99,7 @@ class SmallSamples:
             "pictures": {camera: list(size) for camera, size in sizes.items()},
             "chunk": spread(self._chunks[..., :9].numpy()),
             "keys": spread(self._keys.numpy()),
-            "cameras": self._cameras,
+            "calibration": self._calibration,
             "heights": _spread_of_heights(self._state.numpy(), self._keys.numpy()),
             "words": _spread_of_words(self._words.numpy()),
         }
@@ -193,7 +193,7 @@ class SmallSamples:
 
     def _check(self, config: SmallConfig, camera: str, found: dict[str, Any], where: object) -> None:
         """See that a camera looks in all episodes as in the first."""
-        first = self._cameras[camera]
+        first = self._calibration[camera]
         if config.lift and not looks_alike(first, found):
             raise DatasetError(
                 "a camera looks another way than in other episodes, or is fixed in the world and the arm is not",

@@ -66,14 +66,15 @@ class Lift(nn.Module):
         Returns:
             Points (B, 3) in the TCP's frame, m; what is said of them (B, `SAID`). Neither teaches the pointer anything.
         """
-        with torch.no_grad():
-            share, cell = logits.softmax(dim=1).max(dim=1)
-            rows = torch.arange(len(cell), device=cell.device)
-            what = fine.flatten(2)[rows, :, cell]
-            places = self.middles[cell] + CELL * self.offsets(fine).flatten(2)[rows, :, cell].float() - by
-            heights = self.height(torch.cat([what, asked], dim=1))[:, 0].float()
-            points = self._lifted(places, heights * self._heights[1] + self._heights[0], tcp)
-            said = torch.cat([(points / _COARSE).clamp(-3, 3), (points / _FINE).clamp(-3, 3), share[:, None]], dim=1)
+        share, cell = logits.detach().softmax(dim=1).max(dim=1)
+        rows = torch.arange(len(cell), device=cell.device)
+        what = fine.detach().flatten(2)[rows, :, cell]
+        # with gradients all the same: autocast would keep the weights of a call without for `loss`, in torch before 2.11
+        offsets = self.offsets(fine.detach()).flatten(2)[rows, :, cell].float()
+        heights = self.height(torch.cat([what, asked.detach()], dim=1))[:, 0].float().detach()
+        places = self.middles[cell] + CELL * offsets.detach() - by
+        points = self._lifted(places, heights * self._heights[1] + self._heights[0], tcp)
+        said = torch.cat([(points / _COARSE).clamp(-3, 3), (points / _FINE).clamp(-3, 3), share[:, None]], dim=1)
         return points, said
 
     def _lifted(self, places: torch.Tensor, heights: torch.Tensor, tcp: torch.Tensor) -> torch.Tensor:

@@ -56,7 +56,7 @@ class Eye(nn.Module):
         self.down = nn.Conv2d(4 * channels, 2 * channels, 1)
         self.pointer = Pointer(view, 2 * channels, width)
         if lifts:
-            self.namer = Pointer(view, 2 * channels, width)
+            self.namer = Pointer(view, 2 * channels, width, tells=False)
         self.film, self.project = nn.Linear(width, 8 * channels), nn.Conv2d(4 * channels, width, 1)
         nn.init.zeros_(self.film.weight)
         nn.init.zeros_(self.film.bias)
@@ -130,7 +130,7 @@ class SmallModel(nn.Module):
             heights = facts["heights"]["mean"], facts["heights"]["deviation"]
             for camera, view in config.views.items():
                 for of in (self.lifts, self.stands):
-                    of[camera] = Lift(view, facts["cameras"][camera], heights, 2 * config.channels, width)
+                    of[camera] = Lift(view, facts["calibration"][camera], heights, 2 * config.channels, width)
             self.aim = nn.Sequential(nn.Linear(2 * SAID * len(config.views), width), nn.ReLU(), nn.Linear(width, width))
         self.out, self.key_out = nn.Linear(width, ROW), nn.Linear(width, 9)
 

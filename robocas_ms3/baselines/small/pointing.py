@@ -1,7 +1,7 @@
 """Where in a picture things are that language names: labels, and what finds them.
 
 Demonstrations say it twice. Where the TCP is when the gripper's command changes next is what the instruction leads to
-now; and until the arm comes near, each object stands where the layout put it, so that a picture answers for all of
+now; and until the gripper closes, each object stands where the layout put it, so that a picture answers for all of
 them, by the words of other episodes. To find the object that is meant is what a chunk's error hardly rewards until
 the hand is there.
 """
@@ -60,18 +60,20 @@ class Pointer(nn.Module):
         view: that the map is of.
         channels: of the map.
         width: of what is looked for, and of what is told.
+        tells: whether it is asked for more than `logits`.
     """
 
     places: torch.Tensor
 
-    def __init__(self, view: View, channels: int, width: int) -> None:
+    def __init__(self, view: View, channels: int, width: int, *, tells: bool = True) -> None:
         super().__init__()
         columns, rows = view.size[0] // CELL, view.size[1] // CELL
         y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
         self.register_buffer("places", torch.stack([x, y], dim=-1).reshape(-1, 2), persistent=False)
         self.wanted = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, channels))
         self.offered = nn.Conv2d(channels, channels, 1)
-        self.tell = nn.Linear(channels + 2, width)
+        if tells:
+            self.tell = nn.Linear(channels + 2, width)
 
     def logits(self, seen: torch.Tensor, asked: torch.Tensor) -> torch.Tensor:
         """(B, Q, h w) of the cells, of maps (B, C, h, w) and questions (B, Q, width)."""
