@@ -12,6 +12,6 @@ unset PYTHONDONTWRITEBYTECODE  # else each of the hundreds of processes that tes
 # Processes of one thread: the tensors are small, and threads of several processes get in each other's way. One more than
 # there are cores, up to four: a fifth of a process's time goes by waiting for others that a test has started.
 # Files in our order (tests/conftest.py, the longest first): else a long one comes last, and one process waits for it.
+cores=$(nproc)  # before the next line, which nproc heeds
 export OMP_NUM_THREADS=1
-cores=$(nproc)
 "$bin/python" -m pytest -n $((cores < 4 ? cores + 1 : 4)) --dist loadfile --no-loadscope-reorder "$@"

@@ -30,8 +30,9 @@ class Wants:
         depth: whether pictures come with depth.
         state: whether it is told what only a simulator knows (docs/rl.md).
         language: how it is told what to do.
-        look_every: it looks at pictures before its first step, and again after so many; those between are black, as
-            rendering them is most of what an evaluation costs.
+        look_every: it looks at pictures before its first step, and again after so many; those between may be black,
+            as rendering them is most of what an evaluation costs. Chunks it answers with are of that length, or of
+            several times that.
     """
 
     convention: str = "robocas"
@@ -136,12 +137,14 @@ class Policy(Protocol):
         ...
 
 
+def said_of(wants: Wants) -> dict[str, Any]:
+    """JSON values of what is declared; of looks only if there are fewer than steps, as who reads it may be older."""
+    said = {**vars(wants), "cameras": {name: list(size) for name, size in wants.cameras.items()}}
+    return {key: value for key, value in said.items() if key != "look_every" or value != 1}
+
+
 def describe(policy: Policy) -> dict[str, Any]:
     """What a result says of a policy: its class and what it wants, and what its ``describe()`` adds if it has one."""
-    wants = policy.wants
-    said = {
-        "class": f"{type(policy).__module__}:{type(policy).__qualname__}",
-        "wants": {**vars(wants), "cameras": {name: list(size) for name, size in wants.cameras.items()}},
-    }
+    said = {"class": f"{type(policy).__module__}:{type(policy).__qualname__}", "wants": said_of(policy.wants)}
     more = getattr(policy, "describe", None)
     return {**said, **(more() if more is not None else {})}

@@ -183,6 +183,12 @@ class Rollouts:
                 expected=f"({len(envs)}, {self._size}) or ({len(envs)}, chunk, {self._size})",
                 found=actions.shape,
             )
+        every = self._policy.wants.look_every
+        if chunks.shape[1] > 1 and chunks.shape[1] % every:
+            what = "it would be asked for chunks without a look at pictures"
+            raise EvaluationError(
+                what, where=type(self._policy).__name__, expected=f"a multiple of {every} steps", found=chunks.shape[1]
+            )
         finite = np.isfinite(chunks).all((1, 2))
         for env, chunk, good in zip(envs, chunks, finite, strict=True):
             if not good:

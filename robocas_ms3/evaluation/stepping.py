@@ -105,7 +105,7 @@ class PolicyStepping(gym.Wrapper):
         finally:
             self._base.looks = True
         self._steps += 1
-        if (self._steps % self._look_every == 0).any() and "sensor_data" in obs:
+        if (self._steps % self._look_every == 0).any() and isinstance(obs, dict) and "sensor_data" in obs:
             obs = self._base.get_obs(info)
         if self._weld and not self._told[0]:
             self._weld.look()

@@ -138,9 +138,9 @@ class RoboCASEnv(SceneEnv):
 
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
         """Pictures by camera and kind; see ``BaseEnv``."""
-        if self.looks:
+        last = self._last_obs.get("sensor_data") if isinstance(self._last_obs, dict) else None
+        if self.looks or last is None:  # None: not of pictures, but of points made of them
             return super()._get_obs_sensor_data(apply_texture_transforms)
-        last = self._last_obs["sensor_data"]
         return {camera: {kind: torch.zeros_like(of) for kind, of in kinds.items()} for camera, kinds in last.items()}
 
     def _privileged(self) -> dict[str, torch.Tensor]:

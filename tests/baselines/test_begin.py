@@ -5,13 +5,36 @@ import shutil
 
 import pytest
 import torch
+from made_up_baseline import MadeUp
 from made_up_runs import assert_same, say, stop_at
 from safetensors.torch import load_file
 
-from robocas_ms3.baselines.begin import merged
+from robocas_ms3.baselines.begin import facts_of, find_start, merged
 from robocas_ms3.baselines.session import Said, train_run
 from robocas_ms3.errors import TrainingError
 from robocas_ms3.evaluation.policies import make_policy
+
+
+@pytest.mark.parametrize(
+    ("own", "fits"),
+    [
+        ({"x": [1.0004, 2], "hand": True}, True),
+        ({"x": [1.002, 2], "hand": True}, False),
+        ({"x": [1.0, 3], "hand": True}, False),
+        ({"x": [1.0], "hand": True}, False),
+        ({"x": [1.0, 2], "hand": False}, False),
+        (None, False),
+    ],
+)
+def test_a_start_has_seen_by_the_same_cameras(whole, made_up, own, fits):
+    """To a mm: calibrations are not the same to the bit."""
+    say(whole, facts={"calibration": {"x": [1.0, 2], "hand": True}})
+    begin = find_start(MadeUp(), whole, None, whole)
+    if fits:
+        assert facts_of({"calibration": own}, begin, None) == begin.record.facts
+    else:
+        with pytest.raises(TrainingError, match="other calibration"):
+            facts_of({"calibration": own}, begin, None)
 
 
 def test_options_leave_the_other_defaults(made_up, data, tmp_path):

@@ -40,13 +40,13 @@ def serving(policy, folder):
 
 
 def test_a_policy_of_ones_own_is_served_until_ctrl_c(tmp_path):
+    from robocas_ms3.evaluation.policy import said_of
     from robocas_ms3.evaluation.remote.client import RemotePolicy
-    from robocas_ms3.evaluation.remote.messages import wants_message
 
     (tmp_path / "mine.py").write_text(POLICY)
     with serving("mine:Up", tmp_path) as (served, url):
         remote = RemotePolicy(url)
-        assert wants_message(remote.wants)["convention"] == "delta_quaternion"
+        assert said_of(remote.wants)["convention"] == "delta_quaternion"
         remote.close()
         served.send_signal(signal.SIGINT)
         out, err = served.communicate(timeout=20)

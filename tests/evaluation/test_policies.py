@@ -7,6 +7,7 @@ import pytest
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policies.plain import StillPolicy
+from robocas_ms3.evaluation.policy import Wants, said_of
 
 GOOD = """
 from robocas_ms3.evaluation.policy import Wants
@@ -37,6 +38,13 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "own_spoilt.py").write_text("def (")
     (tmp_path / "own_importing.py").write_text("import not_there_at_all")
     return tmp_path
+
+
+def test_looks_are_told_where_they_are_not_every_steps():
+    assert "look_every" not in said_of(Wants())
+    assert said_of(Wants(look_every=7))["look_every"] == 7
+    with pytest.raises(EvaluationError, match="look_every"):
+        Wants(look_every=0)
 
 
 def test_a_module_in_the_folder_of_the_command(here):

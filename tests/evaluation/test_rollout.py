@@ -65,6 +65,19 @@ def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
     assert policy.asked == [[0, 1], [0, 1], [1]]
 
 
+@pytest.mark.parametrize(("chunk", "looks", "fits"), [(6, 3, True), (1, 3, True), (3, 6, False), (6, 4, False)])
+def test_chunks_begin_with_a_look(chunk, looks, fits):
+    """Whoever acts step by step sees to that himself."""
+    policy = Obedient(chunk)
+    policy.wants = Wants(state=True, look_every=looks)
+    episodes = Rollouts(Counting(1), policy, Rules(7), 0.05, refill=True).play(starts([4]))
+    if fits:
+        assert [one.steps for one in episodes] == [4]
+    else:
+        with pytest.raises(EvaluationError, match=f"without a look at pictures.*a multiple of {looks} steps"):
+            list(episodes)
+
+
 def test_actions_of_another_shape_are_refused():
     policy = Obedient()
     policy.act = lambda observations: np.zeros((2, 6))

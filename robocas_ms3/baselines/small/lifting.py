@@ -69,7 +69,7 @@ class Lift(nn.Module):
         share, cell = logits.detach().softmax(dim=1).max(dim=1)
         rows = torch.arange(len(cell), device=cell.device)
         what = fine.detach().flatten(2)[rows, :, cell]
-        # with gradients all the same: autocast would keep the weights of a call without for `loss`, in torch before 2.11
+        # not without gradients: torch's autocast, before 2.11, would keep the weights as they are for `loss`, too
         offsets = self.offsets(fine.detach()).flatten(2)[rows, :, cell].float()
         heights = self.height(torch.cat([what, asked.detach()], dim=1))[:, 0].float().detach()
         places = self.middles[cell] + CELL * offsets.detach() - by

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,8 @@ class RemotePolicy:
                 found=sorted(self._address.wants),
                 fix="Leave these out of the address.",
             )
-        self.wants: Wants = wants_of(self._address.wants if self._said is None else self._said, self._address.url)
+        wants = wants_of(self._address.wants if self._said is None else self._said, self._address.url)
+        self.wants: Wants = replace(wants, look_every=1) if self._address.play else wants  # it is asked more often
         self._about = json.loads(json.dumps(metadata.get(POLICY), default=str))
         self._spare: list[Link] = [link]
         self._links: dict[int, Link] = {}

@@ -31,11 +31,6 @@ _MAX_PIXELS = 4096  # a side
 _WANTS = TypeAdapter(Wants)
 
 
-def wants_message(wants: Wants) -> dict[str, Any]:
-    """What a policy declares of itself."""
-    return {**vars(wants), "cameras": {name: list(size) for name, size in wants.cameras.items()}}
-
-
 def wants_of(message: Any, where: object) -> Wants:
     """The way back; what is not said is as `Wants` has it.
 

@@ -18,7 +18,7 @@ from websockets.http11 import Request, Response
 
 from robocas_ms3 import __version__
 from robocas_ms3.errors import EvaluationError, WireError
-from robocas_ms3.evaluation.policy import Policy, describe
+from robocas_ms3.evaluation.policy import Policy, describe, said_of
 from robocas_ms3.evaluation.remote.messages import (
     ACTIONS,
     ENV,
@@ -27,7 +27,6 @@ from robocas_ms3.evaluation.remote.messages import (
     WANTS,
     observations_of,
     start_of,
-    wants_message,
 )
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES, pack, unpack
 
@@ -54,7 +53,7 @@ class PolicyServer:
     def __init__(self, policy: Policy, host: str = "127.0.0.1", port: int = 8000) -> None:
         self._policy, self._host, self._port = policy, host, port
         about = json.loads(json.dumps({**describe(policy), "robocas_ms3": __version__}, default=str))
-        self._metadata = pack({WANTS: wants_message(policy.wants), POLICY: about})
+        self._metadata = pack({WANTS: said_of(policy.wants), POLICY: about})
         self._taken: set[int] = set()  # envs of the policy
         self._connections = 0
         self._stopping: Callable[[], Any] = lambda: None

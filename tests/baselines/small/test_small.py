@@ -70,6 +70,26 @@ def test_five_episodes_are_learned(learned, samples):
     assert ((chunk[..., 9] > 0.5) == (batch["chunk"][..., 9] > 0.5)).float().mean() >= 0.95
 
 
+def test_every_weight_is_learned(samples):
+    """In bf16 as well; weights without a gradient would keep several GPUs waiting for them."""
+    torch.manual_seed(0)
+    model = BASELINE.model(SmallConfig(**TINY), samples.facts)
+    batch = samples.__getitems__(list(range(len(samples))))
+    batch |= {
+        "kinds": torch.zeros(len(samples), 1),
+        "asked": batch["words"][:, None],
+    }  # one at the next key
+    batch |= {"heights": torch.full((len(samples), 1), 0.1)}
+    batch |= {f"{camera}_places": batch[f"{camera}_place"][:, None] for camera in model.config.views}
+    with torch.autocast("cpu", torch.bfloat16):
+        loss = model(batch)["loss"]
+    loss.backward()
+    assert [name for name, weight in model.named_parameters() if weight.grad is None] == []
+    assert all(torch.isfinite(weight.grad).all() for weight in model.parameters())
+    for lift in (*model.lifts.values(), *model.stands.values()):
+        assert lift.offsets.weight.grad.any() and lift.height[2].weight.grad.any()
+
+
 def test_a_policy_goes_where_it_was_shown(learned, samples, folder):
     policy = BASELINE.policy(learned.config, samples.facts, learned)
     assert (policy.wants.rate_hz, policy.wants.reference) == (5.0, "tcp")

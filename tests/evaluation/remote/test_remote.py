@@ -40,6 +40,14 @@ def test_a_served_policy_sees_and_says_the_same():
             assert getattr(one, "dtype", None) == getattr(other, "dtype", None)
 
 
+def test_who_is_asked_more_often_than_it_would_looks_more_often():
+    with serving(Told(Wants(look_every=3))) as url:
+        for address, looks in ((url, 3), (f"{url}?play=2", 1)):
+            remote = RemotePolicy(address)
+            assert remote.wants.look_every == looks
+            remote.close()
+
+
 def test_random_is_the_same_directly_and_over_a_socket():
     starts = [a_start(env, episode=env, seed=env + 5) for env in range(3)]
     with serving(RandomPolicy()) as url:
