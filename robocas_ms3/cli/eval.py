@@ -29,9 +29,9 @@ class Eval:
     words: Annotated[Several[str], tyro.conf.Positional] = ()
     """Tasks; or one of the words above, and what it is about."""
     policy: str = "scripted"
-    """Of whom: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), random, still, replay:TRAJECTORY.h5,
-    a folder of `robocas train`, module:Class of your own, one that an installed package brings (`robocas list`), or
-    ws://HOST:PORT, a server's (`robocas serve-policy`)."""
+    """Of whom: scripted (joint targets), scripted-motions (RoboCAS' 7 numbers), scripted-beside (these, off by some
+    cm), random, still, replay:TRAJECTORY.h5, a folder of `robocas train`, module:Class of your own, one that an
+    installed package brings (`robocas list`), or ws://HOST:PORT, a server's (`robocas serve-policy`)."""
     protocol: Maybe[str] = None
     """Name of a shipped protocol, or a folder. Default: ms3-v1; of a result, the shipped one that it names."""
     out: Maybe[Path] = None

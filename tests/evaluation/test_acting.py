@@ -130,6 +130,20 @@ def test_a_target_in_the_hand_is_carried_on(player, generator, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("player", [("scripted-beside", (31, 31))], indirect=True)
+def test_who_has_closed_the_gripper_beside_is_shown_how_to_go_on(player, generator, tmp_path):
+    """In the same scene as above, in which the target is in the hand by then."""
+    takeover = player.do(2)
+    assert takeover.gripper == -1.0
+    assert generator.generate(2, tmp_path, "one", takeover).success
+    (episode,) = read_json(tmp_path / "one.h5")["episodes"]
+    assert [part["goal_type"] for part in episode["robocas"]["subgoals"]] == ["move and grasp", "transfer object"]
+    with h5py.File(tmp_path / "one.h5") as file:
+        told = file["traj_0/actions"][:, 7]
+    assert np.flatnonzero(np.diff(told)).size == 3  # it opens, closes where the target is, and opens above the basket
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("player", [("random", (31, 31))], indirect=True)
 def test_it_is_converted_from_where_the_policy_was(player, generator, tmp_path, needs_renderer):
     assert generator.generate(2, tmp_path, "one", player.do(2)).success

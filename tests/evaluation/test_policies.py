@@ -2,11 +2,13 @@
 
 import sys
 
+import numpy as np
 import pytest
 
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policies.plain import StillPolicy
+from robocas_ms3.evaluation.policies.scripted import BESIDE, beside
 from robocas_ms3.evaluation.policy import Wants, said_of
 
 GOOD = """
@@ -77,3 +79,12 @@ def test_what_is_no_policy_is_one_line(here, name, message):
 def test_an_error_of_the_policys_own_is_its_own(here):
     with pytest.raises(TypeError, match="len"):
         make_policy("own_policy:Broken")
+
+
+def test_how_far_beside_follows_from_the_seed():
+    drawn = np.array([beside(seed) for seed in range(200)])
+    far = np.linalg.norm(drawn, axis=1)
+    assert far.min() >= BESIDE[0] and far.max() <= BESIDE[1]
+    assert np.ptp(far) > 0.9 * (BESIDE[1] - BESIDE[0])
+    assert set(zip(*np.sign(drawn).T, strict=True)) == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
+    assert np.array_equal(beside(7), drawn[7])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +14,9 @@ import robocas_ms3  # noqa: F401
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
 from robocas_ms3.evaluation.tracking import summed
+from robocas_ms3.tasks.vector import make_vec
+
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: unproven on a GPU")
 
 
 def made(convention="robocas", reference="tcp", stepping="timed", rate=5) -> PolicyStepping:
@@ -172,3 +176,34 @@ def test_pictures_are_rendered_when_the_policy_looks(monkeypatch):
                 assert not expected or torch.equal(seen["base_camera"], now)
             assert int(info["elapsed_steps"]) > len(looks)
     env.close()
+
+
+@pytest.mark.parametrize("num_envs", [2, pytest.param(4, marks=[pytest.mark.gpu, needs_cuda])])
+def test_each_of_several_envs_is_looked_at_in_its_own_steps(num_envs):
+    """The last is reset after a step, and is one behind from there on."""
+    envs = make_vec(
+        "RoboCASPick-v1",
+        num_envs,
+        auto_reset=False,
+        ignore_terminations=True,
+        record_metrics=False,
+        wrappers=[partial(PolicyStepping, convention="robocas", reference="tcp", stepping="upstream", look_every=3)],
+        obs_mode="rgb",
+        reward_mode="none",
+        control_mode="pd_ee_delta_pose",
+        sim_config={"control_freq": 5},
+        sensor_configs={"width": 32, "height": 24},
+        max_episode_steps=10_000,
+    )
+
+    def shows(obs: Any) -> list[bool]:
+        return obs["sensor_data"]["base_camera"]["rgb"].flatten(1).any(dim=1).tolist()
+
+    actions = torch.tensor(along(0.02), dtype=torch.float32).repeat(num_envs, 1)
+    assert all(shows(envs.reset(seed=3)[0]))
+    envs.step(actions)
+    envs.reset(options={"env_idx": torch.tensor([num_envs - 1])})
+    found = [shows(envs.step(actions)[0]) for _ in range(4)]
+    assert [one[0] for one in found] == [False, True, False, False]
+    assert [one[-1] for one in found][2:] == [True, False]
+    envs.close()

@@ -26,10 +26,10 @@ GROUP = "robocas_ms3.policies"
 FOLDERS_GROUP = "robocas_ms3.policy_folders"
 
 
-def _scripted(speaks: Literal["joint_positions", "robocas"]) -> Policy:
+def _scripted(speaks: Literal["joint_positions", "robocas"], *, beside: bool = False) -> Policy:
     from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
 
-    return ScriptedPolicy(speaks)
+    return ScriptedPolicy(speaks, beside=beside)
 
 
 POLICIES: Table[Callable[[], Policy]] = Table(
@@ -39,6 +39,7 @@ POLICIES: Table[Callable[[], Policy]] = Table(
     {
         "scripted": partial(_scripted, "joint_positions"),
         "scripted-motions": partial(_scripted, "robocas"),
+        "scripted-beside": partial(_scripted, "robocas", beside=True),
         "random": RandomPolicy,
         "still": StillPolicy,
     },

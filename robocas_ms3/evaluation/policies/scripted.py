@@ -17,7 +17,9 @@ from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.recordings.motion import sample_stride
 from robocas_ms3.robots.table import find_robot
 
+BESIDE = (0.01, 0.05)  # m sideways, least and most: a finger on top of what is meant, or what stands next to it
 _FREQ = 20  # Hz, at which it plans
+_BESIDE = 411  # stream of an episode's seed
 
 
 class ScriptedPolicy:
@@ -28,9 +30,13 @@ class ScriptedPolicy:
 
     Args:
         speaks: joint targets at 20 Hz, as it planned them; or RoboCAS' motions from where the TCP is, at 5 Hz.
+        beside: those motions are off sideways, as those of a policy that does not see well: see `beside`.
     """
 
-    def __init__(self, speaks: Literal["joint_positions", "robocas"] = "joint_positions") -> None:
+    def __init__(
+        self, speaks: Literal["joint_positions", "robocas"] = "joint_positions", *, beside: bool = False
+    ) -> None:
+        self._beside = beside
         self.wants = Wants(speaks, reference="tcp", rate_hz=20 if speaks == "joint_positions" else 5, language="none")
         self._generators: dict[str, EpisodeGenerator] = {}
         self._followers = Followers()
@@ -68,9 +74,19 @@ class ScriptedPolicy:
             return JointTrack(actions)
         if not len(actions):
             return PoseTrack(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
-        return PoseTrack.of(find_robot(start.robot), states, actions[:, 7], sample_stride(_FREQ, 5))
+        track = PoseTrack.of(find_robot(start.robot), states, actions[:, 7], sample_stride(_FREQ, 5))
+        if self._beside:
+            track.poses[:, :2, 3] += beside(start.seed)
+        return track
 
     def close(self) -> None:
         """Close the environments that it plans in."""
         for generator in self._generators.values():
             generator.close()
+
+
+def beside(seed: int) -> NDArray[np.floating]:
+    """(2,) m in the arm's base frame, of which an episode's poses are off: anywhere, by as much as `BESIDE` says."""
+    generator = np.random.default_rng([seed, _BESIDE])
+    angle, far = generator.uniform(0, 2 * np.pi), generator.uniform(*BESIDE)
+    return far * np.array([np.cos(angle), np.sin(angle)])
