@@ -14,6 +14,8 @@ fail() { printf 'dagger_small: error: %s\n' "$*" >&2; exit 2; }
 
 task=${1:-}
 [[ $task == pick || $task == search ]] || fail "which task? bash scripts/dagger_small.sh pick|search [FOLDER]"
+acts=(5 60)
+[[ $task == pick ]] || acts=(5 100) # a search is longer
 from=${2:-reproduced/$task}
 out=$from/dagger
 [[ -f $from/run/weights.safetensors ]] || fail "$from: no run; bash scripts/reproduce_small.sh $task $from makes it"
@@ -29,7 +31,7 @@ timed() {
 
 mkdir -p "$out"
 timed "$robocas" generate "$task" --config "${task}_upstream_eval" -n "$episodes" --seed "$seed" --jobs "$jobs" \
-    --after-policy "$from/run" --out "$out/demos" --resume
+    --after-policy "$from/run" --after-steps "${acts[@]}" --out "$out/demos" --resume
 timed "$robocas" convert "$out/demos/trajectory.h5" --out "$out/parts" --size 512 384 --no-depth --no-video \
     --cameras base_camera gripper_camera --jobs "$jobs" --resume
 timed "$robocas" merge "$from/data" "$out/parts" --out "$out/data" --resume

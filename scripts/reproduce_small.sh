@@ -6,6 +6,7 @@
 # What is there already is gone on with: an interrupted call is simply made again. docs/baselines.md has what comes out.
 #
 # EPISODES, SEED, STEPS   how many demonstrations (default: 800), the first one's seed, steps of training
+# START                   a run to begin with, or `small`: the weights that come with the package (default: none)
 # JOBS                    processes that record, convert and evaluate (default: one a core)
 # ROBOCAS                 the command (default: that of the checkout's virtual environment)
 set -euo pipefail
@@ -48,5 +49,5 @@ for part in "${parts[@]}"; do
     data+=("$out/parts/$config")
 done
 timed "$robocas" merge "${data[@]}" --out "$out/data" --resume
-timed "$robocas" train small --data "$out/data" --out "$out/run" --steps "$steps" --resume
+timed "$robocas" train small --data "$out/data" --out "$out/run" --steps "$steps" ${START:+--start "$START"} --resume
 timed "$robocas" eval "$played" --policy "$out/run" --protocol paper-v1 --out "$out/eval" --envs "$jobs" --resume

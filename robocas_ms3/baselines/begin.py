@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.baselines.baseline import Baseline, BaselineConfig
-from robocas_ms3.baselines.runs import CHECKPOINT, RUN, WEIGHTS, RunRecord, hash_of_weights, read_run
+from robocas_ms3.baselines.runs import CHECKPOINT, RUN, WEIGHTS, RunRecord, find_run, hash_of_weights, read_run
 from robocas_ms3.errors import TrainingError
 from robocas_ms3.strict import parse
 
@@ -47,6 +47,7 @@ def find_start(baseline: Baseline, start: Path | None, before: RunRecord | None,
             what = "this run had no checkpoint yet, and begins with another's weights"
             raise TrainingError(what, where=out, expected=before.start, fix="Name that run by --start again.")
         return None
+    start = find_run(start)
     record = read_run(start)
     name = f"{start.resolve().name}, {hash_of_weights(start)[:12]}"
     if before is not None and before.start != name:

@@ -5,14 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.baselines.runs import RUN, WEIGHTS, RunRecord, hash_of_weights, read_run
+from robocas_ms3.baselines.runs import RUN, SHIPPED, WEIGHTS, RunRecord, hash_of_weights, read_run
 from robocas_ms3.baselines.table import find_baseline
 from robocas_ms3.errors import TrainingError
 from robocas_ms3.evaluation.policy import Observations, Policy, Start, Wants
 from robocas_ms3.strict import parse
-
-SHIPPED = Path(__file__).parents[1] / "data" / "runs"
-"""Runs that come with the package, without what it takes to go on with them."""
 
 
 def shipped_small() -> RunPolicy:

@@ -23,6 +23,8 @@ from robocas_ms3.strict import StrictModel, parse
 
 RUN, METRICS, BOARD = "run.json", "metrics.csv", "tensorboard"
 CHECKPOINT, WEIGHTS = "checkpoint.safetensors", "weights.safetensors"
+SHIPPED = Path(__file__).parents[1] / "data" / "runs"
+"""Runs that come with the package, without what it takes to go on with them."""
 _BLOCK = 1 << 20
 
 
@@ -67,6 +69,11 @@ class RunRecord(StrictModel):
     precision: str
     resumed: list[str] = []
     start: str = ""
+
+
+def find_run(run: Path) -> Path:
+    """The folder of a run; one that comes with the package goes by its name, where there is no such folder."""
+    return SHIPPED / run if len(run.parts) == 1 and not run.exists() and (SHIPPED / run).is_dir() else run
 
 
 def read_run(folder: Path) -> RunRecord:

@@ -1,13 +1,16 @@
 """The weights that come with the package: small enough to ship, of this version, and the policy `small` by name."""
 
 import json
+from pathlib import Path
 
 import pytest
 
-from robocas_ms3.baselines.policy import SHIPPED, RunPolicy
-from robocas_ms3.baselines.runs import CHECKPOINT, read_run
+from robocas_ms3.baselines.begin import find_start
+from robocas_ms3.baselines.policy import RunPolicy
+from robocas_ms3.baselines.runs import CHECKPOINT, SHIPPED, read_run
 from robocas_ms3.baselines.small import BASELINE
 from robocas_ms3.cli.main import run
+from robocas_ms3.errors import TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
 
@@ -23,6 +26,16 @@ def test_they_are_a_policy_by_name():
     assert isinstance(policy, RunPolicy)
     assert (policy.wants.convention, policy.wants.rate_hz, policy.wants.language) == ("robocas", 5.0, "embedding")
     assert policy.describe()["steps"] > 0
+
+
+def test_they_are_a_start_by_name_unless_a_folder_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    begun = find_start(BASELINE, Path("small"), None, tmp_path / "out")
+    assert begun is not None and begun.weights
+    assert begun.record == read_run(SHIPPED / "small")
+    Path("small").mkdir()
+    with pytest.raises(TrainingError, match="no run of robocas train"):
+        find_start(BASELINE, Path("small"), None, tmp_path / "out")
 
 
 @pytest.mark.slow
