@@ -11,7 +11,7 @@ from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.language.texts import instruction_texts, synonym_texts
 from robocas_ms3.scenes.frozen import FrozenLayouts
 
-SUITES = ("objects", "arrangement", "clutter", "instructions", "cameras", "looks", "furniture")
+SUITES = ("objects", "arrangement", "clutter", "instructions", "cameras", "looks", "furniture", "paper-words")
 
 
 def suite(name):
@@ -107,12 +107,35 @@ def test_instructions():
     assert {config.language.split for config in trained("instructions").values()} == {"train"}
 
 
-def test_the_scenes_of_all_instructions_are_the_same():
-    folder = suite("instructions").folder / "layouts"
-    for task in ("pick_table_scattered", "select_table_orderly", "search_table_small_heap"):
+@pytest.mark.parametrize(
+    ("name", "tasks", "splits"),
+    [
+        (
+            "instructions",
+            ("pick_table_scattered", "select_table_orderly", "search_table_small_heap"),
+            ("paraphrase", "wrong", "empty"),
+        ),
+        ("paper-words", ("pick_upstream_eval",), ("wrong", "empty")),
+    ],
+)
+def test_the_scenes_of_all_instructions_are_the_same(name, tasks, splits):
+    folder = suite(name).folder / "layouts"
+    for task in tasks:
         seen = np.load(folder / f"{task}-seen.npy")
-        for split in ("paraphrase", "wrong", "empty"):
+        for split in splits:
             assert np.load(folder / f"{task}-{split}.npy").tobytes() == seen.tobytes()
+
+
+def test_the_words_of_the_paper_are_its_own_anothers_and_none():
+    splits = {split: [one for one, _ in scenes] for split, scenes in standing("paper-words").items()}
+    names = {one: asset.asset.name for one, asset in load_pack("builtin").objects.items()}
+    assert set(splits) == {"seen", "wrong", "empty"}
+    for meant, wrong, nothing in zip(splits["seen"], splits["wrong"], splits["empty"], strict=True):
+        assert names[meant.target] in meant.instruction
+        assert names[meant.target] not in wrong.instruction
+        assert any(name in wrong.instruction for name in names.values())
+        assert nothing.instruction == ""
+        assert meant.target == wrong.target == nothing.target
 
 
 def test_cameras():

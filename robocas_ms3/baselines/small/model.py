@@ -235,11 +235,11 @@ class SmallModel(nn.Module):
 
     def _lit(self, pictures: torch.Tensor) -> torch.Tensor:
         """(B, 3, h, w) around 0 of (B, h, w, 3) uint8; in training in another light, each its own way."""
-        seen = pictures.permute(0, 3, 1, 2).contiguous().float() / 127.5 - 1  # norms are slow where channels are last
-        if self.training and self.config.brightness:
-            amount = self.config.brightness * (2 * torch.rand(2, len(seen), 1, 1, 1, device=seen.device) - 1)
-            seen = seen * (1 + amount[0]) + amount[1]
-        return seen
+        seen = pictures.permute(0, 3, 1, 2).contiguous().float()  # norms are slow where channels are last
+        if not (self.training and self.config.brightness):
+            return seen / 127.5 - 1
+        contrast, light = self.config.brightness * (2 * torch.rand(2, len(seen), 1, 1, 1, device=seen.device) - 1)
+        return seen.mul_((1 + contrast) / 127.5).add_(light - 1 - contrast)  # (seen / 127.5 - 1) (1 + contrast) + light
 
 
 def shifted(pictures: torch.Tensor, by: torch.Tensor) -> torch.Tensor:
