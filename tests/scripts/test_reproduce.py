@@ -14,7 +14,7 @@ STUB = '#!/bin/sh\nprintf "%s\\n" "$*" >> "$CALLS"\n'
 STEPS = {
     "reproduce_small.sh pick": "generate convert merge train eval",
     "reproduce_small.sh select": "generate convert generate convert merge train eval",
-    "reproduce_small.sh search": "generate convert generate convert merge train eval",
+    "reproduce_small.sh search": "generate convert generate convert generate convert merge train eval",
     "dagger_small.sh pick": "generate convert merge train eval",
 }
 
