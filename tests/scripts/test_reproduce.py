@@ -43,7 +43,7 @@ def test_they_call_what_there_is(tmp_path, words):
     folder = tmp_path / "out"
     (folder / "run").mkdir(parents=True)
     (folder / "run" / "weights.safetensors").touch()
-    done, calls = called(tmp_path, *words.split(), str(folder), EPISODES="40")
+    done, calls = called(tmp_path, *words.split(), str(folder), EPISODES="100")
     assert done.returncode == 0, done.stderr
     assert " ".join(call[0] for call in calls) == STEPS[words]
     mistake, made = mistakes(), {str(folder / "run"), str(folder / "data")}
@@ -57,7 +57,7 @@ def test_they_call_what_there_is(tmp_path, words):
         made.add(out)
         assert set(read) <= made, call
     counts = [int(call[call.index("-n") + 1]) for call in calls if call[0] == "generate"]
-    assert sum(counts) == 40
+    assert sum(counts) == 100
 
 
 @pytest.mark.parametrize(
