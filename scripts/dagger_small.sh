@@ -9,6 +9,7 @@
 # JOBS, ROBOCAS           as in reproduce_small.sh
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+source scripts/timed.sh
 
 fail() { printf 'dagger_small: error: %s\n' "$*" >&2; exit 2; }
 
@@ -22,12 +23,6 @@ out=$from/dagger
 episodes=${EPISODES:-300} seed=${SEED:-570000} steps=${STEPS:-1800}
 jobs=${JOBS:-$(nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
-
-timed() {
-    local begun=$SECONDS
-    "$@"
-    printf 'dagger_small: %s: %d min\n' "$2" $(((SECONDS - begun + 30) / 60))
-}
 
 mkdir -p "$out"
 timed "$robocas" generate "$task" --config "${task}_upstream_eval" -n "$episodes" --seed "$seed" --jobs "$jobs" \

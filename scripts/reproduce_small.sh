@@ -12,6 +12,7 @@
 # ROBOCAS                 the command (default: that of the checkout's virtual environment)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+source scripts/timed.sh
 
 fail() { printf 'reproduce_small: error: %s\n' "$*" >&2; exit 2; }
 
@@ -34,12 +35,6 @@ episodes=${EPISODES:-$count} seed=${SEED:-510000} steps=${STEPS:-$steps} start=$
 jobs=${JOBS:-$(nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 command -v "$robocas" >/dev/null || fail "$robocas: no such command; bash scripts/setup.sh makes it"
-
-timed() {
-    local begun=$SECONDS
-    "$@"
-    printf 'reproduce_small: %s: %d min\n' "$2" $(((SECONDS - begun + 30) / 60))
-}
 
 mkdir -p "$out"
 data=()

@@ -17,6 +17,12 @@ STEPS = {
     "reproduce_small.sh search": "generate convert generate convert generate convert merge train eval",
     "dagger_small.sh pick": "generate convert merge train eval",
 }
+STUDY = {
+    "all": ["train", "eval"],
+    "25": ["split", "train", "eval"],
+    "no-language": ["train", "eval"],
+    "no-gripper-camera": ["train", "eval"],
+}
 
 
 def mistakes():
@@ -60,9 +66,52 @@ def test_they_call_what_there_is(tmp_path, words):
     assert sum(counts) == 100
 
 
+def reproduced(tmp_path, episodes):
+    """A folder as the trainings of a study need it."""
+    data = tmp_path / "out" / "data"
+    data.mkdir(parents=True)
+    (data / "data_info.json").touch()
+    for number in range(episodes):
+        (data / f"episode_{number:07d}").mkdir()
+    return tmp_path / "out"
+
+
+@pytest.mark.parametrize("what", STUDY)
+def test_a_study_trains_on_what_is_there_and_on_parts_of_it(tmp_path, what):
+    folder = reproduced(tmp_path, 100)
+    done, calls = called(tmp_path, "study_small.sh", str(folder), what, EPISODES="7", STEPS="9")
+    assert done.returncode == 0, done.stderr
+    assert [call[0] for call in calls] == STUDY[what]
+    mistake = mistakes()
+    assert not [call for call in calls if mistake(call) or "--resume" not in call]
+    train, played = calls[-2:]
+    whole = what != "25"
+    assert Path(train[train.index("--data") + 1]) == folder / ("data" if whole else "study/25/data/part_0")
+    assert train[train.index("--steps") + 1] == "9"
+    assert played[played.index("--policy") + 1] == train[train.index("--out") + 1]
+    assert played[played.index("--episodes") + 1] == "7"
+    if not whole:
+        shares = [float(share) for share in calls[0][calls[0].index("--parts") + 1 :][:2]]
+        assert shares == [0.25, 0.75]
+
+
+def test_a_study_leaves_out_what_it_is_about(tmp_path):
+    _, calls = called(tmp_path, "study_small.sh", str(reproduced(tmp_path, 10)), "no-language", "no-gripper-camera")
+    settings = [call[call.index("--set") + 1] for call in calls if call[0] == "train"]
+    assert settings == ["language=false", "views.gripper_camera=null"]
+
+
+@pytest.mark.parametrize("what", ["10", "11", "0", "5x", "no-words"])
+def test_a_study_refuses_what_it_does_not_know(tmp_path, what):
+    done, calls = called(tmp_path, "study_small.sh", str(reproduced(tmp_path, 10)), "all", what)
+    assert (done.returncode, calls) == (2, [])
+    assert f"study_small: error: {what}: " in done.stderr
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        (["study_small.sh", "nowhere"], "nowhere: no data; bash scripts/reproduce_small.sh pick nowhere makes it"),
         (["reproduce_small.sh"], "which task?"),
         (["reproduce_small.sh", "open_pick"], "which task?"),
         (
