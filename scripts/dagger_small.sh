@@ -21,7 +21,7 @@ from=${2:-reproduced/$task}
 out=$from/dagger
 [[ -f $from/run/weights.safetensors ]] || fail "$from: no run; bash scripts/reproduce_small.sh $task $from makes it"
 episodes=${EPISODES:-300} seed=${SEED:-570000} steps=${STEPS:-1800}
-jobs=${JOBS:-$(nproc)}
+jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 
 mkdir -p "$out"

@@ -32,7 +32,7 @@ case $task in
 esac
 out=${2:-reproduced/$task}
 episodes=${EPISODES:-$count} seed=${SEED:-510000} steps=${STEPS:-$steps} start=${START-$start}
-jobs=${JOBS:-$(nproc)}
+jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 command -v "$robocas" >/dev/null || fail "$robocas: no such command; bash scripts/setup.sh makes it"
 

@@ -17,7 +17,7 @@ fail() { printf 'study_small: error: %s\n' "$*" >&2; exit 2; }
 from=${1:-reproduced/pick}
 whats=("${@:2}")
 ((${#whats[@]})) || whats=(50 200 all no-language no-gripper-camera)
-steps=${STEPS:-1500} episodes=${EPISODES:-200} jobs=${JOBS:-$(nproc)}
+steps=${STEPS:-1500} episodes=${EPISODES:-200} jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 made=$from/data
 [[ -f $made/data_info.json ]] || fail "$from: no data; bash scripts/reproduce_small.sh pick $from makes it"

@@ -76,6 +76,12 @@ def reproduced(tmp_path, episodes):
     return tmp_path / "out"
 
 
+def test_processes_are_one_a_core_whatever_torch_is_told(tmp_path):
+    _, calls = called(tmp_path, "reproduce_small.sh", "pick", str(tmp_path / "out"), JOBS="", OMP_NUM_THREADS="1")
+    jobs = {call[call.index("--jobs") + 1] for call in calls if "--jobs" in call}
+    assert jobs == {str(len(os.sched_getaffinity(0)))}
+
+
 @pytest.mark.parametrize("what", STUDY)
 def test_a_study_trains_on_what_is_there_and_on_parts_of_it(tmp_path, what):
     folder = reproduced(tmp_path, 100)
