@@ -75,6 +75,20 @@ def needs_renderer() -> str:
     return device
 
 
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 600 kB; skipped where it can't be mounted."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", str(folder)], check=False, capture_output=True, text=True
+    )
+    if done.returncode:
+        pytest.skip(f"DISK FULL IS NOT TESTED ON A REAL DISK HERE: no tmpfs can be mounted: {done.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
 def without_renderer(problem: str) -> NoReturn:
     """Skip the test, on CI fail it."""
     if os.environ.get("CI", "").lower() in ("", "0", "false"):

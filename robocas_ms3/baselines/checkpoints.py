@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,45 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 
+from robocas_ms3.baselines.runs import CHECKPOINT, WEIGHTS
 from robocas_ms3.errors import TrainingError
 from robocas_ms3.files import replacing
 
-_HINT = "It is damaged, or of another program: train anew with --overwrite."
+_HINTS = {
+    CHECKPOINT: "It is damaged, or of another program: train anew with --overwrite.",
+    WEIGHTS: "It is damaged, or of another program: `robocas train` with --resume writes it anew.",
+}
 
 
 def save(path: Path, tensors: Mapping[str, torch.Tensor], about: Mapping[str, str]) -> None:
     """Write tensors and texts about them; a file that was there stays whole until the new one is."""
     held = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     with replacing(path, sync=True) as tmp:
-        tmp.write_bytes(to_bytes(held, dict(about)))  # safetensors' own file nobody else could read
+        tmp.write_bytes(_in_order(to_bytes(held, dict(about))))  # safetensors' own file nobody else could read
+
+
+def _in_order(made: bytes) -> bytes:
+    """The same with its header's keys sorted: safetensors has texts in any order, and results are named by a hash."""
+    end = 8 + int.from_bytes(made[:8], "little")
+    header = json.dumps(json.loads(made[8:end]), sort_keys=True, separators=(",", ":")).encode()
+    header += b" " * (-len(header) % 8)  # so that tensors are aligned
+    return len(header).to_bytes(8, "little") + header + made[end:]
+
+
+def save_run(
+    folder: Path, checkpoint: Mapping[str, torch.Tensor], weights: Mapping[str, torch.Tensor], about: Mapping[str, str]
+) -> None:
+    """Write what a run acts with, then what it goes on from: where that is at the last step, so are the weights."""
+    save(folder / WEIGHTS, weights, about)
+    save(folder / CHECKPOINT, checkpoint, about)
+
+
+def mend_weights(folder: Path, weights: Mapping[str, torch.Tensor], about: Mapping[str, str]) -> None:
+    """Write what a run acts with where that is missing, damaged, or of another step than its checkpoint."""
+    try:
+        load(folder / WEIGHTS, about)
+    except TrainingError:
+        save(folder / WEIGHTS, weights, about)
 
 
 def load(path: Path, expected: Mapping[str, str]) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
@@ -34,7 +63,8 @@ def load(path: Path, expected: Mapping[str, str]) -> tuple[dict[str, torch.Tenso
         TrainingError: there is no such file, it is damaged, or of something else.
     """
     if not path.is_file():
-        raise TrainingError("no such file", where=path, fix="The training ended before it wrote one: --resume goes on.")
+        fix = "A training that ended before it wrote one goes on with --resume."
+        raise TrainingError("no such file", where=path, fix=fix)
     try:
         with safe_open(path, "pt") as file:
             about = file.metadata() or {}
@@ -44,7 +74,8 @@ def load(path: Path, expected: Mapping[str, str]) -> tuple[dict[str, torch.Tenso
                     raise TrainingError(f"of another {key.replace('_', ' ')}", where=path, expected=value, found=found)
             return {name: file.get_tensor(name) for name in file.keys()}, about  # noqa: SIM118  (no mapping)
     except (SafetensorError, OSError) as error:
-        raise TrainingError("can't be read", where=path, found=error, fix=_HINT) from error
+        hint = _HINTS.get(path.name, _HINTS[CHECKPOINT])
+        raise TrainingError("can't be read", where=path, found=error, fix=hint) from error
 
 
 def put_in(model: torch.nn.Module, tensors: Mapping[str, torch.Tensor], where: object) -> None:

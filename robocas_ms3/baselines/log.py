@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.baselines.board import Board
 from robocas_ms3.baselines.runs import BOARD, METRICS
 from robocas_ms3.files import naming, replacing
 
@@ -24,8 +25,6 @@ class MetricsLog:
     """
 
     def __init__(self, folder: Path, step: int) -> None:
-        from torch.utils.tensorboard.writer import SummaryWriter
-
         self._path = folder / METRICS
         self._columns: list[str] = []
         self._had: set[tuple[int, str]] = set()
@@ -35,7 +34,7 @@ class MetricsLog:
             self._cut(step)
         if not step:
             shutil.rmtree(folder / BOARD, ignore_errors=True)
-        self._board: Any = SummaryWriter(str(folder / BOARD), purge_step=step + 1 if step else None)
+        self._board = Board(folder / BOARD, step + 1 if step else 0)
 
     def has(self, step: int, split: str) -> bool:
         """Whether those before wrote that line."""
@@ -59,12 +58,11 @@ class MetricsLog:
             if new:
                 lines.writeheader()
             lines.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
-        for key, value in {**metrics, "learning_rate": about["learning_rate"]}.items():
-            if math.isfinite(value):
-                self._board.add_scalar(f"{split}/{key}", value, step)
+        shown = {**metrics, "learning_rate": about["learning_rate"]}
+        self._board.add(step, {f"{split}/{key}": value for key, value in shown.items() if math.isfinite(value)})
 
     def close(self) -> None:
-        """Write what is left."""
+        """End it."""
         self._board.close()
 
     def _cut(self, step: int) -> None:

@@ -19,7 +19,7 @@ from robocas_ms3.baselines import checkpoints
 from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, Batch, Samples
 from robocas_ms3.baselines.log import MetricsLog
 from robocas_ms3.baselines.metrics import means_of, summed
-from robocas_ms3.baselines.runs import CHECKPOINT, WEIGHTS, RunRecord
+from robocas_ms3.baselines.runs import CHECKPOINT, RunRecord
 from robocas_ms3.baselines.schedule import Batches, epochs_at, learning_rate
 from robocas_ms3.errors import RobocasError, TrainingError
 from robocas_ms3.outputs import check_there
@@ -67,13 +67,13 @@ class Trainer:
         self._average = AveragedModel(model, multi_avg_fn=self._mix) if self.settings.ema else None
         optimizer = torch.optim.AdamW(_groups(model, self.settings.weight_decay), lr=1.0, betas=self.settings.betas)
         self.step = 0
+        self._bare = model
         self._sums: dict[str, torch.Tensor] = {}
         self._norms = torch.zeros((), dtype=torch.float64, device=accelerator.device)  # of all gradients, summed up
         if resume and (folder / CHECKPOINT).is_file():
             self._go_on(model, optimizer)
         else:
             torch.manual_seed(self.settings.seed + 1 + accelerator.process_index)
-        self._bare = model
         self._model, self._optimizer = accelerator.prepare(model, optimizer)
 
     def train(self, on_step: Callable[[int, int], None] = lambda done, of: None) -> None:
@@ -192,7 +192,7 @@ class Trainer:
     def _checked(self, samples: Samples) -> dict[str, float]:
         """Means of the validation split, of the average of the weights; changes nothing of what is to come."""
         accelerator = self._accelerator
-        model = (self._average.module if self._average is not None else self._bare).eval()
+        model = self._acting().eval()
         count = min(len(samples), self.settings.check_samples)
         places = torch.linspace(0, len(samples) - 1, count).long().tolist()
         if count >= accelerator.num_processes:  # else each looks at all
@@ -237,9 +237,11 @@ class Trainer:
             return
         check_there(self._folder / "run.json", TrainingError)
         with uninterrupted():
-            checkpoints.save(self._folder / CHECKPOINT, tensors, {**self._about, "step": str(self.step)})
-            acting = self._average.module if self._average is not None else self._bare
-            checkpoints.save(self._folder / WEIGHTS, acting.state_dict(), {**self._about, "step": str(self.step)})
+            about = {**self._about, "step": str(self.step)}
+            checkpoints.save_run(self._folder, tensors, self._acting().state_dict(), about)
+
+    def _acting(self) -> torch.nn.Module:
+        return self._average.module if self._average is not None else self._bare
 
     def _random_states(self) -> dict[str, torch.Tensor]:
         """States of the generators by ``cpu`` or ``cuda`` and number of the process, in each of them."""
@@ -252,8 +254,6 @@ class Trainer:
         return {f"{kind}.{number}": state for kind, rows in gathered.items() for number, state in enumerate(rows)}
 
     def _set_random(self, states: dict[str, torch.Tensor], where: Path) -> None:
-        if "cpu" in states:  # as checkpoints had them when one process alone kept its own
-            states = {f"{kind}.0": state for kind, state in states.items()}
         begun, now = sum(name.startswith("cpu.") for name in states), self._accelerator.num_processes
         if begun != now:
             fix = f"accelerate launch --num_processes {begun}, or train anew with --overwrite."
@@ -277,6 +277,8 @@ class Trainer:
         self._sums = {name: mine * value.to(device) for name, value in checkpoints.part(tensors, "sums.").items()}
         self._set_random(checkpoints.part(tensors, "random."), path)
         self.step = int(about["step"])
+        if self._accelerator.is_main_process:
+            checkpoints.mend_weights(self._folder, self._acting().state_dict(), about)
 
 
 class _Reported:

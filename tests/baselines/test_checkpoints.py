@@ -20,6 +20,19 @@ def test_there_and_back(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["c.safetensors"]
 
 
+def test_the_same_is_the_same_file(tmp_path):
+    """safetensors itself has texts in any order."""
+    path, about = tmp_path / "c.safetensors", {f"key{number}": "x" * number for number in range(20)}
+    tensors = {"b": torch.arange(7, dtype=torch.uint8), "a": torch.arange(3.0), "c": torch.tensor(2)}
+    made = set()
+    for _ in range(5):
+        checkpoints.save(path, tensors, about)
+        made.add(path.read_bytes())
+    assert len(made) == 1
+    back, said = checkpoints.load(path, about)
+    assert said == about and all(torch.equal(back[name], tensors[name]) for name in tensors)
+
+
 @pytest.mark.parametrize("key", ABOUT)
 def test_of_something_else(tmp_path, key):
     path = tmp_path / "c.safetensors"

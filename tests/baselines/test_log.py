@@ -1,5 +1,9 @@
 """The log of a run that goes on: whole lines of before, and none of what came after the checkpoint."""
 
+import math
+
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
 from robocas_ms3.baselines.log import MetricsLog
 
 HEAD = "step,split,epoch,seconds,learning_rate,loss\n"
@@ -28,14 +32,27 @@ def test_a_line_that_was_cut_off_is_none(tmp_path):
 
 def test_a_run_without_a_checkpoint_begins_its_curves_anew(tmp_path):
     """What TensorBoard has of before goes."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
     for loss in (5.0, 1.0):
         log = MetricsLog(tmp_path, 0)
         for step in (50, 100) if loss == 5.0 else (50,):
             about = {"epoch": 1.0, "seconds": 70.0, "learning_rate": 0.1}
             log.add(step, "train", about, {"loss": loss})
         log.close()
-    board = EventAccumulator(str(tmp_path / "tensorboard"))
+    assert shown(tmp_path, "train/loss") == [(50, 1.0)]
+
+
+def test_a_run_that_goes_on_shows_nothing_of_what_came_after_its_checkpoint(tmp_path):
+    for first, losses in ((0, {50: 3.0, 100: 2.0, 150: 9.0}), (100, {150: 1.0, 200: math.nan})):
+        log = MetricsLog(tmp_path, first)
+        for step, loss in losses.items():
+            log.add(step, "train", {"epoch": 1.0, "seconds": 1.0, "learning_rate": 0.5}, {"loss": loss})
+            assert shown(tmp_path, "train/learning_rate")[-1] == (step, 0.5)  # at once
+        log.close()
+    assert shown(tmp_path, "train/loss") == [(50, 3.0), (100, 2.0), (150, 1.0)]
+
+
+def shown(folder, name):
+    """(step, value) of a curve, as TensorBoard has it."""
+    board = EventAccumulator(str(folder / "tensorboard"))
     board.Reload()
-    assert [(point.step, point.value) for point in board.Scalars("train/loss")] == [(50, 1.0)]
+    return [(point.step, point.value) for point in board.Scalars(name)]

@@ -1,23 +1,27 @@
 """Runs: begun, broken off and gone on with to the bit, refused where they are of something else."""
 
+import errno
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import made_up_baseline
 import pytest
 import torch
 from made_up_runs import assert_same, lines, say, stop_at
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
+from robocas_ms3.baselines import checkpoints
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.session import Said, train_run
 from robocas_ms3.baselines.train import Trainer
+from robocas_ms3.cli.main import run
 from robocas_ms3.errors import DatasetError, OutputExistsError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
@@ -65,6 +69,55 @@ def test_a_crash_loses_what_came_after_the_last_checkpoint(whole, data, tmp_path
     done = []
     train_run("made-up", data, out, device="cpu", resume=True, said=Said(step=lambda at, of: done.append(at)))
     assert done[0] == step // 10 * 10
+    assert_same(whole, out)
+
+
+@pytest.mark.parametrize("name", ["weights.safetensors", "checkpoint.safetensors"])
+@pytest.mark.parametrize("at", [20, 40])
+def test_a_checkpoint_that_finds_no_room_is_written_later(whole, data, tmp_path, monkeypatch, name, at):
+    """The last one too: a run that is done acts by its last step."""
+    save = checkpoints.save
+
+    def full(path, tensors, about):
+        if path.name == name and about["step"] == str(at):
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        save(path, tensors, about)
+
+    out = tmp_path / "again"
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints, "save", full)
+        with pytest.raises(OSError, match=f"No space.*{name}"):
+            train_run("made-up", data, out, device="cpu")
+    train_run("made-up", data, out, device="cpu", resume=True)
+    assert_same(whole, out)
+
+
+@pytest.mark.parametrize("change", [Path.unlink, lambda path: path.write_bytes(b"\xff" * 100)])
+def test_what_a_run_acts_with_is_mended_from_its_checkpoint(whole, data, change):
+    before = (whole / "weights.safetensors").read_bytes()
+    change(whole / "weights.safetensors")
+    with pytest.raises(TrainingError, match="--resume"):
+        RunPolicy(whole)
+    train_run("made-up", data, whole, device="cpu", resume=True)
+    assert (whole / "weights.safetensors").read_bytes() == before
+
+
+@pytest.mark.parametrize("room", [0, 4, 8, 16])
+def test_a_full_disk_is_one_line_and_loses_nothing(whole, data, small_disk, capsys, room):
+    """A real one, with room for so many kB: it is full at the record, the log, the curves or a checkpoint."""
+    out = small_disk / "run"
+    words = ["train", "made-up", "--data", str(data), "--out", str(out), "--device", "cpu"]
+    filler = small_disk / "filler"
+    with suppress(OSError), filler.open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(4096))
+    os.truncate(filler, filler.stat().st_size // 4096 * 4096 - 1024 * room)
+    assert run(words) == 1
+    said = capsys.readouterr().err
+    assert re.search(r"^error: .*/small/run.*: No space left on device.*Make room.*--resume", said.splitlines()[-1])
+    assert "Traceback" not in said
+    filler.unlink()
+    assert run([*words, "--resume"]) == 0
     assert_same(whole, out)
 
 
@@ -132,10 +185,14 @@ def test_overwrite_begins_anew(whole, data):
 
 
 def test_a_loss_that_is_no_number_ends_the_run_and_keeps_the_last_checkpoint(made_up, data, tmp_path):
+    done, changes = [], {"broken_at": 7, "train": {"save_every": 1}}
+    said = Said(step=lambda at, _: done.append(at))
     with pytest.raises(TrainingError, match="the loss is no number any more.*learning_rate"):
-        train_run("made-up", data, tmp_path / "run", {"broken_at": 7}, device="cpu")
-    weights = tmp_path / "run" / "weights.safetensors"
-    assert not weights.exists() or all(tensor.isfinite().all() for tensor in load_file(weights).values())
+        train_run("made-up", data, tmp_path / "run", changes, device="cpu", said=said)
+    for name in ("checkpoint", "weights"):
+        tensors, about = checkpoints.load(tmp_path / "run" / f"{name}.safetensors", {})
+        assert all(tensor.isfinite().all() for tensor in tensors.values())
+        assert int(about["step"]) == done[-1] > 0
 
 
 @pytest.mark.parametrize("clip_norm", [0.0, 1.0])
@@ -253,17 +310,3 @@ def test_each_process_goes_on_with_its_own_random_state(shared):
 def test_a_run_goes_on_in_as_many_processes(made_up, shared):
     with pytest.raises(TrainingError, match="as many processes as it began.*expected 2, found 1.*num_processes 2"):
         train_run("made-up", shared / "data.h5", shared / "whole", device="cpu", resume=True)
-
-
-def test_a_checkpoint_of_before_processes_had_numbers(whole, data, tmp_path):
-    out = tmp_path / "older"
-    with pytest.raises(KeyboardInterrupt):
-        train_run("made-up", data, out, device="cpu", said=stop_at(17, KeyboardInterrupt()))
-    path = out / "checkpoint.safetensors"
-    with safe_open(path, "pt") as file:
-        about = file.metadata()
-    tensors = load_file(path)
-    tensors["random.cpu"] = tensors.pop("random.cpu.0")
-    save_file(tensors, path, about)
-    train_run("made-up", data, out, device="cpu", resume=True)
-    assert_same(whole, out)

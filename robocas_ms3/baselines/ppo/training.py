@@ -18,7 +18,7 @@ from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.rollouts import OUTCOMES, Rollouts, Tried, outcomes, steps_of
 from robocas_ms3.baselines.ppo.trials import FIRST_TRIAL, EnvTrials
-from robocas_ms3.baselines.runs import CHECKPOINT, WEIGHTS, RunRecord
+from robocas_ms3.baselines.runs import CHECKPOINT, RunRecord
 from robocas_ms3.errors import TrainingError
 from robocas_ms3.outputs import check_there
 from robocas_ms3.processes.lives import uninterrupted
@@ -157,8 +157,7 @@ class PpoTraining:
         check_there(self._folder / "run.json", TrainingError)
         about = {**self._about, "step": str(self.step)}
         with uninterrupted():
-            checkpoints.save(self._folder / CHECKPOINT, tensors, about)
-            checkpoints.save(self._folder / WEIGHTS, self.agent.state_dict(), about)
+            checkpoints.save_run(self._folder, tensors, self.agent.state_dict(), about)
 
     def _go_on(self) -> None:
         path = self._folder / CHECKPOINT
@@ -167,6 +166,7 @@ class PpoTraining:
         checkpoints.put_in_optimizer(self.optimizer, checkpoints.part(tensors, "optimizer."))
         self.played = int(tensors["episodes.played"]), tensors["episodes.last"]
         self.step, self._tried_out = int(about["step"]), bool(tensors["tried_out"])
+        checkpoints.mend_weights(self._folder, self.agent.state_dict(), about)
         torch.set_rng_state(tensors["random.cpu"])
         if "random.cuda" in tensors and self.agent.mean.is_cuda:
             torch.cuda.set_rng_state(tensors["random.cuda"])

@@ -129,20 +129,6 @@ def test_appending_to_a_damaged_dataset_says_which_episode(trajectory, tmp_path)
     assert json.loads((root / "conversion.json").read_text())["episodes"].keys() >= {"0", "1"}
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of 600 kB; skipped where it can't be mounted."""
-    folder = tmp_path / "small"
-    folder.mkdir()
-    done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", str(folder)], check=False, capture_output=True, text=True
-    )
-    if done.returncode:
-        pytest.skip(f"DISK FULL IS NOT TESTED ON A REAL DISK HERE: no tmpfs can be mounted: {done.stderr.strip()}")
-    yield folder
-    subprocess.run(["umount", "--lazy", str(folder)], check=True)
-
-
 def grow(folder, megabytes=16):
     subprocess.run(["mount", "-o", f"remount,size={megabytes}m", str(folder)], check=True)
 
