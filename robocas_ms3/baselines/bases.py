@@ -40,10 +40,20 @@ def check_tcp(source: EpisodeSource, number: int) -> None:
     """See that actions are motions of ManiSkill's TCP, by where an episode's gripper camera is.
 
     Raises:
-        DatasetError: they are of upstream's, which is turned about its z.
+        DatasetError: they are of upstream's, which is turned about its z; or nothing tells, as that camera is not
+            there, and no description of the scene, which converted episodes have.
     """
-    camera = "gripper_camera"
-    turn = eef_turn(source.episode(number).camera_in_parent(camera)) if camera in source.cameras else 0
+    camera, episode = "gripper_camera", source.episode(number)
+    if camera not in source.cameras:
+        if episode.scene:
+            return
+        raise DatasetError(
+            "nothing tells in which frame actions are",
+            where=episode.where,
+            expected=f"{camera}, or the scene.json of robocas convert",
+            fix="robocas import-robocas makes a dataset of it that tells.",
+        )
+    turn = eef_turn(episode.camera_in_parent(camera))
     if turn:
         raise DatasetError(
             "actions are in another frame than policies act in",

@@ -90,15 +90,20 @@ def precision_of(config: BaselineConfig, before: RunRecord | None) -> Any:
     return "bf16" if before.precision == "bf16" else "fp32"
 
 
-def _alike(one: Any, other: Any) -> bool:
-    """Whether JSON values are the same, numbers to a thousandth: a camera is not to the bit where it was before."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(_alike(one[key], other[key]) for key in one)
-    if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(_alike, one, other))
+def _other(one: Any, other: Any, name: str) -> tuple[str, Any, Any] | None:
+    """Name and values of the first JSON values that differ; None: there are none.
+
+    Numbers differ by more than a thousandth: a camera is not to the bit where it was before.
+    """
+    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
+        found = (_other(one[key], other[key], f"{name}.{key}") for key in one)
+        return next(filter(None, found), None)
+    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        found = (_other(*pair, f"{name}[{place}]") for place, pair in enumerate(zip(one, other, strict=True)))
+        return next(filter(None, found), None)
     if isinstance(one, float) and isinstance(other, float):
-        return abs(one - other) <= 1e-3
-    return one == other
+        return (name, round(one, 4), round(other, 4)) if abs(one - other) > 1e-3 else None
+    return (name, one, other) if one != other else None
 
 
 def facts_of(own: dict[str, Any], begin: Start | None, data: Path | None) -> dict[str, Any]:
@@ -110,13 +115,14 @@ def facts_of(own: dict[str, Any], begin: Start | None, data: Path | None) -> dic
     if begin is None:
         return own
     for key in _SEEN:
-        if not _alike(own.get(key), begin.record.facts.get(key)):
+        if (other := _other(begin.record.facts.get(key), own.get(key), key)) is not None:
+            name, expected, found = other
             raise TrainingError(
                 f"--start is of a run with other {key}",
-                where=data or begin.name,
-                expected=begin.record.facts.get(key),
-                found=own.get(key),
-                fix="Convert the data as it was for that run, or begin without it.",
+                where=f"{data or begin.name}, {name}",
+                expected=expected,
+                found=found,
+                fix="Convert the data as it was for that run and look at the same part of it, or begin without it.",
             )
     return begin.record.facts
 

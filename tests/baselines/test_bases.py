@@ -1,12 +1,13 @@
-"""Datasets whose mobile base drives are refused; one that trembles stands."""
+"""Datasets whose mobile base drives, or whose TCP is turned, are refused; a base that trembles stands."""
 
+import json
 import shutil
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
 from rt1_sizes import SIZES
+from small_sizes import TINY
 from synthetic import write_trajectory
 
 from robocas_ms3.baselines.bases import check_stands, check_tcp
@@ -14,6 +15,8 @@ from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.bc_state.data import StateSamples
 from robocas_ms3.baselines.rt1 import BASELINE as RT1
 from robocas_ms3.baselines.rt1.config import RT1Config
+from robocas_ms3.baselines.small import BASELINE as SMALL
+from robocas_ms3.baselines.small.config import SmallConfig
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.errors import DatasetError
 
@@ -34,20 +37,36 @@ def test_a_base_that_drives_at_once_or_slowly(column, rows):
         check_stands(motion, "here")
 
 
-@pytest.mark.parametrize(("camera", "turn"), [((0.05, 0.0), None), ((0.0, 0.05), -90), ((0.0, -0.05), 90)])
-def test_actions_of_a_turned_tcp_are_refused(camera, turn):
+LEARNERS = {"rt1": (RT1, RT1Config(**SIZES)), "small": (SMALL, SmallConfig(**TINY))}
+
+
+def learn(name, copy, side="train"):
+    baseline, config = LEARNERS[name]
+    return baseline.data(config, copy, side, lambda done, of: None)
+
+
+@pytest.mark.parametrize("name", LEARNERS)
+@pytest.mark.parametrize(("camera", "turn"), [((0.0, 0.05), -90), ((0.0, -0.05), 90)])
+def test_actions_of_a_turned_tcp_are_refused(folder, tmp_path, name, camera, turn):
     """ManiSkill's gripper camera is on the x side of its TCP."""
-    pose = np.eye(4)
-    pose[:2, 3] = camera
-    episode = SimpleNamespace(camera_in_parent=lambda name: pose)
-    source = SimpleNamespace(root="here", cameras=["gripper_camera"], episode=lambda number: episode)
-    if turn is None:
-        check_tcp(source, 0)
-        return
-    with pytest.raises(
-        DatasetError, match=f"here: actions are in another frame.*turned by {turn} degrees.*import-robocas"
-    ):
-        check_tcp(source, 0)
+    copy = shutil.copytree(folder, tmp_path / "dataset")
+    for path in copy.glob("episode_*/gripper_camera/cam_pos*_wrt_ee.npy"):
+        pose = np.load(path)
+        pose[:2, 3] = camera
+        np.save(path, pose)
+    with pytest.raises(DatasetError, match=f"actions are in another frame.*turned by {turn} degrees.*import-robocas"):
+        learn(name, copy)
+
+
+def test_without_a_gripper_camera_the_scene_tells_whose_actions_they_are(folder, tmp_path):
+    """Upstream's episodes have none."""
+    copy = shutil.copytree(folder, tmp_path / "dataset")
+    said = json.loads((copy / "conversion.json").read_text())
+    (copy / "conversion.json").write_text(json.dumps({**said, "cameras": ["base_camera"]}))
+    check_tcp(open_source(copy), 0)
+    (copy / "episode_0000000" / "scene.json").unlink()
+    with pytest.raises(DatasetError, match="episode_0000000: nothing tells in which frame.*import-robocas"):
+        check_tcp(open_source(copy), 0)
 
 
 def driven(folder, tmp_path, side):
@@ -62,11 +81,12 @@ def driven(folder, tmp_path, side):
     return copy, number
 
 
+@pytest.mark.parametrize("name", LEARNERS)
 @pytest.mark.parametrize("side", ["train", "val"])
-def test_rt1_refuses_it(folder, tmp_path, side):
+def test_a_base_that_drives_is_refused(folder, tmp_path, name, side):
     copy, number = driven(folder, tmp_path, side)
     with pytest.raises(DatasetError, match=f"episode {number}: the base drives"):
-        RT1.data(RT1Config(**SIZES), copy, side, lambda done, of: None)
+        learn(name, copy, side)
 
 
 def test_bc_state_refuses_it_before_it_makes_an_environment(tmp_path, monkeypatch):

@@ -22,7 +22,10 @@ def without(monkeypatch, module):
 
 def test_without_the_extra_the_error_names_it(monkeypatch):
     without(monkeypatch, "sentence_transformers")
-    with pytest.raises(MissingExtraError, match=r'pip install "robocas-ms3\[language\]", or pass --no-embeddings'):
+    with pytest.raises(
+        MissingExtraError,
+        match=r'pip install "robocas-ms3\[language\]"; robocas convert does without by --no-embeddings',
+    ):
         embed.TextEmbedder()
 
 

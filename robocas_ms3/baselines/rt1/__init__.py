@@ -21,7 +21,7 @@ class RT1:
 
     def data(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead) -> RT1Samples:
         """Samples of a dataset with pictures and embeddings, which are read when they are asked for."""
-        return RT1Samples(config, folder, split)
+        return RT1Samples(config, folder, split, on_read)
 
     def model(self, config: RT1Config, facts: dict[str, Any]) -> RT1Model:
         """The network."""

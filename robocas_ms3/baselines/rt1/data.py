@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
-from robocas_ms3.baselines.baseline import Batch
+from robocas_ms3.baselines.baseline import Batch, OnRead, Split
 from robocas_ms3.baselines.bases import check_bases, check_tcp
+from robocas_ms3.baselines.fits import check_fits
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.sources.protocol import EpisodeSource
+from robocas_ms3.datasets.training.sample_arrays import read_episode
 from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset
-from robocas_ms3.errors import DatasetError
 
 
 class RT1Samples(torch.utils.data.Dataset):
@@ -36,15 +36,16 @@ class RT1Samples(torch.utils.data.Dataset):
         config: what is looked at.
         folder: of the dataset.
         split: of it.
+        on_read: see `Baseline.data`; what is read here are numbers and texts.
 
     Raises:
-        DatasetError: it lacks embeddings or a camera, is of another rate, has no such split, is damaged, or its base
-            drives.
+        DatasetError: it lacks embeddings or a camera, is of another rate, has no such split, is damaged, holds what is
+            no number, or its base drives.
     """
 
-    def __init__(self, config: RT1Config, folder: Path, split: Literal["train", "val"]) -> None:
+    def __init__(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead = lambda done, of: None) -> None:
         source = open_source(folder)
-        _check(source, config)
+        check_fits(source, "rt1", config.cameras, config.rate_hz, other_cameras='--set cameras="[base_camera]"')
         for number in source.split(split)[:1]:
             check_tcp(source, number)
         check_bases(source, source.split(split))
@@ -59,6 +60,9 @@ class RT1Samples(torch.utils.data.Dataset):
         self._lengths, self._terminate = source.lengths, config.terminate_steps
         self.episodes = len(self._data.episodes)
         scale = ActionScale.of(source.action_space(), folder)
+        for done, number in enumerate(self._data.episodes, start=1):  # before hours of training come upon it
+            read_episode(source, number, (), embedding=True, subgoals=False)
+            on_read(done, self.episodes)
         first = source.episode(self._data.episodes[0])
         self.facts: dict[str, Any] = {
             "rate_hz": self._data.rate_hz,
@@ -75,7 +79,7 @@ class RT1Samples(torch.utils.data.Dataset):
         """A batch.
 
         Raises:
-            DatasetError: a file is missing or damaged, or holds what is no number.
+            DatasetError: a picture is missing or damaged.
         """
         samples = [self._data[index] for index in indices]
         steps = torch.tensor([sample["step"] for sample in samples])[:, None]
@@ -89,31 +93,3 @@ class RT1Samples(torch.utils.data.Dataset):
             "mask": mask,
             "terminate": mask & (acted > last - self._terminate),
         }
-
-
-def _check(source: EpisodeSource, config: RT1Config) -> None:
-    """See that a dataset holds what samples are made of, before anything is read.
-
-    Raises:
-        DatasetError: it does not.
-    """
-    missing = [name for name in config.cameras if name not in source.cameras]
-    if missing:
-        raise DatasetError(
-            "no pictures of a camera of rt1",
-            where=source.root,
-            expected=", ".join(config.cameras),
-            found=", ".join(source.cameras) or "none",
-            fix="Convert the trajectory with these cameras, or set cameras of the configuration.",
-        )
-    if not source.has_embeddings:
-        fix = "Convert the trajectory with embeddings; a LeRobot folder has none."
-        raise DatasetError("rt1 needs embeddings of the instructions", where=source.root, found="none", fix=fix)
-    if source.rate_hz != config.rate_hz:
-        raise DatasetError(
-            "steps at another rate than rt1 is to act at",
-            where=source.root,
-            expected=f"{config.rate_hz:g} Hz",
-            found=f"{source.rate_hz:g} Hz",
-            fix=f"Convert with --rate {config.rate_hz:g}, or set rate_hz={source.rate_hz:g}.",
-        )

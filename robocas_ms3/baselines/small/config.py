@@ -53,7 +53,8 @@ class SmallConfig(BaselineConfig):
         views: by camera; null leaves one out. The base camera sees the room from behind the arm: what can be reached
             lies in the lower middle of its picture, objects of upstream's scenes in a thirtieth of it.
         language: whether it is told what to do.
-        chunk: steps it predicts, at the dataset's rate.
+        rate_hz: steps a second that the data has to have, and the policy acts at.
+        chunk: steps it predicts.
         channels: of the first feature maps.
         width: of the transformer.
         heads, layers: of the transformer.
@@ -77,6 +78,7 @@ class SmallConfig(BaselineConfig):
         "gripper_camera": View(),
     }
     language: bool = True
+    rate_hz: float = Field(default=5.0, gt=0)
     chunk: int = Field(default=8, ge=1)
     channels: int = Field(default=32, ge=8, multiple_of=8)
     width: int = Field(default=128, ge=8)

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
 from robocas_ms3.baselines.bases import check_bases, check_tcp
 from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
+from robocas_ms3.baselines.fits import check_fits
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.pointing import places_of
 from robocas_ms3.baselines.small.standing import Standing, calibration, looks_alike, seen_from, standing
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
-from robocas_ms3.datasets.training.sample_arrays import check_holds
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import Array, from_xyzw
 
@@ -44,8 +44,8 @@ class SmallSamples:
         on_read: see `Baseline.data`.
 
     Raises:
-        DatasetError: the dataset lacks a camera or embeddings, is damaged, its pictures are smaller than asked for, or
-            all of them are more than memory holds.
+        DatasetError: the dataset lacks a camera or embeddings, is of another rate or damaged, its pictures are smaller
+            than asked for, or all of them are more than memory holds.
     """
 
     def __init__(
@@ -56,7 +56,15 @@ class SmallSamples:
         on_read: OnRead = lambda done, of: None,
     ) -> None:
         source = open_source(path)
-        check_holds(source, list(config.views), depth=False, embedding=config.language)
+        check_fits(
+            source,
+            "small",
+            list(config.views),
+            config.rate_hz,
+            language=config.language,
+            other_cameras="--set views.CAMERA=null",
+            without_language="--set language=false",
+        )
         numbers = source.split(split)
         self.episodes = len(numbers)
         if not numbers:
@@ -99,7 +107,7 @@ class SmallSamples:
             "pictures": {camera: list(size) for camera, size in sizes.items()},
             "chunk": spread(self._chunks[..., :9].numpy()),
             "keys": spread(self._keys.numpy()),
-            "calibration": self._calibration,
+            **({"calibration": self._calibration} if config.lift else {}),
             "heights": _spread_of_heights(self._state.numpy(), self._keys.numpy()),
             "words": _spread_of_words(self._words.numpy()),
         }
@@ -195,11 +203,12 @@ class SmallSamples:
         """See that a camera looks in all episodes as in the first."""
         first = self._calibration[camera]
         if config.lift and not looks_alike(first, found):
+            key = "mount" if not looks_alike(first, found, ["mount"]) else "intrinsic"
             raise DatasetError(
                 "a camera looks another way than in other episodes, or is fixed in the world and the arm is not",
-                where=f"{where}, {camera}",
-                expected=first["mount"],
-                found=found["mount"],
+                where=f"{where}, {camera}, {key}",
+                expected=np.round(first[key], 4).tolist(),
+                found=np.round(found[key], 4).tolist(),
                 fix="Train with --set lift=false, or on episodes of one calibration.",
             )
 

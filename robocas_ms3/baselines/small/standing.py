@@ -5,7 +5,7 @@ That is until the gripper is told something else: the scripted policy comes to w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +18,7 @@ from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import Array, from_xyzw, inverse, transform
 
+_ALIKE = {"mount": 1e-3, "intrinsic": 1e-2}
 _PARENTS = {camera.name: camera.parent for camera in CAMERAS}
 
 
@@ -94,11 +95,9 @@ def calibration(
     return {"on_hand": parent == "ee", "mount": mount.tolist(), "intrinsic": [*focal.tolist(), *middle.tolist()]}
 
 
-def looks_alike(one: dict[str, Any], other: dict[str, Any]) -> bool:
+def looks_alike(one: dict[str, Any], other: dict[str, Any], keys: Sequence[str] = tuple(_ALIKE)) -> bool:
     """Whether calibrations are the same, to a mm, a mrad and a hundredth of a pixel."""
-    return all(
-        np.allclose(one[key], other[key], rtol=0, atol=atol) for key, atol in (("mount", 1e-3), ("intrinsic", 1e-2))
-    )
+    return all(np.allclose(one[key], other[key], rtol=0, atol=_ALIKE[key]) for key in keys)
 
 
 def seen_from(camera: str, points: Array, tcp_in_base: Array, arrays: Mapping[str, NDArray[Any]]) -> Array:

@@ -6,12 +6,14 @@ import shutil
 import numpy as np
 import pytest
 import torch
+from made_up_runs import assert_same, stop_at
 from rt1_sizes import SIZES
 from torch.utils.data import DataLoader
 
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.policy import scaled
+from robocas_ms3.baselines.session import train_run
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.errors import DatasetError, TrainingError
 from robocas_ms3.strict import parse
@@ -122,15 +124,26 @@ def test_no_validation_is_said_as_trainers_expect_it(folder, tmp_path):
 
 @pytest.mark.parametrize("key", ["rel_pos", "language_embedding"])
 def test_nan_in_data_is_named(key, folder, tmp_path):
+    """Before the first step."""
     copy = shutil.copytree(folder, tmp_path / "dataset")
-    samples = BASELINE.data(RT1Config(**SIZES), copy, "train", lambda done, of: None)
-    number = open_source(copy).split("train")[0]
+    number = open_source(copy).split("train")[-1]
     path = copy / f"episode_{number:07d}" / "episode_info.npz"
     arrays = dict(np.load(path))
     arrays[key][0] = np.nan
     np.savez(path, **arrays)
-    with pytest.raises(DatasetError, match=f"{key}: not a number"):
-        samples.__getitems__([0])
+    with pytest.raises(DatasetError, match=f"episode {number}, {key}: not a number"):
+        BASELINE.data(RT1Config(**SIZES), copy, "train", lambda done, of: None)
+
+
+def test_it_goes_on_to_the_bit(folder, tmp_path):
+    """With what is random in it: crops and dropout."""
+    few = {"steps": 4, "batch_size": 2, "save_every": 2, "log_every": 1, "workers": 0}
+    changes = {**RT1Config(**SIZES).model_dump(), "train": few}
+    train_run("rt1", folder, tmp_path / "whole", changes, device="cpu")
+    with pytest.raises(RuntimeError):
+        train_run("rt1", folder, tmp_path / "again", changes, device="cpu", said=stop_at(3, RuntimeError("gone")))
+    train_run("rt1", folder, tmp_path / "again", device="cpu", resume=True)
+    assert_same(tmp_path / "whole", tmp_path / "again")
 
 
 @pytest.mark.parametrize(

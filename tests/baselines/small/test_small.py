@@ -2,14 +2,18 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from made_up_runs import assert_same, stop_at
 from pydantic import ValidationError
+from small_sizes import TINY, VIEW
 
 from robocas_ms3.baselines.begin import merged
 from robocas_ms3.baselines.chunks import decode
+from robocas_ms3.baselines.session import train_run
 from robocas_ms3.baselines.small import BASELINE, data
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.data import looked_at
@@ -21,19 +25,6 @@ from robocas_ms3.errors import DatasetError, TrainingError
 from robocas_ms3.evaluation.policy import Observations, Start
 from robocas_ms3.poses import to_wxyz
 from robocas_ms3.strict import parse
-
-VIEW = View(rendered=(64, 48), size=(64, 48))
-TINY = dict(
-    views={"base_camera": VIEW, "gripper_camera": VIEW},
-    chunk=3,
-    channels=8,
-    width=32,
-    heads=2,
-    layers=1,
-    dropout=0.0,
-    shift=0,
-    brightness=0.0,
-)
 
 
 @pytest.fixture(scope="module")
@@ -271,14 +262,9 @@ def test_views_that_there_are_not(change):
         View(**change)
 
 
-def _forget(folder, what):
+def _say(folder, **settings):
     path = folder / "conversion.json"
-    said = json.loads(path.read_text())
-    if what == "embeddings":
-        said["embeddings"] = False
-    else:
-        said["cameras"] = [camera for camera in said["cameras"] if camera != what]
-    path.write_text(json.dumps(said))
+    path.write_text(json.dumps({**json.loads(path.read_text()), **settings}))
 
 
 def _not_a_number(folder):
@@ -291,8 +277,10 @@ def _not_a_number(folder):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda folder: _forget(folder, "embeddings"), "there are no embeddings here"),
-        (lambda folder: _forget(folder, "gripper_camera"), "no such camera"),
+        (lambda folder: _say(folder, embeddings=False), "small needs embeddings.*--set language=false"),
+        (lambda folder: _say(folder, cameras=["base_camera"]), "no pictures of a camera.*--set views.CAMERA=null"),
+        (lambda folder: _say(folder, cameras=[]), "no pictures of a camera.*found none"),
+        (lambda folder: _say(folder, rate_hz=10.0), "expected 5 Hz, found 10 Hz.*--set rate_hz=10"),
         (_not_a_number, "not a number"),
         (lambda folder: next(folder.glob("*/base_camera/rgb/0003.png")).unlink(), "0003.png"),
     ],
@@ -311,9 +299,42 @@ def test_a_camera_that_looks_elsewhere_in_one_episode(folder, tmp_path):
     moved = np.load(path)
     moved[0, 3] += 0.002
     np.save(path, moved)
-    with pytest.raises(DatasetError, match="a camera looks another way"):
+    with pytest.raises(DatasetError, match=r"base_camera, mount: a camera looks another way.*expected \[\["):
         BASELINE.data(SmallConfig(**TINY), copy, "train", lambda done, of: None)
-    assert len(BASELINE.data(SmallConfig(**TINY, lift=False), copy, "train", lambda done, of: None)) == 35
+    config = SmallConfig(**TINY, lift=False)
+    samples = BASELINE.data(config, copy, "train", lambda done, of: None)
+    model = BASELINE.model(config, samples.facts)
+    batch = samples.__getitems__([0, 1, 2])
+    assert torch.isfinite(model(batch)["loss"])
+    assert model.act(batch).shape == (3, 3, 10)
+    assert "calibration" not in samples.facts  # with which a run could not begin where they are others
+
+
+def test_a_camera_that_looks_wider_in_one_episode(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    path = sorted(copy.glob("episode_*/gripper_camera/intrinsic.npy"))[2]
+    np.save(path, np.load(path) * [0.9, 0.9, 1, 1])
+    with pytest.raises(DatasetError, match=r"gripper_camera, intrinsic: a camera looks another way.*expected \["):
+        BASELINE.data(SmallConfig(**TINY), copy, "train", lambda done, of: None)
+
+
+def test_more_pictures_than_memory_holds(folder, monkeypatch):
+    monkeypatch.setattr(data.psutil, "virtual_memory", lambda: SimpleNamespace(available=1e5))
+    with pytest.raises(DatasetError, match="more pictures than memory holds.*robocas split"):
+        BASELINE.data(SmallConfig(**TINY), folder, "train", lambda done, of: None)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_it_goes_on_to_the_bit(folder, tmp_path, precision):
+    """With what is random in it: shifts, light and dropout."""
+    few = {"steps": 6, "batch_size": 8, "save_every": 2, "check_every": 3, "log_every": 1, "precision": precision}
+    changes = {**SmallConfig(**{**TINY, "dropout": 0.1, "shift": 3, "brightness": 0.2}).model_dump(), "train": few}
+    train_run("small", folder, tmp_path / "whole", changes, device="cpu")
+    with pytest.raises(RuntimeError):
+        said = stop_at(5, RuntimeError("gone"))
+        train_run("small", folder, tmp_path / "again", changes, device="cpu", said=said)
+    train_run("small", folder, tmp_path / "again", device="cpu", resume=True)
+    assert_same(tmp_path / "whole", tmp_path / "again")
 
 
 def test_pictures_that_are_too_small(folder):
