@@ -72,8 +72,11 @@ class RunRecord(StrictModel):
 
 
 def find_run(run: Path) -> Path:
-    """The folder of a run; one that comes with the package goes by its name, where there is no such folder."""
-    return SHIPPED / run if len(run.parts) == 1 and not run.exists() and (SHIPPED / run).is_dir() else run
+    """The folder of a run; one that comes with the package goes by its name, as where policies are named.
+
+    A folder of that name is meant by a path of more parts.
+    """
+    return SHIPPED / run if len(run.parts) == 1 and (SHIPPED / run).is_dir() else run
 
 
 def read_run(folder: Path) -> RunRecord:

@@ -10,6 +10,7 @@ from typing import Any
 
 from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, OnRead, Samples, Training
 from robocas_ms3.baselines.begin import (
+    Start,
     check_kind,
     check_same_data,
     config_of,
@@ -109,24 +110,8 @@ def train_run(
             said.note(f"reading {data}")
             samples = baseline.data(config, data, "train", said.read)
             check = _validation(baseline, config, data, said)
-        record = before or RunRecord(
-            baseline=name,
-            version=baseline.version,
-            config=config.model_dump(mode="json"),
-            facts=facts_of(samples.facts, begin, data),
-            data=DataRecord(
-                name=samples.name if data is None else data.name,
-                hash=hashed,
-                episodes=samples.episodes,
-                samples=len(samples),
-            ),
-            versions=versions(),
-            device=str(accelerator.device.type),
-            precision=str(accelerator.mixed_precision),
-            start=begin.name if begin else "",
-        )
-        weights = begin.weights if begin else None
-        more: dict[str, Any] = {"resume": resume, "start": weights, "on_note": said.note}
+        record = before or _record(baseline, config, data, hashed, samples, begin, accelerator)
+        more: dict[str, Any] = {"resume": resume, "start": begin.weights if begin else None, "on_note": said.note}
         if trier is not None:
             trainer: Training = trier.training(config, samples, out, record, accelerator, **more)
         else:
@@ -140,15 +125,45 @@ def train_run(
             said.note(f"goes on {record.resumed[-1]}: not what it would be by what it was begun by")
             write_run(out, record)
         accelerator.wait_for_everyone()
-        count = sum(parameter.numel() for parameter in trainer.parameters())
-        of = f"{len(samples)} steps in {samples.episodes} layouts" if trier else ""
-        said.note(
-            f"{name}: {count / 1e6:.2f} M parameters, "
-            f"{of or f'{len(samples)} samples of {samples.episodes} episodes'}, "
-            f"{accelerator.device.type}, {'bf16' if accelerator.mixed_precision == 'bf16' else 'fp32'}"
-        )
+        of = f"{len(samples)} {'samples of' if trier is None else 'steps in'} {samples.episodes}"
+        said.note(_line(record, trainer, f"{of} {'episodes' if trier is None else 'layouts'}", accelerator))
         trainer.train(said.step)
     return record
+
+
+def _record(
+    baseline: Baseline,
+    config: BaselineConfig,
+    data: Path | None,
+    hashed: str,
+    samples: Any,
+    begin: Start | None,
+    accelerator: Any,
+) -> RunRecord:
+    """Of a run that begins: see `RunRecord`."""
+    return RunRecord(
+        baseline=baseline.name,
+        version=baseline.version,
+        config=config.model_dump(mode="json"),
+        facts=facts_of(samples.facts, begin, data),
+        data=DataRecord(
+            name=samples.name if data is None else data.name,
+            hash=hashed,
+            episodes=samples.episodes,
+            samples=len(samples),
+        ),
+        versions=versions(),
+        device=str(accelerator.device.type),
+        precision=str(accelerator.mixed_precision),
+        start=begin.name if begin else "",
+    )
+
+
+def _line(record: RunRecord, trainer: Training, of: str, accelerator: Any) -> str:
+    """What is trained, on what."""
+    count = sum(parameter.numel() for parameter in trainer.parameters())
+    precision = "bf16" if accelerator.mixed_precision == "bf16" else "fp32"
+    return f"{record.baseline}: {count / 1e6:.2f} M parameters, {of}, {accelerator.device.type}, {precision}"
 
 
 def _check_data(baseline: Baseline, data: Path | None, *, by_trial: bool) -> None:

@@ -101,7 +101,12 @@ def changes_of(cfg: Train) -> dict[str, Any]:
 
     found: dict[str, Any] = {}
     if cfg.config is not None:
-        read = load_yaml(cfg.config)
+        try:
+            read = load_yaml(cfg.config)
+        except FileNotFoundError:
+            raise TrainingError("no such file", where=f"--config {cfg.config}") from None
+        except (OSError, ValueError) as error:
+            raise TrainingError("can't be read", where=f"--config {cfg.config}", found=error) from error
         if not isinstance(read, dict):
             raise TrainingError("no configuration", where=cfg.config, expected="a mapping", found=type(read).__name__)
         found = read

@@ -77,7 +77,7 @@ def groups_of(dataset: Dataset, by: By) -> dict[int, str]:
     return groups
 
 
-def cut(groups: Mapping[int, str], shares: Sequence[float]) -> list[list[int]]:
+def cut(groups: Mapping[int, str], shares: Sequence[float], salt: str = "") -> list[list[int]]:
     """Cut episodes into parts of about these shares; a group is never cut.
 
     Groups come in the order of their SHA-256, and fill the last part first: a group's place depends on the groups
@@ -86,6 +86,7 @@ def cut(groups: Mapping[int, str], shares: Sequence[float]) -> list[list[int]]:
     Args:
         groups: episode number -> its group.
         shares: of each part; they sum to 1.
+        salt: before a group's name; another one gives an order that has nothing to do with this one.
 
     Raises:
         DatasetError: fewer groups than parts, or no shares.
@@ -95,7 +96,7 @@ def cut(groups: Mapping[int, str], shares: Sequence[float]) -> list[list[int]]:
     members: dict[str, list[int]] = {}
     for number, group in groups.items():
         members.setdefault(group, []).append(number)
-    ranked = sorted(members, key=lambda group: hashlib.sha256(group.encode()).hexdigest())
+    ranked = sorted(members, key=lambda group: hashlib.sha256(f"{salt}{group}".encode()).hexdigest())
     if len(ranked) < len(shares):
         raise DatasetError("too few to split", expected=f"{len(shares)} groups", found=len(ranked))
     parts: list[list[int]] = []
@@ -153,7 +154,8 @@ def parts_by_side(part: Part, share: Share | None, train: Path, val: Path) -> di
 
 def parts_by_share(part: Part, shares: Sequence[float], by: By, share: Share | None, out: Path) -> dict[Path, Sides]:
     """Datasets ``out/part_0``, ... of these shares."""
-    pieces = cut(groups_of(part.dataset, by), shares)
+    # In an order of its own: in that of the sides, the last part would get all that validates.
+    pieces = cut(groups_of(part.dataset, by), shares, salt="part ")
     return {out / f"part_{index}": _within(part, piece, share) for index, piece in enumerate(pieces)}
 
 

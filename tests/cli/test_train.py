@@ -1,0 +1,86 @@
+"""`robocas train`: options to a configuration, defaults, and errors of a line."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from made_up_baseline import MadeUp
+
+from robocas_ms3.baselines.table import BASELINES
+from robocas_ms3.cli.main import run
+from robocas_ms3.cli.train import Train, changes_of
+from robocas_ms3.errors import TrainingError
+
+
+def test_options_win_over_the_file_and_later_ones_over_earlier(tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("chunk: 4\ntrain: {steps: 10, seed: 1, ema: 0.5}\nviews: {gripper_camera: null}\n")
+    told = ("chunk=5", "train.seed=2", "train.learning_rate=3e-4", "chunk=6")
+    found = changes_of(Train(config=file, set=told, steps=20, batch_size=8, seed=3))
+    assert found == {
+        "chunk": 6,
+        "views": {"gripper_camera": None},
+        "train": {"steps": 20, "seed": 3, "ema": 0.5, "learning_rate": 3e-4, "batch_size": 8},
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("null", None), ("false", False), ("[1, 2]", [1, 2]), ("3e-4", 3e-4), ("word", "word"), ("b=c", "b=c")],
+)
+def test_a_value_is_yaml(text, value):
+    assert changes_of(Train(set=(f"a={text}",))) == {"a": value}
+
+
+@pytest.mark.parametrize("text", ["steps", "=3", "train.=3", ".a=3", "a=[1"])
+def test_what_is_no_value(text):
+    with pytest.raises(TrainingError, match="--set: not a value"):
+        changes_of(Train(set=(text,)))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "c.yaml: no such file"),
+        ("a: [", "c.yaml: can't be read"),
+        ("- a", "no configuration.*a mapping.*list"),
+        ("widht: 3", "Did you mean width"),
+    ],
+)
+def test_a_file_that_is_none(tmp_path, monkeypatch, capsys, content, said):
+    monkeypatch.setitem(BASELINES.builtin, "made-up", MadeUp)
+    file, data = tmp_path / "c.yaml", tmp_path / "data.h5"
+    data.write_text("demonstrations")
+    if content is not None:
+        file.write_text(content)
+    words = ["train", "made-up", "--data", str(data), "--out", str(tmp_path / "run"), "--config", str(file)]
+    assert run(words) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(f"^error: .*{said}", line)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_training_from_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(BASELINES.builtin, "made-up", MadeUp)
+    monkeypatch.chdir(tmp_path)
+    Path("data.h5").write_text("demonstrations")
+    options = ["--steps", "8", "--batch-size", "2", "--seed", "5", "--set", "width=3", "--device", "cpu"]
+    assert run(["train", "made-up", "--data", "data.h5", *options]) == 0
+    made = Path("runs") / f"made-up-{tmp_path.name}"  # a trajectory's folder says more than its name
+    record = json.loads((made / "run.json").read_text())
+    assert record["config"]["width"] == 3
+    assert [record["config"]["train"][key] for key in ("steps", "batch_size", "seed")] == [8, 2, 5]
+    said = capsys.readouterr()
+    assert f"robocas eval TASK --policy {made} --protocol paper-v1" in said.out
+    assert "steps trained: 8 of 8" in said.err
+
+
+def test_a_run_that_comes_along_goes_by_its_name_as_policies_do(tmp_path, monkeypatch):
+    from robocas_ms3.baselines.runs import SHIPPED, find_run
+
+    monkeypatch.chdir(tmp_path)
+    Path("small").mkdir()
+    assert find_run(Path("small")) == SHIPPED / "small"
+    assert find_run(tmp_path / "small") == tmp_path / "small"
+    assert find_run(Path("large")) == Path("large")
