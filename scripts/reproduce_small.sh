@@ -37,6 +37,9 @@ robocas=${ROBOCAS:-.venv/bin/robocas}
 command -v "$robocas" >/dev/null || fail "$robocas: no such command; bash scripts/setup.sh makes it"
 
 mkdir -p "$out"
+asked="EPISODES=$episodes SEED=$seed" # else what is there would be mixed with what comes
+[[ -f $out/asked ]] || echo "$asked" >"$out/asked"
+[[ $(<"$out/asked") == "$asked" ]] || fail "$out was begun with $(<"$out/asked"), not $asked: name another FOLDER"
 data=()
 for part in "${parts[@]}"; do
     read -r percent offset of config first <<<"$part"

@@ -78,8 +78,15 @@ def config_of(
     if changes:
         wanted = parse(baseline.Config, merged(before.config, changes), TrainingError, where=baseline.name)
         if wanted != config:
-            fix = "Leave these options out, or train anew with --overwrite."
-            raise TrainingError("a run goes on as it was begun", where=out, fix=fix)
+            now, asked = (one.model_dump(mode="json") for one in (config, wanted))
+            name, expected, found = _other(now, asked, "", 0.0) or ("its configuration", now, asked)
+            raise TrainingError(
+                "a run goes on as it was begun",
+                where=f"{out}, {name.removeprefix('.')}",
+                expected=expected,
+                found=found,
+                fix=f"Leave that out; --start {out} --out ANOTHER trains on otherwise; --overwrite trains anew.",
+            )
     return config
 
 
@@ -90,19 +97,16 @@ def precision_of(config: BaselineConfig, before: RunRecord | None) -> Any:
     return "bf16" if before.precision == "bf16" else "fp32"
 
 
-def _other(one: Any, other: Any, name: str) -> tuple[str, Any, Any] | None:
-    """Name and values of the first JSON values that differ; None: there are none.
-
-    Numbers differ by more than a thousandth: a camera is not to the bit where it was before.
-    """
+def _other(one: Any, other: Any, name: str, tolerance: float) -> tuple[str, Any, Any] | None:
+    """Name and values of the first JSON values that differ, numbers by more than a tolerance; None: there are none."""
     if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
-        found = (_other(one[key], other[key], f"{name}.{key}") for key in one)
+        found = (_other(one[key], other[key], f"{name}.{key}", tolerance) for key in one)
         return next(filter(None, found), None)
     if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
-        found = (_other(*pair, f"{name}[{place}]") for place, pair in enumerate(zip(one, other, strict=True)))
+        found = (_other(*pair, f"{name}[{at}]", tolerance) for at, pair in enumerate(zip(one, other, strict=True)))
         return next(filter(None, found), None)
     if isinstance(one, float) and isinstance(other, float):
-        return (name, round(one, 4), round(other, 4)) if abs(one - other) > 1e-3 else None
+        return (name, float(f"{one:.4g}"), float(f"{other:.4g}")) if abs(one - other) > tolerance else None
     return (name, one, other) if one != other else None
 
 
@@ -115,7 +119,8 @@ def facts_of(own: dict[str, Any], begin: Start | None, data: Path | None) -> dic
     if begin is None:
         return own
     for key in _SEEN:
-        if (other := _other(begin.record.facts.get(key), own.get(key), key)) is not None:
+        # To a thousandth: a camera is not to the bit where it was before.
+        if (other := _other(begin.record.facts.get(key), own.get(key), key, 1e-3)) is not None:
             name, expected, found = other
             raise TrainingError(
                 f"--start is of a run with other {key}",

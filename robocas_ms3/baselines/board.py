@@ -22,9 +22,11 @@ class Board:
     """
 
     def __init__(self, folder: Path, first: int = 0) -> None:
-        from tensorboard.compat.proto.event_pb2 import SessionLog
+        from tensorboard.compat.proto import event_pb2, summary_pb2
         from tensorboard.summary.writer.record_writer import RecordWriter
 
+        self._events: Any = event_pb2
+        self._summaries: Any = summary_pb2
         make_folder(folder)
         # TensorBoard reads them in the order of their names.
         self._path = folder / f"events.out.tfevents.{int(time.time()):010d}.{len(list(folder.iterdir())):04d}"
@@ -32,14 +34,14 @@ class Board:
             self._records: Any = RecordWriter(self._path.open("wb"))
         self._write(file_version="brain.Event:2")
         if first:
-            self._write(step=first, session_log=SessionLog(status=SessionLog.START))
+            log = self._events.SessionLog
+            self._write(step=first, session_log=log(status=log.START))
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
         """Write values by name."""
-        from tensorboard.compat.proto.summary_pb2 import Summary
-
-        of = [Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
-        self._write(step=step, summary=Summary(value=of))
+        summary = self._summaries.Summary
+        of = [summary.Value(tag=name, simple_value=value) for name, value in values.items()]
+        self._write(step=step, summary=summary(value=of))
 
     def close(self) -> None:
         """Close the file."""
@@ -47,8 +49,6 @@ class Board:
             self._records.close()
 
     def _write(self, **event: Any) -> None:
-        from tensorboard.compat.proto.event_pb2 import Event
-
         with naming(self._path):
-            self._records.write(Event(wall_time=time.time(), **event).SerializeToString())
+            self._records.write(self._events.Event(wall_time=time.time(), **event).SerializeToString())
             self._records.flush()

@@ -87,9 +87,16 @@ def put_in(model: torch.nn.Module, tensors: Mapping[str, torch.Tensor], where: o
     own = model.state_dict()
     missing, more = own.keys() - tensors.keys(), tensors.keys() - own.keys()
     shapes = [name for name in own if name in tensors and own[name].shape != tensors[name].shape]
-    for what, names in (("lacks", missing), ("has besides", more), ("has in another shape", shapes)):
+    for names, expected, found in ((missing, own, {}), (more, {}, tensors), (shapes, own, tensors)):
         if names:
-            raise TrainingError("not the weights of this model", where=where, found=f"{what} {sorted(names)[0]}")
+            name = sorted(names)[0]
+            raise TrainingError(
+                "not the weights of this model",
+                where=f"{where}, {name}",
+                expected=list(expected[name].shape) if name in expected else "none",
+                found=list(found[name].shape) if name in found else "none",
+                fix="They fit the configuration that they were trained with: leave out what changes sizes.",
+            )
     model.load_state_dict(dict(tensors))
 
 

@@ -168,7 +168,9 @@ def _line(record: RunRecord, trainer: Training, of: str, accelerator: Any) -> st
 
 def _check_data(baseline: Baseline, data: Path | None, *, by_trial: bool) -> None:
     if data is None and not by_trial:
-        raise TrainingError("on what?", where="--data", expected="a dataset's folder or a trajectory.h5")
+        raise TrainingError(
+            f"{baseline.name} learns from data", where="--data", expected="a dataset's folder or a trajectory.h5"
+        )
     if data is not None and by_trial:
         raise TrainingError(f"{baseline.name} learns by trying, of no data", where="--data", fix="Leave it out.")
 

@@ -118,8 +118,13 @@ def test_another_version_is_said_before_what_it_has_otherwise(whole, data):
 
 
 def test_other_options_do_not_go_on(whole, data):
-    with pytest.raises(TrainingError, match="goes on as it was begun"):
+    with pytest.raises(TrainingError, match=r"width: a run goes on as it was begun \(expected 4, found 5\).*--start"):
         train_run("made-up", data, whole, {"width": 5}, device="cpu", resume=True)
+
+
+def test_the_smallest_difference_counts(whole, data):
+    with pytest.raises(TrainingError, match=r"train.learning_rate: a run goes on.*expected 0.001, found 0.0009"):
+        train_run("made-up", data, whole, {"train": {"learning_rate": 9e-4}}, device="cpu", resume=True)
 
 
 def test_to_go_on_elsewhere_is_said_and_kept(whole, data):

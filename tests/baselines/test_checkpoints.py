@@ -83,9 +83,15 @@ def test_without_room_the_one_before_stays(tmp_path, little_room):
 @pytest.mark.parametrize(
     ("tensors", "found"),
     [
-        ({"weight": torch.zeros(2, 3)}, "lacks bias"),
-        ({"weight": torch.zeros(2, 3), "bias": torch.zeros(2), "more": torch.zeros(1)}, "has besides more"),
-        ({"weight": torch.zeros(2, 4), "bias": torch.zeros(2)}, "has in another shape weight"),
+        ({"weight": torch.zeros(2, 3)}, r"w, bias: .*expected \[2\], found none"),
+        (
+            {"weight": torch.zeros(2, 3), "bias": torch.zeros(2), "more": torch.zeros(1)},
+            r"w, more: .*expected none, found \[1\]",
+        ),
+        (
+            {"weight": torch.zeros(2, 4), "bias": torch.zeros(2)},
+            r"w, weight: .*expected \[2, 3\], found \[2, 4\]",
+        ),
     ],
 )
 def test_weights_of_another_model(tensors, found):

@@ -82,6 +82,19 @@ def test_processes_are_one_a_core_whatever_torch_is_told(tmp_path):
     assert jobs == {str(len(os.sched_getaffinity(0)))}
 
 
+def test_what_is_there_is_not_mixed_with_other_episodes(tmp_path):
+    out = str(tmp_path / "out")
+    first, calls = called(tmp_path, "reproduce_small.sh", "pick", out, EPISODES="12")
+    assert (first.returncode, calls[0][0]) == (0, "generate")
+    again, _ = called(tmp_path, "reproduce_small.sh", "pick", out, EPISODES="12")
+    assert again.returncode == 0
+    before = (tmp_path / "calls").read_text()
+    other, _ = called(tmp_path, "reproduce_small.sh", "pick", out, EPISODES="14")
+    assert other.returncode == 2
+    assert "was begun with EPISODES=12 SEED=510000, not EPISODES=14" in other.stderr
+    assert (tmp_path / "calls").read_text() == before
+
+
 @pytest.mark.parametrize("what", STUDY)
 def test_a_study_trains_on_what_is_there_and_on_parts_of_it(tmp_path, what):
     folder = reproduced(tmp_path, 100)

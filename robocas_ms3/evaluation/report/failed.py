@@ -54,9 +54,8 @@ def failed_episodes(result: Result, folder: Path | None) -> str:
         *("steps#", "s#", "p_vis#", "disturbed#", "error"),
     )
     linked = any("<a " in row[0] for row in rows)
-    films = (
-        "Numbers that are links lead to videos." if linked else "<code>robocas eval videos</code> films some of them."
-    )
+    command = "<code>robocas eval videos RESULT --policy POLICY</code>"
+    films = "Numbers that are links lead to videos." if linked else f"{command} films some of them."
     said = (
         f'<span id="count">{len(failed)}</span> of {count_of(len(result.outcomes), "episode")}. '
         "Ended by: the time they had, a failure such as a target on the floor, or an error. " + films
