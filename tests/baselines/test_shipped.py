@@ -28,14 +28,17 @@ def test_they_are_a_policy_by_name():
     assert policy.describe()["steps"] > 0
 
 
-def test_they_are_a_start_by_name_unless_a_folder_is(tmp_path, monkeypatch):
+def test_they_are_a_start_by_name_as_they_are_a_policy(tmp_path, monkeypatch):
+    """Also where a folder is called so, which a longer path names."""
     monkeypatch.chdir(tmp_path)
     begun = find_start(BASELINE, Path("small"), None, tmp_path / "out")
     assert begun is not None and begun.weights
     assert begun.record == read_run(SHIPPED / "small")
     Path("small").mkdir()
+    again = find_start(BASELINE, Path("small"), None, tmp_path / "out")
+    assert again is not None and again.name == begun.name
     with pytest.raises(TrainingError, match="no run of robocas train"):
-        find_start(BASELINE, Path("small"), None, tmp_path / "out")
+        find_start(BASELINE, tmp_path / "small", None, tmp_path / "out")
 
 
 @pytest.mark.slow

@@ -74,13 +74,3 @@ def test_a_training_from_the_command_line(tmp_path, monkeypatch, capsys):
     said = capsys.readouterr()
     assert f"robocas eval TASK --policy {made} --protocol paper-v1" in said.out
     assert "steps trained: 8 of 8" in said.err
-
-
-def test_a_run_that_comes_along_goes_by_its_name_as_policies_do(tmp_path, monkeypatch):
-    from robocas_ms3.baselines.runs import SHIPPED, find_run
-
-    monkeypatch.chdir(tmp_path)
-    Path("small").mkdir()
-    assert find_run(Path("small")) == SHIPPED / "small"
-    assert find_run(tmp_path / "small") == tmp_path / "small"
-    assert find_run(Path("large")) == Path("large")
