@@ -43,8 +43,9 @@ class Train:
     seed: Maybe[int] = None
     """Of everything random; train.seed."""
     start: Maybe[Path] = None
-    """Folder of a run to begin with, such as one on less data, or small, which comes with the package: with its
-    weights, and its configuration where no option says otherwise. Default: random weights, the baseline's defaults."""
+    """Folder of a run to begin with, such as one on less data, or small, which comes with the package (a folder of
+    that name needs a longer path): with its weights, and its configuration where no option says otherwise. Default:
+    random weights, the baseline's defaults."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where it computes. Auto: a GPU if there is one."""
     resume: bool = False
