@@ -27,8 +27,8 @@ def test_it_is_ended_and_says_why(monkeypatch, program, limits, why):
     memory = os.memfd_create("none")
     worker = WorkerHandle(range(2, 4), memory)
     worker.limits, begun = limits, time.monotonic()
-    worker.send(handle.STEP)
     with pytest.raises(WorkerDied, match=f"envs 2, 3: its process died .found {why}") as error:
+        worker.send(handle.STEP)  # which says so already where the process was the faster
         worker.receive()
     assert error.value.envs == (2, 3)
     assert worker.process.wait(5) < 0
