@@ -88,7 +88,7 @@ def videos(folder: Path, protocol: str | None, policy: str, count: int) -> int:
     """Film failed episodes, and link the videos in the page.
 
     Raises:
-        EvaluationError: it is of a policy that is not builtin, and was not named again: a file chooses no code.
+        EvaluationError: it is of a policy that is not installed, and was not named again: a file chooses no code.
     """
     from robocas_ms3.cli.bars import bar, say
     from robocas_ms3.errors import EvaluationError
@@ -100,7 +100,7 @@ def videos(folder: Path, protocol: str | None, policy: str, count: int) -> int:
     result = read(folder)
     loaded = protocol_of(result, protocol)
     name = str(result.run["policy"]["name"])
-    if name not in POLICIES.builtin and policy != name:
+    if name not in {*POLICIES.builtin, *POLICIES.points} and policy != name:
         fix = f"Name it yourself, if you trust it: --policy {name}"
         raise EvaluationError("this result is of a policy of somebody's own", where=folder, found=name, fix=fix)
     from robocas_ms3.evaluation.videos import failed_of_each_kind, film

@@ -37,7 +37,14 @@ WHY = {
     "mplib": "mani_skill 3.0.1 pins it",
 }
 # Extra -> what it is for.
-EXTRAS = {"language": "sentence embeddings in datasets", "assets": "making asset packs"}
+EXTRAS = {
+    "language": "sentence embeddings in datasets, and policies that read words",
+    "train": "training baselines, and playing what they learned",
+    "lerobot": "LeRobot datasets",
+    "assets": "making asset packs",
+    "remote": "policies over a socket",
+    "plots": "pictures of robocas stats",
+}
 # Packages worth a row of their own; the others share one.
 NAMED = ("numpy", "torch", "mani-skill", "sapien", "mplib", "gymnasium")
 

@@ -30,9 +30,11 @@ def test_another_protocol_is_refused(tmp_path):
         next(film(result, load_protocol("smoke"), RandomPolicy(), [0]))
 
 
-def test_where_none_failed_there_is_nothing_to_film(tmp_path, capsys):
+@pytest.mark.parametrize("installed", ["random", "small"])
+def test_where_none_failed_there_is_nothing_to_film(tmp_path, capsys, installed):
     result = of_protocol(tmp_path / "b", load_protocol("smoke"))
-    (result.folder / "run.json").write_text((result.folder / "run.json").read_text().replace('"mine"', '"random"'))
+    run = result.folder / "run.json"
+    run.write_text(run.read_text().replace('"mine"', f'"{installed}"'))
     assert command.main(command.Eval(("videos", str(result.folder)))) == 0
     assert "no episode failed" in capsys.readouterr().out
 

@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+from collections import Counter
 from html.parser import HTMLParser
 
 import numpy as np
@@ -112,7 +113,9 @@ def test_a_result_that_lacks_episodes_says_so(tmp_path):
     whole = of_protocol(tmp_path / "whole", protocol)
     assert "8 of 8 episodes" in page(whole, protocol=protocol)
     part = write(tmp_path / "part", list(whole.outcomes.values())[:5])
-    assert "Missing of the protocol: 3 episodes" in page(part, protocol=protocol)
+    configs = Counter(outcome.config for outcome in list(whole.outcomes.values())[5:])
+    of = ", ".join(f"{many} of {config}" for config, many in configs.items())
+    assert f"Missing of the protocol: 3 episodes ({of}). This" in page(part, protocol=protocol)
 
 
 @pytest.mark.parametrize("count", [0, 1])

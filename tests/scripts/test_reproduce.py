@@ -10,7 +10,7 @@ import pytest
 from robocas_ms3.config import shipped_configs
 
 ROOT = Path(__file__).resolve().parents[2]
-STUB = '#!/bin/sh\nprintf "%s\\n" "$*" >> "$CALLS"\n'
+STUB = '#!/bin/sh\nprintf "%s\\n" "$*" >> "$CALLS"\n[ "$1" != "$BREAKS" ] || exit 130\n'
 STEPS = {
     "reproduce_small.sh pick": "generate convert merge train eval",
     "reproduce_small.sh select": "generate convert generate convert merge train eval",
@@ -80,6 +80,13 @@ def test_processes_are_one_a_core_whatever_torch_is_told(tmp_path):
     _, calls = called(tmp_path, "reproduce_small.sh", "pick", str(tmp_path / "out"), JOBS="", OMP_NUM_THREADS="1")
     jobs = {call[call.index("--jobs") + 1] for call in calls if "--jobs" in call}
     assert jobs == {str(len(os.sched_getaffinity(0)))}
+
+
+def test_what_breaks_off_is_gone_on_with_by_the_same_call(tmp_path):
+    done, calls = called(tmp_path, "reproduce_small.sh", "pick", str(tmp_path / "out"), BREAKS="convert")
+    assert done.returncode == 130
+    assert [call[0] for call in calls] == ["generate", "convert"]
+    assert "reproduce_small: convert ended with 130; what is there is kept, and the same call goes on" in done.stderr
 
 
 def test_what_is_there_is_not_mixed_with_other_episodes(tmp_path):

@@ -62,8 +62,10 @@ def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
     said = f"{whole}, protocol hash <code>{escape(result.run['protocol_hash'][:16])}</code>."
     notes = [WELDED] if result.run["weld"] else []
     if protocol is not None and count < len(protocol.episodes):
+        missing = Counter(episode.config for episode in protocol.episodes if episode.episode not in result.outcomes)
+        of = ", ".join(f"{many} of {escape(config)}" for config, many in missing.items())
         notes.append(
-            f"Missing of the protocol: {count_of(len(protocol.episodes) - count, 'episode')}. This is no whole result."
+            f"Missing of the protocol: {count_of(missing.total(), 'episode')} ({of}). This is no whole result."
         )
     broken = result.broken_off()
     if broken:
