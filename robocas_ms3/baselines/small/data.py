@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -29,6 +30,7 @@ from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import Array, from_xyzw
 
+_log = logging.getLogger(__name__)
 _LEAST_HEIGHT = 0.01  # m
 _LEAST_WORD = 0.01  # deviation of a number of an embedding; all are 0.05 or so
 _KEYS = ("ee_pos", "ee_orn", "gripper_width", "gripper_status", "base_pos", "base_orn")
@@ -102,6 +104,9 @@ class SmallSamples:
                 stood.append(found)
                 on_read(done, len(numbers))
         self._ask(stood if config.language else [replace(one, target="") for one in stood])
+        if config.language and not (self._kinds >= 0).any():
+            what = "no scene.json tells where objects stood: only what is gripped next is pointed at"
+            _log.warning("%s: %s", path, what)
         self.facts: dict[str, Any] = {
             "rate_hz": source.rate_hz,
             "pictures": {camera: list(size) for camera, size in sizes.items()},

@@ -131,7 +131,7 @@ def test_samples_are_the_datasets(samples, folder):
     assert abs(wxyz @ np.roll(arrays["ee_orn"][5], 1)) == pytest.approx(1, abs=1e-5)
 
 
-def test_without_language_nothing_is_asked_for(folder, monkeypatch):
+def test_without_language_nothing_is_asked_for(folder, monkeypatch, caplog):
     """All questions would be the same, and have other answers."""
 
     def made(episode, arrays, poses, looks):
@@ -146,6 +146,14 @@ def test_without_language_nothing_is_asked_for(folder, monkeypatch):
         for language in (True, False)
     ]
     assert kinds == [[[0, -1]], [[-1, -1]]]
+    assert not caplog.records
+
+
+def test_it_is_said_where_nothing_can_be_asked_for(folder, caplog):
+    """The made-up dataset knows no scenes."""
+    BASELINE.data(SmallConfig(**TINY), folder, "val", lambda done, of: None)
+    (said,) = caplog.messages
+    assert said.startswith(f"{folder}: no scene.json tells where objects stood")
 
 
 def test_without_language_words_say_nothing(folder):
