@@ -55,6 +55,10 @@ class DatasetError(RobocasError):
     """A trajectory file or dataset can't be read or written."""
 
 
+class EmptySplitError(DatasetError):
+    """A split of a dataset holds no episodes."""
+
+
 class IncompleteError(DatasetError):
     """Some episodes of a dataset can't be written; the others are.
 

@@ -19,7 +19,7 @@ acts=(5 60)
 [[ $task == pick ]] || acts=(5 100) # a search is longer
 from=${2:-reproduced/$task}
 out=$from/dagger
-[[ -f $from/run/weights.safetensors ]] || fail "$from: no run; bash scripts/reproduce_small.sh $task $from makes it"
+[[ -f $from/eval/report.md ]] || fail "$from: no run that was trained to its end; bash scripts/reproduce_small.sh $task $from makes it"
 episodes=${EPISODES:-300} seed=${SEED:-570000} steps=${STEPS:-1800}
 jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}

@@ -40,11 +40,15 @@ mkdir -p "$out"
 asked="EPISODES=$episodes SEED=$seed" # else what is there would be mixed with what comes
 [[ -f $out/asked ]] || echo "$asked" >"$out/asked"
 [[ $(<"$out/asked") == "$asked" ]] || fail "$out was begun with $(<"$out/asked"), not $asked: name another FOLDER"
-data=()
+data=() left=$episodes
 for part in "${parts[@]}"; do
     read -r percent offset of config first <<<"$part"
+    share=$((episodes * percent / 100))
+    [[ $part != "${parts[-1]}" ]] || share=$left
+    left=$((left - share))
+    ((share)) || continue
     name=$config${first:+-after-$first}
-    timed "$robocas" generate "$of" --config "$config" -n $((episodes * percent / 100)) --seed $((seed + offset)) --jobs "$jobs" \
+    timed "$robocas" generate "$of" --config "$config" -n "$share" --seed $((seed + offset)) --jobs "$jobs" \
         --max-attempts "$attempts" ${first:+--after-policy "$first" --after-steps 15 50} --out "$out/demos/$name" --resume
     timed "$robocas" convert "$out/demos/$name/trajectory.h5" --out "$out/parts/$name" --size 512 384 --no-depth --no-video \
         --cameras base_camera gripper_camera --jobs "$jobs" --resume

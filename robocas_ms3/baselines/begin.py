@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -13,8 +14,8 @@ from robocas_ms3.baselines.runs import CHECKPOINT, RUN, WEIGHTS, RunRecord, find
 from robocas_ms3.errors import TrainingError
 from robocas_ms3.strict import parse
 
-_SEEN = ("rate_hz", "pictures", "cameras", "calibration")
-"""Facts that a run shares with the one it begins with."""
+_SEEN = ("rate_hz", "pictures", "cameras", "calibration", "observed", "acted")
+"""Facts that a run shares with the one it begins with; others, as scales, only have as many numbers as there."""
 _PACKAGES = ("robocas-ms3", "torch", "accelerate", "safetensors", "transformers", "numpy")
 
 
@@ -102,7 +103,9 @@ def _other(one: Any, other: Any, name: str, tolerance: float) -> tuple[str, Any,
     if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
         found = (_other(one[key], other[key], f"{name}.{key}", tolerance) for key in one)
         return next(filter(None, found), None)
-    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+    if isinstance(one, list) and isinstance(other, list):
+        if len(one) != len(other):
+            return name, f"{len(one)} values", f"{len(other)} values"
         found = (_other(*pair, f"{name}[{at}]", tolerance) for at, pair in enumerate(zip(one, other, strict=True)))
         return next(filter(None, found), None)
     if isinstance(one, float) and isinstance(other, float):
@@ -111,25 +114,29 @@ def _other(one: Any, other: Any, name: str, tolerance: float) -> tuple[str, Any,
 
 
 def facts_of(own: dict[str, Any], begin: Start | None, data: Path | None) -> dict[str, Any]:
-    """What a network and its policy know of the data; the scales are those that its weights were learned by.
+    """What a network and its policy know of the data, whose scales are those that its weights were learned by.
+
+    Without data it is what they know of their trials.
 
     Raises:
         TrainingError: the run that it begins with saw something else.
     """
     if begin is None:
         return own
-    for key in _SEEN:
+    scales = () if data is None else (key for key in own if key in begin.record.facts and key not in _SEEN)
+    for key in (*_SEEN, *scales):
         # To a thousandth: a camera is not to the bit where it was before.
-        if (other := _other(begin.record.facts.get(key), own.get(key), key, 1e-3)) is not None:
+        tolerance = 1e-3 if key in _SEEN else math.inf
+        if (other := _other(begin.record.facts.get(key), own.get(key), key, tolerance)) is not None:
             name, expected, found = other
             raise TrainingError(
                 f"--start is of a run with other {key}",
                 where=f"{data or begin.name}, {name}",
                 expected=expected,
                 found=found,
-                fix="Convert the data as it was for that run and look at the same part of it, or begin without it.",
+                fix="Begin with a run that saw the same, convert the data as it was for that run, or begin without it.",
             )
-    return begin.record.facts
+    return own if data is None else begin.record.facts
 
 
 def others(record: RunRecord, accelerator: Any) -> str:
@@ -137,10 +144,23 @@ def others(record: RunRecord, accelerator: Any) -> str:
     now = {
         "device": str(accelerator.device.type),
         "precision": str(accelerator.mixed_precision),
+        "threads": threads_of(accelerator) if record.threads else 0,
         **versions(),
     }
-    before = {"device": record.device, "precision": record.precision, **record.versions}
+    before = {
+        "device": record.device,
+        "precision": record.precision,
+        "threads": record.threads,
+        **record.versions,
+    }
     return ", ".join(f"{name} {value}" for name, value in now.items() if before.get(name) != value)
+
+
+def threads_of(accelerator: Any) -> int:
+    """How many add up on a processor; of a GPU 0."""
+    import torch
+
+    return torch.get_num_threads() if accelerator.device.type == "cpu" else 0
 
 
 def check_kind(before: RunRecord, baseline: Baseline, out: Path) -> None:

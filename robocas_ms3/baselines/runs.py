@@ -54,7 +54,8 @@ class RunRecord(StrictModel):
         data: it was trained on.
         versions: of packages.
         device, precision: it was trained on and in; another may round otherwise.
-        resumed: lines on where it went on with others of these three.
+        threads: of the processor it was trained on; as many add up in the same order. 0: a GPU, or not known.
+        resumed: lines on where it went on with others of these.
         start: the run whose weights it began with: its folder's name and their hash; empty: none.
     """
 
@@ -67,6 +68,7 @@ class RunRecord(StrictModel):
     versions: dict[str, str]
     device: str
     precision: str
+    threads: int = 0
     resumed: list[str] = []
     start: str = ""
 
@@ -106,7 +108,8 @@ def write_run(folder: Path, record: RunRecord) -> None:
 def hash_of(data: Path) -> str:
     """A hash (SHA-256) of a dataset.
 
-    Of a trajectory its bytes and those of the JSON beside it; of a folder its overviews, arrays, and pictures' sizes.
+    Of a trajectory its bytes and those of the JSON beside it; of a folder its overviews, arrays, calibrations, and
+    pictures' sizes.
 
     Raises:
         TrainingError: there is nothing.
@@ -122,7 +125,7 @@ def hash_of(data: Path) -> str:
             if name.startswith("preview/") or path.name.startswith("."):
                 continue
             digest.update(f"{name} {path.stat().st_size}\n".encode())
-            if path.suffix in {".json", ".npz", ".parquet"}:
+            if path.suffix in {".json", ".npz", ".npy", ".parquet"}:
                 _take(digest, path)
     else:
         raise TrainingError("no dataset here", where=data, expected="a dataset's folder or trajectory.h5")

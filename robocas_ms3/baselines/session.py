@@ -18,13 +18,14 @@ from robocas_ms3.baselines.begin import (
     find_start,
     others,
     precision_of,
+    threads_of,
     versions,
 )
 from robocas_ms3.baselines.runs import RUN, DataRecord, RunRecord, hash_of, read_run, write_run
 from robocas_ms3.baselines.table import find_baseline, need_extra
-from robocas_ms3.errors import DatasetError, TrainingError
+from robocas_ms3.errors import EmptySplitError, OutputExistsError, TrainingError
 from robocas_ms3.files import make_folder
-from robocas_ms3.outputs import check_one_way, check_overwrite, check_run, claim_output, locked_folder
+from robocas_ms3.outputs import check_one_way, check_overwrite, check_run, claim_output, is_taken, locked_folder, sweep
 
 
 @dataclass
@@ -89,14 +90,19 @@ def train_run(
     from robocas_ms3.baselines.train import Trainer
 
     accelerator = make_accelerator(device, precision_of(config, before))
-    if config.train.batch_size < accelerator.num_processes:
+    if config.train.batch_size % accelerator.num_processes:
         found = f"{config.train.batch_size} for {accelerator.num_processes} processes"
-        raise TrainingError("a sample a process at least", where="train.batch_size", found=found)
+        raise TrainingError("processes share a batch evenly", where="train.batch_size", found=found)
     with ExitStack() as stack:
         if accelerator.is_main_process:
             stack.enter_context(locked_folder(out))
+            if out.is_dir() and ((out / RUN).is_file() or all(path.name.startswith(".") for path in out.iterdir())):
+                sweep(out)
             if overwrite:
                 check_overwrite(out, [RUN], "a run of robocas train")
+            if resume and before is None and is_taken(out):
+                what, fix = "no run of robocas train to go on with", "Choose another --out."
+                raise OutputExistsError(what, where=out, expected=RUN, fix=fix)
             # What is replaced stays until there is something instead.
             claim_output(out, resume=before is not None or overwrite)
         samples: Any = None
@@ -155,6 +161,7 @@ def _record(
         versions=versions(),
         device=str(accelerator.device.type),
         precision=str(accelerator.mixed_precision),
+        threads=threads_of(accelerator),
         start=begin.name if begin else "",
     )
 
@@ -178,8 +185,6 @@ def _check_data(baseline: Baseline, data: Path | None, *, by_trial: bool) -> Non
 def _validation(baseline: Baseline, config: BaselineConfig, data: Path, said: Said) -> Samples | None:
     try:
         return baseline.data(config, data, "val", said.read)
-    except DatasetError as error:
-        if "split" not in error.what:
-            raise
+    except EmptySplitError:
         said.note("no episodes to validate with: there are too few")
         return None

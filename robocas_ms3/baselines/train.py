@@ -70,11 +70,14 @@ class Trainer:
         self._bare = model
         self._sums: dict[str, torch.Tensor] = {}
         self._norms = torch.zeros((), dtype=torch.float64, device=accelerator.device)  # of all gradients, summed up
+        kept: dict[str, torch.Tensor] = {}
         if resume and (folder / CHECKPOINT).is_file():
-            self._go_on(model, optimizer)
+            kept = self._go_on(model)
         else:
             torch.manual_seed(self.settings.seed + 1 + accelerator.process_index)
         self._model, self._optimizer = accelerator.prepare(model, optimizer)
+        if kept:  # not before: to prepare an optimiser takes its counts of steps to a GPU, which then is waited for
+            checkpoints.put_in_optimizer(self._optimizer, kept)
 
     def train(self, on_step: Callable[[int, int], None] = lambda done, of: None) -> None:
         """Take all steps that are left.
@@ -152,8 +155,7 @@ class Trainer:
         self.step += 1
         if self._average is not None:
             self._average.update_parameters(self._bare)
-        for name, value in found.items():
-            self._sums[name] = self._sums.get(name, 0.0) + summed(value, 1)
+        self._sums = {name: self._sums.get(name, 0.0) + summed(value, 1) for name, value in found.items()}
 
     def _mix(self, average: Any, now: Any, _: Any) -> None:
         """Move an average of the weights on: fast at first, as it begins with what is random."""
@@ -265,13 +267,13 @@ class Trainer:
         if f"cuda.{number}" in states and self._accelerator.device.type == "cuda":
             torch.cuda.set_rng_state(states[f"cuda.{number}"])
 
-    def _go_on(self, model: torch.nn.Module, optimizer: torch.optim.Optimizer) -> None:
+    def _go_on(self, model: torch.nn.Module) -> dict[str, torch.Tensor]:
+        """Go on where the checkpoint was written; gives the optimiser's state."""
         path = self._folder / CHECKPOINT
         tensors, about = checkpoints.load(path, self._about)
         checkpoints.put_in(model, checkpoints.part(tensors, "model."), path)
         if self._average is not None:
             checkpoints.put_in(self._average, checkpoints.part(tensors, "average."), path)
-        checkpoints.put_in_optimizer(optimizer, checkpoints.part(tensors, "optimizer."))
         device = self._accelerator.device
         mine = float(self._accelerator.is_main_process)  # they are those of all
         self._sums = {name: mine * value.to(device) for name, value in checkpoints.part(tensors, "sums.").items()}
@@ -279,6 +281,7 @@ class Trainer:
         self.step = int(about["step"])
         if self._accelerator.is_main_process:
             checkpoints.mend_weights(self._folder, self._acting().state_dict(), about)
+        return checkpoints.part(tensors, "optimizer.")
 
 
 class _Reported:

@@ -120,11 +120,11 @@ def run(cfg: Generate) -> int:
         after_policy=cfg.after_policy or "",
         after_steps=cfg.after_steps,
     )
-    players = None
+    players, weights = None, ""
     if settings.after_policy:
         from robocas_ms3.evaluation.acting import Players, check_acting
 
-        check_acting(settings)
+        weights = check_acting(settings)
         players = Players(settings)
     with bar("episodes recorded") as shown:
 
@@ -148,6 +148,7 @@ def run(cfg: Generate) -> int:
             on_start=partial(shown.start, cfg.episodes),
             on_result=on_result,
             players=players,
+            weights=weights,
         )
         shown.at(cfg.episodes, cfg.episodes)  # some of them may have been there beyond a seed that was not
     seconds = ", ".join(f"{part} {value:.2f}" for part, value in summary.mean_seconds.items())

@@ -21,6 +21,9 @@ from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.strict import check_number
 
+WEIGHTS = "after_policy_weights"
+"""Of ``run.json``; outputs that are older do not say."""
+
 
 def check_limits(episode_seconds: float, memory_gb: float) -> None:
     """Check what an episode may take.
@@ -104,7 +107,7 @@ def check_same_run(path: Path, run: dict[str, Any]) -> None:
         what = "this machine has other versions than this output was begun with"
         check_same(before["versions"], now, what, where=path, fix=fix, error=RobocasError)
     for key, value in json.loads(json.dumps(run)).items():
-        if key != "versions" and before.get(key) != value:
+        if key != "versions" and before.get(key, value if key == WEIGHTS else None) != value:
             raise RobocasError(
                 f"{key} differ from those this output was begun with",
                 where=path,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robocas_ms3.demos.checks import check_arguments, check_same_run
+from robocas_ms3.demos.checks import WEIGHTS, check_arguments, check_same_run
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_stage, failed_attempts
 from robocas_ms3.demos.takeover import Takeover
@@ -80,6 +80,7 @@ def generate(
     on_start: Callable[[int], None] = lambda there: None,
     on_result: Callable[[EpisodeResult], None] = lambda result: None,
     players: Callable[[], Worker[int, Takeover]] | None = None,
+    weights: str = "",
 ) -> Summary:
     """Generate episodes of consecutive seeds until there are enough.
 
@@ -103,6 +104,7 @@ def generate(
             are there.
         on_result: called for each seed that was not dealt with before, in order.
         players: opens what has ``settings.after_policy`` act in the scene of a seed, in a process (is pickled).
+        weights: hash of those that it acts with, if it has some: an output goes on with the same.
 
     Raises:
         OutputExistsError: ``out`` has content and neither flag is set, or what was made by another command.
@@ -117,6 +119,8 @@ def generate(
     with locked_folder(out):
         claim_output(out, overwrite=overwrite or _only_begun(out), resume=resume)
         run = {"settings": asdict(settings), "first_seed": first_seed, "versions": versions()}
+        if weights:
+            run[WEIGHTS] = weights
         check_same_run(out / RUN, run)
         make_folder(out)
         write_json(out / RUN, run)

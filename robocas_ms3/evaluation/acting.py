@@ -42,8 +42,8 @@ def steps_of(seed: int, after_steps: tuple[int, int]) -> int:
     return int(np.random.default_rng([seed, _STEPS]).integers(after_steps[0], after_steps[1] + 1))
 
 
-def check_acting(settings: EpisodeSettings) -> None:
-    """See that the policy named there can act; it is made once for that.
+def check_acting(settings: EpisodeSettings) -> str:
+    """See that the policy named there can act; it is made once for that. Gives a hash of its weights, if it has some.
 
     Raises:
         RobocasError: there is no such policy, it speaks another way, or wants to see where nothing can be rendered.
@@ -52,6 +52,7 @@ def check_acting(settings: EpisodeSettings) -> None:
         load_protocol(PROTOCOL).rules.refuse(policy.wants)
         if policy.wants.cameras:
             require_renderer()
+        return str(getattr(policy, "describe", dict)().get("weights", ""))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -31,11 +32,28 @@ def test_a_start_has_seen_by_the_same_cameras(whole, made_up, own, fits):
     say(whole, facts={"calibration": {"x": [1.0, 2], "hand": True}})
     begin = find_start(MadeUp(), whole, None, whole)
     if fits:
-        assert facts_of({"calibration": own}, begin, None) == begin.record.facts
+        assert facts_of({"calibration": own}, begin, Path("data")) == begin.record.facts
     else:
         with pytest.raises(TrainingError, match="calibration.*: --start is of a run with other calibration") as caught:
-            facts_of({"calibration": own}, begin, None)
+            facts_of({"calibration": own}, begin, Path("data"))
         assert len(str(caught.value)) < 300  # of what differs first, not of all matrices
+
+
+def test_a_start_has_scales_of_as_many_numbers(whole, made_up):
+    """Where other things stand in the scenes, a simulator tells more or less."""
+    say(whole, facts={"inputs": {"mean": [0.5, 2.0]}})
+    begin = find_start(MadeUp(), whole, None, whole)
+    assert facts_of({"inputs": {"mean": [9.0, 9.0]}}, begin, Path("data")) == begin.record.facts
+    with pytest.raises(TrainingError, match="inputs.mean: --start is of a run with other inputs.*2 values.*3 values"):
+        facts_of({"inputs": {"mean": [9.0, 9.0, 9.0]}}, begin, Path("data"))
+
+
+def test_who_tries_knows_of_its_own_trials(whole, made_up):
+    say(whole, facts={"observed": 30, "horizon": 100})
+    begin = find_start(MadeUp(), whole, None, whole)
+    assert facts_of({"observed": 30, "horizon": 200}, begin, None) == {"observed": 30, "horizon": 200}
+    with pytest.raises(TrainingError, match="other observed.*expected 30, found 40"):
+        facts_of({"observed": 40, "horizon": 200}, begin, None)
 
 
 def test_options_leave_the_other_defaults(made_up, data, tmp_path):
@@ -134,6 +152,13 @@ def test_to_go_on_elsewhere_is_said_and_kept(whole, data):
     (said,) = json.loads((whole / "run.json").read_text())["resumed"]
     assert said.startswith("from step 40 by device cpu") and f"torch {torch.__version__}" in said
     assert any(said in note for note in notes)
+
+
+def test_other_threads_are_said_where_their_number_is_known(whole, data):
+    assert json.loads((whole / "run.json").read_text())["threads"] == torch.get_num_threads()
+    for threads, said in ((99, [f"from step 40 by threads {torch.get_num_threads()}"]), (0, [])):
+        say(whole, threads=threads, resumed=[])
+        assert train_run("made-up", data, whole, device="cpu", resume=True).resumed == said
 
 
 def test_a_run_begins_as_the_one_it_starts_from_but_for_its_options(made_up, data, tmp_path):

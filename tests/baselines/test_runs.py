@@ -1,5 +1,6 @@
 """What a run keeps of its data and its weights."""
 
+import numpy as np
 import pytest
 
 from robocas_ms3.baselines.runs import WEIGHTS, hash_of, hash_of_weights
@@ -27,6 +28,14 @@ def test_a_folder_is_its_arrays_and_sizes_of_pictures(tmp_path):
     longer = hash_of(tmp_path)
     (tmp_path / "data_info.json").write_text("[]")
     assert len({before, longer, hash_of(tmp_path)}) == 3
+
+
+def test_where_cameras_look_from_is_part_of_a_folder(tmp_path):
+    hashes = set()
+    for at in (0.1, 0.2):
+        np.save(tmp_path / "cam_pos_wrt_ee.npy", np.full((4, 4), at))
+        hashes.add(hash_of(tmp_path))
+    assert len(hashes) == 2
 
 
 def test_nothing_is_no_dataset(tmp_path):

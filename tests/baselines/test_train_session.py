@@ -10,6 +10,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import made_up_baseline
 import pytest
@@ -17,7 +18,7 @@ import torch
 from made_up_runs import assert_same, lines, say, stop_at
 from safetensors.torch import load_file
 
-from robocas_ms3.baselines import checkpoints
+from robocas_ms3.baselines import checkpoints, devices
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.session import Said, train_run
 from robocas_ms3.baselines.train import Trainer
@@ -234,6 +235,40 @@ def test_without_validation(made_up, data, tmp_path):
     train_run("made-up", data, tmp_path / "run", device="cpu", said=Said(note=notes.append))
     assert any("too few" in note for note in notes)
     assert {row["split"] for row in lines(tmp_path / "run")} == {"train"}
+
+
+def test_a_damaged_validation_is_not_none(made_up, data, tmp_path):
+    data.write_text("damaged")
+    with pytest.raises(DatasetError, match="this split is damaged"):
+        train_run("made-up", data, tmp_path / "run", device="cpu")
+
+
+def test_processes_share_a_batch_evenly(made_up, data, tmp_path, monkeypatch):
+    monkeypatch.setattr(devices, "make_accelerator", lambda *_: SimpleNamespace(num_processes=3))
+    with pytest.raises(TrainingError, match="train.batch_size: processes share a batch evenly.*4 for 3 processes"):
+        train_run("made-up", data, tmp_path / "run", device="cpu")
+
+
+def test_a_kill_before_there_was_a_run_is_gone_on_from(made_up, data, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / ".run.123.tmp.json").write_text("{")
+    train_run("made-up", data, tmp_path / "run", {"train": {"steps": 4}}, device="cpu", resume=True)
+    assert not list((tmp_path / "run").glob(".*"))
+
+
+def test_what_a_kill_left_half_written_goes(whole, data):
+    (whole / ".checkpoint.123.tmp.safetensors").write_bytes(b"half")
+    train_run("made-up", data, whole, device="cpu", resume=True)
+    assert not list(whole.glob(".*"))
+
+
+def test_no_run_to_go_on_with(made_up, data, tmp_path):
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / ".draft.tmp.txt").write_text("mine")
+    (tmp_path / "notes" / "notes.txt").write_text("mine")
+    with pytest.raises(OutputExistsError, match="notes: no run of robocas train to go on with .expected run.json"):
+        train_run("made-up", data, tmp_path / "notes", device="cpu", resume=True)
+    assert len(list((tmp_path / "notes").iterdir())) == 2
 
 
 def test_a_worker_says_what_is_wrong_in_a_line(made_up, data, tmp_path):

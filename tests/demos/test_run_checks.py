@@ -10,7 +10,7 @@ from synthetic import write_trajectory
 from robocas_ms3.cli.main import run
 from robocas_ms3.config import load_task_config
 from robocas_ms3.demos import generate as module
-from robocas_ms3.demos.checks import SIM_FREQ, check_same_run
+from robocas_ms3.demos.checks import SIM_FREQ, WEIGHTS, check_same_run
 from robocas_ms3.demos.convert_actions import CONVERTIBLE
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.generate import _recorded, generate
@@ -224,3 +224,15 @@ def test_an_output_that_is_older_than_the_steps_of_a_policy_goes_on(tmp_path):
     check_same_run(path, {"settings": now})
     with pytest.raises(RobocasError, match="settings differ"):
         check_same_run(path, {"settings": asdict(replace(SETTINGS, after_steps=(5, 61)))})
+
+
+def test_other_weights_do_not_go_on_with_an_output(tmp_path):
+    """A folder of a run may hold others by now; outputs that are older do not say which."""
+    made = {"settings": asdict(SETTINGS), WEIGHTS: "abc"}
+    for before, fits in ((made, True), ({"settings": made["settings"]}, True), ({**made, WEIGHTS: "def"}, False)):
+        (tmp_path / "run.json").write_text(json.dumps(before))
+        if fits:
+            check_same_run(tmp_path / "run.json", made)
+            continue
+        with pytest.raises(RobocasError, match="after_policy_weights differ.*expected def, found abc"):
+            check_same_run(tmp_path / "run.json", made)

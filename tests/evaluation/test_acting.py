@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from robocas_ms3.baselines.runs import SHIPPED, hash_of_weights
 from robocas_ms3.datasets.checks.replay import replay_dataset
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -59,6 +60,11 @@ def test_steps_are_drawn_from_the_seed_both_ends_included():
 def test_a_policy_that_speaks_otherwise_than_the_protocol_is_refused():
     with pytest.raises(EvaluationError, match="joint_positions"):
         check_acting(settings("scripted", (5, 60)))
+
+
+def test_weights_of_what_acts_have_a_hash():
+    assert check_acting(settings("random", (5, 60))) == ""
+    assert check_acting(settings("small", (5, 60))) == hash_of_weights(SHIPPED / "small")
 
 
 @pytest.mark.parametrize("player", [("random", (12, 12))], indirect=True)

@@ -16,6 +16,7 @@ STEPS = {
     "reproduce_small.sh select": "generate convert generate convert merge train eval",
     "reproduce_small.sh search": "generate convert generate convert generate convert merge train eval",
     "dagger_small.sh pick": "generate convert merge train eval",
+    "dagger_small.sh search": "generate convert merge train eval",
 }
 STUDY = {
     "all": ["train", "eval"],
@@ -49,6 +50,8 @@ def test_they_call_what_there_is(tmp_path, words):
     folder = tmp_path / "out"
     (folder / "run").mkdir(parents=True)
     (folder / "run" / "weights.safetensors").touch()
+    (folder / "eval").mkdir()
+    (folder / "eval" / "report.md").touch()
     done, calls = called(tmp_path, *words.split(), str(folder), EPISODES="100")
     assert done.returncode == 0, done.stderr
     assert " ".join(call[0] for call in calls) == STEPS[words]
@@ -64,6 +67,20 @@ def test_they_call_what_there_is(tmp_path, words):
         assert set(read) <= made, call
     counts = [int(call[call.index("-n") + 1]) for call in calls if call[0] == "generate"]
     assert sum(counts) == 100
+
+
+def test_few_episodes_are_shared_among_the_parts_that_get_one(tmp_path):
+    _, calls = called(tmp_path, "reproduce_small.sh", "search", str(tmp_path / "out"), EPISODES="7")
+    recorded = [(call[1], int(call[call.index("-n") + 1])) for call in calls if call[0] == "generate"]
+    assert recorded == [("pick", 4), ("search", 3)]  # of 65, 13 and 22 percent
+
+
+def test_takeovers_are_from_a_run_that_came_to_its_end(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "weights.safetensors").touch()  # there from the first checkpoint on
+    done, calls = called(tmp_path, "dagger_small.sh", "pick", str(tmp_path))
+    assert (done.returncode, calls) == (2, [])
+    assert "no run that was trained to its end" in done.stderr
 
 
 def reproduced(tmp_path, episodes):
@@ -142,7 +159,7 @@ def test_a_study_refuses_what_it_does_not_know(tmp_path, what):
         (["reproduce_small.sh", "open_pick"], "which task?"),
         (
             ["dagger_small.sh", "pick", "nowhere"],
-            "nowhere: no run; bash scripts/reproduce_small.sh pick",
+            "nowhere: no run that was trained to its end; bash scripts/reproduce_small.sh pick",
         ),
     ],
 )

@@ -13,7 +13,7 @@ import torch
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
 from robocas_ms3.baselines.session import Said, train_run
 from robocas_ms3.baselines.table import BASELINES
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.errors import DatasetError, EmptySplitError
 from robocas_ms3.evaluation.policy import Wants
 
 
@@ -83,7 +83,9 @@ class MadeUp:
 
     def data(self, config, folder, split, on_read):
         if split == "val" and folder.read_text() == "few":
-            raise DatasetError("this split holds no episodes", where=folder)
+            raise EmptySplitError("this split holds no episodes", where=folder)
+        if split == "val" and folder.read_text() == "damaged":
+            raise DatasetError("this split is damaged", where=folder)
         bad = config.broken_at, config.steep_at, config.damaged_at
         return MadeUpSamples(*(bad if split == "train" else (-1, -1)))
 

@@ -29,6 +29,8 @@ def assert_same(one, other):
         assert first.keys() == second.keys()
         assert all(torch.equal(first[key], second[key]) for key in first), name
     assert lines(one) == lines(other)
+    first, second = ((folder / "metrics.csv").read_text().partition("\n")[0] for folder in (one, other))
+    assert first == second
 
 
 def say(run, **values):

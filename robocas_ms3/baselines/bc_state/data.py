@@ -21,7 +21,7 @@ from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
 from robocas_ms3.baselines.runs import hash_of
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.documents import DAMAGED
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.errors import DatasetError, EmptySplitError
 from robocas_ms3.evaluation.policy import privileged
 from robocas_ms3.files import replacing
 from robocas_ms3.paths import cache_dir
@@ -58,7 +58,7 @@ class StateSamples:
         self.episodes = len(numbers)
         if not numbers:
             fix = "Add episodes: a tenth of them validates."
-            raise DatasetError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
+            raise EmptySplitError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
         first = np.concatenate([[0], np.cumsum(told["lengths"])])
         rows = [slice(int(first[number]), int(first[number + 1])) for number in numbers]
         poses, opened = told["poses"], told["opened"]

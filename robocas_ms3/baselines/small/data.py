@@ -27,7 +27,7 @@ from robocas_ms3.baselines.small.pointing import places_of
 from robocas_ms3.baselines.small.standing import Standing, calibration, looks_alike, seen_from, standing
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.errors import DatasetError, EmptySplitError
 from robocas_ms3.poses import Array, from_xyzw
 
 _log = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ class SmallSamples:
         self.episodes = len(numbers)
         if not numbers:
             fix = "Add episodes: a tenth of them validates."
-            raise DatasetError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
+            raise EmptySplitError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
         check_tcp(source, numbers[0])
         check_bases(source, numbers)
         seen = source.episode(numbers[0])
@@ -219,7 +219,8 @@ class SmallSamples:
 
 
 def _check_room(config: SmallConfig, count: int, path: Path) -> None:
-    needed = count * sum(3 * view.size[0] * view.size[1] for view in config.views.values())
+    processes = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))  # of accelerate launch, each of which keeps all of them
+    needed = processes * count * sum(3 * view.size[0] * view.size[1] for view in config.views.values())
     free = psutil.virtual_memory().available
     if needed > 0.9 * free:
         raise DatasetError(

@@ -22,7 +22,7 @@ from robocas_ms3.datasets.training.sample_arrays import check_holds, read_episod
 from robocas_ms3.datasets.training.sample_pictures import PictureStack
 from robocas_ms3.datasets.training.sampling import SampleIndex, balancing_weights
 from robocas_ms3.datasets.training.windows import Padding, Window
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.errors import DatasetError, EmptySplitError
 from robocas_ms3.words import count_of
 
 UPSTREAM_CAMERAS = ("base_camera", "gripper_camera")
@@ -120,7 +120,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
         self.episodes: list[int] = self.source.split(split)
         """Numbers of the split's episodes, sorted."""
         if not self.episodes:
-            raise DatasetError(
+            raise EmptySplitError(
                 "this split holds no episodes",
                 where=path,
                 expected=f"some in {split}",

@@ -332,6 +332,15 @@ def test_more_pictures_than_memory_holds(folder, monkeypatch):
         BASELINE.data(SmallConfig(**TINY), folder, "train", lambda done, of: None)
 
 
+def test_each_process_keeps_all_pictures(folder, monkeypatch):
+    fits = 1.5 * 35 * 2 * 3 * VIEW.size[0] * VIEW.size[1] / 0.9  # once, and not twice
+    monkeypatch.setattr(data.psutil, "virtual_memory", lambda: SimpleNamespace(available=fits))
+    BASELINE.data(SmallConfig(**TINY), folder, "train", lambda done, of: None)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
+    with pytest.raises(DatasetError, match="more pictures than memory holds"):
+        BASELINE.data(SmallConfig(**TINY), folder, "train", lambda done, of: None)
+
+
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_it_goes_on_to_the_bit(folder, tmp_path, precision):
     """With what is random in it: shifts, light and dropout."""
