@@ -1,7 +1,7 @@
 """How the `rt1` baseline sees, thinks and is trained; the defaults are those of the paper's RT-1.
 
-They are of RoboCAS-v0's training configuration, as is the batch of 24, where the paper says 64; what that leaves open, as
-TokenLearner's bottleneck, is of RT-1 itself (Brohan et al. 2022, and its code).
+They are of RoboCAS-v0's training configuration, as is the batch of 24, where the paper says 64; what that leaves open,
+as TokenLearner's bottleneck, is of RT-1 itself (Brohan et al. 2022, and its code).
 """
 
 from __future__ import annotations
