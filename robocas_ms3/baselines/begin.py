@@ -16,6 +16,8 @@ from robocas_ms3.strict import parse
 
 _SEEN = ("rate_hz", "pictures", "cameras", "calibration", "observed", "acted")
 """Facts that a run shares with the one it begins with; others, as scales, only have as many numbers as there."""
+_FEW = 8
+"""Values of a list that a message has room for."""
 _PACKAGES = ("robocas-ms3", "torch", "accelerate", "safetensors", "transformers", "numpy")
 
 
@@ -105,7 +107,8 @@ def _other(one: Any, other: Any, name: str, tolerance: float) -> tuple[str, Any,
         return next(filter(None, found), None)
     if isinstance(one, list) and isinstance(other, list):
         if len(one) != len(other):
-            return name, f"{len(one)} values", f"{len(other)} values"
+            shown = max(len(one), len(other)) <= _FEW
+            return (name, one, other) if shown else (name, f"{len(one)} values", f"{len(other)} values")
         found = (_other(*pair, f"{name}[{at}]", tolerance) for at, pair in enumerate(zip(one, other, strict=True)))
         return next(filter(None, found), None)
     if isinstance(one, float) and isinstance(other, float):

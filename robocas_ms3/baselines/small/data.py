@@ -104,8 +104,8 @@ class SmallSamples:
                 stood.append(found)
                 on_read(done, len(numbers))
         self._ask(stood if config.language else [replace(one, target="") for one in stood])
-        if config.language and not (self._kinds >= 0).any():
-            what = "no scene.json tells where objects stood: only what is gripped next is pointed at"
+        if config.language and split == "train" and not (self._kinds >= 0).any():
+            what = "no scene.json tells where objects stood, so that only what is gripped next is pointed at"
             _log.warning("%s: %s", path, what)
         self.facts: dict[str, Any] = {
             "rate_hz": source.rate_hz,
