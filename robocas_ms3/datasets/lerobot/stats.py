@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 _BINS = 5000
+_LEAST_WIDTH = np.finfo(np.float64).tiny  # below it bins are no numbers to divide by: all in one
 _FINE = 300  # longer pictures are thinned for statistics, as LeRobot does it
 _THINNED = 150
 
@@ -67,7 +68,8 @@ class Histogram:
     """Counts of a feature between its smallest and largest number, for quantiles over any number of episodes."""
 
     def __init__(self, low: NDArray, high: NDArray) -> None:
-        self._low, self._width = low, np.where(high > low, high - low, 1.0) / _BINS
+        width = (high - low) / _BINS
+        self._low, self._width = low, np.where(width > _LEAST_WIDTH, width, 1 / _BINS)
         self._counts = np.zeros((len(low), _BINS), np.int64)
 
     def add(self, values: NDArray) -> None:
