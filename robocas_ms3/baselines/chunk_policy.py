@@ -14,6 +14,8 @@ from robocas_ms3.baselines.chunks import decode
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.poses import Array, from_wxyz
 
+_EMPTY = 0.004
+"""m; between fingers that hold nothing."""
 Predict = Callable[[Observations, int], NDArray[np.floating]]
 
 
@@ -25,18 +27,25 @@ class ChunkPolicy:
     A step's pose is the mean of what was predicted for it, weighted by exp(-fade age) (Zhao et al. 2023 weigh the
     oldest most; at 5 Hz the newest knows more).
 
+    One reflex is not learned, and off unless asked for: an empty fist that has not moved since the last chunk opens.
+    Whoever missed looks like one who pushes with a closed hand, and would wait for ever.
+
     Args:
         wants: what it is to be shown; of pictures those that a new chunk begins with.
         predict: (K, 10) chunk of what one env shows, of observations and its row, see `chunks`.
         play: steps of a chunk before the next one, up to K.
         fade: how fast older predictions lose weight, a step.
         about: what a result says of it besides.
+        reopen: m that an empty fist moves less than in a chunk, to be opened for the next one; 0: never.
     """
 
-    def __init__(self, wants: Wants, predict: Predict, play: int, fade: float, about: dict[str, Any]) -> None:
+    def __init__(
+        self, wants: Wants, predict: Predict, play: int, fade: float, about: dict[str, Any], reopen: float = 0.0
+    ) -> None:
         self.wants, self._predict, self._about = replace(wants, look_every=play), predict, about
-        self._play, self._fade = play, fade
+        self._play, self._fade, self._reopen = play, fade, reopen
         self._plans: dict[int, list[_Plan]] = {}  # by env, newest first
+        self._looked_from: dict[int, Array] = {}  # by env, (3,) where the TCP was in the arm's base
 
     def describe(self) -> dict[str, Any]:
         """What a result says of it besides."""
@@ -46,6 +55,7 @@ class ChunkPolicy:
         """Forget what was planned in these envs."""
         for start in starts:
             self._plans[start.env] = []
+            self._looked_from.pop(start.env, None)
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """(E, 7) motions."""
@@ -56,8 +66,17 @@ class ChunkPolicy:
         for row, env in enumerate(envs):
             if not self._plans[env] or self._plans[env][0].age >= self._play:
                 chunk = self._predict(observations, row)  # by itself: in a batch it would depend on the others' bits
-                self._plans[env].insert(0, _Plan(*decode(chunk, tcp[row])))
+                poses, opened = decode(chunk, tcp[row])
+                if self._waits(env, tcp[row, :3, 3], float(observations.gripper_width.reshape(-1)[row])):
+                    opened = np.ones_like(opened)
+                self._plans[env].insert(0, _Plan(poses, opened))
         return np.stack([self._next(self._plans[env], here) for env, here in zip(envs, tcp, strict=True)])
+
+    def _waits(self, env: int, here: Array, width: float) -> bool:
+        """Whether an empty fist is where it was when the last chunk began; remembers where it is."""
+        before = self._looked_from.get(env)
+        self._looked_from[env] = here.copy()
+        return width < _EMPTY and before is not None and bool(np.linalg.norm(here - before) < self._reopen)
 
     def _next(self, plans: list[_Plan], here: Array) -> NDArray[np.float64]:
         weights = np.exp(-self._fade * np.array([plan.age for plan in plans]))

@@ -9,7 +9,7 @@ from robocas_ms3.evaluation.policy import Observations, Start, Wants
 STAY = [0, 0, 0, 1, 0, 0, 0, 1, 0, 1.0]
 
 
-def seen(tcps, envs=(0,)):
+def seen(tcps, envs=(0,), width=0.0):
     count = len(envs)
     return Observations(
         envs=np.array(envs),
@@ -19,7 +19,7 @@ def seen(tcps, envs=(0,)):
         depths={},
         qpos=np.zeros((count, 12), np.float32),
         tcp_in_base=np.array(tcps, np.float32),
-        gripper_width=np.zeros((count, 1), np.float32),
+        gripper_width=np.full((count, 1), width, np.float32),
         state=None,
     )
 
@@ -100,6 +100,36 @@ def test_a_reset_forgets_one_env():
     acting.reset([start(1)])
     moved = acting.act(seen([HERE] * 2, (0, 1)))[:, 0]
     assert moved.tolist() == pytest.approx([0.3, 0.4])
+
+
+CLOSED = [[row(0.0, 0.0), row(0.0, 0.0)]]
+
+
+@pytest.mark.parametrize(
+    ("reopen", "width", "moved", "opened"),
+    [
+        (0.02, 0.001, 0.015, 1.0),  # an empty fist that waits
+        (0.0, 0.001, 0.0, 0.0),  # not asked for
+        (0.02, 0.03, 0.0, 0.0),  # it holds something
+        (0.02, 0.001, 0.025, 0.0),  # it pushes
+    ],
+)
+def test_an_empty_fist_that_waits_opens(reopen, width, moved, opened):
+    """At the look after the one that closed it, which was a step before; where to go is as predicted."""
+    asked = iter(CLOSED * 2)
+    acting = ChunkPolicy(Wants(), lambda observations, place: np.array(next(asked)), 1, 2.0, {}, reopen)
+    acting.reset([start(0)])
+    assert acting.act(seen([HERE], width=width))[0, 6] == 0.0
+    there = [HERE[0] + moved, *HERE[1:]]
+    assert acting.act(seen([there], width=width))[0, 6] == opened
+
+
+def test_where_another_episode_ended_is_forgotten():
+    asked = iter(CLOSED * 2)
+    acting = ChunkPolicy(Wants(), lambda observations, place: np.array(next(asked)), 1, 2.0, {}, 0.02)
+    for _ in range(2):
+        acting.reset([start(0)])
+        assert acting.act(seen([HERE]))[0, 6] == 0.0
 
 
 def test_motions_are_in_the_tcps_frame():

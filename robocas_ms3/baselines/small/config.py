@@ -70,6 +70,7 @@ class SmallConfig(BaselineConfig):
         brightness: share that brightness and contrast change by at most, at random, in training.
         play: steps of a chunk that it follows before it predicts the next one.
         fade: how fast older predictions lose weight when it acts, see `ChunkPolicy`.
+        reopen: m; an empty fist that moves less between two looks opens, see `ChunkPolicy`. 0: never.
         train: see `TrainSettings`.
     """
 
@@ -96,6 +97,7 @@ class SmallConfig(BaselineConfig):
     brightness: float = Field(default=0.2, ge=0, lt=1)
     play: int = Field(default=7, ge=1)
     fade: float = Field(default=0.15, ge=0)
+    reopen: float = Field(default=0.02, ge=0)
     train: TrainSettings = TrainSettings(steps=3_500, batch_size=96, learning_rate=6e-4, weight_decay=0.01)
 
     @model_validator(mode="after")

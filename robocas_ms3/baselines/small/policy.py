@@ -37,4 +37,5 @@ def make_policy(config: SmallConfig, facts: dict[str, Any], model: SmallModel) -
         cameras={camera: (width, height) for camera, (width, height) in facts["pictures"].items()},  # as it learned
         language="embedding" if config.language else "none",
     )
-    return ChunkPolicy(wants, predict, min(config.play, config.chunk), config.fade, {})
+    about = {"reopen": config.reopen}  # runs of before know nothing of it
+    return ChunkPolicy(wants, predict, min(config.play, config.chunk), config.fade, about, config.reopen)
