@@ -16,6 +16,7 @@ from robocas_ms3.poses import Array, from_wxyz
 
 _EMPTY = 0.004
 """m; between fingers that hold nothing."""
+
 Predict = Callable[[Observations, int], NDArray[np.floating]]
 
 
@@ -67,9 +68,9 @@ class ChunkPolicy:
             if not self._plans[env] or self._plans[env][0].age >= self._play:
                 chunk = self._predict(observations, row)  # by itself: in a batch it would depend on the others' bits
                 poses, opened = decode(chunk, tcp[row])
-                if self._waits(env, tcp[row, :3, 3], float(observations.gripper_width.reshape(-1)[row])):
-                    opened = np.ones_like(opened)
                 self._plans[env].insert(0, _Plan(poses, opened))
+                if self._waits(env, tcp[row, :3, 3], float(observations.gripper_width.reshape(-1)[row])):
+                    self._plans[env] = [plan.open() for plan in self._plans[env]]  # else older ones could outvote it
         return np.stack([self._next(self._plans[env], here) for env, here in zip(envs, tcp, strict=True)])
 
     def _waits(self, env: int, here: Array, width: float) -> bool:
@@ -100,3 +101,7 @@ class _Plan:
     def older(self) -> _Plan:
         """The same a step later."""
         return replace(self, age=self.age + 1)
+
+    def open(self) -> _Plan:
+        """The same with an open hand."""
+        return replace(self, opened=np.ones_like(self.opened))

@@ -124,6 +124,15 @@ def test_an_empty_fist_that_waits_opens(reopen, width, moved, opened):
     assert acting.act(seen([there], width=width))[0, 6] == opened
 
 
+def test_older_plans_do_not_keep_it_closed():
+    """All predictions weigh alike, and five of six want it closed."""
+    asked = iter([[row(0.0, 0.0)] * 8] * 6)
+    acting = ChunkPolicy(Wants(), lambda observations, place: np.array(next(asked)), 1, 0.0, {}, 0.02)
+    acting.reset([start(0)])
+    away = [[HERE[0] + 0.1 * place, *HERE[1:]] for place in range(5)]  # it moves, then stays
+    assert [acting.act(seen([here]))[0, 6] for here in [*away, away[-1]]] == [0, 0, 0, 0, 0, 1]
+
+
 def test_where_another_episode_ended_is_forgotten():
     asked = iter(CLOSED * 2)
     acting = ChunkPolicy(Wants(), lambda observations, place: np.array(next(asked)), 1, 2.0, {}, 0.02)
