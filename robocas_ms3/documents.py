@@ -1,13 +1,13 @@
-"""JSON and YAML files of others, bounded before anything is built of them: a small file must not take all memory.
+"""Read JSON, YAML and NumPy files of unknown origin within bounds: a small file must not take all memory.
 
-And what NumPy says of damaged files of arrays.
-
-What is wrong with a file is a `DocumentError`, and thereby a ``ValueError``; that it can't be read an ``OSError``.
+A file with wrong content raises `DocumentError`, which is a ``ValueError``. A file that cannot be read raises
+``OSError``.
 """
 
 from __future__ import annotations
 
 import json
+import stat
 import tokenize
 import zipfile
 import zlib
@@ -24,7 +24,11 @@ JSON_LIMIT = 256 * 2**20
 YAML_LIMIT = 4 * 2**20
 ARRAYS_LIMIT = 2**31
 """Bytes that the arrays of an ``.npz`` may have: compressed, they can be a thousandth of that."""
-YAML_DEPTH = 64
+INTEGER_LIMIT = 2**63
+"""Integers are smaller in magnitude: NumPy, torch and Parquet hold 64 bits."""
+_NUMBER_LENGTH = 64  # characters of a YAML number; the time to read base 60 ("1:1:1") grows with their square
+JSON_DEPTH = YAML_DEPTH = 64
+_TOO_DEEP = f"nested more than {JSON_DEPTH} deep"
 YAML_NODES = 500_000
 """Values, those that aliases stand for counted each time: nine aliases of nine aliases of ... are a billion."""
 
@@ -60,51 +64,66 @@ def load_json(path: Path) -> Any:
     """Read a JSON file.
 
     Raises:
-        DocumentError: it is no JSON, or too large or deep, or a number in it is not finite.
-        OSError: it can't be read.
+        DocumentError: the file is not regular or not JSON, is too large or deep, or has a number out of range.
+        OSError: the file cannot be read.
     """
     with _of(path):
         return json_values(_text(path, JSON_LIMIT))
 
 
 def json_values(text: str | bytes) -> Any:
-    """Values of a text of JSON. It knows no NaN and no infinity, whatever Python's own reader takes.
+    """Read the values of a JSON text. NaN, infinity and integers beyond 64 bits are refused.
 
     Raises:
-        DocumentError: it is no JSON, or too deep, or a number in it is not finite.
+        DocumentError: the text is not JSON, is nested too deeply, or has a number out of range.
     """
     try:
-        return json.loads(text, parse_constant=_no_number, parse_float=_finite)
+        values = json.loads(text, parse_constant=_no_number, parse_float=_finite, parse_int=_integer)
     except ValueError as error:
         raise DocumentError(str(error)) from error
     except RecursionError as error:
-        raise DocumentError("nested too deeply") from error
+        raise DocumentError(_TOO_DEEP) from error
+    _check_depth(values)
+    return values
+
+
+def _check_depth(values: Any) -> None:
+    """Refuse nesting that would exhaust the stack of functions that call themselves per level."""
+    level = [values] if isinstance(values, list | dict) else []
+    for _ in range(JSON_DEPTH):
+        inside = (node.values() if isinstance(node, dict) else node for node in level)
+        level = [child for children in inside for child in children if isinstance(child, list | dict)]
+        if not level:
+            return
+    raise DocumentError(_TOO_DEEP)
 
 
 def load_yaml(path: Path) -> Any:
     """Read a YAML file; a key given twice in a mapping is an error.
 
     Raises:
-        DocumentError: it is no YAML, or too large or deep, or its aliases stand for too much.
-        OSError: it can't be read.
+        DocumentError: the file is not regular or not YAML, is too large or deep, has a number out of range, or its
+            aliases stand for too many values.
+        OSError: the file cannot be read.
     """
     with _of(path):
         text = _text(path, YAML_LIMIT)
         try:
             return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
-        except (yaml.YAMLError, ValueError, AttributeError, LookupError, TypeError) as error:
+        except (yaml.YAMLError, ValueError, AttributeError, LookupError, TypeError, OverflowError) as error:
             raise DocumentError(" ".join(str(error).split())) from error
 
 
 def open_arrays(path: Path) -> Any:
-    """Open an ``.npz``; NumPy's reader of it, for a ``with`` statement, which makes no objects of Python's.
+    """Open an ``.npz`` file; returns NumPy's reader, for a ``with`` statement. Pickled objects are never loaded.
 
     Raises:
-        ValueError: or another of `DAMAGED`: it is none, or its arrays are too large.
+        ValueError: or another error of `DAMAGED`: the file is not an archive, or its arrays are too large.
     """
     import numpy as np  # not for every command
     from numpy.lib.npyio import NpzFile
 
+    check_regular(path)
     file = np.load(path, allow_pickle=False)
     if not isinstance(file, NpzFile):
         raise DocumentError("one array, not an archive of several")
@@ -112,6 +131,36 @@ def open_arrays(path: Path) -> Any:
         file.close()
         raise DocumentError(f"more than {ARRAYS_LIMIT >> 20} MB of arrays")
     return file
+
+
+def load_array(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
+    """Read an ``.npy`` file of at most ``limit`` bytes. Pickled objects are never loaded.
+
+    Raises:
+        ValueError: or another error of `DAMAGED`: the file is too large, or does not hold one array.
+    """
+    import numpy as np  # not for every command
+
+    check_regular(path)
+    if path.stat().st_size > limit:
+        raise DocumentError(f"more than {limit} bytes")
+    array = np.load(path, allow_pickle=False)
+    if not isinstance(array, np.ndarray):
+        array.close()
+        raise DocumentError("an archive, not one array")
+    return array
+
+
+def check_regular(path: Path) -> None:
+    """Refuse a pipe, a device or a socket, on which a read may never end; a folder is left to ``open``.
+
+    Raises:
+        DocumentError: the path leads to one of these.
+        OSError: the path cannot be read.
+    """
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise DocumentError("not a regular file")
 
 
 def _no_number(word: str) -> float:
@@ -123,7 +172,15 @@ def _finite(word: str) -> float:
     return number if isfinite(number) else _no_number(word[:40])
 
 
+def _integer(word: str) -> int:
+    number = int(word) if len(word) <= _NUMBER_LENGTH else INTEGER_LIMIT
+    if abs(number) >= INTEGER_LIMIT:
+        raise DocumentError(f"integer {word[:24]}{'...' if len(word) > 24 else ''} has more than 64 bits")
+    return number
+
+
 def _text(path: Path, limit: int) -> str:
+    check_regular(path)
     with path.open("rb") as file:
         content = file.read(limit + 1)
     if len(content) > limit:
@@ -149,7 +206,7 @@ class _Loader(yaml.SafeLoader):
         if self._nodes > YAML_NODES:
             raise DocumentError(f"more than {YAML_NODES} values, with those that aliases stand for")
         if self._depth >= YAML_DEPTH:
-            raise DocumentError(f"nested more than {YAML_DEPTH} deep")
+            raise DocumentError(_TOO_DEEP)
         before = self._nodes
         self._depth += 1
         node = super().compose_node(parent, index)
@@ -167,3 +224,20 @@ class _Loader(yaml.SafeLoader):
                 raise yaml.MarkedYAMLError(None, None, f"the key {key.value!r} is given twice", key.start_mark)
             seen.add((key.tag, str(key.value)))
         return node
+
+    def construct_yaml_int(self, node: Any) -> int:
+        """Return an integer of at most 64 bits."""
+        number = INTEGER_LIMIT if len(node.value) > _NUMBER_LENGTH else super().construct_yaml_int(node)
+        if abs(number) >= INTEGER_LIMIT:
+            raise DocumentError(f"integer {node.value[:24]} has more than 64 bits")
+        return number
+
+    def construct_yaml_float(self, node: Any) -> float:
+        """Return a number; infinity and NaN stay, for the forms that take them."""
+        if len(node.value) > _NUMBER_LENGTH:
+            raise DocumentError(f"number {node.value[:24]}... has more than {_NUMBER_LENGTH} characters")
+        return super().construct_yaml_float(node)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_yaml_float)

@@ -36,7 +36,7 @@ _EXPECTED = {
     "dict_type": "a mapping",
 }
 _FOUND_LENGTH = 80  # of a wrong value in a message
-_ENDLESS = re.compile(rb"NaN|Infinity|\d[eE]\+?\d{3}|\d{309}")  # what may be a number that is not finite
+_OUT_OF_RANGE = re.compile(rb"NaN|Infinity|\d[eE]\+?\d{3}|\d{19}")  # may be a number that `json_values` refuses
 
 
 class StrictModel(BaseModel):
@@ -102,7 +102,7 @@ def parse_json(
 
 
 def validate_json(form: type[_Model] | TypeAdapter[_Value], text: str | bytes) -> Any:
-    """JSON in a declared form, by its types; no number is NaN or infinite, not even where the form takes anything.
+    """Read JSON strictly in a declared form; every number is finite and every integer has at most 64 bits.
 
     Raises:
         ValidationError: it says something else.
@@ -111,7 +111,7 @@ def validate_json(form: type[_Model] | TypeAdapter[_Value], text: str | bytes) -
         found: Any = form.validate_json(text, strict=True)
     else:
         found = form.model_validate_json(text, strict=True)
-    if _ENDLESS.search(text.encode() if isinstance(text, str) else text):  # hardly ever: then it is read once more
+    if _OUT_OF_RANGE.search(text.encode() if isinstance(text, str) else text):  # hardly ever: then it is read once more
         try:
             json_values(text)
         except DocumentError as problem:

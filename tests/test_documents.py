@@ -1,13 +1,22 @@
 """Files of others are bounded before anything is built of them."""
 
 import json
+import os
 import re
 import time
 
 import pytest
 
 from robocas_ms3 import documents
-from robocas_ms3.documents import YAML_DEPTH, DocumentError, load_json, load_yaml
+from robocas_ms3.documents import (
+    JSON_DEPTH,
+    YAML_DEPTH,
+    DocumentError,
+    load_array,
+    load_json,
+    load_yaml,
+    open_arrays,
+)
 
 
 @pytest.fixture
@@ -55,9 +64,12 @@ def test_yaml_may_be_nested_so_deep_and_no_deeper(file):
             load_yaml(file("[" * depth + "]" * depth))
 
 
-def test_json_nested_too_deeply(file):
-    with pytest.raises(DocumentError, match="nested too deeply"):
-        load_json(file("[" * 100_000 + "]" * 100_000))
+@pytest.mark.parametrize("before", ["", '[1, {"a": []}, '])
+@pytest.mark.parametrize("depth", [JSON_DEPTH + 1, 500, 100_000])
+def test_json_nested_too_deeply(file, before, depth):
+    with pytest.raises(DocumentError):
+        load_json(file(before + "[" * depth + "]" * depth + "]" * bool(before)))
+    load_json(file("[" * JSON_DEPTH + "]" * JSON_DEPTH))
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "-2.5E+400", "9" * 400 + ".0"])
@@ -65,6 +77,30 @@ def test_json_knows_finite_numbers_only(file, number):
     with pytest.raises(DocumentError, match=f"^{re.escape(number[:40])} is no number of JSON$"):
         load_json(file(f'{{"a": [1, {number}]}}'))
     assert load_json(file(f'["{number}", 1e300]')) == [number, 1e300]
+
+
+@pytest.mark.parametrize("load", [load_json, load_yaml])
+@pytest.mark.parametrize("number", [2**63, -(2**63), 10**400, int("9" * 4300)])
+def test_integers_have_64_bits(file, load, number):
+    with pytest.raises(DocumentError):
+        load(file(f'{{"a": [1, {number}]}}'))
+    assert load(file(f"[{2**63 - 1}]")) == [2**63 - 1]
+
+
+@pytest.mark.parametrize("number", ["1:" * 200_000 + "1", "1:" * 300 + "1.5", "0x" + "f" * 4000, "9" * 5000])
+def test_long_yaml_numbers_are_refused_at_once(file, number):
+    with pytest.raises(DocumentError):
+        load_yaml(file(f"a: {number}"))
+    assert load_yaml(file("a: [1:30, 0x10, 1:30.5, .inf]")) == {"a": [90, 16, 90.5, float("inf")]}
+
+
+@pytest.mark.parametrize("load", [load_json, load_yaml, open_arrays, load_array])
+def test_only_regular_files_are_read(tmp_path, load):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    for name in ("pipe", "zero"):
+        with pytest.raises(DocumentError):
+            load(tmp_path / name)
 
 
 @pytest.mark.parametrize(("load", "limit"), [(load_json, "JSON_LIMIT"), (load_yaml, "YAML_LIMIT")])

@@ -13,13 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.provenance import recording_entry
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings, header
-from robocas_ms3.documents import DAMAGED, load_json
+from robocas_ms3.documents import DAMAGED, load_array, load_json
 from robocas_ms3.errors import PlanError
 from robocas_ms3.files import flush_to_disk, make_folder, replacing, write_json
 from robocas_ms3.outputs import sweep
@@ -160,7 +158,7 @@ def _join_once(
 
 def _damage_of_layouts(path: Path, seeds: Sequence[int]) -> str:
     try:
-        found = np.load(path, allow_pickle=False)["seed"].tolist()
+        found = load_array(path)["seed"].tolist()
     except (*DAMAGED, IndexError, KeyError, TypeError) as error:
         return _said(error)
     return "" if found == list(seeds) else f"{len(found)} layouts, of other seeds"

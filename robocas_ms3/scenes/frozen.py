@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.documents import DAMAGED
+from robocas_ms3.documents import DAMAGED, load_array
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import replacing
 from robocas_ms3.scenes.layout import Layout
@@ -29,7 +29,7 @@ class FrozenLayouts:
     def __init__(self, path: Path, names: Collection[str]) -> None:
         self._path, self._names = path, sorted(names)
         try:
-            self._records = np.load(path, allow_pickle=False)
+            self._records = load_array(path)
             check_record(self._records.dtype)
             self._places = {int(seed): i for i, seed in enumerate(self._records["seed"])}
         except (*DAMAGED, IndexError, KeyError, TypeError) as error:
@@ -71,7 +71,7 @@ def join_frozen(path: Path, parts: Sequence[Path]) -> None:
     pieces: list[NDArray[np.void]] = []
     for part in parts:
         try:
-            pieces.append(np.load(part, allow_pickle=False))
+            pieces.append(load_array(part))
             check_record(np.concatenate([pieces[0][:0], pieces[-1][:0]]).dtype)  # texts may be of other lengths
         except (*DAMAGED, IndexError, KeyError, TypeError) as error:
             raise LayoutError("no frozen layouts", where=part, found=error) from error

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.documents import DAMAGED
+from robocas_ms3.documents import DAMAGED, check_regular
 from robocas_ms3.errors import LayoutError
 from robocas_ms3.files import replacing
 from robocas_ms3.poses import from_wxyz, to_wxyz
@@ -62,6 +62,7 @@ class LayoutTable:
     def __init__(self, path: Path, names: Sequence[str]) -> None:
         self._names: list[str] = list(names)
         try:
+            check_regular(path)
             self.rows: NDArray[np.void] = np.lib.format.open_memmap(path, mode="r")
             self._sets, self._seeds = (self.rows[name][place].copy() for name, place in _AXES)
             self._states = self.rows["state"].copy()

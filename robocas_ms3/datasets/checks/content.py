@@ -16,8 +16,9 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line, read_arrays
-from robocas_ms3.documents import DAMAGED, load_json
+from robocas_ms3.documents import DAMAGED, load_array, load_json
 
 NO_FILE = "no file"
 SURPLUS = "a file beyond them"
@@ -140,8 +141,7 @@ def _camera_files(folder: Path, cameras: Iterable[schema.CameraSpec]) -> dict[st
     for camera in cameras:
         for name in (schema.INTRINSIC_FILE, *camera.pose_files):
             try:
-                array = np.load(folder / camera.name / name, allow_pickle=False)
-                found[f"{camera.name}/{name}"] = array if isinstance(array, np.ndarray) else "an archive"
+                found[f"{camera.name}/{name}"] = load_array(folder / camera.name / name, CAMERA_LIMIT)
             except FileNotFoundError:
                 continue
             except DAMAGED as error:

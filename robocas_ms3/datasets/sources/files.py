@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.documents import DAMAGED, load_json
+from robocas_ms3.documents import DAMAGED, load_array, load_json
 from robocas_ms3.errors import DatasetError
 
+CAMERA_LIMIT = 2**22
+"""Bytes of an array of intrinsics or poses; a pose has 128."""
 SEE_VALIDATE = "robocas validate lists all that is wrong."
 
 
@@ -60,14 +62,14 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_array(path: Path) -> NDArray[np.float64]:
-    """An array of numbers.
+    """Read an array of numbers that describes a camera.
 
     Raises:
         DatasetError: the file is missing or damaged, or holds something else.
     """
     try:
-        array = np.load(path, allow_pickle=False)
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+        array = load_array(path, CAMERA_LIMIT)
+        if array.dtype.kind not in "fiu":
             raise ValueError("no array of numbers")
     except DAMAGED as error:
         raise DatasetError(
