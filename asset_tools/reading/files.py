@@ -1,0 +1,145 @@
+"""Files that a model names: only regular ones, of bounded size, below the folder that the user imports."""
+
+from __future__ import annotations
+
+import os
+import stat
+import unicodedata
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from robocas_ms3.errors import AssetError
+
+LARGEST_FILE = 200 * 2**20  # bytes
+MOST_ENTRIES = 20_000  # of a folder that is searched for a file
+
+
+def read_file(path: Path, root: Path) -> bytes:
+    """Return the content of a regular file below the imported folder.
+
+    Args:
+        path: the file; a symbolic link may stay below ``root``.
+        root: the folder that the user imports.
+
+    Raises:
+        AssetError: the file is missing, outside of ``root``, not regular (a pipe, a device), or larger than 200 MB.
+    """
+    check_inside(path, root)
+    try:
+        # without O_NONBLOCK, opening a named pipe waits for a writer
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open(descriptor, "rb") as file:
+            status = os.fstat(descriptor)
+            if not stat.S_ISREG(status.st_mode):
+                raise AssetError("not a regular file", where=path, fix="Replace it by the file itself.")
+            if status.st_size > LARGEST_FILE:
+                raise AssetError(
+                    "the file is too large",
+                    where=path,
+                    expected=f"at most {LARGEST_FILE >> 20} MB",
+                    found=f"{status.st_size >> 20} MB",
+                    fix="Reduce the mesh, or shrink its textures.",
+                )
+            return file.read(LARGEST_FILE + 1)
+    except OSError as error:
+        raise AssetError("can't read this file", where=path, found=error.strerror) from error
+
+
+def check_inside(path: Path, root: Path) -> None:
+    """Check that a path, its links followed, is below the imported folder.
+
+    Raises:
+        AssetError: it is outside.
+    """
+    try:
+        inside = path.resolve().is_relative_to(root.resolve())
+    except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a null byte
+        raise AssetError("can't read this file", where=path, found=error) from error
+    if not inside:
+        raise AssetError(
+            "the path leaves the imported folder",
+            where=path,
+            expected=f"a file below {root}",
+            fix="Copy the file into the folder, or import the folder that holds both.",
+        )
+
+
+@dataclass
+class ModelFiles:
+    """The files of one model.
+
+    Attributes:
+        root: the folder that the user imports; nothing outside of it is read.
+        home: the model's own folder, below which files are searched by name.
+        notes: one line per file that is not where the model says.
+        used: the files that were read, for the content hash.
+    """
+
+    root: Path
+    home: Path
+    notes: list[str] = field(default_factory=list)
+    used: list[Path] = field(default_factory=list)
+
+    def read(self, path: Path) -> bytes:
+        """Return the content of a file, see `read_file`."""
+        data = read_file(path, self.root)
+        if path not in self.used:
+            self.used.append(path)
+        return data
+
+    def find(self, name: str, folder: Path) -> Path | None:
+        """Find a file by the name that a model gives it, which may be of another machine or differ in letter case.
+
+        Args:
+            name: as the model has it: relative to ``folder``, or absolute; with slashes or backslashes.
+            folder: of the file that names it.
+
+        Returns:
+            The path; None if there is no such file.
+
+        Raises:
+            AssetError: the name leads out of ``root``, and no file below ``home`` has its last part as a name.
+        """
+        name = name.strip().strip('"')
+        plain = name.replace("\\", "/").removeprefix("file://")
+        if not plain or "\0" in plain:
+            return None
+        relative = not plain.startswith("/") and not (len(plain) > 1 and plain[1] == ":")
+        path = Path(os.path.normpath(folder / plain))
+        outside = relative and not path.is_relative_to(self.root)
+        if relative and not outside and os.path.lexists(path) and not path.is_dir():
+            if plain != name:
+                self._note(f"read {name} as {plain}")
+            return path
+        wanted = _letters(plain.rsplit("/", 1)[-1])
+        alike = [found for found in files_below(self.home) if _letters(found.name) == wanted]
+        if alike:
+            found = min(alike, key=lambda path: (len(path.parts), path.as_posix()))
+            self._note(f"took {found.relative_to(self.home).as_posix()} for {name}")
+            return found
+        if outside:
+            check_inside(folder / plain, self.root)
+        return None
+
+    def _note(self, text: str) -> None:
+        if text not in self.notes:
+            self.notes.append(text)
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """Yield all files below a folder, hidden ones and links to folders left out; the order is that of names."""
+    count = 0
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        for name in sorted(names):
+            count += 1
+            if count > MOST_ENTRIES:
+                return
+            if not name.startswith("."):
+                yield Path(place, name)
+
+
+def _letters(name: str) -> str:
+    """Return a name without letter case, its accents written in one way."""
+    return unicodedata.normalize("NFC", name).casefold()

@@ -1,0 +1,282 @@
+"""Wavefront OBJ and MTL files, as exporters write them rather than as the format's description has them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.errors import AssetError
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MOST_FACES = 1_000_000
+MOST_VERTICES = 3_000_000
+# of a map statement, by the number of its arguments; -s, -o and -t take one to three numbers
+FLAGS = {"-blendu", "-blendv", "-cc", "-clamp", "-imfchan", "-type", "-bm", "-boost", "-texres"}
+VECTORS = {"-s": 3, "-o": 3, "-t": 3, "-mm": 2}
+
+
+@dataclass
+class MtlMaterial:
+    """A material of an MTL file.
+
+    Attributes:
+        name: as the file has it, white space reduced to single spaces.
+        color: Kd, (3,) 0 to 1, sRGB; None: not given.
+        emission: Ke, likewise.
+        image: name of the colour texture (``map_Kd``, else ``map_Ka``); empty: none.
+        emission_image: name of the emissive texture (``map_Ke``).
+        uv_scale: of the colour texture (``-s``).
+        uv_offset: of the colour texture (``-o``).
+    """
+
+    name: str
+    color: tuple[float, float, float] | None = None
+    emission: tuple[float, float, float] | None = None
+    image: str = ""
+    emission_image: str = ""
+    uv_scale: tuple[float, float] = (1.0, 1.0)
+    uv_offset: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass
+class ObjMesh:
+    """The content of an OBJ file; polygons are fans of triangles.
+
+    Attributes:
+        vertices: (V, 3).
+        colors: (V, 3) 0 to 1, sRGB; None where no vertex has a colour.
+        uvs: (T, 2), v upward.
+        normals: (N, 3).
+        faces: (F, 3) indices of vertices.
+        face_uvs: (F, 3) indices of ``uvs``, -1 where a corner has none.
+        face_normals: (F, 3) indices of ``normals``, -1 where a corner has none.
+        face_materials: (F,) indices of ``material_names``; -1: before the first ``usemtl``.
+        material_names: of ``usemtl``, white space reduced to single spaces.
+        libraries: the rest of each ``mtllib`` line.
+    """
+
+    vertices: Array
+    colors: Array | None
+    uvs: Array
+    normals: Array
+    faces: Ints
+    face_uvs: Ints
+    face_normals: Ints
+    face_materials: Ints
+    material_names: list[str] = field(default_factory=list)
+    libraries: list[str] = field(default_factory=list)
+
+
+def decode_text(data: bytes) -> str:
+    """Return the text of a file: UTF-8, with or without a mark, or else Latin letters as Windows has them."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", errors="replace")
+
+
+def parse_mtl(text: str) -> dict[str, MtlMaterial]:
+    """Return the materials of an MTL file by name; what can't be read of a statement is left out."""
+    found: dict[str, MtlMaterial] = {}
+    current: MtlMaterial | None = None
+    ambient: dict[str, str] = {}
+    for word, rest in _statements(text):
+        key = word.lower()
+        if key == "newmtl":
+            current = MtlMaterial(" ".join(rest.split()))
+            found[current.name] = current
+        elif current is None:
+            continue
+        elif key == "kd":
+            current.color = _color(rest)
+        elif key == "ke":
+            current.emission = _color(rest)
+        elif key == "map_kd":
+            current.image, current.uv_scale, current.uv_offset = _map(rest)
+        elif key == "map_ka":
+            ambient[current.name] = _map(rest)[0]
+        elif key == "map_ke":
+            current.emission_image = _map(rest)[0]
+    for name, image in ambient.items():
+        found[name].image = found[name].image or image
+    return found
+
+
+def find_material(name: str, materials: dict[str, MtlMaterial]) -> MtlMaterial | None:
+    """Return the material that a ``usemtl`` names, by its exact name or else whatever the letters' case."""
+    if name in materials:
+        return materials[name]
+    alike = [material for other, material in materials.items() if other.casefold() == name.casefold()]
+    return alike[0] if alike else None
+
+
+def parse_obj(text: str, where: object) -> ObjMesh:
+    """Return the content of an OBJ file.
+
+    Args:
+        text: of the file.
+        where: for errors.
+
+    Raises:
+        AssetError: a number or an index can't be read, or there are too many faces or vertices.
+    """
+    points: list[str] = []
+    uvs: list[str] = []
+    normals: list[str] = []
+    rows = {"v": points, "vt": uvs, "vn": normals}
+    corners: list[tuple[int, int, int]] = []
+    counts: list[int] = []  # corners per polygon
+    polygon_materials: list[int] = []
+    names: dict[str, int] = {}
+    libraries: list[str] = []
+    material = -1
+    known: dict[str, tuple[int, int, int]] = {}
+    try:
+        for key, rest in _statements(text):
+            if key in rows:
+                rows[key].append(rest)
+                if len(rows[key]) > MOST_VERTICES:
+                    raise _too_many("vertices", MOST_VERTICES, where)
+            elif key == "f":
+                words = rest.split()
+                if len(words) < 3:
+                    continue
+                for word in words:
+                    corner = known.get(word)
+                    if corner is None:
+                        corner = _corner(word, len(points), len(uvs), len(normals))
+                        if "-" not in word:  # others count back from where they stand
+                            known[word] = corner
+                    corners.append(corner)
+                counts.append(len(words))
+                polygon_materials.append(material)
+                if len(corners) > 4 * MOST_FACES:
+                    raise _too_many("faces", MOST_FACES, where)
+            elif key == "usemtl":
+                material = names.setdefault(" ".join(rest.split()), len(names))
+            elif key == "mtllib":
+                libraries.append(rest.strip())
+        vertices = _numbers(points, 3)
+        colors = _numbers([row.split(None, 3)[3] for row in points], 3) if points and _colored(points) else None
+        triangles, source = _fans(np.array(counts, np.int64))
+        if len(triangles) > MOST_FACES:
+            raise _too_many("faces", MOST_FACES, where)
+        table = np.array(corners, np.int64).reshape(-1, 3)
+        for column, count, what in zip(table.T, (len(points), len(uvs), len(normals)), ("v", "vt", "vn"), strict=True):
+            if len(column) and (column.max() >= count or column.min() < -1):
+                raise ValueError(f"a face names {what} {int(column.max()) + 1} of {count}")
+        if len(table) and table[:, 0].min() < 0:
+            raise ValueError("a face names vertex 0")
+        return ObjMesh(
+            vertices,
+            colors,
+            _numbers(uvs, 2, fill=0.0),
+            _numbers(normals, 3),
+            table[triangles, 0],
+            table[triangles, 1],
+            table[triangles, 2],
+            np.array(polygon_materials, np.int64)[source],
+            list(names),
+            libraries,
+        )
+    except (ValueError, IndexError, OverflowError) as error:
+        raise AssetError("can't read this mesh", where=where, found=error) from error
+
+
+def _statements(text: str) -> Iterator[tuple[str, str]]:
+    """Yield keyword and rest of each line; comments left out, continued lines joined."""
+    for line in re.sub(r"\\\r?\n", " ", text).splitlines():
+        words = line.split(None, 1)
+        if len(words) == 2 and not words[0].startswith("#"):
+            yield words[0], words[1].rstrip()
+
+
+def _corner(word: str, points: int, uvs: int, normals: int) -> tuple[int, int, int]:
+    """Return the indices of ``v/vt/vn``, from 0; -1 where there is none."""
+    parts = (word.split("/") + ["", ""])[:3]
+    index = [int(part) if part else 0 for part in parts]
+    counts = (points, uvs, normals)
+    if not index[0] or any(-value > count for value, count in zip(index, counts, strict=True)):
+        raise ValueError(f"a face names {word} of {points} vertices")
+    first, second, third = (
+        value - 1 if value >= 0 else count + value for value, count in zip(index, counts, strict=True)
+    )
+    return first, second, third
+
+
+def _fans(counts: Ints) -> tuple[Ints, Ints]:
+    """Return triangles (F, 3) of corners counted through all polygons, and (F,) the polygon of each."""
+    starts = np.cumsum(counts) - counts
+    many = counts - 2
+    source = np.repeat(np.arange(len(counts)), many)
+    step = np.arange(len(source)) - np.repeat(np.cumsum(many) - many, many)
+    first = starts[source]
+    return np.column_stack([first, first + step + 1, first + step + 2]), source
+
+
+def _numbers(rows: list[str], columns: int, fill: float | None = None) -> Array:
+    """Return the first numbers of each row; ``fill`` where there are too few."""
+    found = np.empty((len(rows), columns))
+    for start in range(0, len(rows), 100_000):  # words take much more memory than numbers
+        words = [row.split() for row in rows[start : start + 100_000]]
+        if fill is not None:
+            words = [line + [str(fill)] * (columns - len(line)) for line in words]
+        found[start : start + len(words)] = np.array([line[:columns] for line in words], dtype=float)
+    return found
+
+
+def _colored(rows: list[str]) -> bool:
+    """Whether all vertices have a colour: x y z r g b."""
+    return len(rows[0].split()) in (6, 7) and all(len(row.split()) in (6, 7) for row in rows)
+
+
+def _color(rest: str) -> tuple[float, float, float] | None:
+    try:
+        values = [min(max(float(word), 0.0), 1.0) for word in rest.split()[:3]]
+    except ValueError:
+        return None
+    if len(values) == 1:
+        values *= 3
+    if len(values) != 3 or not np.isfinite(values).all():
+        return None
+    return values[0], values[1], values[2]
+
+
+def _map(rest: str) -> tuple[str, tuple[float, float], tuple[float, float]]:
+    """Return the file name of a map statement, which may hold spaces, and scale and offset of its UVs."""
+    vectors: dict[str, list[float]] = {}
+    left = rest.strip()
+    while left.startswith("-"):
+        option, _, tail = left.partition(" ")
+        option, tail = option.lower(), tail.strip()
+        if option in FLAGS:
+            left = tail.partition(" ")[2].strip()
+        elif option in VECTORS:
+            values = []
+            while len(values) < VECTORS[option] and tail:
+                word, _, after = tail.partition(" ")
+                try:
+                    values.append(float(word))
+                except ValueError:
+                    break
+                tail = after.strip()
+            vectors[option], left = values, tail
+        else:
+            break
+    scale, offset = (vectors.get(option, []) for option in ("-s", "-o"))
+    return left, _pair(scale, 1.0), _pair(offset, 0.0)
+
+
+def _pair(values: list[float], default: float) -> tuple[float, float]:
+    found = [value if np.isfinite(value) else default for value in values] + [default, default]
+    return found[0], found[1]
+
+
+def _too_many(what: str, limit: int, where: object) -> AssetError:
+    return AssetError(f"the mesh has too many {what}", where=where, expected=f"at most {limit:,}", fix="Reduce it.")
