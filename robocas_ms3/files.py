@@ -7,18 +7,23 @@ import errno
 import glob
 import json
 import os
+import secrets
 import shutil
+import stat
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedRandom, FileIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.paths import variable_of
 
+_Error = TypeVar("_Error", bound=RobocasError)
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})  # what the system says of a disk without room
+_KEY_DEPTH = 8  # of the key that a message names
 ABANDONED = 86400.0  # s without a change: what a killed run left
 
 
@@ -41,7 +46,8 @@ def naming(path: Path | str) -> Iterator[None]:
 def replacing(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; on success it replaces ``path``, on failure it is removed.
 
-    The temporary name keeps the suffix, since many writers choose their format by it.
+    The temporary name keeps the suffix, since many writers choose their format by it. Nobody can predict the name, so
+    nobody can put a symbolic link there first.
 
     Args:
         path: of the file.
@@ -49,7 +55,7 @@ def replacing(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
     """
     path = Path(path)
     make_folder(path.parent)
-    tmp = path.parent / f".{path.stem}.{os.getpid()}.tmp{path.suffix}"
+    tmp = path.parent / f".{path.stem}.{secrets.token_hex(8)}.tmp{path.suffix}"
     try:
         with naming(path):
             yield tmp
@@ -63,6 +69,31 @@ def replacing(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
             shutil.rmtree(tmp, ignore_errors=True)
         else:
             tmp.unlink(missing_ok=True)
+
+
+def open_for_append(path: Path) -> BufferedRandom:
+    """Open a file for reading and appending; create it if missing, follow no symbolic link.
+
+    Raises:
+        RobocasError: the path is a symbolic link, or not a regular file.
+        OSError: the file can't be opened.
+    """
+    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise _not_regular(path, f"a symbolic link to {os.readlink(path)}") from error
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise _not_regular(path, "a pipe or device")
+    return BufferedRandom(FileIO(descriptor, "r+"))
+
+
+def _not_regular(path: Path, found: str) -> RobocasError:
+    what, fix = "refusing to write to this file", "Remove it, or choose another output folder."
+    return RobocasError(what, where=path, expected="a regular file", found=found, fix=fix)
 
 
 def _sync(path: Path) -> None:
@@ -113,12 +144,16 @@ def is_fixed(folder: Path) -> bool:
 def empty_folder(folder: Path, but: Path | None = None) -> None:
     """Delete what is in a folder, ``but`` one entry."""
     for entry in folder.iterdir():
-        if entry == but:
-            continue
-        if entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry)
-        else:
-            entry.unlink()
+        if entry != but:
+            remove(entry)
+
+
+def remove(path: Path) -> None:
+    """Delete a file or a folder; of a symbolic link the link alone."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
 
 
 def _move_in(tmp: Path, path: Path, tries: int = 5) -> None:
@@ -193,6 +228,53 @@ def flush_to_disk(folder: Path | str) -> None:
 
 
 def write_json(path: Path | str, data: Any, *, sync: bool = False) -> None:
-    """Write JSON whole or not at all; ``sync`` is that of `replacing`."""
+    """Write JSON whole or not at all; ``sync`` is that of `replacing`.
+
+    Raises:
+        RobocasError: see `json_text`.
+    """
+    text = json_text(data, path, indent=2) + "\n"
     with replacing(path, sync=sync) as tmp:
-        tmp.write_text(json.dumps(data, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        tmp.write_text(text, encoding="utf-8")
+
+
+def json_text(
+    data: Any, where: object, *, indent: int | None = None, ascii_only: bool = False, error: type[_Error] = RobocasError
+) -> str:
+    """Return values as a JSON text that `documents.load_json` and pydantic read.
+
+    Args:
+        data: dicts, lists, strings, numbers, booleans and None.
+        where: the file or object, for messages.
+        indent: spaces per level; None: one line.
+        ascii_only: whether to escape all other characters.
+        error: type of the error.
+
+    Raises:
+        RobocasError: ``error``: they would refuse a value, such as NaN; ``where`` names its key.
+    """
+    if problem := _refused(data):
+        key, found = _first_refused(data) or ("", problem)
+        place, expected = f"{where}, {key}" if key else where, "finite numbers of 64 bits, Unicode text, JSON types"
+        raise error("this value can't be written as JSON", where=place, expected=expected, found=found)
+    return json.dumps(data, indent=indent, ensure_ascii=ascii_only)
+
+
+def _refused(data: Any) -> str:
+    """Return why a reader of JSON would refuse values; empty if it takes them."""
+    from robocas_ms3.documents import json_values  # with YAML, for which `robocas --help` need not wait
+
+    try:
+        json_values(json.dumps(data, ensure_ascii=False, allow_nan=False).encode())
+    except (TypeError, ValueError, RecursionError) as problem:
+        return " ".join(str(problem).split())
+    return ""
+
+
+def _first_refused(data: Any, key: str = "") -> tuple[str, str] | None:
+    """Return key and text of the first value that a reader of JSON would refuse; None if only the whole is refused."""
+    if not isinstance(data, dict | list | tuple) or key.count(".") > _KEY_DEPTH:
+        return (key, f"{data!r:.80} ({type(data).__name__})") if _refused(data) else None
+    inner = data.items() if isinstance(data, dict) else enumerate(data)
+    places = ((f"{key}.{name}" if key else f"{name}", value) for name, value in inner)
+    return next((found for place, value in places if (found := _first_refused(value, place))), None)

@@ -6,7 +6,6 @@ that is NaN or infinite is damaged.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, is_dataclass
@@ -16,8 +15,9 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
+from robocas_ms3.documents import check_regular
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.files import naming, replacing
+from robocas_ms3.files import json_text, naming, open_for_append, replacing
 from robocas_ms3.strict import refusal, validate_json
 
 Record = TypeVar("Record")
@@ -62,9 +62,11 @@ class Ledger(Generic[Record]):
         """All lines but empty ones, the damaged ones too; none where there is no file.
 
         Raises:
-            OSError: it can't be read.
+            OSError: the file cannot be read.
+            DocumentError: the path leads to a pipe or a device.
         """
         try:
+            check_regular(self.path)
             pieces = self.path.read_bytes().split(b"\n")
         except FileNotFoundError:
             return []
@@ -80,11 +82,14 @@ class Ledger(Generic[Record]):
         Args:
             records: what they say, in finite numbers; if there are none, the file is not touched.
             sync: whether they are on the disk when this returns.
+
+        Raises:
+            RobocasError: a record has no place in JSON, or the file is a symbolic link.
         """
-        text = _text(records)
+        text = _text(records, self.path)
         if not text:
             return
-        with naming(self.path), self.path.open("ab+") as file:
+        with naming(self.path), open_for_append(self.path) as file:
             self._end(file)
             file.write(text)
             file.flush()
@@ -94,7 +99,7 @@ class Ledger(Generic[Record]):
     def rewrite(self, records: Iterable[Record]) -> None:
         """Write the file anew, whole or not at all."""
         with replacing(self.path) as tmp:
-            tmp.write_bytes(_text(records))
+            tmp.write_bytes(_text(records, self.path))
 
     def refusal(self, line: Line[Record], error: type[_Error], about: str) -> _Error:
         """What is wrong with a damaged line, as an error of ours.
@@ -129,6 +134,6 @@ class Ledger(Generic[Record]):
             file.write(b"\n")
 
 
-def _text(records: Iterable[Any]) -> bytes:
+def _text(records: Iterable[Any], path: Path) -> bytes:
     plain = (asdict(record) if is_dataclass(record) and not isinstance(record, type) else record for record in records)
-    return "".join(json.dumps(record, allow_nan=False) + "\n" for record in plain).encode()
+    return "".join(json_text(record, path, ascii_only=True) + "\n" for record in plain).encode()

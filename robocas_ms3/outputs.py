@@ -19,13 +19,12 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
-from io import TextIOWrapper
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from robocas_ms3.documents import load_json
 from robocas_ms3.errors import OutputExistsError, RobocasError
-from robocas_ms3.files import empty_folder, is_fixed, make_folder
+from robocas_ms3.files import empty_folder, is_fixed, make_folder, open_for_append, remove
 
 # What the system says where there are none: of some network file systems, or of a lock server that is gone
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS})
@@ -245,12 +244,12 @@ def _lock_of(path: Path) -> Path:
     return path.parent / f".{path.name}.lock"
 
 
-def _locked(lock: Path, path: Path) -> tuple[TextIOWrapper, bool]:
+def _locked(lock: Path, path: Path) -> tuple[IO[bytes], bool]:
     """Open and lock a file that whoever held it before may just have removed; and whether there are locks."""
     while True:
         make_folder(lock.parent)
         try:
-            file = lock.open("w")
+            file = open_for_append(lock)
         except OSError as error:  # it says that it is writable, as those of /proc do
             what = "can't write into this folder"
             raise RobocasError(what, where=lock.parent, found=error.strerror, fix="Choose another.") from error
@@ -260,12 +259,12 @@ def _locked(lock: Path, path: Path) -> tuple[TextIOWrapper, bool]:
             file.close()
             raise
         with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
+            if os.path.samestat(os.fstat(file.fileno()), lock.lstat()):
                 return file, held
         file.close()
 
 
-def lock_file(file: TextIOWrapper, path: Path, *, wait: bool) -> bool:
+def lock_file(file: IO[Any], path: Path, *, wait: bool) -> bool:
     """Hold a lock on an open file until it is closed; on a file system that has none go on without, and say so.
 
     Args:
@@ -301,7 +300,7 @@ def lock_file(file: TextIOWrapper, path: Path, *, wait: bool) -> bool:
 def sweep(folder: Path) -> None:
     """Remove what a killed run left half written; nobody else may write here, so lock the folder before."""
     for leftover in [*folder.glob(".*.tmp*"), *folder.glob(".*.old")]:
-        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+        remove(leftover)
 
 
 @contextmanager

@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3 import files
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.files import make_folder, naming, replacing, replacing_folder, write_json
+from robocas_ms3.files import make_folder, naming, open_for_append, replacing, replacing_folder, write_json
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
@@ -85,9 +86,75 @@ def test_what_is_to_survive_a_power_cut_is_on_the_disk_before_it_has_its_name(tm
     note(files, "flush_to_disk", lambda folder: ("sync", Path(folder).name))
     write_json(tmp_path / "a.json", {})
     write_json(tmp_path / "b.json", {}, sync=True)
-    temporary = f".b.{os.getpid()}.tmp.json"
+    (_, temporary), *_ = done[1:]
     assert done[1:] == [("sync", temporary), ("rename", temporary), ("sync", tmp_path.name)]
+    assert temporary.startswith(".b.")
+    assert temporary.endswith(".tmp.json")  # as `outputs.sweep` looks for it
     done.clear()
     with replacing_folder(tmp_path / "folder", sync=True) as folder:
         (folder / "file").write_text("")
     assert done == [("sync", folder.name), ("rename", folder.name)]
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling link", "pipe"])
+def test_only_a_regular_file_is_opened_for_append(tmp_path, kind):
+    path, target = tmp_path / "notes", tmp_path / "target"
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(target)
+    if kind == "link":
+        target.write_text("kept")
+    with pytest.raises(RobocasError) as error:
+        open_for_append(path)
+    assert error.value.where == path
+    assert (target.read_text() if kind == "link" else target.exists()) == ("kept" if kind == "link" else False)
+
+
+def test_append_keeps_the_content_of_a_file(tmp_path):
+    (tmp_path / "notes").write_bytes(b"one ")
+    with open_for_append(tmp_path / "notes") as file:
+        assert file.read() == b"one "
+        file.seek(0)
+        file.write(b"two")
+    assert (tmp_path / "notes").read_bytes() == b"one two"
+
+
+def test_a_temporary_name_is_another_each_time(tmp_path):
+    """A symbolic link under a name known before would lead the writer to another file."""
+    names = set()
+    for _ in range(3):
+        with replacing(tmp_path / "run.json") as tmp:
+            tmp.write_text("{}")
+            names.add(tmp.name)
+    assert len(names) == 3
+    (tmp_path / "target").write_text("kept")
+    (tmp_path / "link.json").symlink_to(tmp_path / "target")
+    write_json(tmp_path / "link.json", {})  # the name itself is replaced, not what it leads to
+    assert (tmp_path / "target").read_text() == "kept"
+
+
+_CYCLE: dict = {}
+_CYCLE["a"] = _CYCLE
+
+
+@pytest.mark.parametrize(
+    ("value", "key"),
+    [
+        ({"wants": {"rates": [1.0, float("nan")]}}, "wants.rates.1"),
+        ({"a": float("inf")}, "a"),
+        ({"a": 10**400}, "a"),
+        ({"a": -(2**70)}, "a"),
+        ({"a": "\udcff"}, "a"),
+        ({"a": {1, 2}}, "a"),
+        (_CYCLE, "a.a"),
+        ({(1, 2): 3}, ""),
+    ],
+)
+def test_json_that_the_package_could_not_read_is_not_written(tmp_path, value, key):
+    write_json(tmp_path / "a.json", {"n": 1})
+    with pytest.raises(RobocasError) as error:
+        write_json(tmp_path / "a.json", value)
+    assert str(error.value.where).startswith(f"{tmp_path / 'a.json'}{', ' if key else ''}{key}")
+    assert load_json(tmp_path / "a.json") == {"n": 1}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]

@@ -78,6 +78,19 @@ def test_a_lock_that_was_removed_meanwhile_is_none(tmp_path, monkeypatch):
             pass
 
 
+def test_a_lock_that_is_a_link_is_refused_and_leads_nowhere(tmp_path):
+    (tmp_path / "target").write_text("kept")
+    (tmp_path / ".out.lock").symlink_to(tmp_path / "target")
+    with pytest.raises(RobocasError) as error, locked_folder(tmp_path / "out"):
+        pass
+    assert error.value.where == tmp_path / ".out.lock"
+    assert (tmp_path / "target").read_text() == "kept"
+    os.unlink(tmp_path / ".out.lock")
+    os.link(tmp_path / "target", tmp_path / ".out.lock")
+    with locked_folder(tmp_path / "out"):
+        assert (tmp_path / "target").read_text() == "kept"  # of another name of the file, too
+
+
 @pytest.mark.skipif(not os.access("/proc", os.W_OK), reason="here it says that it is not writable")
 def test_a_lock_in_a_folder_that_only_says_it_is_writable():
     with pytest.raises(RobocasError, match="/proc: can't write into this folder") as error, locked_folder("/proc/out"):
@@ -100,8 +113,12 @@ def test_only_what_is_ours_is_overwritten(tmp_path, error):
 def test_what_was_left_half_written_is_swept(tmp_path):
     for name in (".a.1.tmp.png", ".b.tmp", "kept.tmp", ".c.old"):
         (tmp_path / name).mkdir() if name == ".b.tmp" else (tmp_path / name).touch()
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "file").touch()
+    (tmp_path / ".link.tmp").symlink_to(tmp_path / "disk")
     sweep(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["kept.tmp"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "kept.tmp"]
+    assert (tmp_path / "disk" / "file").exists()  # of a link, the link alone goes
 
 
 @pytest.mark.parametrize("begun", [False, True])

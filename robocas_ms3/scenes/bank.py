@@ -18,7 +18,7 @@ import numpy as np
 from robocas_ms3.assets.pack import MANIFEST, LoadedFurniture, sha256
 from robocas_ms3.documents import DAMAGED, open_arrays
 from robocas_ms3.errors import LayoutError
-from robocas_ms3.files import make_folder, replacing, write_json
+from robocas_ms3.files import make_folder, open_for_append, replacing, write_json
 from robocas_ms3.outputs import lock_file
 from robocas_ms3.paths import cache_dir
 from robocas_ms3.scenes.frozen import FrozenLayouts
@@ -121,7 +121,7 @@ class LayoutBank:
     @contextmanager
     def _alone(self) -> Iterator[None]:
         """While no other process changes the tables: each change begins with what is there."""
-        with (make_folder(self.folder) / ".tables.lock").open("w") as file:
+        with open_for_append(make_folder(self.folder) / ".tables.lock") as file:
             lock_file(file, self.folder, wait=True)
             yield
 
