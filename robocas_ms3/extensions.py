@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 from robocas_ms3.after_import import half_imported
 from robocas_ms3.errors import ExtensionError
+from robocas_ms3.exits import no_exit
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -101,7 +102,10 @@ class Table(Mapping[str, T]):
             raise ExtensionError(what, where=point.name, found=packages, fix="Uninstall all but one.")
         fix = f"Mend or uninstall {package_of(point)}."
         try:
-            row = point.load()
+            with no_exit(f"{self.kind} {point.name} = {point.value}"):
+                row = point.load()
+        except ExtensionError:
+            raise
         except Exception as error:  # whatever another package's module meets
             what, found = f"this {self.kind} can't be loaded", " ".join(f"{type(error).__name__}: {error}".split())
             raise ExtensionError(what, where=f"{point.name} = {point.value}", found=found, fix=fix) from error
@@ -125,6 +129,7 @@ def load(path: str) -> Any:
     """
     module, _, name = path.partition(":")
     try:
-        return getattr(import_module(module), name)
+        with no_exit(path):
+            return getattr(import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise ExtensionError("no such object", where=path, expected="package.module:name", found=error) from error

@@ -24,6 +24,7 @@ LAYERS = (
         "processes",
         "strict",
         "ledger",
+        "exits",
         "extensions",
         "after_import",
         "words",

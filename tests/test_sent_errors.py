@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 
-from robocas_ms3.errors import VectorEnvError
+from robocas_ms3.errors import ExtensionError, VectorEnvError
 from robocas_ms3.processes import SentError, SentTraceback
 
 
@@ -60,5 +60,7 @@ def test_what_does_not_come_through_is_told_of(error):
 
 def test_what_must_not_end_the_other_process_is_told_of():
     assert type(received(SentError.of(KeyboardInterrupt(), "a branch"))) is KeyboardInterrupt
-    sent = SentError.of(SystemExit(3), "env 0", sendable=Exception, otherwise=VectorEnvError)
-    assert repr(received(sent)) == "VectorEnvError('SystemExit: 3')"
+    sent = SentError.of(KeyboardInterrupt(), "env 0", sendable=Exception, otherwise=VectorEnvError)
+    assert type(received(sent)) is VectorEnvError
+    exited = received(SentError.of(SystemExit(3), "env 0"))
+    assert (type(exited), exited.where) == (ExtensionError, "env 0")

@@ -24,8 +24,9 @@ from robocas_ms3.baselines.begin import (
 from robocas_ms3.baselines.runs import RUN, DataRecord, RunRecord, hash_of, read_run, write_run
 from robocas_ms3.baselines.table import find_baseline, need_extra
 from robocas_ms3.errors import EmptySplitError, OutputExistsError, TrainingError
+from robocas_ms3.exits import no_exit
 from robocas_ms3.files import make_folder
-from robocas_ms3.outputs import check_one_way, check_overwrite, check_run, claim_output, is_taken, locked_folder, sweep
+from robocas_ms3.outputs import check_one_way, check_overwrite, check_run, claim_output, is_taken, locked_folder, sweep, while_there
 
 
 @dataclass
@@ -94,6 +95,7 @@ def train_run(
         found = f"{config.train.batch_size} for {accelerator.num_processes} processes"
         raise TrainingError("processes share a batch evenly", where="train.batch_size", found=found)
     with ExitStack() as stack:
+        stack.enter_context(no_exit(f"baseline {name}"))
         if accelerator.is_main_process:
             stack.enter_context(locked_folder(out))
             if out.is_dir() and ((out / RUN).is_file() or all(path.name.startswith(".") for path in out.iterdir())):
@@ -133,7 +135,8 @@ def train_run(
         accelerator.wait_for_everyone()
         of = f"{len(samples)} {'samples of' if trier is None else 'steps in'} {samples.episodes}"
         said.note(_line(record, trainer, f"{of} {'episodes' if trier is None else 'layouts'}", accelerator))
-        trainer.train(said.step)
+        with while_there(out / RUN, TrainingError):
+            trainer.train(said.step)
     return record
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from robocas_ms3.errors import MissingExtraError, TrainingError
+from robocas_ms3.exits import no_exit
 from robocas_ms3.extensions import Table
 from robocas_ms3.strict import nearest
 
@@ -62,8 +63,8 @@ def find_baseline(name: str, *, where: object = "") -> Baseline:
         expected = f"one of {', '.join(known)}"
         raise TrainingError("no such baseline", where=where or name, expected=expected, fix=nearest(name, known))
     need_extra("safetensors")
-    found: Any = BASELINES[name]()
-    return found
+    with no_exit(f"baseline {name}"):
+        return BASELINES[name]()
 
 
 def need_extra(*modules: str) -> None:

@@ -22,8 +22,8 @@ from robocas_ms3.baselines.metrics import means_of, summed
 from robocas_ms3.baselines.runs import CHECKPOINT, RunRecord
 from robocas_ms3.baselines.schedule import Batches, epochs_at, learning_rate
 from robocas_ms3.errors import RobocasError, TrainingError
+from robocas_ms3.exits import deferred_interrupts, exit_error, uninterrupted
 from robocas_ms3.outputs import check_there
-from robocas_ms3.processes.lives import uninterrupted
 
 
 class Trainer:
@@ -99,7 +99,7 @@ class Trainer:
             if not validated:  # it was broken off
                 self._validate(log, begun)
             for batch in self._batches():
-                with uninterrupted():  # between two steps everything is as a checkpoint has it
+                with deferred_interrupts():  # between two steps everything is as a checkpoint has it
                     self._take(batch)
                     last = self.step == settings.steps
                     if last or self.step % settings.log_every == 0:
@@ -298,6 +298,8 @@ class _Reported:
             return self._samples.__getitems__(indices)
         except RobocasError as error:
             return error
+        except SystemExit as error:  # a worker would end without a word
+            return exit_error(error, "samples of the dataset")
 
 
 def _loader(samples: Any, batches: Any, workers: int) -> DataLoader:

@@ -128,7 +128,7 @@ def run(cfg: Eval) -> int:
 
     use_one_torch_thread()
     name = re.sub(r"[^\w.-]+", "_", cfg.policy) + ("_weld" if cfg.weld else "")
-    out = cfg.out or Path("eval") / protocol.rules.name / name
+    out = cfg.out or (Path("eval") / protocol.rules.name / name).absolute()
     settings = Settings(
         num_envs=cfg.envs,
         backend=cfg.backend,

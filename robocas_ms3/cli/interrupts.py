@@ -1,4 +1,7 @@
-"""Ctrl-C and SIGTERM: the first ends the command, soon and in one line, whatever it is at; others change nothing."""
+"""Ctrl-C and SIGTERM: the first ends the command within seconds and in one line; later ones change nothing.
+
+Python can't handle a signal during a long native call. There the second Ctrl-C ends the process at once (`exits`).
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,8 @@ import threading
 from contextlib import suppress
 from types import FrameType
 
+from robocas_ms3.exits import handle_interrupt
+
 INTERRUPTED = 130  # what a shell reports of a program that Ctrl-C ended
 _TERMINATED = 143  # and of one that `timeout`, `kill` or a batch system did
 _GRACE = 2.2  # s to end in: processes, files, policies
@@ -18,7 +23,7 @@ _GRACE = 2.2  # s to end in: processes, files, policies
 def heed_ctrl_c() -> None:
     """Let the first Ctrl-C be the only one, of a command that is this process's own program."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where a shell has it ignored
-        signal.signal(signal.SIGINT, _interrupt)
+        handle_interrupt(_interrupt)
     if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _interrupt)
 

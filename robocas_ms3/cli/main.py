@@ -20,9 +20,11 @@ import platformdirs
 import tyro
 
 from robocas_ms3 import __version__
+from robocas_ms3.cli.absolute import with_absolute_paths
 from robocas_ms3.cli.interrupts import INTERRUPTED, heed_ctrl_c, leave
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import FULL
+from robocas_ms3.exits import no_exit
 from robocas_ms3.paths import is_writable, temporary_cache, variable_of
 
 # Each names a module beside this one, with a dataclass called as the command and `main(cfg) -> int`; a dash in its name
@@ -124,7 +126,8 @@ def _dispatch(arguments: list[str]) -> int:
         if wrong := _misspelt(of_command, known, f"robocas {name}", rest):
             return _say(f"error: {wrong}", sys.stderr, 2)
         cfg = tyro.cli(of_command, prog=f"robocas {name}", args=rest, config=CLI_STYLE)
-        return module.main(cfg)
+        with no_exit(f"robocas {name}"):
+            return module.main(with_absolute_paths(cfg))
     if arguments and not arguments[0].startswith("-"):
         return _unknown(arguments[0], "command", COMMANDS)
     modules = {name: module_of(name) for name in COMMANDS}

@@ -42,7 +42,7 @@ class Train:
     """Samples a step; train.batch_size."""
     seed: Maybe[int] = None
     """Of everything random; train.seed."""
-    start: Maybe[Path] = None
+    start: Maybe[str] = None
     """Folder of a run to begin with, such as one on less data, or small, which comes with the package (a folder of
     that name needs a longer path): with its weights, and its configuration where no option says otherwise. Default:
     random weights, the baseline's defaults."""
@@ -56,10 +56,13 @@ class Train:
 
 def main(cfg: Train) -> int:
     """Run the command; gives the exit code."""
+    from robocas_ms3.baselines.runs import find_run
     from robocas_ms3.baselines.session import Said, train_run
     from robocas_ms3.cli.bars import bar, say
 
-    out = cfg.out or _default_out(cfg)
+    shown = cfg.out or _default_out(cfg)
+    out = shown.absolute()
+    start = None if cfg.start is None else find_run(Path(cfg.start)).absolute()
     with bar("episodes read", transient=True) as reading, bar("steps trained") as stepping:
 
         def step(done: int, of: int) -> None:
@@ -74,7 +77,7 @@ def main(cfg: Train) -> int:
                 cfg.data,
                 out,
                 changes_of(cfg),
-                start=cfg.start,
+                start=start,
                 device=cfg.device,
                 resume=cfg.resume,
                 overwrite=cfg.overwrite,
@@ -83,7 +86,7 @@ def main(cfg: Train) -> int:
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command with --resume goes on") from None
     if first:
-        say(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if cfg.data else 'P'}")
+        say(f"{shown}: trained. Next: robocas eval TASK --policy {shown} --protocol {'paper-v1' if cfg.data else 'P'}")
     return 0
 
 

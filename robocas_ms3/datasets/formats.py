@@ -16,6 +16,7 @@ from typing import Any
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.exits import no_exit
 from robocas_ms3.extensions import Table
 
 GROUP = "robocas_ms3.formats"
@@ -56,7 +57,8 @@ class Format:
             raise DatasetError(f"this format has no {name}", where=self.title)
         module, _, function = path.partition(":")
         try:
-            return getattr(import_module(module), function)
+            with no_exit(f"{name} {path}"):
+                return getattr(import_module(module), function)
         except (ImportError, AttributeError) as error:
             raise DatasetError(f"the {name} of this format can't be imported", where=path, found=error) from error
 

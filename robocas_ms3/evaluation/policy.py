@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -11,6 +13,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
+from robocas_ms3.exits import no_exit
+from robocas_ms3.files import json_text
 from robocas_ms3.robots.table import DEFAULT
 
 Language = Literal["none", "text", "embedding"]
@@ -144,7 +148,24 @@ def said_of(wants: Wants) -> dict[str, Any]:
 
 
 def describe(policy: Policy) -> dict[str, Any]:
-    """What a result says of a policy: its class and what it wants, and what its ``describe()`` adds if it has one."""
-    said = {"class": f"{type(policy).__module__}:{type(policy).__qualname__}", "wants": said_of(policy.wants)}
-    more = getattr(policy, "describe", None)
-    return {**said, **(more() if more is not None else {})}
+    """Return what a result says of a policy: its class, what it wants, and what its optional ``describe()`` adds.
+
+    Raises:
+        EvaluationError: the description is not a dict, or has a value that a result can't hold, such as NaN.
+    """
+    where = f"policy {_class_of(policy)}, describe()"
+    with policy_code(policy):
+        added = getattr(policy, "describe", dict)()
+    if not isinstance(added, dict):
+        raise EvaluationError("invalid policy description", where=where, expected="a dict", found=type(added).__name__)
+    said = {"class": _class_of(policy), "wants": said_of(policy.wants), **added}
+    return json.loads(json_text(said, where, error=EvaluationError))
+
+
+def policy_code(policy: Policy) -> AbstractContextManager[None]:
+    """Call a policy inside: where its code tries to end the process, that is an error with its name (`no_exit`)."""
+    return no_exit(f"policy {_class_of(policy)}")
+
+
+def _class_of(policy: Policy) -> str:
+    return f"{type(policy).__module__}:{type(policy).__qualname__}"

@@ -191,7 +191,7 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
         EvaluationError: there is none, or it is not what it should be.
     """
     shipped = shipped_protocols()
-    folder = shipped.get(str(name), Path(name))
+    folder = shipped.get(str(name), Path(name)).absolute()
     if not (folder / RULES).is_file():
         likely = nearest(str(name), shipped)
         expected = f"a folder with {RULES}, or one of {', '.join(sorted(shipped))}"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.policy import Observations, Policy, Start, privileged
+from robocas_ms3.evaluation.policy import Observations, Policy, Start, policy_code, privileged
 from robocas_ms3.evaluation.tracking import MEASURES, summed
 from robocas_ms3.language.embed import TextEmbedder
 
@@ -125,7 +125,8 @@ class Rollouts:
             self._held = np.zeros((len(self._flags), self._count), dtype=bool)
         self._held[:, envs] = False
         self._note()
-        self._policy.reset(starts)
+        with policy_code(self._policy):
+            self._policy.reset(starts)
 
     def _step(self) -> Iterator[Rollout]:
         self._ask()
@@ -166,7 +167,8 @@ class Rollouts:
         seen = self._observed(envs)
         begun = time.perf_counter()
         try:
-            acted: Any = self._policy.act(seen)
+            with policy_code(self._policy):
+                acted: Any = self._policy.act(seen)
         except PolicyFailed as failed:
             acted = failed.actions
             for env in envs if acted is None else failed.reasons:

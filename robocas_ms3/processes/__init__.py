@@ -1,7 +1,8 @@
 """Tasks done by several processes, limits of what they may take, and errors sent between them."""
 
+from robocas_ms3.exits import uninterrupted
 from robocas_ms3.processes.child import NO_LIMITS, Limits
-from robocas_ms3.processes.lives import is_too_large, leave_with, uninterrupted, use_one_torch_thread
+from robocas_ms3.processes.lives import is_too_large, leave_with, use_one_torch_thread
 from robocas_ms3.processes.pool import Pool
 from robocas_ms3.processes.sent import SentError, SentTraceback
 from robocas_ms3.processes.worker import Calls, Worker

@@ -20,10 +20,12 @@ import psutil
 from tqdm import tqdm
 
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.processes.lives import is_too_large, leave_with, uninterrupted
+from robocas_ms3.exits import exit_error, uninterrupted
+from robocas_ms3.processes.lives import is_too_large, leave_with
 from robocas_ms3.processes.sent import SentError
 from robocas_ms3.processes.starting import end_with, start
 from robocas_ms3.processes.worker import Worker
+from robocas_ms3.words import escape_log_lines
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -224,6 +226,7 @@ def _serve(open_worker: Callable[[], Worker[Any, Any]], pipe: Connection, parent
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     end_with(parent)
     leave_with(parent)
+    escape_log_lines()
     tqdm.set_lock(threading.RLock())  # its own is the system's, which a process that is killed leaves behind
     worker: Worker[Any, Any] | None = None
     while True:
@@ -236,6 +239,8 @@ def _serve(open_worker: Callable[[], Worker[Any, Any]], pipe: Connection, parent
                 worker = open_worker()
                 pipe.send(None)
             answer = worker.do(task)
+        except KeyboardInterrupt as error:  # no signal's: the process ignores those
+            answer = SentError.of(exit_error(error, "a worker"), "a worker")
         except BaseException as error:  # noqa: BLE001  (it is raised again where it can be dealt with)
             answer = SentError.of(error, "a worker")
         try:

@@ -1,15 +1,11 @@
-"""How a process lives beside others: its threads, its memory, Ctrl-C, its end."""
+"""Threads and memory of a worker process, and its end with the process that started it."""
 
 from __future__ import annotations
 
 import os
-import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from types import FrameType
-from typing import Any
+from collections.abc import Callable
 
 import psutil
 
@@ -40,40 +36,6 @@ def leave_with(parent: int, look: Callable[[], object] = lambda: time.sleep(_LOO
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back for a moment; processes that are started meanwhile inherit that."""
-    with _deferred():
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            yield
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def _deferred() -> Iterator[None]:
-    """Call what deals with Ctrl-C and SIGTERM afterwards, once.
-
-    A mask is not enough: the system gives the signal to another thread, of which Python tells the main one.
-    """
-    came: list[tuple[int, FrameType | None]] = []
-    held: dict[int, Any] = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            if callable(handler := signal.getsignal(number)):
-                held[number] = handler
-                signal.signal(number, lambda number, frame: came.append((number, frame)))
-    try:
-        yield
-    finally:
-        with ExitStack() as restored:  # one that comes now interrupts this, but not what is restored after it
-            for number, handler in held.items():
-                restored.callback(signal.signal, number, handler)
-        if came:
-            held[came[0][0]](*came[0])
 
 
 def is_too_large(pid: int, memory_gb: float, *, forks: bool = True) -> bool:

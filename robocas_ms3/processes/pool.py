@@ -22,8 +22,8 @@ from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from robocas_ms3.errors import RobocasError
+from robocas_ms3.exits import uninterrupted
 from robocas_ms3.processes.child import NO_LIMITS, Child, ChildDied, Limits, NotBegun
-from robocas_ms3.processes.lives import uninterrupted
 from robocas_ms3.processes.worker import Worker
 
 Task = TypeVar("Task")

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from traceback import format_exception
 from typing import NoReturn
 
+from robocas_ms3.exits import exit_error
+
 
 @dataclass(frozen=True)
 class SentError:
@@ -40,6 +42,8 @@ class SentError:
             sendable: what is sent as it is, if it pickles.
             otherwise: the type of what takes an error's place if not.
         """
+        if isinstance(error, SystemExit):  # which would end the process that it is sent to, without a word
+            error = exit_error(error, where).with_traceback(error.__traceback__)
         cause = error.__cause__
         place = cause.args if isinstance(cause, SentTraceback) else (where, "".join(format_exception(error)))
         with suppress(Exception):  # whatever its class does

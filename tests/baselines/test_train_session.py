@@ -23,7 +23,7 @@ from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.session import Said, train_run
 from robocas_ms3.baselines.train import Trainer
 from robocas_ms3.cli.main import run
-from robocas_ms3.errors import DatasetError, OutputExistsError, TrainingError
+from robocas_ms3.errors import DatasetError, ExtensionError, OutputExistsError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
 
@@ -227,6 +227,26 @@ def test_a_folder_that_goes_is_missed(made_up, data, tmp_path):
 
     with pytest.raises(TrainingError, match="the output folder is gone"):
         train_run("made-up", data, out, device="cpu", said=Said(step=remove))
+
+
+def test_a_folder_that_is_removed_during_a_write_is_an_error_of_the_training(made_up, data, tmp_path, monkeypatch):
+    out, before = tmp_path / "run", checkpoints.save
+
+    def save(path, tensors, about):
+        shutil.rmtree(out, ignore_errors=True)
+        before(path, tensors, about)
+
+    monkeypatch.setattr(checkpoints, "save", save)
+    with pytest.raises(TrainingError) as caught:
+        train_run("made-up", data, out, device="cpu")
+    assert caught.value.where == out
+
+
+def test_a_baseline_can_not_end_the_process(made_up, data, tmp_path, monkeypatch):
+    monkeypatch.setattr(made_up, "model", lambda self, config, facts: sys.exit(0))
+    with pytest.raises(ExtensionError) as caught:
+        train_run("made-up", data, tmp_path / "run", device="cpu")
+    assert caught.value.where == "baseline made-up"
 
 
 def test_without_validation(made_up, data, tmp_path):

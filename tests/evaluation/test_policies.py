@@ -4,19 +4,22 @@ import sys
 
 import numpy as np
 import pytest
+from counting import Counting
 
-from robocas_ms3.errors import EvaluationError
-from robocas_ms3.evaluation.policies import make_policy
+from robocas_ms3.errors import EvaluationError, ExtensionError
+from robocas_ms3.evaluation.policies import make_policy, open_policy
 from robocas_ms3.evaluation.policies.plain import StillPolicy
 from robocas_ms3.evaluation.policies.scripted import BESIDE, beside
-from robocas_ms3.evaluation.policy import Wants, said_of
+from robocas_ms3.evaluation.policy import Start, Wants, describe, said_of
+from robocas_ms3.evaluation.rollout import Rollouts, Rules
 
 GOOD = """
+import numpy as np
 from robocas_ms3.evaluation.policy import Wants
 class Mine:
     wants = Wants()
     def reset(self, starts): ...
-    def act(self, observations): ...
+    def act(self, observations): return np.ones((len(observations.envs), 7))
 class Picky(Mine):
     def __init__(self, folder): ...
 class Wishless(Mine):
@@ -26,6 +29,19 @@ class Idle:
     def reset(self, starts): ...
 class Broken(Mine):
     def __init__(self): len(3)
+class LeavesMade(Mine):
+    def __init__(self): raise SystemExit(0)
+class LeavesWanting(Mine):
+    @property
+    def wants(self): raise SystemExit(0)
+class LeavesReset(Mine):
+    def reset(self, starts): raise SystemExit(0)
+class LeavesActing(Mine):
+    def act(self, observations): raise SystemExit(0)
+class LeavesDescribed(Mine):
+    def describe(self): raise SystemExit(0)
+class LeavesClosed(Mine):
+    def close(self): raise SystemExit(0)
 """
 
 
@@ -34,10 +50,11 @@ def here(tmp_path, monkeypatch):
     """The folder that a command runs in."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    for name in ("own_policy", "own_spoilt", "own_importing"):
+    for name in ("own_policy", "own_spoilt", "own_importing", "own_leaving"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     (tmp_path / "own_policy.py").write_text(GOOD)
     (tmp_path / "own_spoilt.py").write_text("def (")
+    (tmp_path / "own_leaving.py").write_text("raise SystemExit(0)")
     (tmp_path / "own_importing.py").write_text("import not_there_at_all")
     return tmp_path
 
@@ -79,6 +96,20 @@ def test_what_is_no_policy_is_one_line(here, name, message):
 def test_an_error_of_the_policys_own_is_its_own(here):
     with pytest.raises(TypeError, match="len"):
         make_policy("own_policy:Broken")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "own_leaving:Mine",
+        *(f"own_policy:Leaves{when}" for when in ("Made", "Wanting", "Reset", "Acting", "Described", "Closed")),
+    ],
+)
+def test_a_policy_can_not_end_the_process(here, name):
+    with pytest.raises(ExtensionError) as caught, open_policy(name) as policy:
+        describe(policy)
+        list(Rollouts(Counting(1), policy, Rules(3), 0.05, refill=True).play([Start(-1, 0, "pick", "", "", "", 2, "")]))
+    assert str(caught.value.where).startswith("policy own_")
 
 
 def test_how_far_beside_follows_from_the_seed():

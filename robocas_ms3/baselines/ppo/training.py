@@ -20,8 +20,8 @@ from robocas_ms3.baselines.ppo.rollouts import OUTCOMES, Rollouts, Tried, outcom
 from robocas_ms3.baselines.ppo.trials import FIRST_TRIAL, EnvTrials
 from robocas_ms3.baselines.runs import CHECKPOINT, RunRecord
 from robocas_ms3.errors import TrainingError
+from robocas_ms3.exits import deferred_interrupts, uninterrupted
 from robocas_ms3.outputs import check_there
-from robocas_ms3.processes.lives import uninterrupted
 
 
 class PpoTraining:
@@ -96,7 +96,7 @@ class PpoTraining:
             while self.step < settings.steps:
                 rollouts = rollouts or Rollouts(self._trials.envs, self.agent, self.config, self.played)
                 tried = rollouts.collect()
-                with uninterrupted():  # between two updates everything is as a checkpoint has it
+                with deferred_interrupts():  # between two updates everything is as a checkpoint has it
                     losses = learn(self.agent, self.optimizer, tried, self.config)
                     self._check(losses)
                     self.step += self.config.envs * steps_of(self.config)

@@ -19,6 +19,7 @@ from typing import Any, Literal
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policies.plain import RandomPolicy, StillPolicy
 from robocas_ms3.evaluation.policy import Policy, Wants
+from robocas_ms3.exits import no_exit
 from robocas_ms3.extensions import Table
 from robocas_ms3.strict import nearest
 
@@ -62,7 +63,18 @@ def make_policy(name: str) -> Policy:
         ExtensionError: that of a package can't be loaded, or several have it.
         MissingExtraError: it is elsewhere, and the ``remote`` extra is not installed.
     """
-    policy = _made(name)
+    with no_exit(f"policy {name}"):
+        policy = _made(name)
+        _check(policy, name)
+    return policy
+
+
+def _check(policy: Any, name: str) -> None:
+    """Check that a policy has what `Policy` asks for.
+
+    Raises:
+        EvaluationError: it hasn't.
+    """
     for what, fits in (
         ("wants", isinstance(getattr(policy, "wants", None), Wants)),
         ("reset", callable(getattr(policy, "reset", None))),
@@ -71,7 +83,6 @@ def make_policy(name: str) -> Policy:
         if not fits:
             expected = "wants (robocas_ms3.evaluation.policy.Wants), reset(starts) and act(observations)"
             raise EvaluationError(f"a policy without {what}", where=name, expected=expected)
-    return policy
 
 
 def check_policy(name: str) -> None:
@@ -156,4 +167,5 @@ def open_policy(name: str) -> Iterator[Policy]:
     finally:
         close = getattr(policy, "close", None)
         if close is not None:
-            close()
+            with no_exit(f"policy {name}"):
+                close()

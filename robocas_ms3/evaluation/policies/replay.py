@@ -28,6 +28,7 @@ class ReplayPolicy:
     """
 
     def __init__(self, trajectory: Path) -> None:
+        trajectory = trajectory.absolute()
         data = read_json(trajectory)
         env = read_env(data["env_info"], trajectory.with_suffix(".json"))
         if env.control_mode != "pd_joint_pos":
