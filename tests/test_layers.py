@@ -28,6 +28,7 @@ LAYERS = (
         "extensions",
         "after_import",
         "words",
+        "names",
     ),
     ("benchmark",),
     ("robots",),
@@ -205,7 +206,7 @@ def test_the_builtin_formulas_are_imported_by_their_command_alone():
 
 
 def test_mesh_tools_know_only_the_lowest_layers():
-    allowed = {"errors", "paths", "files", "documents", "outputs", "poses", "processes", "strict", "assets"}
+    allowed = {"errors", "paths", "files", "documents", "names", "outputs", "poses", "processes", "strict", "assets"}
     for module, path in MESH_TOOLS.items():
         for name, _ in imports(module, path):
             if name.startswith("robocas_ms3"):

@@ -13,6 +13,11 @@ from robocas_ms3.errors import AssetError
 from robocas_ms3.strict import StrictModel, parse
 
 SHIPPED = Path(__file__).parent / "annotations"
+LARGEST = 100.0
+"""m or rad: greatest limit of a joint, and greatest coordinate."""
+
+Coordinate = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Scale = Annotated[float, Field(ge=1e-4, le=1e4)]
 
 
 class HandleNote(StrictModel):
@@ -30,8 +35,12 @@ class JointNote(StrictModel):
     mass: Positive | None = Field(default=None, description="of what it moves, kg; none: by volume")
     friction: NotNegative | None = None
     damping: NotNegative | None = None
-    closed: float | None = Field(default=None, description="position at which it is closed, as the URDF counts")
-    limits: tuple[float, float] | None = Field(default=None, description="counted from where it is closed")
+    closed: Annotated[float, Field(ge=-1e6, le=1e6)] | None = Field(
+        default=None, description="position at which it is closed, as the URDF counts"
+    )
+    limits: tuple[Coordinate, Coordinate] | None = Field(
+        default=None, description="m or rad, counted from where it is closed"
+    )
     fixed: bool = Field(default=False, description="hold it closed")
 
 
@@ -40,7 +49,8 @@ class Annotation(StrictModel):
 
     name: Annotated[str, Field(min_length=1)]
     category: Annotated[str, Field(min_length=1)]
-    origin_lift: float
+    origin_lift: Coordinate
+    scale: Scale = Field(default=1.0, description="metres of one unit of the model; all else here is in metres")
     mass: Positive | None = Field(default=None, description="kg; none: it can't be moved")
     surfaces: dict[Name, Surface] = {}
     handles: dict[Name, HandleNote] = {}

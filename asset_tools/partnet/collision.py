@@ -71,7 +71,8 @@ def pieces_of(parts: Sequence[Part], middle: Array) -> list[Array]:
     hulls = [few_vertices(piece, bevel=0) for piece in found]
     hulls = _without_hidden(hulls)
     if not hulls:
-        raise AssetError("nothing to touch", found=f"{len(parts)} parts", expected="a body")
+        where, expected = ", ".join(part.name for part in parts)[:80], f"a part of {TINY * 1000:g} mm"
+        raise AssetError("nothing to touch", where=where, expected=expected, found="smaller ones")
     if len(hulls) > MOST:
         order = np.argsort([-np.ptp(hull, axis=0).max() for hull in hulls], kind="stable")[:MOST]
         hulls = [hulls[index] for index in sorted(order)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -11,15 +12,17 @@ from scipy.spatial import ConvexHull
 
 from asset_tools.build import build_furniture
 from asset_tools.import_scans import object_id
-from asset_tools.partnet.annotation import Annotation, JointNote, find_annotation
+from asset_tools.partnet.annotation import LARGEST, Annotation, JointNote, find_annotation
 from asset_tools.partnet.clearance import trimmed
 from asset_tools.partnet.collision import Part, for_gpu, pieces_of
+from asset_tools.partnet.geometry import Geometry
 from asset_tools.partnet.looks import merged
-from asset_tools.partnet.obj import Faces, read_obj
+from asset_tools.partnet.obj import Faces
 from asset_tools.partnet.urdf import URDF, Mobility, MovingLink, Visual, read_urdf
 from asset_tools.pipeline import Job, content_hash
+from asset_tools.reading.files import LARGEST_FILE, files_below
 from asset_tools.sources import FurnitureSource, LinkSource
-from robocas_ms3.assets.manifest import FurnitureAsset, Handle, Joint, Surface
+from robocas_ms3.assets.manifest import BODY, FurnitureAsset, Handle, Joint, Surface
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray
@@ -29,6 +32,10 @@ ATTRIBUTION = "PartNet-Mobility (SAPIEN, UCSD; PartNet, Stanford; ShapeNet)"
 DENSITY = 300.0  # kg/m3 of moving parts whose mass nobody gave: boards with air between
 FRICTION = 0.05  # of joints, as PhysX has it
 DAMPING = {"prismatic": 8.0, "revolute": 0.8}  # N s/m, N m s/rad
+SMALLEST = 0.01  # m of the longest side
+MOST_REPAIRS = 30  # lines in the manifest
+# of files that a model may be made of
+SUFFIXES = {".obj", ".mtl", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp", ".gif"}
 EDGE = 0.002  # m that a surface may reach beyond the model
 
 
@@ -36,40 +43,51 @@ def read_partnet(folder: Path, annotation: Annotation) -> FurnitureSource:
     """Read a model: collision pieces, one textured mesh a link, joints, surfaces and handles.
 
     The frame is upstream's: the model's origin, x out of its front, z up; joints closed at 0. Links and joints keep
-    the URDF's names.
+    the URDF's names, as far as these can be names in a pack.
 
     Args:
-        folder: of the model; its name is the id.
+        folder: of the model; its name is the id, and nothing outside of it is read.
         annotation: what the model doesn't say of itself.
 
     Raises:
         AssetError: naming the file that is missing or wrong, or what of the annotation doesn't fit the model.
     """
-    notes = annotation.joints
-    closed = {name: note.closed for name, note in notes.items() if note.closed is not None}
-    fixed = frozenset(name for name, note in notes.items() if note.fixed)
-    model = read_urdf(folder, closed=closed, fixed=fixed)
-    looks = {"": _looks(model.body)} | {link.name: _looks(link.visuals) for link in model.links}
-    corners = np.concatenate([faces.corners.reshape(-1, 3) for group in looks.values() for _, _, faces in group])
+    folder = folder.resolve()
+    model = read_urdf(folder, annotation.joints, annotation.scale)
+    geometry = Geometry(folder)
+    looks = {name: geometry.faces(name, visuals) for name, visuals in _groups(model)}
+    corners = np.concatenate(
+        [np.zeros((0, 3))] + [faces.corners.reshape(-1, 3) for group in looks.values() for _, _, faces in group]
+    )
+    empty = next((name for name, group in looks.items() if not group), None)
+    if empty is not None:
+        what = f"the moving link {empty} has no mesh" if empty else "the fixed body has no mesh"
+        fix = "Hold a joint in the annotation: `fixed: true`."
+        raise AssetError(what, where=folder / URDF, expected="a <visual> of each body", fix=fix)
     bounds = np.array([corners.min(axis=0), corners.max(axis=0)])
+    _check_size(bounds, folder.name)
     _check(model, annotation, bounds)
     if annotation.mass is not None and model.links:
         fix = "Leave `mass` out; that of moving parts goes under `joints`."
         raise AssetError("furniture with moving parts stands fixed", where=folder.name, found="a mass", fix=fix)
+    repairs = [*model.repairs, *geometry.repairs]
+    ids = _ids([link.name for link in model.links], repairs)
+    joint_ids = _ids([link.joint for link in model.links], repairs)
     middle = bounds.mean(axis=0)
     pieces = {name: _for_gpu(pieces_of(_parts(group), middle)) for name, group in looks.items()}
-    joints = {link.name: _joint(link, notes.get(link.joint, JointNote())) for link in model.links}
+    joints = {link.name: _joint(link, joint_ids[link.joint], annotation) for link in model.links}
     for link in model.links:
         others = [piece for name, group in pieces.items() if name not in _carried(model, link.name) for piece in group]
         pieces[link.name] = _for_gpu(trimmed(pieces[link.name], others, joints[link.name]))
     links = []
     for link in model.links:
-        note = notes.get(link.joint, JointNote())
+        note = annotation.joints.get(link.joint, JointNote())
         volume = sum(ConvexHull(piece).volume for piece in pieces[link.name])
         mesh = merged([faces for _, _, faces in looks[link.name]])
         mass = note.mass or max(0.3, round(DENSITY * volume, 2))
-        links.append(LinkSource(link.name, joints[link.name], mesh, pieces[link.name], mass, link.parent))
-    names = {link.joint: link.name for link in model.links}
+        parent = ids[link.parent] if link.parent else ""
+        links.append(LinkSource(ids[link.name], joints[link.name], mesh, pieces[link.name], mass, parent))
+    moved = {link.joint: ids[link.name] for link in model.links}
     return FurnitureSource(
         id=object_id(folder.name),
         name=annotation.name,
@@ -78,16 +96,48 @@ def read_partnet(folder: Path, annotation: Annotation) -> FurnitureSource:
         pieces=pieces[""],
         mass=annotation.mass,
         origin_height=annotation.origin_lift,
-        surfaces=annotation.surfaces,
+        surfaces={
+            name: surface.model_copy(update={"link": ids[surface.link]}) if surface.link else surface
+            for name, surface in annotation.surfaces.items()
+        },
         links=tuple(links),
         handles={
-            name: Handle(link=names[note.joint], position=note.position, wxyz=note.wxyz, width=note.width)
+            name: Handle(link=moved[note.joint], position=note.position, wxyz=note.wxyz, width=note.width)
             for name, note in annotation.handles.items()
         },
         source="partnet",
         licence=LICENCE,
         attribution=ATTRIBUTION,
+        repairs=_short(repairs),
     )
+
+
+def _groups(model: Mobility) -> list[tuple[str, list[Visual]]]:
+    """Shapes of the fixed body, whose name is empty, and of each moving link."""
+    return [("", model.body), *((link.name, link.visuals) for link in model.links)]
+
+
+def _ids(names: Sequence[str], repairs: list[str]) -> dict[str, str]:
+    """Names of a URDF -> names in a pack: small letters, digits and underscores, all of them different."""
+    ids: dict[str, str] = {}
+    taken = {BODY}
+    for name in names:
+        plain = name if re.fullmatch("[a-z0-9_]+", name) else object_id(name)
+        found, number = plain, 2
+        while found in taken:
+            found, number = f"{plain}_{number}", number + 1
+        taken.add(found)
+        ids[name] = found
+        if found != name:
+            repairs.append(f"called {name!r} {found}")
+    return ids
+
+
+def _short(repairs: Sequence[str]) -> tuple[str, ...]:
+    """Each line once, and not too many of them."""
+    lines = list(dict.fromkeys(repairs))
+    left = len(lines) - MOST_REPAIRS
+    return (*lines[:MOST_REPAIRS], *([f"{left} more like these"] if left > 0 else []))
 
 
 def _for_gpu(pieces: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -101,57 +151,65 @@ def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> li
         folders: of the models, each with a ``mobility.urdf``; their names are the ids.
         annotations: folder of the user's ``<id>.yaml``; they go before those shipped.
 
-    Raises:
-        AssetError: a folder is no model, an annotation is missing or wrong, or two models have one id.
+    Returns:
+        Jobs; those that can only fail come first, so that an import that is to stop does so before anything is made.
     """
-    jobs: dict[str, Job] = {}
-    for folder in (folder.resolve() for folder in folders):
+    good: dict[str, Job] = {}
+    bad: dict[str, Job] = {}
+    for folder in dict.fromkeys(folder.resolve() for folder in folders):
         name = object_id(folder.name)
-        if name in jobs:
-            raise AssetError("two models would get the same id", where=folder, found=name, fix="Rename one.")
-        model = read_urdf(folder)  # says what is missing before anything is made
-        annotation = find_annotation(folder.name, annotations)
-        meshes = {
-            visual.path.parent for group in (model.body, *(link.visuals for link in model.links)) for visual in group
-        }
-        files = [
-            folder / URDF,
-            *(path for home in sorted(meshes | {folder / "images"}) for path in sorted(home.glob("*.*"))),
-        ]
-        content = content_hash(name, annotation, files=files, packages=("partnet",))
-        jobs[name] = Job(name, partial(_make, folder, annotation), content)
-    return list(jobs.values())
+        try:
+            if name in good or name in bad:
+                raise AssetError("two models would get the same id", where=folder, found=name, fix="Rename one.")
+            good[name] = _job(name, folder, annotations)
+        except AssetError as error:
+            label = name if name not in good and name not in bad else object_id(str(folder))
+            bad[label] = Job(label, partial(_fail, error), content_hash(str(error)))
+    return [*bad.values(), *good.values()]
+
+
+def _job(name: str, folder: Path, annotations: Path | None) -> Job:
+    annotation = find_annotation(folder.name, annotations)
+    model, geometry = read_urdf(folder, annotation.joints, annotation.scale), Geometry(folder)
+    for link, visuals in _groups(model):
+        geometry.check(link, visuals)
+    content = content_hash(name, annotation, files=_files(folder), packages=("partnet", "reading"))
+    return Job(name, partial(_make, folder, annotation), content)
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files that a model may be made of."""
+    found = [folder / URDF]
+    for path in files_below(folder):
+        inside = path.suffix.lower() in SUFFIXES and path.is_file() and path.resolve().is_relative_to(folder)
+        if inside and path.stat().st_size <= LARGEST_FILE:  # larger ones are not read
+            found.append(path)
+    return found
+
+
+def _fail(error: AssetError, out: Path) -> FurnitureAsset:
+    raise error
 
 
 def _make(folder: Path, annotation: Annotation, out: Path) -> FurnitureAsset:
     return build_furniture(read_partnet(folder, annotation), out)
 
 
-def _looks(visuals: Sequence[Visual]) -> list[tuple[str, Path, Faces]]:
-    """Faces of each part and file, in the furniture's frame."""
-    found = []
-    for visual in visuals:
-        turn, shift = visual.pose[:3, :3], visual.pose[:3, 3]
-        for faces in read_obj(visual.path):
-            found.append((visual.part, visual.path, Faces(faces.corners @ turn.T + shift, faces.uv, faces.material)))
-    return found
-
-
-def _parts(group: Sequence[tuple[str, Path, Faces]]) -> list[Part]:
-    parts: dict[str, dict[Path, list[Array]]] = {}
-    for name, path, faces in group:
-        parts.setdefault(name, {}).setdefault(path, []).append(faces.corners)
+def _parts(group: Sequence[tuple[str, str, Faces]]) -> list[Part]:
+    parts: dict[str, dict[str, list[Array]]] = {}
+    for name, source, faces in group:
+        parts.setdefault(name, {}).setdefault(source, []).append(faces.corners)
     return [Part(name, [np.concatenate(blocks) for blocks in meshes.values()]) for name, meshes in parts.items()]
 
 
-def _joint(link: MovingLink, note: JointNote) -> Joint:
-    limits = note.limits or link.limits
-    if not limits[0] <= 0 <= limits[1]:
+def _joint(link: MovingLink, name: str, annotation: Annotation) -> Joint:
+    note, limits = annotation.joints.get(link.joint, JointNote()), link.limits
+    if not limits[0] <= 0 <= limits[1] or limits[0] == limits[1]:
         raise AssetError("a joint's range doesn't hold 0, which is closed", where=link.joint, found=limits)
     x, y, z = (float(value) for value in np.round(link.axis, 9) + 0.0)
     a, b, c = (float(value) for value in np.round(link.origin, 9) + 0.0)
     return Joint(
-        name=link.joint,
+        name=name,
         kind=link.kind,
         axis=(x, y, z),
         origin=(a, b, c),
@@ -180,8 +238,10 @@ def _check(model: Mobility, annotation: Annotation, bounds: Array) -> None:
     for name, handle in annotation.handles.items():
         if handle.joint not in moving:
             expected = f"one of {', '.join(sorted(moving)) or '(none)'}"
-            found = handle.joint
-            raise AssetError(f"the handle {name!r} is of an unknown joint", where=where, expected=expected, found=found)
+            found, known = handle.joint, handle.joint in model.joints
+            what = f"the handle {name!r} is of {'a joint that is held closed' if known else 'an unknown joint'}"
+            fix = "Give the joint `limits` in the annotation, or leave the handle out." if known else ""
+            raise AssetError(what, where=where, expected=expected, found=found, fix=fix)
     links = {"", *(link.name for link in model.links)}
     for name, surface in annotation.surfaces.items():
         if surface.link not in links:
@@ -189,6 +249,14 @@ def _check(model: Mobility, annotation: Annotation, bounds: Array) -> None:
             found = surface.link
             raise AssetError(f"the surface {name!r} is of an unknown link", where=where, expected=expected, found=found)
         _check_surface(name, surface, bounds, where)
+
+
+def _check_size(bounds: Array, where: str) -> None:
+    size = float((bounds[1] - bounds[0]).max())
+    if size < SMALLEST or np.abs(bounds).max() > LARGEST:
+        expected, found = f"{SMALLEST} to {LARGEST:g} m", f"{size:.4g} m"
+        fix = "Set `scale` in the annotation: metres of one unit of the model."
+        raise AssetError("the model has no size of furniture", where=where, expected=expected, found=found, fix=fix)
 
 
 def _check_surface(name: str, surface: Surface, bounds: Array, where: str) -> None:

@@ -7,9 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from asset_tools.reading.files import ModelFiles, check_inside
+from asset_tools.reading.obj import MtlMaterial, ObjMesh, decode_text, find_material, parse_mtl, parse_obj
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray
+
+GREY = (0.7, 0.7, 0.7)
+OBJ_LIMIT = 64 * 2**20  # bytes; the largest of PartNet-Mobility have some 10 MB
 
 
 @dataclass(frozen=True)
@@ -18,10 +23,10 @@ class Material:
 
     Attributes:
         color: (3,) 0 to 1.
-        image: of the texture, which then is all there is to see; none: plain.
+        image: of the texture, which then is all there is to see, its links followed; none: plain.
     """
 
-    color: tuple[float, float, float] = (0.7, 0.7, 0.7)
+    color: tuple[float, float, float] = GREY
     image: Path | None = None
 
 
@@ -40,69 +45,83 @@ class Faces:
     material: Material
 
 
-def read_obj(path: Path) -> list[Faces]:
-    """Read a mesh; polygons become fans of triangles.
+def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | None = None) -> list[Faces]:
+    """Read a mesh; empty where it has no faces with an area.
+
+    Args:
+        path: of the mesh.
+        files: of the model; gets notes of what is missing.
+        color: (3,) 0 to 1, of faces whose material is not known.
 
     Raises:
-        AssetError: it can't be read, or has no faces.
+        AssetError: a file can't be read, or leads out of the model's folder.
     """
-    points: list[list[float]] = []
-    uvs: list[list[float]] = [[0.0, 0.0]]  # for corners that have none
-    groups: dict[str, list[tuple[int, int]]] = {}
-    materials: dict[str, Material] = {}
-    current = groups.setdefault("", [])
-    try:
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            head, _, rest = line.partition(" ")
-            if head == "v":
-                points.append([float(word) for word in rest.split()[:3]])
-            elif head == "vt":
-                uvs.append([float(word) for word in rest.split()[:2]])
-            elif head == "f":
-                corners = [_corner(word, len(points), len(uvs)) for word in rest.split()]
-                for second, third in zip(corners[1:], corners[2:], strict=False):
-                    current += [corners[0], second, third]
-            elif head == "usemtl":
-                current = groups.setdefault(rest.strip(), [])
-            elif head == "mtllib":
-                materials |= _read_materials(path.parent / rest.strip())
-        places, spots = np.array(points, float).reshape(-1, 3), np.array(uvs, float)
-        found = []
-        for name, indices in groups.items():
-            if indices:
-                which = np.array(indices).reshape(-1, 3, 2)
-                found.append(Faces(places[which[..., 0]], spots[which[..., 1]], materials.get(name, Material())))
-    except (OSError, ValueError, IndexError) as error:
-        raise AssetError("the mesh can't be read", where=path, found=error) from error
-    if not found or not all(np.isfinite(faces.corners).all() for faces in found):
-        raise AssetError("the mesh has no faces, or no finite ones", where=path)
+    data = files.read(path)
+    if len(data) > OBJ_LIMIT:
+        expected, found = f"at most {OBJ_LIMIT >> 20} MB", f"{len(data) >> 20} MB"
+        raise AssetError("the mesh is too detailed", where=path, expected=expected, found=found, fix="Reduce it.")
+    mesh = parse_obj(decode_text(data), path)
+    corners = mesh.vertices[mesh.faces]
+    if not np.isfinite(corners).all():
+        raise AssetError("the mesh has vertices that are NaN or infinite", where=path)
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    if not len(areas) or not areas.max() > 0:
+        return []
+    uvs = np.concatenate([mesh.uvs, np.zeros((1, 2))])[mesh.face_uvs]  # index -1: the zeros
+    found = _materials(mesh, path, files)
+    groups = []
+    for index in np.unique(mesh.face_materials, return_index=True)[0].tolist():
+        own = mesh.face_materials == index
+        look, folder = found.get(index, (None, path.parent))
+        material = Material(color or GREY) if look is None else _material(look, folder, files)
+        uv = uvs[own] if look is None else uvs[own] * look.uv_scale + look.uv_offset
+        groups.append(Faces(corners[own], uv, material))
+    return groups
+
+
+def _materials(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[int, tuple[MtlMaterial, Path]]:
+    """Material of each index of the mesh, with the folder that its images are relative to."""
+    known: dict[str, MtlMaterial] = {}
+    homes: dict[str, Path] = {}
+    for file in _libraries(mesh, path, files):
+        new = parse_mtl(decode_text(files.read(file)))
+        known |= new
+        homes |= dict.fromkeys(new, file.parent)
+    only = next(iter(known.values())) if len(known) == 1 else None
+    found = {}
+    for index in np.unique(mesh.face_materials).tolist():
+        name = mesh.material_names[index] if index >= 0 else ""
+        look = find_material(name, known) or only
+        if look is not None:
+            found[index] = look, homes[look.name]
+        elif known or name:
+            files.notes.append(f"{path.name}: no material {name!r}; the faces are plain")
     return found
 
 
-def _corner(word: str, points: int, uvs: int) -> tuple[int, int]:
-    numbers = word.split("/")
-    point, uv = int(numbers[0]), int(numbers[1]) if len(numbers) > 1 and numbers[1] else 0
-    if not 0 < point <= points and not 0 < -point <= points:
-        raise ValueError(f"a face of vertex {point}, of {points}")
-    # counted from 1, or back from the end
-    return point - 1 if point > 0 else points + point, uv if uv >= 0 else uvs + uv
+def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> list[Path]:
+    """The MTL files that a mesh names; where one is missing, that of the mesh's own name."""
+    found = []
+    for line in mesh.libraries:
+        whole = files.find(line, path.parent)
+        for name in [line] if whole else line.split():
+            library = whole or files.find(name, path.parent)
+            own = path.with_suffix(".mtl")
+            if library is None and own.is_file():
+                files.notes.append(f"{path.name}: took {own.name} for the missing {name}")
+                library = own
+            if library is None:
+                files.notes.append(f"{path.name}: the material file {name} is missing")
+            else:
+                found.append(library)
+    return list(dict.fromkeys(found))
 
 
-def _read_materials(path: Path) -> dict[str, Material]:
-    """Materials of an MTL file by name; a missing file or image leaves the colour."""
-    found: dict[str, Material] = {}
-    name = ""
-    if not path.is_file():
-        return found
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        head, _, rest = line.strip().partition(" ")
-        if head == "newmtl":
-            name = rest.strip()
-            found[name] = Material()
-        elif head == "Kd" and name:
-            red, green, blue = (float(word) for word in rest.split()[:3])
-            found[name] = Material((red, green, blue), found[name].image)
-        elif head == "map_Kd" and name:
-            image = path.parent / rest.strip()
-            found[name] = Material(found[name].color, image if image.is_file() else None)
-    return found
+def _material(look: MtlMaterial, folder: Path, files: ModelFiles) -> Material:
+    image = files.find(look.image, folder) if look.image else None
+    if image is None:
+        if look.image:
+            files.notes.append(f"the texture {look.image} is missing: its faces have a plain colour")
+        return Material(look.color or GREY)
+    check_inside(image, files.root)
+    return Material(look.color or GREY, image.resolve())

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
+from asset_tools.import_scans import object_id
 from asset_tools.partnet.urdf import read_urdf
 
 TEMPLATE = """\
@@ -27,13 +30,29 @@ def template(folder: Path) -> str:
     Raises:
         AssetError: the model can't be read.
     """
-    links = read_urdf(folder).links
-    drawer = "  {0}: {{link: {0}, min_xy: [-0.2, -0.4], max_xy: [0.2, 0.4], z: 0.1, headroom: 0.1}}\n"
+    links = read_urdf(folder.resolve()).links
+    drawer = "  {0}: {{link: {1}, min_xy: [-0.2, -0.4], max_xy: [0.2, 0.4], z: 0.1, headroom: 0.1}}\n"
     handle = "  {0}: {{joint: {1}, position: [0.3, 0, 0.2], wxyz: [0.5, 0.5, -0.5, -0.5], width: 0.012}}\n"
     joint = "  {0}: {{mass: 2.0, friction: 0.05, damping: 5.0}}  # {1}, moves {2}, {3:.3g} to {4:.3g}\n"
+    still = "  {0}: {{fixed: true}}  # {1}, moves {2}, which has no mesh\n"
+    ids = [object_id(link.name) for link in links]
     return TEMPLATE.format(
         id=folder.resolve().name,
-        surfaces="".join(drawer.format(link.name) for link in links if link.kind == "prismatic"),
-        handles="".join(handle.format(link.name, link.joint) for link in links),
-        joints="".join(joint.format(link.joint, link.kind, link.name, *link.limits) for link in links),
+        surfaces="".join(
+            drawer.format(id_, _quoted(link.name))
+            for id_, link in zip(ids, links, strict=True)
+            if link.kind == "prismatic" and link.visuals
+        ),
+        handles="".join(
+            handle.format(id_, _quoted(link.joint)) for id_, link in zip(ids, links, strict=True) if link.visuals
+        ),
+        joints="".join(
+            (joint if link.visuals else still).format(_quoted(link.joint), link.kind, link.name, *link.limits)
+            for link in links
+        ),
     )
+
+
+def _quoted(name: str) -> str:
+    """A name as YAML has it: in quotation marks unless it is a plain word."""
+    return name if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) else json.dumps(name, ensure_ascii=False)

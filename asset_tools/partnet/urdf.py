@@ -1,21 +1,27 @@
-"""PartNet-Mobility's ``mobility.urdf``: which meshes hang on which joints, in one frame with every joint closed."""
+"""PartNet-Mobility's ``mobility.urdf``: which shapes hang on which joints, in one frame with every joint closed."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Literal
+from xml.parsers import expat
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from asset_tools.partnet.annotation import LARGEST, JointNote
+from asset_tools.reading.files import read_file
 from robocas_ms3.errors import AssetError
+from robocas_ms3.names import check_name
 
 Array = np.ndarray
 
 URDF = "mobility.urdf"
+URDF_LIMIT = 16 * 2**20  # bytes; the largest of PartNet-Mobility has 1 MB
 # PartNet's URDFs look along -x; furniture here looks along +x, as upstream turns them
 TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
 KINDS: dict[str, Literal["prismatic", "revolute"]] = {
@@ -23,21 +29,42 @@ KINDS: dict[str, Literal["prismatic", "revolute"]] = {
     "revolute": "revolute",
     "continuous": "revolute",
 }
+SIZES = {"box": ("size", 3), "cylinder": ("radius length", 2), "sphere": ("radius", 1)}  # attributes, numbers
+MOST_LINKS, MOST_SHAPES = 1000, 2000
+MOST_MOVING = 60  # PhysX simulates articulations of at most 64 bodies
+FAR = 1e6  # greatest number of a position, size or angle
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What the `<geometry>` of a link says.
+
+    Attributes:
+        kind: the tag: ``mesh``, ``box``, ``cylinder``, ``sphere``; another one has no size.
+        size: scale (3,) of a mesh; size (3,) of a box; radius and length; radius. Meters.
+        filename: of a mesh, as the URDF has it.
+    """
+
+    kind: str
+    size: tuple[float, ...] = ()
+    filename: str = ""
 
 
 @dataclass(frozen=True)
 class Visual:
-    """A mesh of a link.
+    """A shape of a link.
 
     Attributes:
         part: the part of the furniture it belongs to: ``drawer_side-23``.
-        path: the mesh file.
+        shape: a mesh file or a primitive.
         pose: 4x4 of it in the furniture's frame, joints closed.
+        color: (3,) 0 to 1, of a shape without a material of its own.
     """
 
     part: str
-    path: Path
+    shape: Shape
     pose: Array
+    color: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -52,7 +79,7 @@ class MovingLink:
         axis: (3,) unit vector, furniture's frame, joints closed.
         origin: (3,) point on the axis, m.
         limits: of the joint, 0 is closed.
-        visuals: its meshes and those of links fixed to it.
+        visuals: its shapes and those of links fixed to it.
     """
 
     name: str
@@ -71,15 +98,23 @@ class Mobility:
 
     Attributes:
         folder: where it was read from.
-        body: meshes of the fixed body.
+        body: shapes of the fixed body.
         links: moving parts, parents first.
         joints: names of all joints that could move.
+        repairs: what of the URDF was not taken as it is.
     """
 
     folder: Path
     body: list[Visual]
     links: list[MovingLink]
     joints: frozenset[str]
+    repairs: tuple[str, ...] = ()
+
+    def visuals(self) -> Iterator[Visual]:
+        """All shapes."""
+        yield from self.body
+        for link in self.links:
+            yield from link.visuals
 
 
 @dataclass(frozen=True)
@@ -89,149 +124,250 @@ class _Joint:
     parent: str
     child: str
     pose: Array
-    axis: Array
-    limits: tuple[float, float] | None
+    element: ET.Element
 
 
-def read_urdf(
-    folder: Path, *, closed: Mapping[str, float] | None = None, fixed: frozenset[str] = frozenset()
-) -> Mobility:
-    """Read a model's links and joints. Fixed joints are merged, and so are those that turn without limits (casters).
+def read_urdf(folder: Path, notes: Mapping[str, JointNote] | None = None, scale: float = 1.0) -> Mobility:
+    """Read a model's links and joints.
+
+    Fixed joints are merged, and so are those without a finite range (casters), unless a note gives their limits.
 
     Args:
         folder: of the model; holds ``mobility.urdf``.
-        closed: position of joints by name at which they are closed, as the URDF counts; others at their lower limit.
-        fixed: joints that are held closed.
+        notes: what an annotation says of joints, by their names.
+        scale: metres of one unit of the URDF.
 
     Raises:
-        AssetError: no URDF, or one that can't be read; a mesh that is not there; a joint of an unknown type.
+        AssetError: no URDF, or one that can't be read, or names or joints in it that can't be used.
     """
-    path = folder / URDF
-    root = _parse(path)
-    visuals = {_name(link, path): _visuals(link, folder) for link in root.findall("link")}
-    joints = [_joint(element, path) for element in root.findall("joint")]
-    below = {joint.child: joint for joint in joints}
-    for joint in joints:
-        if joint.parent not in visuals or joint.child not in visuals:
-            raise AssetError(
-                "a joint of unknown links", where=path, found=f"{joint.name}: {joint.parent} {joint.child}"
-            )
-    roots = [name for name in visuals if name not in below]
-    if len(roots) != 1 or len(below) != len(joints):
-        raise AssetError("the links are no tree", where=path, expected="one root", found=", ".join(roots) or "a loop")
-    body: list[Visual] = []
-    links: list[MovingLink] = []
-    queue: list[tuple[str, Array, MovingLink | None]] = [(roots[0], TURNED, None)]
-    while queue:
-        name, pose, carrier = queue.pop(0)
-        (carrier.visuals if carrier else body).extend(
-            Visual(part, mesh, pose @ placed) for part, mesh, placed in visuals[name]
-        )
+    return _Reader(folder, notes or {}, scale).read()
+
+
+class _Reader:
+    def __init__(self, folder: Path, notes: Mapping[str, JointNote], scale: float) -> None:
+        self._folder, self._path, self._notes, self._scale = folder, folder / URDF, notes, scale
+        self._repairs: list[str] = []
+        self._colors: dict[str, tuple[float, float, float]] = {}
+
+    def read(self) -> Mobility:
+        root = _parse(self._folder)
+        named = root.findall("link"), root.findall("joint")
+        shapes = max(len(root.findall(f"link/{tag}")) for tag in ("visual", "collision"))
+        if len(named[0]) > MOST_LINKS or shapes > MOST_SHAPES:
+            expected = f"at most {MOST_LINKS} links and {MOST_SHAPES} shapes"
+            found = f"{len(named[0])} links, {shapes} shapes"
+            raise AssetError("the model is too large", where=self._path, expected=expected, found=found)
+        for material in root.findall("material"):
+            self._color(material)
+        links = dict(zip(self._names(named[0]), named[0], strict=True))
+        visuals = {name: self._visuals(name, link) for name, link in links.items()}
+        joints = [self._joint(*both) for both in zip(self._names(named[1]), named[1], strict=True)]
+        body, moving = self._placed(visuals, joints)
+        if len(moving) > MOST_MOVING:
+            expected, fix = f"at most {MOST_MOVING}", "Hold some of their joints: `fixed: true`."
+            raise AssetError("too many moving links", where=self._path, expected=expected, found=len(moving), fix=fix)
+        could_move = frozenset(joint.name for joint in joints if joint.kind != "fixed")
+        return Mobility(self._folder, body, moving, could_move, tuple(self._repairs))
+
+    def _placed(
+        self, visuals: Mapping[str, list[Visual]], joints: list[_Joint]
+    ) -> tuple[list[Visual], list[MovingLink]]:
+        below: dict[str, list[_Joint]] = {name: [] for name in visuals}
         for joint in joints:
-            if joint.parent != name:
-                continue
-            frame = pose @ joint.pose
-            moves = joint.kind != "fixed" and joint.limits is not None and joint.name not in fixed
-            if not moves:
-                queue.append((joint.child, frame, carrier))
-                continue
-            assert joint.limits is not None
-            zero = (closed or {}).get(joint.name, joint.limits[0])
-            link = MovingLink(
-                joint.child,
-                carrier.name if carrier else "",
-                joint.name,
-                KINDS[joint.kind],
-                frame[:3, :3] @ joint.axis,
-                frame[:3, 3],
-                (joint.limits[0] - zero, joint.limits[1] - zero),
+            if joint.parent not in visuals or joint.child not in visuals:
+                found = f"{joint.name}: {joint.parent} {joint.child}"
+                raise AssetError("a joint of unknown links", where=self._path, found=found)
+            below[joint.parent].append(joint)
+        children = {joint.child for joint in joints}
+        roots = [name for name in visuals if name not in children]
+        if len(roots) != 1 or len(children) != len(joints):
+            found = ", ".join(roots) or "a loop"
+            raise AssetError("the links are no tree", where=self._path, expected="one root", found=found)
+        body: list[Visual] = []
+        links: list[MovingLink] = []
+        queue: list[tuple[str, Array, MovingLink | None]] = [(roots[0], TURNED, None)]
+        for name, pose, carrier in queue:
+            (carrier.visuals if carrier else body).extend(
+                Visual(one.part, one.shape, pose @ one.pose, one.color) for one in visuals[name]
             )
-            links.append(link)
-            queue.append((joint.child, frame @ _motion(joint, zero), link))
-    for link in links:
-        if not link.visuals:
-            raise AssetError(
-                "a moving link without a mesh", where=path, found=link.name, fix="Hold its joint: `fixed: true`."
-            )
-    return Mobility(folder, body, links, frozenset(joint.name for joint in joints if joint.kind != "fixed"))
+            for joint in below[name]:
+                frame = pose @ joint.pose
+                span = self._range(joint)
+                if span is None:
+                    queue.append((joint.child, frame, carrier))
+                    continue
+                closed, limits = span
+                axis = self._axis(joint)
+                parent = carrier.name if carrier else ""
+                turned, kind = frame[:3, :3] @ axis, KINDS[joint.kind]
+                links.append(MovingLink(joint.child, parent, joint.name, kind, turned, frame[:3, 3], limits))
+                queue.append((joint.child, frame @ _motion(kind, axis, closed), links[-1]))
+        if len(queue) != len(visuals):
+            lost = sorted(visuals.keys() - {name for name, _, _ in queue})
+            raise AssetError("the links are no tree", where=self._path, expected="one root", found=f"a loop of {lost}")
+        return body, links
+
+    def _range(self, joint: _Joint) -> tuple[float, tuple[float, float]] | None:
+        """Where a joint is closed as the URDF counts, and its limits counted from there; none: it is held."""
+        note = self._notes.get(joint.name, JointNote())
+        if joint.kind == "fixed" or note.fixed:
+            return None
+        if joint.kind not in KINDS:
+            fix = f"Hold it in the annotation: `joints: {{{joint.name}: {{fixed: true}}}}`."
+            expected = ", ".join(["fixed", *KINDS])
+            found = f"{joint.name}: {joint.kind!r}"
+            raise AssetError("a joint of an unknown type", where=self._path, expected=expected, found=found, fix=fix)
+        if joint.element.find("mimic") is not None:
+            self._repairs.append(f"the joint {joint.name} moves on its own: `mimic` is not simulated")
+        unit = self._scale if joint.kind == "prismatic" else 1.0
+        low, high = self._limits(joint, note, unit)
+        finite = np.isfinite([low, high]).all()
+        closed = low if finite else 0.0
+        if note.closed is not None:
+            closed = note.closed * unit
+        if note.limits is not None:
+            return closed, note.limits
+        if not finite or low == high:
+            why = "it has no range" if finite else "it has no finite limits"
+            self._repairs.append(f"held the joint {joint.name} closed: {why}")
+            return None
+        return closed, (low - closed, high - closed)
+
+    def _limits(self, joint: _Joint, note: JointNote, unit: float) -> tuple[float, float]:
+        """Limits in m or rad, counted as the URDF does; infinite where there are none."""
+        limit = joint.element.find("limit")
+        if limit is None or joint.kind == "continuous":
+            return -np.inf, np.inf
+        try:
+            low, high = (float(limit.get(end, "0")) * unit for end in ("lower", "upper"))
+        except ValueError:
+            low = high = np.nan
+        ends = np.array([low, high])
+        usable = low <= high and not (np.isfinite(ends) & (np.abs(ends) > LARGEST)).any()
+        if not usable and note.limits is None:
+            found = f"{joint.name}: {limit.get('lower', '0')} to {limit.get('upper', '0')}"
+            fix = "Give the joint `limits` in the annotation, or hold it: `fixed: true`."
+            expected = f"lower <= upper, at most {LARGEST:g} m or rad, or `inf`"
+            raise AssetError("limits that can't be used", where=self._path, expected=expected, found=found, fix=fix)
+        return (low, high) if usable else (-np.inf, np.inf)
+
+    def _names(self, elements: list[ET.Element]) -> list[str]:
+        names: dict[str, None] = {}
+        for element in elements:
+            name = check_name(element.get("name", ""), AssetError, where=f"{self._path}, name of a <{element.tag}>")
+            if name in names:
+                raise AssetError(f"two {element.tag}s have the same name", where=self._path, found=repr(name))
+            names[name] = None
+        return list(names)
+
+    def _visuals(self, name: str, link: ET.Element) -> list[Visual]:
+        """Shapes of a link in its frame: those to look at, or where it has none those to touch."""
+        found, tag = link.findall("visual"), "visual"
+        if not found and link.find("collision") is not None:
+            found, tag = link.findall("collision"), "collision"
+            self._repairs.append(f"the link {name} has no <visual>: shows its <collision>")
+        visuals = []
+        for index, one in enumerate(found):
+            where = f"{self._path}, <{tag}> {index} of the link {name}"
+            part = one.get("name") or f"part-{index}"
+            shape, pose = self._shape(one.find("geometry"), where), self._pose(one.find("origin"), where)
+            material = one.find("material")
+            visuals.append(Visual(part, shape, pose, None if material is None else self._color(material)))
+        return visuals
+
+    def _shape(self, geometry: ET.Element | None, where: str) -> Shape:
+        shape = next(iter(geometry), None) if geometry is not None else None
+        if shape is None:
+            return Shape("nothing")
+        if shape.tag == "mesh":
+            factors = _numbers(shape.get("scale", "1 1 1"), where, (1, 3)) * self._scale
+            if not factors.all():
+                raise AssetError("a mesh scaled to nothing", where=where, found=factors.tolist())
+            return Shape("mesh", tuple(np.broadcast_to(factors, 3).tolist()), shape.get("filename", ""))
+        if shape.tag not in SIZES:
+            return Shape(shape.tag)
+        names, count = SIZES[shape.tag]
+        sizes = _numbers(" ".join(shape.get(name, "") for name in names.split()), where, (count,)) * self._scale
+        if not (sizes > 0).all():
+            raise AssetError("a shape without a size", where=where, expected="sizes > 0", found=sizes.tolist())
+        return Shape(shape.tag, tuple(sizes.tolist()))
+
+    def _color(self, material: ET.Element) -> tuple[float, float, float] | None:
+        """Of a material, which may be declared elsewhere in the file by its name."""
+        name, color = material.get("name", ""), material.find("color")
+        if color is None:
+            return self._colors.get(name)
+        red, green, blue = np.clip(_numbers(color.get("rgba", ""), f"{self._path}, <color>", (3, 4))[:3], 0, 1).tolist()
+        self._colors[name] = red, green, blue
+        return red, green, blue
+
+    def _joint(self, name: str, element: ET.Element) -> _Joint:
+        ends = [element.find(end) for end in ("parent", "child")]
+        if any(end is None for end in ends):
+            raise AssetError("a joint without parent or child", where=self._path, found=name)
+        parent, child = (end.get("link", "") for end in ends if end is not None)
+        pose = self._pose(element.find("origin"), f"{self._path}, the joint {name}")
+        return _Joint(name, element.get("type", ""), parent, child, pose, element)
+
+    def _axis(self, joint: _Joint) -> Array:
+        element, where = joint.element.find("axis"), f"{self._path}, axis of the joint {joint.name}"
+        axis = _numbers("1 0 0" if element is None else element.get("xyz", "1 0 0"), where, (3,))
+        length = float(np.linalg.norm(axis))
+        if length < 1e-9:
+            raise AssetError("an axis of no length", where=where, found=axis.tolist())
+        return axis / length
+
+    def _pose(self, origin: ET.Element | None, where: str) -> Array:
+        pose = np.eye(4)
+        if origin is not None:
+            pose[:3, :3] = Rotation.from_euler("xyz", _numbers(origin.get("rpy", "0 0 0"), where, (3,))).as_matrix()
+            pose[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), where, (3,)) * self._scale
+        return pose
 
 
-def _parse(path: Path) -> ET.Element:
-    if not path.is_file():
-        raise AssetError(
-            "no such file", where=path, expected="the folder of a PartNet-Mobility model", fix="Give its folder."
-        )
+def _parse(folder: Path) -> ET.Element:
+    path = folder / URDF
+    if not path.exists():
+        expected = "the folder of a PartNet-Mobility model"
+        raise AssetError("no such file", where=path, expected=expected, fix="Give its folder.")
+    data = read_file(path, folder)
+    if len(data) > URDF_LIMIT:
+        expected, found = f"at most {URDF_LIMIT >> 20} MB", f"{len(data) >> 20} MB"
+        raise AssetError("the URDF is too large", where=path, expected=expected, found=found)
+    tree, reader = ET.TreeBuilder(), expat.ParserCreate()
+    reader.StartElementHandler, reader.EndElementHandler = tree.start, tree.end
+    reader.StartDoctypeDeclHandler = partial(_refuse_doctype, path)
     try:
-        return ET.parse(path).getroot()
-    except ET.ParseError as error:
+        reader.Parse(data, True)
+    except (expat.ExpatError, LookupError, ValueError) as error:  # also of unknown encodings
         raise AssetError("the URDF can't be read", where=path, found=error) from error
+    root = tree.close()
+    if root.tag != "robot":
+        raise AssetError("the file is no URDF", where=path, expected="<robot>", found=f"<{root.tag[:40]}>")
+    return root
 
 
-def _name(element: ET.Element, path: Path) -> str:
-    name = element.get("name")
-    if not name:
-        raise AssetError(f"a {element.tag} without a name", where=path)
-    return name
+def _refuse_doctype(path: Path, *_: object) -> None:
+    """A few lines of entities can stand for gigabytes, or for another file."""
+    fix = "Remove the line `<!DOCTYPE ...>` and the entities in it."
+    raise AssetError("the URDF declares a document type", where=path, expected="plain XML", fix=fix)
 
 
-def _visuals(link: ET.Element, folder: Path) -> list[tuple[str, Path, Array]]:
-    found = []
-    for index, visual in enumerate(link.findall("visual")):
-        mesh = visual.find("geometry/mesh")
-        if mesh is None:
-            raise AssetError("only meshes can be read", where=folder / URDF, found=f"link {link.get('name')}")
-        path = folder / mesh.get("filename", "")
-        if not path.is_file():
-            raise AssetError("this mesh of the model is missing", where=path, fix="Download the model again.")
-        found.append((visual.get("name") or f"part-{index}", path, _pose(visual.find("origin"), folder / URDF)))
-    return found
-
-
-def _joint(element: ET.Element, path: Path) -> _Joint:
-    name, kind = _name(element, path), element.get("type", "")
-    if kind != "fixed" and kind not in KINDS:
-        expected = ", ".join(["fixed", *KINDS])
-        raise AssetError("a joint of an unknown type", where=path, expected=expected, found=f"{name}: {kind}")
-    ends = [element.find(end) for end in ("parent", "child")]
-    if any(end is None for end in ends):
-        raise AssetError("a joint without parent or child", where=path, found=name)
-    axis = element.find("axis")
-    direction = _numbers(axis.get("xyz", "1 0 0") if axis is not None else "1 0 0", path)
-    length = float(np.linalg.norm(direction))
-    if length < 1e-9:
-        raise AssetError("a joint with an axis of no length", where=path, found=name)
-    limit, limits = element.find("limit"), None
-    if limit is not None and kind in ("prismatic", "revolute"):
-        low, high = (float(_numbers(limit.get(end, "0"), path, 1)[0]) for end in ("lower", "upper"))
-        limits = (low, high)
-        if not low < high:
-            raise AssetError("a joint without a range", where=path, expected="lower < upper", found=f"{name}: {limits}")
-    parent, child = (end.get("link", "") for end in ends if end is not None)
-    return _Joint(name, kind, parent, child, _pose(element.find("origin"), path), direction / length, limits)
-
-
-def _pose(origin: ET.Element | None, path: Path) -> Array:
-    pose = np.eye(4)
-    if origin is not None:
-        pose[:3, :3] = Rotation.from_euler("xyz", _numbers(origin.get("rpy", "0 0 0"), path)).as_matrix()
-        pose[:3, 3] = _numbers(origin.get("xyz", "0 0 0"), path)
-    return pose
-
-
-def _numbers(text: str, path: Path, count: int = 3) -> Array:
+def _numbers(text: str, where: str, counts: tuple[int, ...]) -> Array:
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError:
         values = np.zeros(0)
-    if len(values) != count or not np.isfinite(values).all():
-        raise AssetError("numbers that can't be read", where=path, expected=f"{count} numbers", found=repr(text))
+    if len(values) not in counts or not (np.abs(values) <= FAR).all():  # NaN is not
+        expected = f"{' or '.join(map(str, counts))} numbers, at most {FAR:g}"
+        raise AssetError("numbers that can't be read", where=where, expected=expected, found=repr(text[:80]))
     return values
 
 
-def _motion(joint: _Joint, position: float) -> Array:
+def _motion(kind: str, axis: Array, position: float) -> Array:
     motion = np.eye(4)
-    if joint.kind == "prismatic":
-        motion[:3, 3] = joint.axis * position
+    if kind == "prismatic":
+        motion[:3, 3] = axis * position
     else:
-        motion[:3, :3] = Rotation.from_rotvec(joint.axis * position).as_matrix()
+        motion[:3, :3] = Rotation.from_rotvec(axis * position).as_matrix()
     return motion

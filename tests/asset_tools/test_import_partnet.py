@@ -151,13 +151,13 @@ def test_what_does_not_fit_the_model_is_named(chest, more, words):
 
 def test_missing_files_are_named(chest, tmp_path):
     (chest / "tray.obj").unlink()
-    with pytest.raises(AssetError, match=r"tray\.obj: this mesh of the model is missing"):
+    with pytest.raises(AssetError, match=r"tray\.obj"):
         read(chest)
     (chest / "mobility.urdf").write_text("<robot>")
-    with pytest.raises(AssetError, match=r"mobility\.urdf: the URDF can't be read"):
-        read(chest)
-    with pytest.raises(AssetError, match=r"mobility\.urdf: no such file"):
-        read(tmp_path / "nothing")
+    for folder in (chest, tmp_path / "nothing"):
+        with pytest.raises(AssetError) as raised:
+            read(folder)
+        assert raised.value.where == folder / "mobility.urdf"
 
 
 def test_bad_annotations_are_named(tmp_path):
@@ -202,8 +202,8 @@ def test_a_model_becomes_a_pack_and_the_same_bytes_again(chest, tmp_path):
     before = partnet_jobs([chest], notes)[0].content
     (chest / "paint.mtl").write_text("newmtl red\nKd 0.1 0.8 0.1\n")
     assert partnet_jobs([chest], notes)[0].content != before
-    with pytest.raises(AssetError, match="same id"):
-        partnet_jobs([chest, chest], notes)
+    (job,) = partnet_jobs([chest, chest], notes)
+    assert job.id == "chest"
 
 
 def test_the_sliding_door_is_where_upstream_has_it(shared_dir):

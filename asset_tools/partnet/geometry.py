@@ -1,0 +1,129 @@
+"""The faces of a model's shapes: mesh files and primitives; what can't be used is left out and reported."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+import trimesh
+
+from asset_tools.partnet.obj import GREY, Faces, Material, read_obj
+from asset_tools.partnet.urdf import SIZES, URDF, Shape, Visual
+from asset_tools.reading.files import ModelFiles
+from robocas_ms3.errors import AssetError
+
+Array = np.ndarray
+
+MOST_TRIANGLES = 3_000_000  # of a model: 0.4 GB
+SCHEMES = ("package://", "model://")
+SIDES = 32  # of a cylinder
+
+
+class Geometry:
+    """Reads the shapes of one model, each mesh file once.
+
+    Args:
+        folder: of the model; nothing outside of it is read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.files = ModelFiles(folder, folder)
+        self.repairs: list[str] = self.files.notes
+        self._read: dict[tuple[Path, tuple[float, float, float] | None], list[Faces]] = {}
+        self._left = MOST_TRIANGLES
+
+    def check(self, link: str, visuals: Sequence[Visual]) -> None:
+        """Check that the files of a link are there, without reading them.
+
+        Raises:
+            AssetError: most are missing, or one is outside of the folder or in a format that is not read.
+        """
+        self._check_most(link, [self._missing(one.shape) for one in visuals])
+
+    def faces(self, link: str, visuals: Sequence[Visual]) -> list[tuple[str, str, Faces]]:
+        """Return the faces of a link, in the furniture's frame, with the part and the file each belongs to.
+
+        Args:
+            link: its name, for messages.
+            visuals: its shapes.
+
+        Raises:
+            AssetError: a file can't be read, or most of the shapes can't be used.
+        """
+        found: list[tuple[str, str, Faces]] = []
+        reasons = []
+        for index, visual in enumerate(visuals):
+            reason = self._missing(visual.shape)
+            shown = [] if reason else self._faces(visual)
+            if not reason and not shown:
+                reason = f"{visual.shape.filename} has no faces"
+            reasons.append(reason)
+            self._left -= sum(len(faces.corners) for faces in shown)
+            if self._left < 0:
+                where, expected = self.files.root / URDF, f"at most {MOST_TRIANGLES:,} triangles"
+                raise AssetError("the model is too detailed", where=where, expected=expected, fix="Reduce its meshes.")
+            turn, shift = visual.pose[:3, :3], visual.pose[:3, 3]
+            source = visual.shape.filename or f"shape {index}"
+            found += [(visual.part, source, replace(one, corners=one.corners @ turn.T + shift)) for one in shown]
+        self._check_most(link, reasons)
+        self.repairs += [f"left out a shape of {link or 'the body'}: {reason}" for reason in reasons if reason]
+        return found
+
+    def _check_most(self, link: str, reasons: Sequence[str]) -> None:
+        """Refuse a link of which more is missing than there is."""
+        lost = [reason for reason in reasons if reason]
+        if len(lost) > len(reasons) / 2:
+            what = f"most shapes of {f'the link {link}' if link else 'the fixed body'} can't be used"
+            found = f"{len(lost)} of {len(reasons)}: {lost[0]}"
+            raise AssetError(what, where=self.files.root / URDF, found=found, fix="Download the model again.")
+
+    def _missing(self, shape: Shape) -> str:
+        """Why a shape can't be used; empty: it can."""
+        if shape.kind in SIZES:
+            return ""
+        if shape.kind != "mesh":
+            return f"a <{shape.kind}> is no shape of a URDF"
+        path = self._path(shape)
+        if path is None:
+            return f"{shape.filename or 'a mesh without a file name'} is missing"
+        if path.suffix.lower() != ".obj":
+            fix = "Convert it to OBJ, and name that in the URDF."
+            raise AssetError("a mesh format that is not read", where=path, expected=".obj", found=path.suffix, fix=fix)
+        return ""
+
+    def _path(self, shape: Shape) -> Path | None:
+        """The mesh file that a URDF names; ``package://NAME/`` is the model's folder, or a folder in it."""
+        name, root = shape.filename, self.files.root
+        if name.startswith(SCHEMES):
+            package, _, inside = unquote(name.partition("://")[2]).partition("/")
+            name = f"{package}/{inside}" if (root / package).is_dir() else inside
+        return self.files.find(name, root)
+
+    def _faces(self, visual: Visual) -> list[Faces]:
+        shape = visual.shape
+        if shape.kind != "mesh":
+            corners = _primitive(shape)
+            return [Faces(corners, np.zeros((len(corners), 3, 2)), Material(visual.color or GREY))]
+        path = self._path(shape)
+        assert path is not None
+        key = path, visual.color
+        if key not in self._read:
+            self._read[key] = read_obj(path, self.files, visual.color)
+        # a mirror image would show its inside
+        order = slice(None, None, -1 if np.prod(shape.size) < 0 else 1)
+        return [
+            replace(one, corners=(one.corners * shape.size)[:, order], uv=one.uv[:, order]) for one in self._read[key]
+        ]
+
+
+def _primitive(shape: Shape) -> Array:
+    if shape.kind == "box":
+        body = trimesh.creation.box(shape.size)
+    elif shape.kind == "cylinder":
+        body = trimesh.creation.cylinder(shape.size[0], shape.size[1], SIDES)
+    else:
+        body = trimesh.creation.icosphere(2, shape.size[0])
+    return np.asarray(body.triangles, float)
