@@ -134,7 +134,9 @@ def import_partnet(command: ImportPartNet) -> int:
         from asset_tools.partnet.importer import partnet_jobs
         from asset_tools.partnet.template import template
     if command.template:
-        print(template(command.models[0]))
+        from robocas_ms3.cli.terminal import say_lines
+
+        say_lines(template(command.models[0]))
         return 0
     return _make(partnet_jobs(command.models, command.annotations), command, command.pack, "PartNet model")
 
@@ -164,14 +166,12 @@ def build(command: Build) -> int:
 
 
 def _make(jobs: list[Job], command: _Making, name: str, what: str) -> int:
-    from rich.console import Console
-
     from asset_tools.pipeline import check_target, made_of
     from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.errors import AssetError, OutputExistsError
     from robocas_ms3.paths import builtin_packs_dir, data_dir
 
-    console = Console(highlight=False, soft_wrap=True, markup=False)
     if (builtin_packs_dir() / name).exists() or Path(name).name != name:
         raise AssetError("this can't be the name of an imported pack", found=name, fix="Choose another with --pack.")
     out = data_dir() / "packs" / name
@@ -180,9 +180,9 @@ def _make(jobs: list[Job], command: _Making, name: str, what: str) -> int:
         try:
             load_pack(out)
         except AssetError as error:
-            console.print(f"making it again: {error}")
+            say(f"making it again: {error}")
         else:
-            console.print(f"{out} is made of just this already")
+            say(f"{out} is made of just this already")
             return 0
     elif out.exists() and not command.overwrite:
         fix = "Pass --overwrite to replace it, or choose another name with --pack."
@@ -193,7 +193,8 @@ def _make(jobs: list[Job], command: _Making, name: str, what: str) -> int:
 def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, record: bool = True) -> int:
     from asset_tools.pipeline import JobResult, write_pack
     from robocas_ms3.cli.assets_show import Info, info
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.paths import cache_dir
 
     with bar(f"assets of {out.name} made") as shown:

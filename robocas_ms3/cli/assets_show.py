@@ -12,12 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from robocas_ms3.assets.pack import Pack
 
 from robocas_ms3.cli.options import Maybe, Several
-from robocas_ms3.words import count_of
+from robocas_ms3.words import count_of, printable
 
 
 @dataclass
@@ -64,32 +62,33 @@ class Sheet:
 
 def list_packs(command: ListPacks) -> int:
     """Run ``list``; a pack that can't be read is listed with the reason."""
-    from rich.markup import escape
     from rich.table import Column, Table
+    from rich.text import Text
 
     from robocas_ms3.assets.pack import load_pack, pack_folders
+    from robocas_ms3.cli.terminal import table_console
     from robocas_ms3.errors import AssetError
 
     table = Table(Column("pack", no_wrap=True), "objects", "furniture", "folder")
     for name, folder in pack_folders().items():
         try:
             pack = load_pack(name)
-            table.add_row(escape(name), str(len(pack.objects)), str(len(pack.furniture)), escape(str(folder)))
+            table.add_row(name, str(len(pack.objects)), str(len(pack.furniture)), str(folder))
         except AssetError as error:
-            table.add_row(escape(name), "-", "-", f"[red]{escape(str(error))}[/red]")
-    _console().print(table)
+            table.add_row(name, "-", "-", Text(str(error), "red"))
+    table_console().print(table)
     return 0
 
 
 def info(command: Info) -> int:
     """Run ``info``."""
-    from rich.markup import escape
     from rich.table import Column, Table
 
     from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.cli.terminal import table_console
 
     pack = load_pack(command.pack)
-    console = _console()
+    console = table_console()
     if pack.objects:
         names = ("size (mm)", "mass (g)", "hulls", "overlap", "resting poses", "grasps", "repairs")
         table = Table(Column("object", no_wrap=True), *names)
@@ -103,7 +102,7 @@ def info(command: Info) -> int:
                 f"{asset.quality.volume_iou:.3f}",
                 str(len(loaded.annotations.resting_poses)),
                 str(asset.grasp_count),
-                escape("; ".join(asset.repairs)),
+                "; ".join(asset.repairs),
             )
         console.print(table)
     if pack.furniture:
@@ -124,19 +123,17 @@ def info(command: Info) -> int:
 
 def verify(command: Verify) -> int:
     """Run ``verify``; 1 where an asset falls short of what is asked of packs."""
-    from rich.console import Console
-
     from robocas_ms3.assets.cooking import cooking_faults
     from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.cli.terminal import console, say
 
     pack = load_pack(command.pack)
     for loaded in pack.objects.values():
         _ = loaded.annotations
     faults = cooking_faults(pack.root)
-    console = Console(highlight=False, soft_wrap=True, markup=False)
-    console.print(f"{pack.name}: {count_of(len(pack.manifest.assets), 'asset')}, every file is as it should be")
+    say(f"{pack.name}: {count_of(len(pack.manifest.assets), 'asset')}, every file is as it should be")
     for fault in faults:
-        console.print(str(fault), style="red")
+        console().print(printable(str(fault)), style="red", soft_wrap=True)
     if command.physics:
         return max(_verify_physics(pack, command.jobs or os.cpu_count() or 1, command.json), int(bool(faults)))
     return int(bool(faults))
@@ -147,7 +144,8 @@ def sheet(command: Sheet) -> int:
     with mesh_tools():
         from asset_tools.sheet import contact_sheet
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.bars import say, working
+    from robocas_ms3.cli.bars import working
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.errors import AssetError
 
     pack = load_pack(command.pack)
@@ -160,14 +158,6 @@ def sheet(command: Sheet) -> int:
     return 0
 
 
-def _console() -> Console:
-    """Tables in a file or a pipe are not squeezed into the 80 columns of a terminal that isn't there."""
-    from rich.console import Console
-
-    console = Console()
-    return console if console.is_terminal else Console(width=180)
-
-
 def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     from rich.table import Table
 
@@ -175,6 +165,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
         from asset_tools.quality.measure import HEADER, differences, judge, rows
         from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
     from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import table_console
     from robocas_ms3.files import write_json
 
     total = len(pack.manifest.assets)
@@ -186,7 +177,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
             shown.advance()
     objects = {name: measured[name] for name in pack.objects}
     furniture = {name: measured[name] for name in pack.furniture}
-    console = _console()
+    console = table_console()
     for header, cells in ((HEADER, rows(objects)), (FURNITURE_HEADER, furniture_rows(furniture))):
         if cells:
             table = Table(*header)

@@ -11,6 +11,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
+from robocas_ms3.cli.terminal import tell, terminal_of_stderr
+from robocas_ms3.words import printable
+
 EVERY = 60.0  # s between two lines of a log
 
 
@@ -40,7 +43,7 @@ class Log:
         if due:
             self._next, self._text = now + EVERY, text
             after = f"after {span(now - self._begun)}" if now - self._begun >= 1 else ""
-            print(", ".join(filter(None, (text, about, after))), file=sys.stderr, flush=True)
+            tell(", ".join(filter(None, (text, about, after))))
 
 
 class Bar:
@@ -87,9 +90,9 @@ class Bar:
     def note(self, text: str) -> None:
         """Write a line above it."""
         if self._progress:
-            self._progress.console.print(text, soft_wrap=True, highlight=False, markup=False, emoji=False)
+            self._progress.console.print(printable(text), soft_wrap=True)
         else:
-            print(text, file=sys.stderr, flush=True)
+            tell(text)
 
     def stop(self) -> None:
         """End it, with how far it came."""
@@ -146,7 +149,13 @@ def columns() -> tuple[Any, ...]:
                 about = speed(task.completed, task.total or 0, 0, task.elapsed or 0.0)
             return Text(about, style="progress.remaining")
 
-    return TextColumn("{task.description}"), BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn(), Speed()
+    return (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(20),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        Speed(),
+    )
 
 
 @contextmanager
@@ -181,20 +190,3 @@ def _progress(transient: bool) -> Any:
 
     beside = sys.stdout.isatty()  # else what goes into a file or a pipe would be shown here instead
     return Progress(*columns(), console=terminal, transient=transient, redirect_stdout=beside)
-
-
-def terminal_of_stderr() -> Any:
-    """Rich's console of stderr, if that is a terminal that can move its cursor; FORCE_COLOR makes none of a log."""
-    if not sys.stderr.isatty():
-        return None
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    return console if console.is_interactive else None
-
-
-def say(text: str) -> None:
-    """Print a line on stdout."""
-    from rich.console import Console
-
-    Console().print(text, soft_wrap=True, highlight=False, markup=False, emoji=False)

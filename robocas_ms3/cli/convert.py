@@ -130,7 +130,8 @@ def _format(cfg: Convert) -> Format:
 
 
 def _convert(cfg: Convert) -> int:
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.datasets.pictures.stored import Pictures
     from robocas_ms3.processes import Limits
     from robocas_ms3.words import count_of

@@ -21,7 +21,8 @@ class Doctor:
 
 def main(cfg: Doctor) -> int:
     """Run the command."""
-    from robocas_ms3.cli.bars import say, working
+    from robocas_ms3.cli.bars import working
+    from robocas_ms3.cli.terminal import say_lines
     from robocas_ms3.doctor.checks import examine
 
     with working("examining"):
@@ -31,26 +32,26 @@ def main(cfg: Doctor) -> int:
         import json
 
         report = {"ok": not failed, "findings": [asdict(finding) for finding in findings]}
-        say(json.dumps(report, indent=2))
+        say_lines(json.dumps(report, indent=2))
         return 1 if failed else 0
     _print(findings, failed)
     return 1 if failed else 0
 
 
 def _print(findings: list[Finding], failed: int) -> None:
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
-    from robocas_ms3.cli.tables import table_console
+    from robocas_ms3.cli.terminal import table_console
 
-    marks = {"ok": "[green]ok[/]", "limited": "[yellow]limited[/]", "fail": "[bold red]FAIL[/]"}
+    marks = {"ok": Text("ok", "green"), "limited": Text("limited", "yellow"), "fail": Text("FAIL", "bold red")}
     table = Table("", "what")
     table.add_column("found", overflow="fold")
     if any(finding.fix for finding in findings):
         table.add_column("fix", overflow="fold")
     for finding in findings:
         row = (finding.name, finding.found, finding.fix)[: len(table.columns) - 1]
-        table.add_row(marks[finding.status], *map(escape, row))
+        table.add_row(marks[finding.status], *row)
     console = table_console()
     console.print(table)
     limited = sum(finding.status == "limited" for finding in findings)

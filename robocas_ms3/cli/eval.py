@@ -104,8 +104,9 @@ def run(cfg: Eval) -> int:
         if word not in TASKS:
             expected = f"one of {', '.join(TASKS)}; or {', '.join(WORDS)}"
             raise EvaluationError("no such task", where=word, expected=expected, fix=nearest(word, [*TASKS, *WORDS]))
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.eval_results import write_pages
+    from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.evaluation.policies import check_policy, open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.results import read
@@ -153,7 +154,7 @@ def run(cfg: Eval) -> int:
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command with --resume goes on") from None
     result = read(out)
-    say(markdown(result))
+    say_lines(markdown(result))
     broken = result.broken_off()
     fix = f", {broken} broken off by an error (--resume --retry-errors plays them again)" if broken else ""
     there = count_of(len(result.outcomes), "episode")

@@ -9,7 +9,7 @@ from robocas_ms3.words import count_of
 
 def protocols() -> int:
     """List the protocols that are shipped."""
-    from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 
     for name in shipped_protocols():
@@ -24,7 +24,8 @@ def protocols() -> int:
 
 def freeze(plan: Path, out: Path | None) -> int:
     """Make a protocol."""
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.freeze import freeze as make
     from robocas_ms3.evaluation.freeze import read_plan

@@ -14,12 +14,12 @@ from robocas_ms3.words import count_of
 
 def report(folders: list[Path], out: Path | None, protocol: str | None) -> int:
     """Print a result's tables; write them and its page into its folder, those of several into another one."""
-    from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.tables import markdown
 
     result = read(*folders)
-    say(markdown(result))
+    say_lines(markdown(result))
     if out is None and len(folders) > 1:
         say("Pass --out DIR for the page of several folders.")
     else:
@@ -29,7 +29,7 @@ def report(folders: list[Path], out: Path | None, protocol: str | None) -> int:
 
 def merge(folders: list[Path], out: Path | None, protocol: str | None) -> int:
     """Write parts of a result as one."""
-    from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.results import merge as write
 
@@ -46,22 +46,22 @@ def compare(folders: list[Path], protocol: str | None) -> int:
 
     A single result is compared with itself, split by split.
     """
-    from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.terminal import say_lines
     from robocas_ms3.evaluation.comparison import comparison, comparison_of_splits
     from robocas_ms3.evaluation.results import parts_of, read
 
     groups = [[folder] for folder in folders] if len(folders) == 2 else parts_of(folders)
     results = [read(*parts) for parts in groups]
     if len(results) == 1:
-        say(comparison_of_splits(results[0], protocol_of(results[0], protocol)))
+        say_lines(comparison_of_splits(results[0], protocol_of(results[0], protocol)))
     else:
-        say(comparison(results))
+        say_lines(comparison(results))
     return 0
 
 
 def verify(folders: list[Path], protocol: str | None) -> int:
     """See that a result is whole, and of a protocol that is here; 1 where it isn't."""
-    from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.verify import problems
 
@@ -90,7 +90,8 @@ def videos(folder: Path, protocol: str | None, policy: str, count: int) -> int:
     Raises:
         EvaluationError: it is of a policy that is not installed, and was not named again: a file chooses no code.
     """
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.policies import POLICIES, open_policy
     from robocas_ms3.evaluation.results import read
@@ -138,7 +139,7 @@ def protocol_of(result: Result, given: str | None) -> LoadedProtocol:
 
 def write_pages(result: Result, out: Path, given: str | None) -> None:
     """Write the report, and say where it is."""
-    from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.report import write_report
 

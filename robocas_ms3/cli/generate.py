@@ -92,7 +92,8 @@ def run(cfg: Generate) -> int:
 
     name = cfg.config or TASKS[cfg.task].default_config
     loaded = load_task_config(name)  # before seconds go by for what is imported next
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.demos.checks import check_limits
     from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, recordable_config
     from robocas_ms3.demos.generate import generate

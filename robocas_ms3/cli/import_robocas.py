@@ -14,8 +14,6 @@ from robocas_ms3.cli.options import Maybe
 if TYPE_CHECKING:
     from robocas_ms3.datasets.manage.survey import Survey
 
-_FILE_WIDTH = 200  # columns of the table where it goes into a file
-
 
 @dataclass
 class ImportRobocas:
@@ -49,7 +47,8 @@ def main(cfg: ImportRobocas) -> int:
     """Look, tell, import; gives the exit code."""
     import json
 
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.datasets.manage.importing import import_robocas
     from robocas_ms3.datasets.manage.survey import survey
     from robocas_ms3.datasets.writing.output import check_apart
@@ -67,7 +66,7 @@ def main(cfg: ImportRobocas) -> int:
     with bar("episodes read") as shown:
         found = survey(cfg.dataset, rate_hz=cfg.rate, turn_eef=cfg.turn_eef, on_episode=shown.at)
     if cfg.json:
-        say(json.dumps(found.as_json(), indent=2, ensure_ascii=False))
+        say_lines(json.dumps(found.as_json(), indent=2, ensure_ascii=False))
     else:
         _table(found)
     if not found.taken or cfg.out is None:
@@ -90,10 +89,9 @@ def main(cfg: ImportRobocas) -> int:
 
 def _table(found: Survey) -> None:
     """What is wrong, the same of many episodes in one line."""
-    from rich.console import Console
     from rich.table import Table
 
-    from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.terminal import say, table_console
     from robocas_ms3.words import count_of
 
     rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
@@ -108,10 +106,7 @@ def _table(found: Survey) -> None:
             table.add_column(name, overflow="fold", no_wrap=False)
         for (outcome, place, problem), numbers in sorted(rows.items()):
             table.add_row(ranges(numbers) or "all", outcome, place, problem)
-        console = Console(markup=False, highlight=False)
-        if not console.is_terminal:
-            console.width = _FILE_WIDTH
-        console.print(table)
+        table_console().print(table)
     left_out = len(found.as_json()["left_out"])
     say(f"{found.root}: {count_of(found.episodes, 'episode')}, can be taken: {len(found.taken)}, left out: {left_out}")
 

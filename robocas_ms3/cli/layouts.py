@@ -72,7 +72,8 @@ def main(cfg: Layouts) -> int:
 def build(command: Build) -> int:
     """Run ``build``."""
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.config import load_task_config
     from robocas_ms3.strict import check_number
 
@@ -157,7 +158,7 @@ def info(command: Info) -> int:
     from rich.markup import escape
     from rich.table import Table
 
-    from robocas_ms3.cli.tables import table_console
+    from robocas_ms3.cli.terminal import table_console
     from robocas_ms3.documents import load_json
     from robocas_ms3.scenes.bank import ABOUT, banks_folder, count_layouts
 

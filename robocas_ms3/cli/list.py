@@ -19,13 +19,13 @@ class List:
 
 def main(cfg: List) -> int:
     """Run the command."""
-    from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.terminal import say_lines
 
     found = collect()
     if cfg.json:
         import json
 
-        say(json.dumps(found, indent=2, ensure_ascii=False))
+        say_lines(json.dumps(found, indent=2, ensure_ascii=False))
     else:
         _print(found)
     return 0
@@ -93,10 +93,9 @@ def _size(folder: Path) -> int:
 
 
 def _print(found: dict[str, list[dict[str, Any]]]) -> None:
-    from rich.markup import escape
     from rich.table import Table
 
-    from robocas_ms3.cli.tables import table_console
+    from robocas_ms3.cli.terminal import table_console
 
     tables = {
         "tasks": ("name", "env_id", "default_config", "summary"),
@@ -114,8 +113,8 @@ def _print(found: dict[str, list[dict[str, Any]]]) -> None:
             table.add_column(column.replace("_", " "), overflow="fold", no_wrap=name)
         for row in found[kind]:
             values = (row[column] for column in columns)
-            table.add_row(*(escape(", ".join(value) if isinstance(value, list) else str(value)) for value in values))
+            table.add_row(*(", ".join(value) if isinstance(value, list) else str(value) for value in values))
         console.print(table)
     for pack in found["packs"]:
         if pack["error"]:
-            console.print(f"[bold red]damaged:[/] {escape(pack['error'])}", soft_wrap=True)
+            console.print(f"damaged: {pack['error']}", style="red", soft_wrap=True)

@@ -22,10 +22,12 @@ import tyro
 from robocas_ms3 import __version__
 from robocas_ms3.cli.absolute import with_absolute_paths
 from robocas_ms3.cli.interrupts import INTERRUPTED, heed_ctrl_c, leave
+from robocas_ms3.cli.terminal import print_traceback
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.files import FULL
 from robocas_ms3.exits import no_exit
+from robocas_ms3.files import FULL
 from robocas_ms3.paths import is_writable, temporary_cache, variable_of
+from robocas_ms3.words import escape_log_lines, printable
 
 # Each names a module beside this one, with a dataclass called as the command and `main(cfg) -> int`; a dash in its name
 # is an underscore in the module's: import-robocas, import_robocas.py, ImportRobocas.
@@ -70,6 +72,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     Args:
         argv: arguments after the program's name; default: the process's own.
     """
+    sys.excepthook = print_traceback
     heed_ctrl_c()
     leave(run(sys.argv[1:] if argv is None else argv))
 
@@ -88,6 +91,7 @@ def run(argv: Sequence[str]) -> int:
         # ManiSkill's logger (the blank is in its name) remarks on its own installation, and on CPUs without a GPU.
         logging.getLogger("mani_skill ").addFilter(lambda record: record.levelno >= logging.ERROR)
         logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # it says that it looks for fonts
+    escape_log_lines()
     _lend_folders()
     try:
         return _dispatch(arguments)
@@ -197,5 +201,5 @@ def config_type(module: ModuleType, name: str) -> type:
 
 
 def _say(text: str, stream: TextIO, code: int) -> int:
-    stream.write(text + "\n")
+    stream.write(printable(text) + "\n")
     return code

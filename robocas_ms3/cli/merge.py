@@ -33,7 +33,8 @@ class Merge:
 
 def main(cfg: Merge) -> int:
     """Merge, with a progress bar; gives the exit code."""
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.datasets.manage.merging import merge
     from robocas_ms3.words import count_of
 

@@ -71,7 +71,7 @@ def main(cfg: Plan) -> int:
             raise KeyboardInterrupt("the same command with --resume goes on") from None
     if isinstance(cfg.command, Status):
         return show_status(cfg.command)
-    from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.plans.plan import load_plan, shipped_plans
 
     for name in shipped_plans():
@@ -84,8 +84,8 @@ def run(command: Run) -> int:
     """Run ``run``."""
     import os
 
-    from robocas_ms3.cli.bars import say
     from robocas_ms3.cli.plan_progress import PlanProgress
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.demos.checks import check_number
     from robocas_ms3.plans.engines import check_engine, open_engine
     from robocas_ms3.plans.plan import load_plan
@@ -133,13 +133,12 @@ def show_status(command: Status) -> int:
     from rich.markup import escape
     from rich.table import Table
 
-    from robocas_ms3.cli.bars import say
-    from robocas_ms3.cli.tables import table_console
+    from robocas_ms3.cli.terminal import say, say_lines, table_console
     from robocas_ms3.plans.status import status
 
     found = status(command.out)
     if command.json:
-        say(json.dumps(found.as_json(), indent=2))
+        say_lines(json.dumps(found.as_json(), indent=2))
         return 0
     table = Table("part", "episodes", "seeds", "failed", "record, CPU s each", "render, CPU s each", "MB")
     for part in found.parts:

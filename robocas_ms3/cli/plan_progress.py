@@ -11,11 +11,12 @@ from types import TracebackType
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from robocas_ms3.cli.bars import Log, span, terminal_of_stderr
+from robocas_ms3.cli.bars import Log, span
+from robocas_ms3.cli.terminal import tell, terminal_of_stderr
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.status import status
-from robocas_ms3.words import count_of
+from robocas_ms3.words import count_of, printable
 
 _BARS = 12  # parts; of more there is one bar for all
 _LOOK = 5.0  # s between two estimates, which read the folder
@@ -36,7 +37,12 @@ class PlanProgress:
         self._text = self._speed = ""
         self._looked = -_LOOK
         terminal = terminal_of_stderr()
-        columns = TextColumn("{task.description}"), BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn()
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(20),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+        )
         beside = sys.stdout.isatty()  # else what goes into a file or a pipe would be shown here instead
         about = TextColumn("{task.fields[about]}")
         self._shown = Progress(*columns, about, console=terminal, redirect_stdout=beside) if terminal else None
@@ -64,9 +70,9 @@ class PlanProgress:
         """Say what is done now."""
         if self._shown is None:
             self._log.tell(self._text, last=True)  # how far it was when this began
-            print(text, file=sys.stderr, flush=True)
+            tell(text)
         else:
-            self._shown.console.print(text, soft_wrap=True, highlight=False, markup=False, emoji=False)
+            self._shown.console.print(printable(text), soft_wrap=True)
 
     def _draw(self, shown: Progress, counts: Sequence[int]) -> None:
         rows = [(f"{part.name}", part.episodes, count) for part, count in zip(self._plan.parts, counts, strict=True)]

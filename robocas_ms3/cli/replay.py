@@ -43,7 +43,8 @@ def main(cfg: Replay) -> int:
     """Run the command."""
     import numpy as np
 
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.recordings.entries import read_json
 
     trajectory = cfg.trajectory / "trajectory.h5" if cfg.trajectory.is_dir() else cfg.trajectory

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import ipaddress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+from robocas_ms3.cli.options import Several
 
 
 @dataclass
@@ -23,21 +26,30 @@ class ServePolicy:
     """Address to listen on; 0.0.0.0: all of this machine's."""
     port: int = 8000
     """0: any that is free, which is printed."""
+    protocol: Several[Path] = ()
+    """Folders of your own protocols, for policies that read an episode's configuration, such as scripted. Clients may
+    choose among these and the shipped ones."""
 
 
 def main(cfg: ServePolicy) -> int:
     """Run the command; gives the exit code."""
-    from robocas_ms3.cli.bars import say
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.policies import open_policy
+    from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.evaluation.remote.served import ServedFiles
     from robocas_ms3.evaluation.remote.server import PolicyServer
 
     if not 0 <= cfg.port < 2**16:
         raise EvaluationError("no such port", where="--port", expected="0 to 65535", found=cfg.port)
+    if not cfg.host:
+        raise EvaluationError("no address to listen on", where="--host", expected="such as 127.0.0.1 or ::1")
+    packs = [load_protocol(folder).rules.pack for folder in cfg.protocol]
+    files = ServedFiles.of(cfg.protocol, packs)
     if not _is_loopback(cfg.host):
         say(f"{cfg.host} is no loopback address: whoever can reach it can ask this policy")
     with open_policy(cfg.policy) as policy:
-        PolicyServer(policy, cfg.host, cfg.port).run(lambda url: say(f"{cfg.policy} at {url}"))
+        PolicyServer(policy, cfg.host, cfg.port, files).run(lambda url: say(f"{cfg.policy} at {url}"))
     return 0
 
 

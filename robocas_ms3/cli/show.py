@@ -39,10 +39,10 @@ def main(cfg: Show) -> int:
     if cfg.shader.startswith("rt"):
         _require_gpu(cfg.shader)
     import gymnasium as gym
-    from rich.console import Console
 
     import robocas_ms3.tasks  # noqa: F401  (registers the environments)
     from robocas_ms3.benchmark import TASKS
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.files import make_folder, replacing
     from robocas_ms3.tasks.transfer import TransferEnv
 
@@ -70,13 +70,12 @@ def main(cfg: Show) -> int:
     overview = base_env.render_rgb_array()
     assert overview is not None  # there is a render device, and the environment has a camera for it
     pictures["overview"] = overview[0]
-    console = Console(highlight=False, soft_wrap=True, markup=False)
     for name, pixels in pictures.items():
         path = cfg.out / f"{Path(cfg.config).stem}_seed{cfg.seed}_{name}.png"
         with replacing(path) as tmp:
             Image.fromarray(pixels.cpu().numpy()).save(tmp)
-        console.print(f"wrote {path}")
-    console.print(f"instruction: {base_env.get_language_instruction()[0]}")
+        say(f"wrote {path}")
+    say(f"instruction: {base_env.get_language_instruction()[0]}")
     env.close()
     return 0
 

@@ -47,7 +47,8 @@ class Split:
 
 def main(cfg: Split) -> int:
     """Split, with a progress bar; gives the exit code."""
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.datasets.manage.splitting import Share, resplit, write_parts
     from robocas_ms3.words import count_of
 

@@ -30,7 +30,8 @@ def main(cfg: Stats) -> int:
     """Count and draw; gives the exit code."""
     import json
 
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say, say_lines
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER
     from robocas_ms3.datasets.statistics.collect import collect
     from robocas_ms3.datasets.statistics.plots import write_stats
@@ -41,7 +42,7 @@ def main(cfg: Stats) -> int:
     out = cfg.out or (None if cfg.json else default)
     paths = write_stats(stats, out) if out else []
     if cfg.json:
-        say(json.dumps(stats.as_json(), indent=2, ensure_ascii=False))
+        say_lines(json.dumps(stats.as_json(), indent=2, ensure_ascii=False))
         return 0
     pictures = len(paths) - 1
     say(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {count_of(pictures, 'picture')}")

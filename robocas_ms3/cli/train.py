@@ -58,7 +58,8 @@ def main(cfg: Train) -> int:
     """Run the command; gives the exit code."""
     from robocas_ms3.baselines.runs import find_run
     from robocas_ms3.baselines.session import Said, train_run
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
 
     shown = cfg.out or _default_out(cfg)
     out = shown.absolute()

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from robocas_ms3.cli.bars import bar, say
+from robocas_ms3.cli.bars import bar
 from robocas_ms3.cli.options import Maybe
+from robocas_ms3.cli.terminal import say, say_lines
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.words import count_of
 
@@ -72,7 +73,7 @@ def main(cfg: Validate) -> int:
             for line in _lines(replays):
                 say(line)
     if cfg.json:
-        say(json.dumps(content, indent=2, ensure_ascii=False))
+        say_lines(json.dumps(content, indent=2, ensure_ascii=False))
     return 1 if wrong else 0
 
 

@@ -29,7 +29,8 @@ class Video:
 
 def main(cfg: Video) -> int:
     """Write them; gives the exit code."""
-    from robocas_ms3.cli.bars import bar, say
+    from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.datasets.formats import open_source
     from robocas_ms3.datasets.pictures.video import contact_sheet, write_video
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER, episode_folder

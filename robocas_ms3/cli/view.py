@@ -36,14 +36,12 @@ class View:
 
 def main(cfg: View) -> int:
     """Serve until Ctrl-C, or write; gives the exit code."""
-    from rich.console import Console
-
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.viewer.source import open_source
 
-    console = Console(soft_wrap=True, highlight=False, markup=False)
     source = open_source(cfg.path)
     if cfg.static is not None:
-        return _write(cfg, cfg.static, source, console)
+        return _write(cfg, cfg.static, source)
     import signal
     import webbrowser
 
@@ -51,7 +49,7 @@ def main(cfg: View) -> int:
 
     with Viewer(source, cfg.port) as server:
         server.warm_up()
-        console.print(f"{cfg.path} at {server.url} (Ctrl-C ends)")
+        say(f"{cfg.path} at {server.url} (Ctrl-C ends)")
         # a supervisor's stop is as clean as Ctrl-C, which is ignored where a shell started this in the background
         for ending in (signal.SIGTERM, signal.SIGINT):
             signal.signal(ending, signal.default_int_handler)
@@ -60,12 +58,13 @@ def main(cfg: View) -> int:
         try:
             server.serve_forever(poll_interval=0.1)
         except KeyboardInterrupt:
-            console.print("ended")
+            say("ended")
     return 0
 
 
-def _write(cfg: View, out: Path, source, console) -> int:
+def _write(cfg: View, out: Path, source) -> int:
     from robocas_ms3.cli.bars import bar
+    from robocas_ms3.cli.terminal import say
     from robocas_ms3.outputs import check_overwrite, claim_output
     from robocas_ms3.viewer.export import export
 
@@ -82,6 +81,6 @@ def _write(cfg: View, out: Path, source, console) -> int:
             on_episode=shown.at,
         )
     for number, wrong in damaged.items():
-        console.print(f"episode {number} is damaged: {wrong}")
-    console.print(f"{count_of(count, 'episode')}: {out / 'index.html'}")
+        say(f"episode {number} is damaged: {wrong}")
+    say(f"{count_of(count, 'episode')}: {out / 'index.html'}")
     return 0

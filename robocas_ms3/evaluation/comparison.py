@@ -11,7 +11,7 @@ from robocas_ms3.evaluation.power import too_few
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Comparison, compare, holm
-from robocas_ms3.words import count_of
+from robocas_ms3.words import count_of, in_markdown
 
 _ALPHA = 0.05
 ALL = "all"
@@ -57,7 +57,7 @@ def comparison(results: Sequence[Result]) -> str:
     measured = first.run["protocol"] + (" with upstream's weld" if first.run["weld"] else "")
     said = [f"{name}: {one.run['policy']['name']} ({one.folder})" for name, one in zip(names, results, strict=True)]
     both = "both" if len(results) == 2 else "all"
-    head = f"{', '.join(said)}; {count_of(len(shared), 'episode')} of {measured} that {both} have."
+    head = in_markdown(f"{', '.join(said)}; {count_of(len(shared), 'episode')} of {measured} that {both} have.")
     differing = [key for key in ("backend", "versions") if any(one.run[key] != first.run[key] for one in results)]
     if differing:
         head += f" **Measured with different {' and '.join(differing)}.**"
@@ -101,7 +101,7 @@ def comparison_of_splits(result: Result, protocol: LoadedProtocol) -> str:
         fix = "Name another result to compare it with."
         raise EvaluationError("no two splits of this result have the same scenes", where=result.folder, fix=fix)
     head = f"{result.run['policy']['name']} ({result.folder}), splits of {result.run['protocol']} over the same scenes."
-    return _table(head, "task", rows)
+    return _table(in_markdown(head), "task", rows)
 
 
 def _table(head: str, where: str, rows: list[Row]) -> str:
@@ -123,11 +123,12 @@ def _table(head: str, where: str, rows: list[Row]) -> str:
         found, (p, claims) = row.found, adjusted[number]
         change = f"{100 * found.difference:+.1f} ({100 * found.low:+.1f} to {100 * found.high:+.1f})"
         lines.append(
-            f"| {row.where} | {', '.join(row.pair)} | {found.n} | {found.successes_b} | {found.successes_a} | "
+            f"| {in_markdown(row.where)} | {in_markdown(', '.join(row.pair))} | "
+            f"{found.n} | {found.successes_b} | {found.successes_a} | "
             f"{found.only_b} | {found.only_a} | {change} | {found.p_value:.3g} | {p:.3g} |"
         )
         warning = None if p <= _ALPHA else too_few(found, alpha=_ALPHA / claims)
         if warning:
             pair = "" if len({row.pair for row in rows}) == 1 else f", {', '.join(row.pair)}"
-            warnings.append(f"- {row.where}{pair}: {warning}")
+            warnings.append(f"- {in_markdown(f'{row.where}{pair}')}: {warning}")
     return "\n".join([*lines, *(["", *warnings] if warnings else [])]) + "\n"

@@ -12,6 +12,7 @@ from robocas_ms3.benchmark import TASKS
 from robocas_ms3.benchmark.spec import STAGES as STAGES_ON_THE_WAY
 from robocas_ms3.evaluation.orders import order_of
 from robocas_ms3.evaluation.protocol import Episode
+from robocas_ms3.words import printable
 
 if TYPE_CHECKING:
     from robocas_ms3.evaluation.rollout import Rollout  # which imports the tasks; results are read without
@@ -92,7 +93,7 @@ class Outcome:
             steps=played.steps,
             seconds=round(played.seconds, 4),
             failure_stage=failure_stage(flags, played.error, TASKS[episode.task].stages),
-            error=played.error,
+            error=printable(played.error),  # a text of whoever wrote the policy
             flags=flags,
             flag_seconds=played.flag_seconds,
             measures=played.measures,

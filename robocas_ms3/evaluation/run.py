@@ -155,7 +155,7 @@ def about(protocol: LoadedProtocol, policy: Policy, name: str, settings: Setting
     return {
         "protocol": protocol.rules.name,
         "protocol_hash": protocol.hash,
-        "policy": {"name": name, **describe(policy)},
+        "policy": {"name": name} | describe(policy) | {"name": name},  # a description may not rename it
         "weld": settings.weld,
         "backend": choose_backend(settings.backend),
         "versions": results.versions(),

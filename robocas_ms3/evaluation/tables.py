@@ -8,7 +8,7 @@ from robocas_ms3.evaluation.orders import orders
 from robocas_ms3.evaluation.outcomes import STAGES, Outcome
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Share, success_by
-from robocas_ms3.words import count_of
+from robocas_ms3.words import count_of, in_markdown
 
 P_VIS_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 WELDED = (
@@ -18,7 +18,7 @@ WELDED = (
 
 
 def title(result: Result) -> str:
-    """What a result is of, in a line."""
+    """Return what a result is of, in a line of plain text."""
     how = " with upstream's weld" if result.run["weld"] else ""
     return f"{result.run['policy']['name']} by {result.run['protocol']}{how}"
 
@@ -27,11 +27,12 @@ def markdown(result: Result) -> str:
     """The tables of a result."""
     run, broken = result.run, result.broken_off()
     lines = [
-        f"# {title(result)}",
+        f"# {in_markdown(title(result))}",
         "",
         *([f"**{WELDED}**", ""] if run["weld"] else []),
-        f"Protocol hash `{run['protocol_hash'][:16]}`, {count_of(len(result.outcomes), 'episode')}, {run['backend']}; "
-        + ", ".join(f"{name} {number}" for name, number in run["versions"].items())
+        f"Protocol hash {in_markdown(run['protocol_hash'][:16])}, {count_of(len(result.outcomes), 'episode')}, "
+        f"{in_markdown(run['backend'])}; "
+        + in_markdown(", ".join(f"{name} {number}" for name, number in run["versions"].items()))
         + ". Intervals are Clopper-Pearson's, 95 %. RA, PA: any object reached, lifted; RR: the target reached; "
         "CO: what hid it cleared.",
         *(["", f"**Broken off by an error: {count_of(broken, 'episode')}, counted as failed.**"] if broken else []),
@@ -41,7 +42,7 @@ def markdown(result: Result) -> str:
     ]
     for config, outcomes in result.by("config").items():
         cells = [
-            config,
+            in_markdown(config),
             str(len(outcomes)),
             percent(result.rate("success", outcomes)),
             percent(result.rate("success_at_end", outcomes), interval=False),
@@ -56,7 +57,7 @@ def markdown(result: Result) -> str:
     for config, outcomes in result.by("config").items():
         found = Counter(one.failure_stage for one in outcomes if one.failure_stage)
         said = ", ".join(f"{stage} {count}" for stage, count in found.most_common())
-        lines.append(f"| {config} | {said or 'none failed'} |")
+        lines.append(f"| {in_markdown(config)} | {in_markdown(said) or 'none failed'} |")
     hidden = [one for one in first_splits(result) if one.p_vis is not None]
     if hidden:
         lines += ["", "## By what is seen of the target (p_vis)", "", "| p_vis | n | success |", "|---|---|---|"]
@@ -82,13 +83,14 @@ def _splits(result: Result) -> list[str]:
     splits = result.by("split")
     if len(splits) < 2:
         return []
-    lines = ["", "## By split", "", f"| task | {' | '.join(splits)} |", "|---|" + "---|" * len(splits)]
+    heads = " | ".join(map(in_markdown, splits))
+    lines = ["", "## By split", "", f"| task | {heads} |", "|---|" + "---|" * len(splits)]
     for task in result.by("task"):
         cells = []
         for outcomes in splits.values():
             of_task = [one for one in outcomes if one.task == task]
             cells.append(f"{percent(result.rate('success', of_task))} of {len(of_task)}" if of_task else "")
-        lines.append(f"| {task} | {' | '.join(cells)} |")
+        lines.append(f"| {in_markdown(task)} | {' | '.join(cells)} |")
     return lines
 
 
@@ -104,7 +106,7 @@ def _retrieval(result: Result) -> list[str]:
     for config, one in found.items():
         if one is not None:
             shares = f"{one.score:.2f} | {one.moved:.1f} | {100 * one.needed:.0f} %"
-            lines.append(f"| {config} | {one.held} | {shares} | {one.left:.1f} |")
+            lines.append(f"| {in_markdown(config)} | {one.held} | {shares} | {one.left:.1f} |")
     return lines
 
 

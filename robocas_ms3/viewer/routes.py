@@ -29,6 +29,7 @@ from robocas_ms3.viewer import pictures
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import without_nan
 from robocas_ms3.viewer.parts import CAMERA_NAME, Picture
+from robocas_ms3.words import printable
 
 PAGE_FILES = {
     "index.html": "text/html; charset=utf-8",
@@ -44,6 +45,9 @@ _INDEX = re.compile(r"/data/index\.js")
 _EPISODE = re.compile(rf"/data/episode_{_NUMBER}\.js")
 _PICTURE = re.compile(rf"/pictures/{_NUMBER}/({CAMERA_NAME.pattern})/(rgb|depth)/{_NUMBER}\.jpg")
 _THUMBNAIL = re.compile(rf"/thumbnails/{_NUMBER}\.jpg")
+_CONTROL = re.compile(  # of `words.printable`, but for surrogates, of which JSON makes emoji
+    r"(?<!\\)((?:\\\\)*)\\(u(?:00[01].|007f|00[89].|061c|200[ef]|202[89a-e]|206[6-9]))"
+)
 _SCRIPT = "text/javascript; charset=utf-8"
 
 
@@ -127,7 +131,12 @@ def script(name: str, content: Any) -> bytes:
         text = write(content)
     except ValueError:
         text = write(without_nan(content))
-    return f'robocas.put("{name}",{text});\n'.encode()
+    return f'robocas.put("{name}",{_shown(text)});\n'.encode()
+
+
+def _shown(json_text: str) -> str:
+    r"""JSON of ASCII whose control characters a page shows as escapes: ``\u202e`` becomes ``\\u202e``."""
+    return _CONTROL.sub(r"\1\\\\\2", json_text)
 
 
 def page_file(name: str) -> bytes:
@@ -140,4 +149,4 @@ def _picture(picture: Picture) -> Response:
 
 
 def _not_found(why: str) -> Response:
-    return Response(404, "text/plain; charset=utf-8", (why + "\n").encode())
+    return Response(404, "text/plain; charset=utf-8", (printable(why) + "\n").encode())

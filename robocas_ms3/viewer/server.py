@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.routes import Response, Routes
+from robocas_ms3.words import printable
 
 HOST = "127.0.0.1"
 _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -102,7 +103,7 @@ class _Handler(BaseHTTPRequestHandler):
             try:
                 response = self.server.routes.respond(urlsplit(self.path).path)
             except Exception as error:  # a broken episode must not end the connection of all others
-                text = f"{type(error).__name__}: {error}\n"
+                text = printable(f"{type(error).__name__}: {error}") + "\n"
                 response = Response(500, "text/plain; charset=utf-8", text.encode())
         self.send_response(response.status)
         self.send_header("Content-Type", response.kind)

@@ -4,10 +4,10 @@ import io
 
 import pytest
 from plan_stages import PLAN
-from rich.console import Console
 
 from robocas_ms3.cli import bars, plan_progress
 from robocas_ms3.cli.plan_progress import PlanProgress
+from robocas_ms3.cli.terminal import console
 
 
 @pytest.fixture
@@ -16,8 +16,8 @@ def shown(monkeypatch, tmp_path):
 
     def show(terminal):
         file = io.StringIO()
-        console = Console(file=file, force_terminal=True, width=120) if terminal else None
-        monkeypatch.setattr(plan_progress, "terminal_of_stderr", lambda: console)
+        shown = console(file=file, force_terminal=True, width=120) if terminal else None
+        monkeypatch.setattr(plan_progress, "terminal_of_stderr", lambda: shown)
         monkeypatch.setattr(plan_progress, "_LOOK", 0.0)
         monkeypatch.setattr(bars, "EVERY", 0.0)
         found = type("Found", (), {"seconds_left": 5400.0, "episodes_an_hour": 120.0})

@@ -20,6 +20,7 @@ from robocas_ms3.baselines.lerobot.policy import LeRobotPolicy
 from robocas_ms3.datasets.lerobot.schema import checksum
 from robocas_ms3.errors import EvaluationError, RobocasError
 from robocas_ms3.evaluation.remote.server import PolicyServer
+from robocas_ms3.words import printable
 
 CHECKPOINT = "train/checkpoints/last/pretrained_model"
 INFO = "dataset/meta/info.json"
@@ -97,9 +98,9 @@ def main(words: Sequence[str] | None = None) -> int:
         checkpoint = cfg.run if alone else cfg.run / CHECKPOINT
         rate_hz = cfg.rate if cfg.rate is not None else rate_of(cfg.run / INFO)
         policy = open_checkpoint(checkpoint, rate_hz, cfg.device, cfg.play)
-        PolicyServer(policy, cfg.host, cfg.port).run(lambda url: print(f"{checkpoint} at {url}", flush=True))
+        PolicyServer(policy, cfg.host, cfg.port).run(lambda url: print(printable(f"{checkpoint} at {url}"), flush=True))
     except RobocasError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(printable(f"error: {error}"), file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130

@@ -10,6 +10,7 @@ from robocas_ms3.evaluation.report.page import page
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.tables import markdown
 from robocas_ms3.files import make_folder, replacing
+from robocas_ms3.words import printable
 
 MARKDOWN, PAGE, PARQUET = "report.md", "report.html", "episodes.parquet"
 
@@ -30,7 +31,7 @@ def write_report(result: Result, folder: Path, protocol: LoadedProtocol | None =
     for name, text in ((MARKDOWN, markdown(result)), (PAGE, page(result, folder, protocol))):
         written.append(folder / name)
         with replacing(folder / name) as tmp:
-            tmp.write_text(text, encoding="utf-8")
+            tmp.write_text(printable(text, lines=True), encoding="utf-8")
     if has_parquet():
         written.append(folder / PARQUET)
         with replacing(folder / PARQUET) as tmp:

@@ -246,7 +246,7 @@ def _care(result: Result) -> str:
 
 
 def _row(said: str, found: Share, kind: str) -> str:
-    return f'<div class="row"><span>{said}</span>{bar(found, kind)}<b>{100 * found.rate:.0f} %</b></div>\n'
+    return f'<div class="row"><span>{escape(said)}</span>{bar(found, kind)}<b>{100 * found.rate:.0f} %</b></div>\n'
 
 
 def _with_all(groups: dict[str, list[Outcome]]) -> list[tuple[str, list[Outcome]]]:

@@ -1,0 +1,77 @@
+"""Text on the terminal: what comes from data is shown as it is, and never moves the cursor or changes colours."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Iterable
+from functools import lru_cache
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from robocas_ms3.words import printable
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_PIPED_WIDTH = 200  # of a terminal's 80 columns names would be broken, and no search would find them
+
+
+def console(**options: Any) -> Console:
+    """Return a console that shows control characters as escapes and takes no text for markup.
+
+    Args:
+        options: those of rich's console.
+    """
+    return _printable_console()(**{"markup": False, "emoji": False, "highlight": False, **options})
+
+
+def table_console() -> Console:
+    """Return a console as wide as the terminal; into a pipe or a file as wide as our tables need."""
+    made = console()
+    return made if made.is_terminal else console(width=_PIPED_WIDTH)
+
+
+def terminal_of_stderr() -> Console | None:
+    """Return a console of stderr if that is a terminal that can move its cursor; FORCE_COLOR makes none of a log."""
+    if not sys.stderr.isatty():
+        return None
+    made = console(stderr=True)
+    return made if made.is_interactive else None
+
+
+def say(text: str) -> None:
+    """Print one line on stdout."""
+    say_lines(printable(text))
+
+
+def say_lines(text: str) -> None:
+    """Print lines on stdout. Data in them must not bring its own line breaks."""
+    console().print(text, soft_wrap=True)
+
+
+def tell(text: str) -> None:
+    """Print one line on stderr."""
+    print(printable(text), file=sys.stderr, flush=True)
+
+
+def print_traceback(kind: type[BaseException], error: BaseException, at: TracebackType | None) -> None:
+    """Print a traceback on stderr; a `sys.excepthook`."""
+    sys.stderr.write(printable("".join(traceback.format_exception(kind, error, at)), lines=True))
+
+
+@lru_cache(maxsize=1)
+def _printable_console() -> type[Console]:
+    from rich.console import Console  # 0.1 s, for which `robocas --version` need not wait
+    from rich.segment import Segment
+    from rich.text import Text
+
+    class PrintableConsole(Console):
+        def render_str(self, text: str, **options: Any) -> Text:
+            return super().render_str(printable(text, lines=True), **options)
+
+        def render(self, *args: Any, **options: Any) -> Iterable[Segment]:
+            for one in super().render(*args, **options):  # of a `Text` that was made elsewhere
+                yield one if one.control else Segment(printable(one.text, lines=True), one.style)
+
+    return PrintableConsole
