@@ -31,7 +31,7 @@ class Board:
         # TensorBoard reads them in the order of their names.
         self._path = folder / f"events.out.tfevents.{int(time.time()):010d}.{len(list(folder.iterdir())):04d}"
         with naming(self._path):
-            self._records: Any = RecordWriter(self._path.open("wb"))
+            self._records: Any = RecordWriter(self._path.open("xb"))
         self._write(file_version="brain.Event:2")
         if first:
             log = self._events.SessionLog

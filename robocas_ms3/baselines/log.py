@@ -6,12 +6,13 @@ import csv
 import math
 import shutil
 from collections.abc import Mapping
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
 from robocas_ms3.baselines.board import Board
 from robocas_ms3.baselines.runs import BOARD, METRICS
-from robocas_ms3.files import naming, replacing
+from robocas_ms3.files import naming, open_for_append, replacing
 
 _FIRST = ("step", "split", "epoch", "seconds", "learning_rate")
 
@@ -53,7 +54,7 @@ class MetricsLog:
         new = not self._columns
         if new:
             self._columns = [*_FIRST, *metrics]
-        with naming(self._path), self._path.open("a", newline="", encoding="utf-8") as file:
+        with naming(self._path), TextIOWrapper(open_for_append(self._path), "utf-8", newline="") as file:
             lines = csv.DictWriter(file, self._columns, extrasaction="ignore", lineterminator="\n")
             if new:
                 lines.writeheader()

@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Any, Literal
 
@@ -102,7 +101,7 @@ def read_run(folder: Path) -> RunRecord:
 
 def write_run(folder: Path, record: RunRecord) -> None:
     """Write the record of a run."""
-    write_json(folder / RUN, json.loads(record.model_dump_json()), sync=True)
+    write_json(folder / RUN, record.model_dump(mode="json"), sync=True)
 
 
 def hash_of(data: Path) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections import Counter
@@ -19,7 +18,7 @@ from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings, header
 from robocas_ms3.documents import DAMAGED, load_array, load_json
 from robocas_ms3.errors import PlanError
-from robocas_ms3.files import flush_to_disk, make_folder, replacing, write_json
+from robocas_ms3.files import flush_to_disk, json_text, make_folder, replacing, write_json
 from robocas_ms3.outputs import sweep
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.sides import rule_of, sides_of
@@ -213,7 +212,7 @@ def _join_episodes(plan: Plan, out: Path, tasks: Tasks) -> None:
 def _say_source(path: Path, source: dict[str, Any]) -> None:
     """Say in an episode's ``scene.json`` where its recording is in the end."""
     scene = load_json(path)
-    text = json.dumps({**scene, "source": {**scene["source"], **source}}, indent=1, ensure_ascii=False)
+    text = json_text({**scene, "source": {**scene["source"], **source}}, path, indent=1)
     with replacing(path, sync=True) as tmp:  # nobody else makes it again
         tmp.write_text(text + "\n", encoding="utf-8")
 

@@ -35,7 +35,9 @@ from robocas_ms3.baselines.lerobot.observations import (
 )
 from robocas_ms3.datasets.lerobot.schema import FEATURES, INDICES, INFO_FILE, STATS_FILE, TASKS_FILE
 from robocas_ms3.errors import DatasetError, RobocasError
+from robocas_ms3.files import replacing_folder, write_json
 from robocas_ms3.outputs import check_absent
+from robocas_ms3.words import printable
 
 Embed = Callable[[Sequence[str]], NDArray[np.float32]]
 _WIDTHS = {feature.key: feature.width for feature in FEATURES}
@@ -56,23 +58,21 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
     """
     check_absent(out)
     info = _info(source)
-    part = out.with_name(f".{out.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    shutil.copytree(source, part, ignore=_ignored, copy_function=_link)
-    vectors = None if embed is None else scaled(embed(_texts(source)))
-    kept: dict[str, list[NDArray]] = {}
-    for path in sorted((source / "data").rglob("*.parquet")):
-        columns, indices = _columns(path, vectors)
-        table = pa.table({**{key: _rows(values) for key, values in columns.items()}, **indices})
-        _write(table, part / path.relative_to(source))
-        for key, values in columns.items():
-            kept.setdefault(key, []).append(values)
-    for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
-        table = pq.read_table(path)  # LeRobot reads no statistics of episodes, and these are of other columns
-        _write(table.select([name for name in table.column_names if not name.startswith("stats/")]),
-               part / path.relative_to(source))  # fmt: skip
-    _write_meta(source, part, info, {key: np.concatenate(values) for key, values in kept.items()})
-    part.rename(out)
+    with replacing_folder(out) as part:
+        shutil.copytree(source, part, ignore=_ignored, copy_function=_link, dirs_exist_ok=True)
+        vectors = None if embed is None else scaled(embed(_texts(source)))
+        kept: dict[str, list[NDArray]] = {}
+        for path in sorted((source / "data").rglob("*.parquet")):
+            columns, indices = _columns(path, vectors)
+            table = pa.table({**{key: _rows(values) for key, values in columns.items()}, **indices})
+            _write(table, part / path.relative_to(source))
+            for key, values in columns.items():
+                kept.setdefault(key, []).append(values)
+        for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
+            table = pq.read_table(path)  # LeRobot reads no statistics of episodes, and these are of other columns
+            names = [name for name in table.column_names if not name.startswith("stats/")]
+            _write(table.select(names), part / path.relative_to(source))
+        _write_meta(source, part, info, {key: np.concatenate(values) for key, values in kept.items()})
 
 
 def _info(source: Path) -> dict[str, Any]:
@@ -135,8 +135,8 @@ def _write_meta(source: Path, part: Path, info: dict[str, Any], columns: dict[st
     stats = {key: said for key, said in stats.items() if key in features} | {
         key: _stats(values.astype(np.float64)) for key, values in columns.items()
     }
-    (part / INFO_FILE).write_text(json.dumps({**info, "features": features}, indent=2), encoding="utf-8")
-    (part / STATS_FILE).write_text(json.dumps(stats, indent=2), encoding="utf-8")
+    write_json(part / INFO_FILE, {**info, "features": features})
+    write_json(part / STATS_FILE, stats)
 
 
 def _stats(values: NDArray[np.float64]) -> dict[str, list]:
@@ -179,7 +179,7 @@ def main(words: Sequence[str] | None = None) -> int:
             embed = TextEmbedder()
         prepare(cfg.dataset, cfg.out, embed)
     except RobocasError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(printable(f"error: {error}"), file=sys.stderr)
         return 1
     return 0
 

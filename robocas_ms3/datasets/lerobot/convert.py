@@ -21,7 +21,7 @@ from robocas_ms3.datasets.writing.output import check_overwrite
 from robocas_ms3.datasets.writing.players import Request, open_env
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.errors import DatasetError, IncompleteError
-from robocas_ms3.files import flush_to_disk, make_folder, naming, write_json
+from robocas_ms3.files import flush_to_disk, make_folder, naming, remove, write_json
 from robocas_ms3.outputs import (
     check_there,
     claim_output,
@@ -186,6 +186,6 @@ def _join(out: Path, plan: dict[str, Any], fps: int, limits: Limits, failed: Inc
 def _sweep(out: Path) -> None:
     """Remove what a killed conversion left half written or half joined."""
     for name in (_JOINED, *_FOLDERS):
-        if (out / name).is_dir():
-            shutil.rmtree(out / name)
+        if os.path.lexists(out / name):
+            remove(out / name)
     sweep(out / PARTS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Generator
 from contextlib import ExitStack, closing
@@ -29,7 +28,7 @@ from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
 from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import replacing_folder
+from robocas_ms3.files import json_text, replacing_folder
 from robocas_ms3.processes import Limits
 
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
@@ -152,7 +151,8 @@ def stage_episode(job: StageJob, player: Player, index: int, number: int) -> Wri
             "levels": {name: levels.counts.tolist() for name, levels in videos.levels.items()},
             "sizes": _sizes(folder),
         }
-        (folder / EPISODE_FILE).write_text(json.dumps(about, ensure_ascii=False), encoding="utf-8")
+        text = json_text(about, f"episode {number}", error=DatasetError)
+        (folder / EPISODE_FILE).write_text(text, encoding="utf-8")
         size = sum(file.stat().st_size for file in folder.iterdir())
     timing.write += time.perf_counter() - begun  # with the folder's renaming
     timing.total += time.perf_counter() - started

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +26,7 @@ from robocas_ms3.datasets.writing.output import Placer, begun_output
 from robocas_ms3.datasets.writing.plan import dataset_settings
 from robocas_ms3.datasets.writing.writer import write_cameras
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import replacing_folder, write_json
+from robocas_ms3.files import json_text, replacing_folder, write_json
 from robocas_ms3.words import count_of
 
 Embed = Callable[[list[str]], NDArray[np.float32]]
@@ -160,7 +159,7 @@ def _write(folder: Path, episode: Episode, taken: EpisodeImport, surveyed: Surve
     write_cameras(folder, cameras)
     arrays = {key: taken.stored.arrays[key] for key in SPECS if key in taken.stored.arrays}
     np.savez(folder / schema.EPISODE_FILE, **arrays)
-    text = json.dumps(_scene(episode, taken, surveyed), indent=1, ensure_ascii=False)
+    text = json_text(_scene(episode, taken, surveyed), episode.folder, indent=1, error=DatasetError)
     (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
 
 

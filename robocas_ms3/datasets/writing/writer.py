@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections import deque
 from collections.abc import Callable
@@ -22,7 +21,8 @@ from robocas_ms3.datasets.sources.arrays import with_embeddings
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame
 from robocas_ms3.datasets.writing.players import Player
 from robocas_ms3.datasets.writing.timing import Timing
-from robocas_ms3.files import replacing_folder
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.files import json_text, replacing_folder
 
 ENCODERS = 2  # threads; ISA-L and OpenCV work outside Python's lock
 _MAX_WAITING = 24  # pictures, which bounds memory
@@ -89,7 +89,7 @@ def write_episode(
             write_cameras(folder, {name: cameras[name] for name in pictures.cameras})
             arrays = with_embeddings(played.arrays, embed) if embed else played.arrays
             np.savez(folder / schema.EPISODE_FILE, **arrays)
-            text = json.dumps(played.scene(), indent=1, ensure_ascii=False)
+            text = json_text(played.scene(), f"episode {source}", indent=1, error=DatasetError)
             (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
             size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
         renaming = time.perf_counter()
