@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from pydantic import AfterValidator
+
 from robocas_ms3.errors import RobocasError
 
 LONGEST = 200
 """Bytes; file systems allow 255, of which temporary files add some."""
+
+
+_EXPECTED = f"1 to {LONGEST} printable characters without / and \\, no leading dot"
 
 
 def is_name(name: object) -> bool:
@@ -28,7 +35,16 @@ def check_name(name: object, error: type[RobocasError], *, where: object, fix: s
         RobocasError: ``error``: the name can't be used in a path.
     """
     if not is_name(name):
-        expected = f"1 to {LONGEST} printable characters without / and \\, no leading dot"
         found = repr(name) if len(repr(name)) <= 80 else f"{repr(name)[:77]}..."
-        raise error("this name can't be used for a file", where=where, expected=expected, found=found, fix=fix)
+        raise error("this name can't be used for a file", where=where, expected=_EXPECTED, found=found, fix=fix)
     return str(name)
+
+
+def _checked(name: str) -> str:
+    if not is_name(name):
+        raise ValueError(f"not a name for a file: expected {_EXPECTED}")
+    return name
+
+
+FileName = Annotated[str, AfterValidator(_checked)]
+"""A field of a declared form that becomes a part of a path."""

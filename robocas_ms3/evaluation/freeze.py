@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -17,8 +18,19 @@ from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config import TaskConfig, load_task_config, shipped_configs
 from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import EvaluationError, LayoutError
-from robocas_ms3.evaluation.protocol import CONFIGS, EPISODES, LAYOUTS, NO_RULES, RULES, TRAIN, Episode, Protocol
+from robocas_ms3.evaluation.protocol import (
+    CONFIG_NAME,
+    CONFIGS,
+    EPISODES,
+    LAYOUTS,
+    NO_RULES,
+    RULES,
+    TRAIN,
+    Episode,
+    Protocol,
+)
 from robocas_ms3.files import make_folder, replacing, replacing_folder
+from robocas_ms3.names import LONGEST
 from robocas_ms3.robots.table import DEFAULT
 from robocas_ms3.scenes.frozen import write_frozen
 from robocas_ms3.scenes.layout import Layout
@@ -147,6 +159,10 @@ def _configs(parts: Sequence[Scene]) -> dict[str, TaskConfig]:
     found: dict[str, TaskConfig] = {}
     for part in parts:
         config = part.changed()
+        if not re.fullmatch(CONFIG_NAME, part.file) or len(part.file) > LONGEST:
+            expected, fix = f"letters, digits, _ and -, at most {LONGEST}", "Give it a `name`, and a plain `split`."
+            what = "this name can't be that of a configuration"
+            raise EvaluationError(what, where=part.config, expected=expected, found=repr(part.file)[:80], fix=fix)
         if found.setdefault(part.file, config) != config:
             raise EvaluationError("two configurations of one name", where=part.file, fix="Give one of them a `name`.")
     return found

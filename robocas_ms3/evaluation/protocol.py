@@ -27,19 +27,21 @@ from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.names import LONGEST, FileName
 from robocas_ms3.paths import protocols_dir
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
 from robocas_ms3.strict import StrictModel, nearest, parse, parse_json
 
 NO_RULES = "no rules of a protocol"
 DEFAULT_HZ = 20  # where neither protocol nor policy says
+CONFIG_NAME = r"^[A-Za-z0-9_-]+$"
 RULES, EPISODES, CONFIGS, LAYOUTS, TRAIN = "protocol.yaml", "episodes.jsonl", "configs", "layouts", "train"
 
 
 class Protocol(StrictModel):
     """Rules that all episodes of a protocol have in common."""
 
-    name: str
+    name: FileName = Field(description="its results are written below a folder of this name")
     description: str = Field(description="what a score by it says")
     rate_hz: Annotated[int, Field(ge=1, le=100)] | None = Field(
         default=None, description="actions a second; null: what the policy wants, else 20"
@@ -124,7 +126,9 @@ class Episode(StrictModel):
 
     episode: Annotated[int, Field(ge=0)] = Field(description="its number, from 0 on")
     task: str
-    config: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] = Field(description="name of a file in configs/")
+    config: Annotated[str, Field(pattern=CONFIG_NAME, max_length=LONGEST)] = Field(
+        description="name of a file in configs/"
+    )
     seed: Annotated[int, Field(ge=0)]
     split: str = Field(default="test", description="what it belongs to, such as a suite's")
     instruction: str = Field(description="what the policy is told")

@@ -127,7 +127,7 @@ def load_plan(plan: str | Path) -> Plan:
                 update={
                     "config": name if shipped else loaded_config.model_dump(mode="json"),
                     "pack": pack,
-                    "name": part.name or re.sub(r"[^\w-]+", "-", f"{number:02d}-{stem}"),
+                    "name": part.name or re.sub(r"[^\w-]+", "-", f"{number:02d}-{stem}")[:60],
                 }
             )
         )

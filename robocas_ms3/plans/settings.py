@@ -24,7 +24,9 @@ class PartConfig(StrictModel):
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(description="successful ones")
     seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)] = Field(default=0, description="the first; others follow")
     split: Side | None = Field(default=None, description="side of all of its episodes; default: by the plan's rule")
-    name: Annotated[str, Field(pattern=r"^[\w-]+$")] | None = Field(default=None, description="of its folders")
+    name: Annotated[str, Field(pattern=r"^[\w-]+$", max_length=60)] | None = Field(
+        default=None, description="of its folders"
+    )
 
 
 class RecordingConfig(StrictModel):

@@ -137,3 +137,15 @@ def test_plans_that_can_not_be_followed(tmp_path, changed, said):
 def test_a_name_is_no_path():
     with pytest.raises(ValueError, match="name"):
         Plan.model_validate({**PLAN, "train": [{"config": "pick_table_scattered", "name": "../x"}]})
+
+
+@pytest.mark.parametrize(
+    ("part", "rules"),
+    [({"split": "../../evil"}, {}), ({"split": "x" * 300}, {}), ({"split": ""}, {"name": "../../evil"})],
+)
+def test_names_that_lead_elsewhere_are_refused_before_anything_is_written(tmp_path, part, rules):
+    parts = [{**PLAN["parts"][0], **part}]
+    plan = Plan.model_validate({"rules": PLAN["rules"] | rules, "parts": parts})
+    with pytest.raises(EvaluationError):
+        list(freeze(plan, tmp_path / "inside" / "out"))
+    assert not list(tmp_path.rglob("*"))

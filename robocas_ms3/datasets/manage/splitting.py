@@ -169,7 +169,7 @@ def parts_by_value(part: Part, by: By, share: Share | None, out: Path) -> dict[P
 
 def folder_names(values: Iterable[str]) -> dict[str, str]:
     """Names of folders for values, whatever a dataset says; no two have the same."""
-    plain = {value: re.sub(r"[^\w.-]+", "_", value).strip(".") or "_" for value in values}
+    plain = {value: re.sub(r"[^\w.-]+", "_", value).strip(".")[:40] or "_" for value in values}
     shared = Counter(plain.values())
     return {
         value: name if shared[name] == 1 else f"{name}-{hashlib.sha256(value.encode()).hexdigest()[:8]}"
