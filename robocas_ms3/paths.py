@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import logging
 import os
+import pwd
 import tempfile
+from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
 import platformdirs
+
+from robocas_ms3.errors import RobocasError
 
 PACKAGE_DIR = Path(__file__).resolve().parent
 CACHE, DATA = "ROBOCAS_CACHE", "ROBOCAS_DATA"  # environment variables that choose folders
@@ -16,17 +21,50 @@ _log = logging.getLogger(__name__)
 
 
 def data_dir() -> Path:
-    """Asset packs the user made: ``$ROBOCAS_DATA``, by default the user's data folder."""
-    return Path(os.environ.get(DATA) or platformdirs.user_data_dir("robocas"))
+    """Return the folder of asset packs the user made: ``$ROBOCAS_DATA``, by default the user's data folder.
+
+    Raises:
+        RobocasError: the variable is not set, and the user has no home folder.
+    """
+    return Path(os.environ.get(DATA) or _of_user(platformdirs.user_data_path))
 
 
 def cache_dir() -> Path:
-    """Files that can be made again at any time: ``$ROBOCAS_CACHE``, by default the user's cache folder.
+    """Return the folder of files that can be made again: ``$ROBOCAS_CACHE``, by default the user's cache folder.
 
     Where nobody chose one and the user's can't be written to, it is a private one among the temporary files.
+
+    Raises:
+        RobocasError: the variable is not set, and the user has no home folder.
     """
     chosen = os.environ.get(CACHE)
-    return Path(chosen) if chosen else _cache_of_user(Path(platformdirs.user_cache_dir("robocas")))
+    return Path(chosen) if chosen else _cache_of_user(_of_user(platformdirs.user_cache_path))
+
+
+def _of_user(find: Callable[[str], Path]) -> Path:
+    folder = Path()
+    with suppress(RuntimeError):  # without a home folder some versions raise, others return "~/.cache/robocas"
+        folder = find("robocas")
+    if not folder.is_absolute():
+        found, fix = os.environ.get("HOME") or "nothing", f"Set {CACHE} and {DATA} to folders that can be written to."
+        raise RobocasError("the user has no home folder", where="HOME", expected="a path", found=found, fix=fix)
+    return folder
+
+
+def ensure_home() -> None:
+    """Set ``HOME`` to an absolute path, which libraries need: the user's home folder, or one in the cache.
+
+    Raises:
+        RobocasError: the user has no home folder, and the variables do not choose both cache and data.
+    """
+    home = os.environ.get("HOME", "")
+    if not os.path.isabs(home):
+        with suppress(KeyError):  # a user id without an entry, as in many containers
+            home = pwd.getpwuid(os.getuid()).pw_dir
+    if not os.path.isabs(home):
+        data_dir()
+        home = str(cache_dir().absolute() / "home")
+    os.environ["HOME"] = home
 
 
 @lru_cache(maxsize=8)
@@ -56,10 +94,13 @@ def is_writable(folder: Path) -> bool:
 
 
 def variable_of(path: Path | str) -> str:
-    """Environment variable that chooses where a path is: of the cache, or of the user's data; empty if none does."""
+    """Return the environment variable that chooses where a path is, of cache or user's data; empty if none does."""
     path = Path(path).absolute()
-    folders = ((CACHE, cache_dir()), (DATA, data_dir()))
-    return next((name for name, folder in folders if path.is_relative_to(folder.absolute())), "")
+    for name, folder_of in ((CACHE, cache_dir), (DATA, data_dir)):
+        with suppress(RobocasError):  # no home folder
+            if path.is_relative_to(folder_of().absolute()):
+                return name
+    return ""
 
 
 def task_configs_dir() -> Path:

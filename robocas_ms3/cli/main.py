@@ -26,7 +26,7 @@ from robocas_ms3.cli.terminal import print_traceback
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.exits import no_exit
 from robocas_ms3.files import FULL
-from robocas_ms3.paths import is_writable, temporary_cache, variable_of
+from robocas_ms3.paths import ensure_home, is_writable, temporary_cache, variable_of
 from robocas_ms3.words import escape_log_lines, printable
 
 # Each names a module beside this one, with a dataclass called as the command and `main(cfg) -> int`; a dash in its name
@@ -92,7 +92,6 @@ def run(argv: Sequence[str]) -> int:
         logging.getLogger("mani_skill ").addFilter(lambda record: record.levelno >= logging.ERROR)
         logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # it says that it looks for fonts
     escape_log_lines()
-    _lend_folders()
     try:
         return _dispatch(arguments)
     except KeyboardInterrupt as interrupt:  # a command may say how to go on
@@ -130,6 +129,7 @@ def _dispatch(arguments: list[str]) -> int:
         if wrong := _misspelt(of_command, known, f"robocas {name}", rest):
             return _say(f"error: {wrong}", sys.stderr, 2)
         cfg = tyro.cli(of_command, prog=f"robocas {name}", args=rest, config=CLI_STYLE)
+        _lend_folders()
         with no_exit(f"robocas {name}"):
             return module.main(with_absolute_paths(cfg))
     if arguments and not arguments[0].startswith("-"):
@@ -167,7 +167,12 @@ def _unknown(word: str, what: str, known: Iterable[str]) -> int:
 
 
 def _lend_folders() -> None:
-    """Give libraries that only want a place to write one, where theirs is read-only: else each process complains."""
+    """Give libraries that only want a place to write one, where theirs is missing or read-only.
+
+    Raises:
+        RobocasError: see `ensure_home`.
+    """
+    ensure_home()
     places = {
         "MPLCONFIGDIR": platformdirs.user_config_path("matplotlib"),
         "MESA_SHADER_CACHE_DIR": platformdirs.user_cache_path("mesa_shader_cache"),

@@ -345,10 +345,10 @@ def test_libraries_get_a_place_where_the_home_is_read_only(monkeypatch, tmp_path
         monkeypatch.delenv(name)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     cli.run(["--version"])
-    cli.run(["nothing"])
+    cli.run(["validate", "nothing"])
     assert "MPLCONFIGDIR" not in os.environ  # the home is as it should be
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    cli.run(["nothing"])
+    cli.run(["validate", "nothing"])
     assert os.environ["MPLCONFIGDIR"] == f"{tmp_path}/robocas-{os.getuid()}/matplotlib"
     assert os.environ["MESA_SHADER_CACHE_DIR"].startswith(f"{tmp_path}/robocas-")
 
