@@ -134,7 +134,7 @@ def check_values(scene: Mapping[str, Any], file: str = schema.SCENE_FILE) -> lis
         scene: its content.
         file: it is in.
     """
-    wrong = _check(Scene, scene, file)
+    wrong = check_form(Scene, scene, file)
     if wrong:
         return wrong
     layout = scene["layout"] or {}
@@ -148,12 +148,12 @@ def check_values(scene: Mapping[str, Any], file: str = schema.SCENE_FILE) -> lis
 
 def check_settings_values(settings: Mapping[str, Any]) -> list[Violation]:
     """What is wrong with the values of a ``conversion.json``."""
-    return _check(Settings, settings, schema.CONVERSION_FILE)
+    return check_form(Settings, settings, schema.CONVERSION_FILE)
 
 
 def check_rate(content: Mapping[str, Any]) -> list[Violation]:
     """What is wrong with ``rate_hz``, which both files have."""
-    return _check(_Rated, content, "")
+    return check_form(_Rated, content, "")
 
 
 def sound(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, Any], str]:
@@ -165,7 +165,8 @@ def sound(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, Any], st
     return {key: value for key, value in scene.items() if key not in spoilt}, "; ".join(map(str, wrong))
 
 
-def _check(model: type[_Part], content: Mapping[str, Any], file: str) -> list[Violation]:
+def check_form(model: type[BaseModel], content: Mapping[str, Any], file: str) -> list[Violation]:
+    """Return how the content of a JSON file differs from a declared form."""
     try:
         model.model_validate(content)
     except ValidationError as error:

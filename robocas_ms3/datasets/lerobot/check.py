@@ -5,29 +5,36 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.content import read_object
 from robocas_ms3.datasets.checks.dataset import Report
+from robocas_ms3.datasets.checks.scene_values import check_form, check_values
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_videos import TOLERANCE, check_videos
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
+from robocas_ms3.datasets.lerobot.records import (
+    ConversionRecord,
+    InfoRecord,
+    episode_columns,
+    frame_columns,
+    unknown_numbers,
+    wrong_shapes,
+)
 from robocas_ms3.datasets.lerobot.stats import QUANTILES, shape_of
-from robocas_ms3.datasets.lerobot.tables import numbers, read_rows
+from robocas_ms3.datasets.lerobot.tables import faults, numbers, open_table, read_rows
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
+from robocas_ms3.errors import DatasetError
 from robocas_ms3.words import count_of
 
-_KEYS = ("codebase_version", "total_episodes", "total_frames", "total_tasks", "fps", "splits", "features", "data_path")
-_UNREADABLE = (OSError, pa.ArrowException, KeyError)
 Ranges = Mapping[str, tuple[NDArray, NDArray, int]]
 """Feature -> least and greatest of each of its numbers, and how many frames."""
 Texts = Mapping[str, list[str]]
@@ -80,11 +87,14 @@ def check_lerobot(
         return wrong
     try:
         dataset = LeRobotDataset(root)
+        wrong = list(_check_rows(dataset))
+        if wrong:
+            return wrong
         subtasks = dataset.subtasks if schema.SUBTASK_INDEX.key in dataset.info["features"] else []
         texts = {"task_index": dataset.tasks, schema.SUBTASK_INDEX.key: subtasks}
         totals = list(_check_totals(dataset))
-    except _UNREADABLE as error:
-        return [Violation("meta", "", "readable tables", first_line(error))]
+    except DatasetError as error:
+        return [_violation("meta", "readable tables", error)]
     data, ranges = _check_data(dataset, texts, on_episode or (lambda *_: None))
     videos = [key for key, feature in dataset.info["features"].items() if feature["dtype"] == "video"]
     return [
@@ -92,21 +102,33 @@ def check_lerobot(
         *data,
         *(wrong for key in videos for wrong in check_videos(dataset, key, decode)),
         *_check_statistics(dataset, ranges),
+        *_check_conversion(dataset),
+        *_check_scenes(dataset),
         *_check_checksums(root),
     ]
 
 
+def _violation(file: str, expected: str, error: DatasetError) -> Violation:
+    return Violation(file, "", expected, first_line(error))
+
+
 def _check_info(info: Mapping[str, Any]) -> Iterator[Violation]:
-    missing = [key for key in _KEYS if key not in info]
-    if missing:
-        yield Violation(schema.INFO_FILE, ", ".join(missing), "a value", "nothing")
-    elif info["codebase_version"] != schema.CODEBASE_VERSION:
-        found = str(info["codebase_version"])
-        yield Violation(schema.INFO_FILE, "codebase_version", schema.CODEBASE_VERSION, found)
-    elif not isinstance(info["fps"], int):
-        yield Violation(schema.INFO_FILE, "fps", "a whole number", str(info["fps"]))
-    elif not (isinstance(info["features"], dict) and all(map(schema.is_feature, info["features"].values()))):
-        yield Violation(schema.INFO_FILE, "features", "dtype and shape of each", str(info["features"])[:80])
+    wrong = check_form(InfoRecord, info, schema.INFO_FILE)
+    yield from wrong
+    for key, expected, found in wrong_shapes(info["features"]) if not wrong else ():
+        yield Violation(schema.INFO_FILE, key, str(expected), str(found))
+
+
+def _check_rows(dataset: LeRobotDataset) -> Iterator[Violation]:
+    """Check the columns of ``meta/episodes``, on which the other checks rely."""
+    numbers: list[int] = []
+    for path, table in dataset.tables_of_episodes():
+        name = str(path.relative_to(dataset.root))
+        wrong = list(faults(table, episode_columns(table.column_names, dataset.info["features"])))
+        yield from (Violation(name, key, expected, found) for key, expected, found in wrong)
+        numbers += table.column("episode_index").to_pylist() if not wrong else []
+    if len(set(numbers)) < len(numbers):
+        yield Violation("meta/episodes", "episode_index", "each episode once", "some twice")
 
 
 def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
@@ -135,35 +157,40 @@ def _check_data(
     by_file: dict[Path, list[dict[str, Any]]] = defaultdict(list)
     for row in dataset.rows:
         place = row["data/chunk_index"], row["data/file_index"]
-        by_file[schema.data_file(root, dataset.info["data_path"], *place)].append(row)
+        by_file[schema.data_file(root, schema.DATA_PATH, *place)].append(row)
     violations: list[Violation] = []
     ranges: Ranges = {}
     done = 0
     for path, inside in by_file.items():
         name, count = str(path.relative_to(root)), sum(row["length"] for row in inside)
         try:
-            with pq.ParquetFile(path) as file:
+            with open_table(path) as file:
                 names, found = sorted(file.schema_arrow.names), file.metadata.num_rows
             if names != wanted:
                 violations.append(Violation(name, "columns", ", ".join(wanted), ", ".join(names)))
             if found != count:
                 violations.append(Violation(name, "rows", str(count), str(found)))
+            if names != wanted or found != count:
                 continue
             for row in inside:  # one at a time: memory does not grow with the file
-                frames = _read_frames(path, name, row, features)
+                table = read_rows(path, row["episode_index"])
+                wrong = list(faults(table, frame_columns(features)))
+                if wrong:
+                    violations += [Violation(name, key, expected, found) for key, expected, found in wrong]
+                    break
+                frames = _frames(table, name, row, features)
                 violations += check_frames(frames, dataset.info, texts)
                 ranges = _widened(ranges, frames, features)
                 done += 1
                 on_episode(done, len(dataset.rows))
-        except _UNREADABLE as error:
-            violations.append(Violation(name, "", "a readable table", first_line(error)))
+        except DatasetError as error:
+            violations.append(_violation(name, "a readable table", error))
     others = sorted(path for path in (root / "data").rglob("*") if path.is_file() and path not in by_file)
     extra = (Violation(str(path.relative_to(root)), "", "files of episodes only", "of none") for path in others)
     return [*violations, *extra], ranges
 
 
-def _read_frames(path: Path, name: str, row: Mapping[str, Any], features: Mapping[str, Any]) -> Frames:
-    table = read_rows(path, row["episode_index"])
+def _frames(table: pa.Table, name: str, row: Mapping[str, Any], features: Mapping[str, Any]) -> Frames:
     numeric = [key for key, feature in features.items() if feature["dtype"] not in ("video", "string", "image")]
     key = schema.SUBGOAL_TYPE.key
     types = table.column(key).to_pylist() if key in table.column_names else []
@@ -254,6 +281,9 @@ def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Viola
         if feature["dtype"] == "string":
             continue
         found = stats.content.get(key, {})
+        if not isinstance(found, dict):
+            yield Violation(schema.STATS_FILE, key, "an object", type(found).__name__)
+            continue
         missing = {"min", "max", "mean", "std", "count", *QUANTILES} - set(found)
         if missing:
             yield Violation(schema.STATS_FILE, key, ", ".join(sorted(missing)), "nothing")
@@ -263,6 +293,8 @@ def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Viola
         if wrong:
             shown = f"{shape_of(found[wrong[0]])}"
             yield Violation(schema.STATS_FILE, f"{key}, {wrong[0]}", f"shape {shape}", shown)
+        elif outside := _outside(found):
+            yield Violation(schema.STATS_FILE, f"{key}, {outside}", "between min and max", str(found[outside])[:80])
         elif key in ranges:
             low, high, count = ranges[key]
             same = np.allclose(found["min"], low, atol=1e-6) and np.allclose(found["max"], high, atol=1e-6)
@@ -272,15 +304,61 @@ def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Viola
                 yield Violation(schema.STATS_FILE, key, expected, text)
 
 
+def _outside(found: Mapping[str, Any]) -> str | None:
+    """Return the first statistic of a feature that is outside of the range, or None."""
+    low, high = (np.asarray(found[name], np.float64) for name in ("min", "max"))
+    slack = 1e-3 * (1 + np.abs(low) + np.abs(high))  # of histograms and float32
+    bounds = {name: (low - slack, high + slack) for name in ("mean", *QUANTILES)} | {"std": (0, high - low + slack)}
+    return next(
+        (k for k, (a, b) in bounds.items() if not ((a <= np.array(found[k])) & (np.array(found[k]) <= b)).all()), None
+    )
+
+
 def _check_checksums(root: Path) -> Iterator[Violation]:
     sums = read_object(root, schema.CHECKSUMS_FILE)
     if sums.wrong and (root / schema.CHECKSUMS_FILE).is_file():
         yield sums.wrong
     for name, expected in sums.content.items():
-        if not (root / name).is_file():
+        if not isinstance(expected, str):
+            yield Violation(schema.CHECKSUMS_FILE, name, "a SHA-256", type(expected).__name__)
+        elif PurePosixPath(name).parts[:1] not in {(folder,) for folder in schema.CONTENT} or ".." in Path(name).parts:
+            yield Violation(schema.CHECKSUMS_FILE, name, f"a file in {', '.join(schema.CONTENT)}", "another path")
+        elif not (root / name).is_file():
             yield Violation(name, "", "a file", "none")
         elif (found := schema.checksum(root / name)) != expected:
             yield Violation(name, "", f"the bytes that were written, SHA-256 {expected[:12]}", found[:12])
+
+
+def _check_conversion(dataset: LeRobotDataset) -> Iterator[Violation]:
+    """Check how the dataset says it was made, where it does."""
+    if not (dataset.root / schema.CONVERSION_FILE).exists():
+        return
+    made = read_object(dataset.root, schema.CONVERSION_FILE)
+    wrong = [made.wrong] if made.wrong else check_form(ConversionRecord, made.content, schema.CONVERSION_FILE)
+    yield from wrong
+    sides = {key: made.content.get(key, []) for key in ("train_eps", "val_eps")} if not wrong else {}
+    for key, unknown in unknown_numbers(sides, dataset.row_of).items():
+        yield Violation(schema.CONVERSION_FILE, key, "numbers of episodes", str(unknown[:5]))
+
+
+def _check_scenes(dataset: LeRobotDataset) -> Iterator[Violation]:
+    """Check scenes and cameras of the episodes, where the dataset has them."""
+    try:
+        described = dataset.described
+    except DatasetError as error:
+        yield _violation(schema.SCENES_FILE, "a readable table", error)
+        return
+    if described and described.keys() != dataset.row_of.keys():
+        found = sorted(described.keys() ^ dataset.row_of.keys())[:5]
+        yield Violation(schema.SCENES_FILE, "episode_index", "the episodes of the dataset", f"{found} more or missing")
+    for number in sorted(described.keys() & dataset.row_of.keys()):
+        episode = dataset.episode(number)
+        try:
+            yield from check_values(episode.scene, f"{schema.SCENES_FILE}, episode {number}")
+            for camera in dataset.cameras:
+                episode.intrinsic(camera)
+        except DatasetError as error:
+            yield _violation(schema.SCENES_FILE, "scene and cameras", error)
 
 
 def report_lerobot(root: Path, *, on_episode: Callable[[int, int], None] | None = None) -> Report:

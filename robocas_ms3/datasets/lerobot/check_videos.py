@@ -28,7 +28,7 @@ def check_videos(dataset: LeRobotDataset, key: str, decode: bool) -> Iterator[Vi
     """
     root, info, rows = dataset.root, dataset.info, dataset.rows
     camera, feature = schema.camera_of(key), info["features"][key]
-    kinds = [(f"videos/{key}", info["video_path"], {"video_key": key})]
+    kinds = [(f"videos/{key}", schema.VIDEO_PATH, {"video_key": key})]
     if rows and f"depth/{camera}/file_index" in rows[0]:
         kinds.append((f"depth/{camera}", schema.DEPTH_PATH, {"camera": camera}))
     for prefix, pattern, names in kinds:

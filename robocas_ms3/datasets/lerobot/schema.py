@@ -263,9 +263,3 @@ def content_files(root: Path) -> list[Path]:
 def data_file(root: Path, pattern: str, chunk: int, file: int, **names: str) -> Path:
     """Path of one of the numbered files."""
     return root / pattern.format(chunk_index=chunk, file_index=file, **names)
-
-
-def is_feature(said: Any) -> bool:
-    """Whether it is what ``info.json`` says of a feature: its type and shape."""
-    shape = said.get("shape") if isinstance(said, dict) else None
-    return isinstance(shape, list) and all(type(n) is int for n in shape) and isinstance(said.get("dtype"), str)

@@ -128,8 +128,9 @@ class Levels:
 
 
 def shape_of(value: Any) -> tuple[int, ...] | str:
-    """Shape of numbers in nested lists, or that they are none."""
+    """Return the shape of numbers in nested lists, or that they are no numbers."""
     try:
-        return np.asarray(value, dtype=np.float64).shape
-    except (TypeError, ValueError):
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
         return "no numbers"
+    return array.shape if array.dtype.kind in "iuf" else "no numbers"

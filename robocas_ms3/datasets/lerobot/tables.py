@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -15,8 +17,177 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets.lerobot.schema import CHUNK_FILES
+from robocas_ms3.documents import check_regular
+from robocas_ms3.errors import DatasetError
 
+ARRAYS_LIMIT = 2**29
+"""Bytes that the columns of one reading may have as arrays: 40 million rows of one value are 1 MB as a file."""
+OBJECTS_LIMIT = 2**26
+"""The same where the values become Python objects, each of which takes about ten times as much."""
+INTEGER, NUMBER, NUMBERS, TEXT, TEXTS = "integers", "numbers", "numbers or lists of numbers", "texts", "lists of texts"
+Kind = Literal["integers", "numbers", "numbers or lists of numbers", "texts", "lists of texts"]
+TEXT_INDEX = "__index_level_0__"  # pandas' name of an index without one
 _EPISODE = "episode_index"
+_SEE_VALIDATE = "robocas validate lists all that is wrong."
+
+
+@dataclass(frozen=True)
+class Column:
+    """What a column of a table holds: a kind of values and, of integers and numbers, their range."""
+
+    kind: Kind
+    least: float = 0
+    greatest: float = 2**53
+
+    def fault(self, values: pa.ChunkedArray) -> tuple[str, str] | None:
+        """Return what is expected of a column's values and what is found, if that differs."""
+        if not _is_kind(values.type, self.kind):
+            return self.kind, str(values.type)
+        if values.null_count:
+            return f"{self.kind}, no nulls", f"{values.null_count} nulls"
+        if self.kind == TEXTS and pc.list_flatten(values).null_count:  # pyright: ignore[reportAttributeAccessIssue]
+            return f"{self.kind}, no nulls", "nulls"
+        if self.kind in (INTEGER, NUMBER) and len(values):
+            found = values.to_numpy()
+            wrong = found[~((found >= self.least) & (found <= self.greatest))]  # NaN too
+            if len(wrong):
+                return f"{self.kind} from {self.least:g} to {self.greatest:g}", str(wrong[0])
+        return None
+
+
+def faults(table: pa.Table, columns: Mapping[str, Column]) -> Iterator[tuple[str, str, str]]:
+    """Yield key, expected and found of columns that are missing or hold other values than declared."""
+    for key, column in columns.items():
+        if key not in table.column_names:
+            yield key, "a column", "nothing"
+        elif fault := column.fault(table.column(key)):
+            yield key, *fault
+
+
+@contextmanager
+def open_table(path: Path, *, most_rows: float = np.inf) -> Iterator[pq.ParquetFile]:
+    """Open a Parquet file; texts are read as dictionaries, so that a repeated one takes no memory.
+
+    Args:
+        path: of the file.
+        most_rows: more are refused.
+
+    Raises:
+        DatasetError: the file is missing, damaged or too long, or two columns have the same name. Errors of Arrow
+            inside of the ``with`` statement are of the same kind.
+    """
+    try:
+        check_regular(path)
+        footer, texts, _ = _footer(path, path.stat().st_mtime_ns)
+        with pq.ParquetFile(path, metadata=footer, read_dictionary=texts) as file:
+            names = file.schema_arrow.names
+            if len(set(names)) < len(names):
+                raise DatasetError("two columns of this table have the same name", where=path, fix=_SEE_VALIDATE)
+            if footer.num_rows > most_rows:
+                what, expected = "this table has too many rows", f"{most_rows:g} at most"
+                raise DatasetError(what, where=path, expected=expected, found=footer.num_rows, fix=_SEE_VALIDATE)
+            yield file
+    except (OSError, ValueError, LookupError, MemoryError, pa.ArrowException) as error:
+        found = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        raise DatasetError("this table can't be read", where=path, found=found, fix=_SEE_VALIDATE) from error
+
+
+def read_columns(
+    file: pq.ParquetFile,
+    path: Path,
+    columns: Collection[str] | None = None,
+    *,
+    groups: Sequence[int] | None = None,
+    limit: int = ARRAYS_LIMIT,
+) -> pa.Table:
+    """Read columns of an open file within bounds.
+
+    Args:
+        file: from `open_table`.
+        path: of the file, for messages.
+        columns: to read, those that are there; None: all.
+        groups: row groups to read; None: all.
+        limit: bytes that the values may have.
+
+    Raises:
+        DatasetError: the columns are too large.
+    """
+    footer = file.metadata
+    groups = range(footer.num_row_groups) if groups is None else groups
+    names = file.schema_arrow.names if columns is None else [key for key in file.schema_arrow.names if key in columns]
+    leaves = [
+        (number, max(8, footer.schema.column(number).length or 0))
+        for number in range(footer.num_columns)
+        if any(f"{footer.schema.column(number).path}.".startswith(f"{name}.") for name in names)
+    ]
+    size = 0
+    for group in map(footer.row_group, groups):
+        for number, width in leaves:
+            chunk = group.column(number)
+            size += max(group.num_rows, chunk.num_values) * width + chunk.total_uncompressed_size
+    table = file.read_row_groups(list(groups), columns=names) if size <= limit else None
+    if table is None or (size := size + sum(map(_text_bytes, table.columns))) > limit:
+        what, expected = "this table is too large to be read at once", f"{limit >> 20} MB of values at most"
+        raise DatasetError(what, where=path, expected=expected, found=f"{size >> 20} MB", fix="Write shorter files.")
+    return table
+
+
+def read_objects(path: Path, columns: Mapping[str, Column], *, most_rows: float = np.inf) -> pa.Table:
+    """Read columns that will become Python objects, and check them.
+
+    Raises:
+        DatasetError: the file is damaged or too large, or a column is missing or holds other values than declared.
+    """
+    with open_table(path, most_rows=most_rows) as file:
+        table = read_columns(file, path, columns, limit=OBJECTS_LIMIT)
+        check_columns(table, columns, path)
+    return table
+
+
+def check_columns(table: pa.Table, columns: Mapping[str, Column], path: Path) -> None:
+    """Refuse a table in which a column is missing or holds other values than declared.
+
+    Raises:
+        DatasetError: for the first such column.
+    """
+    for key, expected, found in faults(table, columns):
+        what = "wrong column of a table"
+        raise DatasetError(what, where=f"{path}, {key}", expected=expected, found=found, fix=_SEE_VALIDATE)
+
+
+def is_numeric(kind: pa.DataType) -> bool:
+    """Return whether a column holds numbers, or lists of numbers of any depth."""
+    return _is_kind(kind, NUMBERS)
+
+
+def _is_kind(found: pa.DataType, kind: Kind) -> bool:
+    lists = pa.types.is_list, pa.types.is_fixed_size_list, pa.types.is_large_list
+    if kind in (NUMBERS, TEXTS):
+        depth = 0
+        while any(is_list(found) for is_list in lists):
+            found, depth = found.value_type, depth + 1
+        if kind == TEXTS:
+            return depth == 1 and _is_kind(found, TEXT)
+        return pa.types.is_boolean(found) or _is_kind(found, NUMBER)
+    if pa.types.is_dictionary(found):
+        found = found.value_type
+        return kind == TEXT and (pa.types.is_string(found) or pa.types.is_large_string(found))
+    if kind == TEXT:
+        return pa.types.is_string(found) or pa.types.is_large_string(found)
+    return pa.types.is_integer(found) or (kind == NUMBER and pa.types.is_floating(found))
+
+
+def _text_bytes(values: pa.ChunkedArray) -> int:
+    """Return the bytes of texts that are stored as dictionaries, each counted as often as it occurs."""
+    size = 0
+    for chunk in values.chunks:
+        flat = chunk
+        while pa.types.is_list(flat.type) or pa.types.is_large_list(flat.type):
+            flat = flat.flatten()
+        if pa.types.is_dictionary(flat.type) and len(flat):
+            lengths = pc.binary_length(flat.dictionary).to_numpy(zero_copy_only=False)  # pyright: ignore[reportAttributeAccessIssue]
+            size += int(lengths[flat.indices.drop_null().to_numpy()].sum())
+    return size
 
 
 def column(values: NDArray) -> pa.Array:
@@ -27,11 +198,21 @@ def column(values: NDArray) -> pa.Array:
 
 
 def numbers(values: pa.ChunkedArray | pa.Array) -> NDArray:
-    """The way back: (T, D), or (T, 1) for numbers."""
+    """Return a column as an array: (T, D) of lists of D numbers, (T, 1) of numbers.
+
+    Raises:
+        DatasetError: the column holds something else, or lists of different lengths.
+    """
     whole = values.combine_chunks() if isinstance(values, pa.ChunkedArray) else values
-    if isinstance(whole, pa.ChunkedArray):  # of no rows
+    if not is_numeric(whole.type):
+        raise DatasetError("no column of numbers", expected=NUMBERS, found=whole.type)
+    if not len(whole):
         return np.zeros((0, 1))
-    flat = whole.flatten() if pa.types.is_list(whole.type) or pa.types.is_fixed_size_list(whole.type) else whole
+    flat = whole
+    while not (pa.types.is_primitive(flat.type)):
+        flat = flat.flatten()
+    if len(flat) % len(whole):
+        raise DatasetError("no column of numbers", expected="lists of one length", found=f"{len(flat)} numbers in all")
     return flat.to_numpy(zero_copy_only=False).reshape(len(whole), -1)
 
 
@@ -91,33 +272,40 @@ class RollingTable:
             self._waiting.clear()
 
 
-def read_rows(path: Path, number: int) -> pa.Table:
-    """An episode's rows of a file of the data; only row groups that may hold some of them are read.
+def read_rows(path: Path, number: int, most_rows: float = np.inf) -> pa.Table:
+    """Read an episode's rows of a file of the data; only row groups that may hold some of them are read.
 
     Raises:
-        OSError, pa.ArrowException, LookupError: the file is missing, damaged, or does not say whose a row is.
+        DatasetError: the file is missing, damaged or too large, or does not say which episode a row is of.
     """
-    footer, spans = _footer(path, path.stat().st_mtime_ns)
-    groups = [group for group, (low, high) in enumerate(spans) if low <= number <= high]
-    with pq.ParquetFile(path, metadata=footer) as file:
-        table = file.read_row_groups(groups)
-    return table.filter(pc.field(_EPISODE) == number)
+    with open_table(path, most_rows=most_rows) as file:
+        _, _, spans = _footer(path, path.stat().st_mtime_ns)
+        groups = [group for group, (low, high) in enumerate(spans) if low <= number <= high]
+        table = read_columns(file, path, groups=groups)
+        check_columns(table, {_EPISODE: Column(INTEGER)}, path)
+        return table.filter(pc.field(_EPISODE) == number)
 
 
 @lru_cache(maxsize=8)
-def _footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[tuple[float, float]]]:
-    """A file's footer, which takes long to read where it is of many episodes, and each row group's span of these."""
+def _footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[str], list[tuple[float, float]]]:
+    """Return a file's footer, its columns of texts, and the span of episode numbers in each row group.
+
+    They take long to read where a file has many episodes.
+    """
     with pq.ParquetFile(path) as file:
         footer = file.metadata
-    place = {name: place for place, name in enumerate(footer.schema.names)}.get(_EPISODE)
+    leaves = [footer.schema.column(number) for number in range(footer.num_columns)]
+    texts = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
+    place = {leaf.path: place for place, leaf in enumerate(leaves)}.get(_EPISODE)
     groups = range(footer.num_row_groups)
     found = [None if place is None else footer.row_group(group).column(place).statistics for group in groups]
-    return footer, [(s.min, s.max) if s and s.has_min_max and type(s.min) is int else (-np.inf, np.inf) for s in found]
+    spans = [(s.min, s.max) if s and s.has_min_max and type(s.min) is int else (-np.inf, np.inf) for s in found]
+    return footer, texts, spans
 
 
 def write_texts(path: Path, name: str, texts: Sequence[str]) -> None:
     """Write a table of texts and their numbers; pandas makes the texts its index, by which LeRobot finds them."""
-    index = "__index_level_0__"
+    index = TEXT_INDEX
     about = {
         "index_columns": [index],
         "column_indexes": [
@@ -141,6 +329,16 @@ def write_texts(path: Path, name: str, texts: Sequence[str]) -> None:
     pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(about)}), path)
 
 
-def read_texts(path: Path) -> list[str]:
-    """Texts of such a table, by their numbers."""
-    return pq.read_table(path).column("__index_level_0__").to_pylist()
+def read_texts(path: Path, name: str, most_rows: float = np.inf) -> list[str]:
+    """Read the texts of such a table, in the order of their numbers.
+
+    Raises:
+        DatasetError: the table is damaged, or its numbers are not 0, 1, 2, ...
+    """
+    table = read_objects(path, {name: Column(INTEGER), TEXT_INDEX: Column(TEXT)}, most_rows=most_rows)
+    places, texts = table.column(name).to_numpy(), table.column(TEXT_INDEX).to_pylist()
+    order = np.argsort(places, kind="stable")
+    if not np.array_equal(places[order], np.arange(len(places))):
+        expected = f"0 to {len(places) - 1}, each once"
+        raise DatasetError("wrong numbers of texts", where=f"{path}, {name}", expected=expected, fix=_SEE_VALIDATE)
+    return [texts[place] for place in order.tolist()]
