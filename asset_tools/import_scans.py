@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import unicodedata
 import zlib
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,10 +12,12 @@ from pathlib import Path
 import trimesh
 
 from asset_tools.build import build_object
+from asset_tools.inspection import ModelSource, inspect_models
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.prepare import prepare
-from asset_tools.scan import FORMATS, Unit, Up, find_mesh, guess_unit, guess_units, longest_side
-from asset_tools.scan_files import scan_files as resolved_files
+from asset_tools.reading.choice import OTHER_FOLDERS, is_collision, is_mesh
+from asset_tools.reading.files import files_below
+from asset_tools.scan import Unit, Up, guess_unit, guess_units
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
 from robocas_ms3.errors import AssetError
@@ -24,7 +25,8 @@ from robocas_ms3.errors import AssetError
 # Filled packages weigh about what water does, half-empty ones and boxes of cereal far less.
 DENSITY = 600.0  # kg/m3 of the whole body
 MASS_RANGE = (0.03, 0.8)  # kg
-BESIDE = {".mtl", ".bin", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp"}
+# mesh formats that are not read; a folder with one of them is an object, not a folder of textures
+UNREAD = {".fbx", ".blend", ".usd", ".usda", ".usdc", ".usdz", ".3ds", ".max", ".ma", ".mb", ".step", ".stp", ".wrl"}
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,8 @@ class ImportSettings:
     """How scans are read; the same for all of a folder.
 
     Attributes:
-        units: of the files; none: guessed from all sizes together.
-        up: axis that points up in the files; none: guessed for each.
+        units: of the files; None: guessed from all sizes together.
+        up: axis that points up in the files; None: guessed for each.
         masses: kg by object id; others are estimated from their volume.
         licence: of the scans.
         attribution: whom to name.
@@ -46,82 +48,123 @@ class ImportSettings:
     attribution: str = "unknown"
 
 
-def scan_jobs(source: Path, settings: ImportSettings) -> list[Job]:
-    """What is to be made of a folder of scans. One that can't be read is a job that fails when it is its turn.
+@dataclass
+class FoundScans:
+    """The scans of a folder.
+
+    Attributes:
+        models: by object id.
+        errors: why an id can't be imported.
+        skipped: what is no scan, with the reason, a line each.
+    """
+
+    models: dict[str, ModelSource] = field(default_factory=dict)
+    errors: dict[str, AssetError] = field(default_factory=dict)
+    skipped: list[str] = field(default_factory=list)
+
+
+def scan_jobs(source: Path, settings: ImportSettings, processes: int = 1) -> list[Job]:
+    """Return the jobs that import a folder of scans. One that can't be read is a job that fails when it is its turn.
+
+    Args:
+        source: the folder.
+        settings: how scans are read.
+        processes: how many read at a time, see `inspect_models`.
 
     Raises:
         AssetError: there are none, or masses are given for others.
     """
     scans = find_scans(source)
-    unknown = sorted(set(settings.masses) - set(scans))
+    ids = sorted([*scans.models, *scans.errors])
+    unknown = sorted(set(settings.masses) - set(ids))
     if unknown:
-        expected = f"ids among {', '.join(scans)}"
+        expected = f"ids among {', '.join(ids)}"
         raise AssetError("masses are given for scans that are not there", expected=expected, found=", ".join(unknown))
-    bad: dict[str, AssetError] = {}
-    meshes, sides = {}, {}
-    for id_, path in scans.items():
-        try:
-            meshes[id_] = find_mesh(path)
-            sides[id_] = longest_side(meshes[id_])
-        except AssetError as error:
-            bad[id_] = error
+    inspected = inspect_models(scans.models, processes)
+    errors = {**scans.errors, **{id_: found.error for id_, found in inspected.items() if found.error is not None}}
     units: dict[str, Unit] = {}
+    # a scan that fits no unit says nothing about which one is usual
+    sides = {id_: found.longest for id_, found in inspected.items() if id_ not in errors}
+    usual = {id_: side for id_, side in sides.items() if _in_some_unit(side)}
     for id_, side in sides.items():
         try:
-            # the others say which unit is usual; one that fits none is bad by itself
-            others = {name: length for name, length in sides.items() if _in_some_unit(length)}
-            units[id_] = settings.units or guess_units({**others, id_: side})[id_]
+            units[id_] = settings.units or guess_units({**usual, id_: side})[id_]
         except AssetError as error:
-            bad[id_] = error
+            errors[id_] = error
     jobs = []
-    for id_ in scans:
-        if id_ in bad:
-            jobs.append(Job(id_, partial(_fail, bad[id_]), content_hash(str(bad[id_]))))
+    for id_ in ids:
+        if id_ in errors:
+            jobs.append(failing_job(id_, errors[id_]))
             continue
-        job = partial(_make, id_, meshes[id_], units[id_], settings)
+        make = partial(_make, id_, scans.models[id_], units[id_], settings)
         facts = (id_, units[id_], settings.up, settings.masses.get(id_), settings.licence, settings.attribution)
-        jobs.append(Job(id_, job, content_hash(*facts, files=scan_files(meshes[id_]))))
+        jobs.append(Job(id_, make, content_hash(*facts, files=inspected[id_].files)))
     return jobs
 
 
-def find_scans(source: Path) -> dict[str, Path]:
-    """Object id -> mesh file or folder: every subfolder and every mesh file in a folder.
+def find_scans(source: Path) -> FoundScans:
+    """Find the scans of a folder: every subfolder with a mesh in it, and every mesh file.
+
+    Files of one name, such as ``mug.obj`` and ``mug.stl``, are versions of one object.
 
     Raises:
-        AssetError: no such folder, nothing in it, or two scans with one name.
+        AssetError: there is no such folder, or no scan in it.
     """
     if not source.is_dir():
         raise AssetError("no such folder of scans", where=source)
-    scans: dict[str, Path] = {}
-    for path in sorted(source.iterdir()):
-        if path.name.startswith(".") or not (path.is_dir() or path.suffix.lower() in FORMATS):
+    found = FoundScans()
+    entries = [path for path in sorted(source.iterdir()) if not path.name.startswith(".")]
+    meshes = [path for path in entries if is_mesh(path)]
+    shown = [path for path in meshes if not is_collision(path)]
+    if shown:
+        found.skipped += [f"{path.name}: a collision mesh" for path in meshes if path not in shown]
+    versions: dict[str, list[Path]] = {}
+    for path in shown or meshes:
+        versions.setdefault(object_id(path.stem), []).append(path)
+    found.models = {id_: ModelSource(tuple(paths), source) for id_, paths in versions.items()}
+    for path in entries:
+        if not path.is_dir():
             continue
-        name = object_id(path.stem if path.is_file() else path.name)
-        if name in scans:
-            raise AssetError("two scans would get the same id", where=path, found=name, fix="Rename one.")
-        scans[name] = path
-    if not scans:
-        raise AssetError("no scans in this folder", where=source, expected="a mesh file or a subfolder per object")
-    return scans
+        reason, name = _no_scan(path), object_id(path.name)
+        if reason:
+            found.skipped.append(f"{path.name}/: {reason}")
+        elif name in found.models or name in found.errors:
+            found.models.pop(name, None)
+            found.errors[name] = AssetError(
+                "two scans would get the same id", where=path, found=name, fix="Rename one."
+            )
+        else:
+            found.models[name] = ModelSource((path,), source)
+    if not found.models and not found.errors:
+        expected = "a mesh file or a subfolder per object"
+        raise AssetError("no scans in this folder", where=source, expected=expected, found="; ".join(found.skipped))
+    return found
 
 
-def scan_files(mesh: Path) -> list[Path]:
-    """The files that a scan may be made of: the mesh, materials and pictures below its folder, textures elsewhere."""
-    beside = {path for path in mesh.parent.rglob("*") if path.suffix.lower() in BESIDE and path.is_file()}
-    with suppress(AssetError):  # a missing one: said when the scan is read
-        beside.update(path.resolve() for path in resolved_files(mesh, []).paths.values())
-    return [mesh, *sorted(beside)]
+def failing_job(id_: str, error: AssetError) -> Job:
+    """Return a job that raises an error when it is its turn, so that it can be left out as any other."""
+    return Job(id_, partial(_fail, error), content_hash(str(error)))
 
 
 def object_id(name: str) -> str:
-    """A name as an id: small letters, digits and underscores; one that has none of these gets a number."""
+    """Return a name as an id: small letters, digits and underscores; one that has none of these gets a number."""
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
     return re.sub(r"[^a-z0-9]+", "_", plain.lower()).strip("_") or f"object_{zlib.crc32(name.encode()):08x}"
 
 
 def estimate_mass(closed: trimesh.Trimesh) -> float:
-    """Mass in kg of a household product of this volume (m3)."""
+    """Return the mass in kg of a household product of this volume (m3)."""
     return round(min(max(DENSITY * float(closed.volume), MASS_RANGE[0]), MASS_RANGE[1]), 4)
+
+
+def _no_scan(folder: Path) -> str:
+    """Return why a folder is no object; empty: it is one."""
+    if folder.name.lower() in OTHER_FOLDERS:
+        return "its name says that it holds no object"
+    files = list(files_below(folder))
+    if any(is_mesh(path) or path.suffix.lower() in UNREAD for path in files):
+        return ""
+    return "no mesh is in it"
 
 
 def _in_some_unit(side: float) -> bool:
@@ -136,8 +179,8 @@ def _fail(error: AssetError, folder: Path) -> ObjectAsset:
     raise error
 
 
-def _make(id_: str, path: Path, unit: Unit, settings: ImportSettings, folder: Path) -> ObjectAsset:
-    scan = prepare(path, up=settings.up, unit=unit)
+def _make(id_: str, model: ModelSource, unit: Unit, settings: ImportSettings, folder: Path) -> ObjectAsset:
+    scan = prepare(model.paths, root=model.root, up=settings.up, unit=unit)
     source = ObjectSource(
         id=id_,
         name=id_.replace("_", " "),

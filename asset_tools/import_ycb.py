@@ -15,10 +15,10 @@ from typing import Any
 
 from asset_tools.build import build_object
 from asset_tools.graspnet.catalogue import ENTRIES, NUMBERS
-from asset_tools.import_scans import estimate_mass, scan_files
+from asset_tools.import_scans import estimate_mass, failing_job
+from asset_tools.inspection import Inspection, ModelSource, inspect_models
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.prepare import prepare
-from asset_tools.scan import find_mesh
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
 from robocas_ms3.documents import load_json
@@ -74,12 +74,13 @@ def default_root() -> Path:
     return data / "assets" / "mani_skill2_ycb"
 
 
-def ycb_jobs(root: Path | None = None, ids: Sequence[str] = ()) -> list[Job]:
-    """What is to be made of ManiSkill's YCB folder.
+def ycb_jobs(root: Path | None = None, ids: Sequence[str] = (), processes: int = 1) -> list[Job]:
+    """Return the jobs that import ManiSkill's YCB folder. A model that can't be read is a job that fails.
 
     Args:
-        root: the folder; none: where ManiSkill puts it.
-        ids: names such as ``005_tomato_soup_can``; none: all.
+        root: the folder; None: where ManiSkill puts it.
+        ids: names such as ``005_tomato_soup_can``; empty: all.
+        processes: how many models are read at a time, see `inspect_models`.
 
     Raises:
         AssetError: it isn't there, or lacks objects, naming them all.
@@ -92,10 +93,11 @@ def ycb_jobs(root: Path | None = None, ids: Sequence[str] = ()) -> list[Job]:
             "no such YCB objects", where=root / INFO, expected=f"among {len(info)}", found=_listed(unknown)
         )
     models = sorted(set(ids) or info)
-    missing = [model for model in models if not (root / MODELS / model / "textured.obj").is_file()]
+    missing = [model for model in models if not _mesh(root, model).is_file()]
     if missing:
         raise AssetError("models of YCB objects are missing", where=root / MODELS, found=_listed(missing), fix=DOWNLOAD)
-    return [_job(root, model, info[model]) for model in models]
+    inspected = inspect_models({model: ModelSource((_mesh(root, model),), root) for model in models}, processes)
+    return [_job(root, model, info[model], inspected[model]) for model in models]
 
 
 def ycb_source(root: Path, model: str) -> ObjectSource:
@@ -111,7 +113,7 @@ def ycb_source(root: Path, model: str) -> ObjectSource:
     info = _info(root)
     if model not in info:
         raise AssetError("no such YCB object", where=root / INFO, expected=f"among {len(info)}", found=model)
-    scan = prepare(root / MODELS / model / "textured.obj", up="z", unit="m")
+    scan = prepare(_mesh(root, model), root=root, up="z", unit="m")
     scale = _scale(root, model, info[model])
     if scale != 1:
         scan.mesh.apply_scale(scale)
@@ -143,10 +145,19 @@ def ycb_id(model: str) -> str:
     return f"{name}_{letter}" if letter else name
 
 
-def _job(root: Path, model: str, info: dict[str, Any]) -> Job:
-    files = scan_files(find_mesh(root / MODELS / model / "textured.obj"))
-    content = content_hash("ycb", model, _scale(root, model, info), files=files, packages=["graspnet"])
+def _job(root: Path, model: str, info: dict[str, Any], inspected: Inspection) -> Job:
+    if inspected.error is not None:
+        return failing_job(ycb_id(model), inspected.error)
+    try:
+        scale = _scale(root, model, info)
+    except AssetError as error:
+        return failing_job(ycb_id(model), error)
+    content = content_hash("ycb", model, scale, files=inspected.files, packages=["graspnet"])
     return Job(ycb_id(model), partial(_make, root, model), content)
+
+
+def _mesh(root: Path, model: str) -> Path:
+    return root / MODELS / model / "textured.obj"
 
 
 def _make(root: Path, model: str, folder: Path) -> ObjectAsset:

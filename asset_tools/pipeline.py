@@ -35,7 +35,7 @@ TOOLS = ("coacd", "trimesh", "manifold3d", "numpy", "scipy", "sapien", "xatlas",
     "shapely",
 )
 PACK_NAME = r"[a-z0-9_\-]+"
-NOT_INVOLVED = ("pipeline", "sheet", "studio")  # files that say what is made or show it, not how it is made
+NOT_INVOLVED = ("inspection", "pipeline", "sheet", "studio")  # files that do not change what an asset is made into
 
 log = logging.getLogger(__name__)
 
@@ -115,7 +115,7 @@ def content_hash(*parts: object, files: Iterable[Path] = (), packages: Sequence[
     digest = hashlib.sha256(repr((SCHEMA_VERSION, parts)).encode())
     for path in files:
         digest.update(f"{path.name} {sha256(path)}".encode())
-    for package in ("", "quality", *packages):
+    for package in ("", "quality", "reading", *packages):
         digest.update(_code(package).encode())
     return digest.hexdigest()
 

@@ -1,7 +1,8 @@
-"""From a raw scan to what assets are made of: a textured mesh and a solid, in metres, z up, every mend logged."""
+"""From a raw scan to what assets are made of: a textured mesh and a solid, in metres, z up, every repair logged."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,10 @@ from typing import Any
 import trimesh
 
 from asset_tools.level import level_base
+from asset_tools.reading.model import read_model
+from asset_tools.reading.surface import Textures
 from asset_tools.repair import close
-from asset_tools.scan import METRES, PLAUSIBLE, Unit, Up, find_mesh, guess_unit, guess_up, load_scan, upright
+from asset_tools.scan import METRES, PLAUSIBLE, Unit, Up, guess_unit, guess_up, upright
 from robocas_ms3.errors import AssetError
 
 NAMES = {"cm": "centimetres", "mm": "millimetres", "inch": "inches"}
@@ -25,7 +28,8 @@ class PreparedScan:
         closed: watertight, of the same body in the same frame.
         up: axis of the file that points up.
         unit: of the file.
-        repairs: what had to be mended, in words.
+        repairs: what was repaired, substituted or left out, one line each; those that begin with "warning:" change how
+            the object looks.
     """
 
     mesh: trimesh.Trimesh
@@ -35,24 +39,26 @@ class PreparedScan:
     repairs: tuple[str, ...]
 
 
-def prepare(path: Path, *, up: Up | None = None, unit: Unit | None = None) -> PreparedScan:
-    """Read a scan and mend it: files, faces, holes, axis, unit, base.
+def prepare(
+    path: Path | Sequence[Path], *, root: Path | None = None, up: Up | None = None, unit: Unit | None = None
+) -> PreparedScan:
+    """Read a scan and repair it: files, faces, holes, axis, unit, base.
 
     Args:
-        path: of the mesh, or of a folder with one.
-        up: axis of the file that points up; none: guessed.
-        unit: of the file; none: guessed.
+        path: the mesh file, a folder with its files, or several files of which some are versions of others.
+        root: the imported folder, outside of which nothing is read; None: the scan's own folder.
+        up: axis of the file that points up; None: guessed.
+        unit: of the file; None: guessed.
 
     Raises:
         AssetError: it can't be read or closed, or is of no size that can be picked up.
     """
-    path = find_mesh(path)
-    repairs: list[str] = []
-    scan = load_scan(path, repairs)
-    solid = close(scan)
+    model = read_model(path if isinstance(path, Path) else list(path), root)
+    repairs = list(model.notes)
+    solid = close(model.mesh)
     repairs += solid.repairs
     repairs += _about_colours(solid.scan)
-    up = up or guess_up(solid.mesh, path.suffix)
+    up = up or model.up or guess_up(solid.mesh)
     if up != "z":
         repairs.append(f"turned {up} up")
     longest = float(solid.mesh.extents.max())
@@ -60,7 +66,7 @@ def prepare(path: Path, *, up: Up | None = None, unit: Unit | None = None) -> Pr
     if not PLAUSIBLE[0] <= longest * METRES[unit] <= PLAUSIBLE[1]:
         raise AssetError(
             "the scan is of no size that can be picked up",
-            where=path,
+            where=path if isinstance(path, Path) else path[0],
             expected=f"{PLAUSIBLE[0]} to {PLAUSIBLE[1]} m for the longest side",
             found=f"{longest * METRES[unit]:g} m, taking its {longest:g} for {NAMES.get(unit, 'metres')}",
             fix="Pass --units.",
@@ -73,13 +79,11 @@ def prepare(path: Path, *, up: Up | None = None, unit: Unit | None = None) -> Pr
 
 
 def _about_colours(mesh: trimesh.Trimesh) -> list[str]:
-    """What becomes of colours that are no texture."""
+    """Return what becomes of colours that are no single texture."""
     visual: Any = mesh.visual
     if visual.kind == "vertex":
-        return ["baked the vertices' colours into a texture"]
-    if visual.kind == "face":
-        return ["baked the faces' colours into a texture"]
-    image = getattr(getattr(visual, "material", None), "image", None)
-    if image is not None and getattr(visual, "uv", None) is None:
-        return ["left out a texture without coordinates"]
-    return [] if visual.kind == "texture" else ["has no colours"]
+        return ["baked colours into a texture"]
+    if visual.kind == "texture":
+        several = isinstance(visual.material, Textures)
+        return ["baked several textures and colours into one texture"] if several else []
+    return ["has no colours"]

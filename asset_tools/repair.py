@@ -83,8 +83,8 @@ def _filled(
     rim_edges = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
     edges = mesh.edges[rim_edges]
     following = {int(a): int(b) for b, a in edges}  # the fill runs along the rim the other way
-    if len(following) < len(edges):
-        return mesh, shown  # two holes meet in a vertex: left to re-meshing
+    if len(following) < len(edges) or not following:
+        return mesh, shown  # holes meet in a vertex, or more than two faces in an edge: left to re-meshing
     middles: dict[int, Any] = {}
     vertices, faces = [np.asarray(mesh.vertices)], [np.asarray(mesh.faces)]
     count, holes, area = len(mesh.vertices), 0, 0.0
@@ -140,8 +140,11 @@ def _patched(shown: trimesh.Trimesh, face: Ints, corner: Ints, middles: Array) -
     elif visual.kind == "vertex":
         visual = ColorVisuals(vertex_colors=np.concatenate([visual.vertex_colors, visual.vertex_colors[first]]))
     else:
-        return trimesh.Trimesh(vertices, faces, process=False)
-    return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
+        visual = None
+    attributes: Any = {
+        name: np.concatenate([values, np.asarray(values)[first]]) for name, values in shown.vertex_attributes.items()
+    }
+    return trimesh.Trimesh(vertices, faces, visual=visual, vertex_attributes=attributes, process=False)
 
 
 def _as_solid(mesh: trimesh.Trimesh) -> Manifold | None:

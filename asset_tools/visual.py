@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import fast_simplification
@@ -15,6 +16,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.glb import rgba_of, roughness_of
+from asset_tools.reading.surface import TEXTURE, TINT, Textures, decode_srgb, encode_srgb
 from robocas_ms3.errors import AssetError, MissingExtraError
 
 Array = NDArray[np.float64]
@@ -22,6 +24,8 @@ Array = NDArray[np.float64]
 CREASE = np.cos(np.deg2rad(40))  # faces that meet more sharply get an edge, not a smooth normal
 DENSE = 3  # times as many faces as are wanted
 STUCK = 0.9  # of the faces left by a step of simplifying: a rougher one is needed
+ENOUGH = 6  # times as many faces as are wanted are accepted of a mesh with many holes or pieces
+GRIDS = (512, 362, 256, 181, 128, 91, 64, 45, 32, 16)  # cells along the diagonal, to merge vertices in, fine first
 SAMPLES = 150_000  # on the original surface, to find the face that a texel shows
 NORMAL_WEIGHT = 0.02  # of the diagonal; keeps the two sides of a thin shell apart, hardly moves anything else
 
@@ -35,14 +39,14 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
 
     Args:
         mesh: textured, coloured or plain; any unit.
-        triangles: most faces of the result.
+        triangles: most faces of the result; up to six times as many where it has many holes or pieces.
         texture_size: largest side of its texture, pixels.
 
     Returns:
         A mesh with a ``PBRMaterial`` and vertex normals.
 
     Raises:
-        AssetError: the mesh has no faces, is not finite or can't be simplified so far.
+        AssetError: the mesh has no faces, or is not finite.
         MissingExtraError: xatlas is not installed.
     """
     if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
@@ -50,13 +54,12 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
             "can't show this mesh", expected="faces, and finite vertices", found=f"{len(mesh.faces)} faces"
         )
     source = _Source(mesh)
-    if len(mesh.faces) <= triangles and (source.plain or source.image is not None):
-        vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-        normals = np.array(mesh.vertex_normals)
+    if len(mesh.faces) <= triangles and (source.plain or source.single is not None):
+        vertices, faces, normals, origin = _shaded(mesh)
         if mesh.volume < 0:
             faces, normals = faces[:, ::-1], -normals
-        uv = None if source.plain else source.uv
-        texture = None if source.image is None else _shrunk(source.image, texture_size)
+        uv = None if source.plain else source.uv[origin]
+        texture = None if source.single is None else _shrunk(source.single, texture_size)
     else:
         body = simplified(mesh, triangles)
         corner_normals = _crease_normals(body)
@@ -82,29 +85,75 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
 
 
 class _Source:
-    """How the original looks: texture and UVs, or else (F, 3, 3) colours of the corners, 0 to 255."""
+    """How the original looks: images and UVs with linear tints, or else colours of the corners, sRGB, 0 to 255.
+
+    Attributes:
+        images: RGB; empty: colours alone.
+        texture: (F,) index of the image of each face.
+        uv: (V, 2).
+        tints: (F, 3, 3) linear, of the corners; None: none.
+        colors: (F, 3, 3) of the corners, where there are no images.
+        plain: one colour everywhere.
+        factor: (3,) or (4,) linear colour that the material of the result keeps, 0 to 255.
+        roughness: that it keeps.
+    """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         visual: Any = mesh.visual
         material: Any = getattr(visual, "material", None)
+        uv = getattr(visual, "uv", None)
         self.roughness, self.factor = roughness_of(material), rgba_of(None)
-        uv, image = getattr(visual, "uv", None), None
-        if isinstance(material, PBRMaterial):
-            image, self.factor = material.baseColorTexture, rgba_of(material.baseColorFactor)
-        elif material is not None:
-            image = material.image  # a diffuse colour beside a texture is a mere default in most OBJ files
-        self.image = None if image is None or uv is None else image.convert("RGB")
         self.uv = np.zeros((0, 2)) if uv is None else np.array(uv, dtype=float)
+        self.texture, self.tints = np.zeros(len(mesh.faces), int), None
+        images: Sequence[Image.Image | None]
+        if isinstance(material, Textures):
+            images = material.images
+            self.texture = np.asarray(mesh.vertex_attributes[TEXTURE])[mesh.faces[:, 0]]
+            self.tints = np.asarray(mesh.vertex_attributes[TINT])[mesh.faces]
+        elif isinstance(material, PBRMaterial):
+            images, self.factor = [material.baseColorTexture], rgba_of(material.baseColorFactor)
+        else:
+            images = [getattr(material, "image", None)]  # a diffuse colour next to it is a mere default
+        self.images = [] if uv is None else [image.convert("RGB") for image in images if image is not None]
+        self.colors = np.full((len(mesh.faces), 3, 3), 255.0)
         if visual.kind == "face":
             self.colors = np.repeat(np.asarray(visual.face_colors, dtype=float)[:, None, :3], 3, axis=1)
         elif visual.kind == "vertex":
             self.colors = np.asarray(visual.vertex_colors, dtype=float)[mesh.faces][:, :, :3]
-        else:
-            color = rgba_of(None if material is None else material.main_color)
-            self.colors = np.broadcast_to(color[:3], (len(mesh.faces), 3, 3))
-        self.plain = self.image is None and bool((self.colors == self.colors[0, 0]).all())
-        if self.plain:
-            self.factor = self.colors[0, 0]
+        elif material is not None and not isinstance(material, PBRMaterial):
+            self.colors = np.broadcast_to(rgba_of(material.main_color)[:3], (len(mesh.faces), 3, 3))
+        self.plain = not self.images and bool((self.colors == self.colors[0, 0]).all())
+        if self.plain and not isinstance(material, PBRMaterial):
+            self.factor = 255 * decode_srgb(self.colors[0, 0])
+
+    @property
+    def single(self) -> Image.Image | None:
+        """The image, where it is all there is to see."""
+        return self.images[0] if len(self.images) == 1 and self.tints is None else None
+
+    def at(self, faces: NDArray, face: NDArray, weights: Array) -> Array:
+        """Return colours (N, 3) of points, sRGB, 0 to 255.
+
+        Args:
+            faces: (F, 3) of the mesh.
+            face: (N,) that each point is on.
+            weights: (N, 3) of its corners.
+        """
+        if not self.images:
+            return np.einsum("nc,ncd->nd", weights, self.colors[face])
+        colors = np.empty((len(face), 3))
+        for index, picture in enumerate(self.images):
+            here = np.flatnonzero(self.texture[face] == index)
+            own = self.uv[faces[self.texture == index]]
+            spread = _double_area(own).sum() / 2 * picture.width * picture.height / max(1, len(here))
+            scale = min(max(1, round(np.sqrt(spread))), max(picture.size))
+            image = picture.reduce(scale)  # finer detail would only alias
+            spots = np.einsum("nc,ncd->nd", weights[here], self.uv[faces[face[here]]])
+            colors[here] = _bilinear(np.asarray(image, dtype=np.float32), spots)
+        if self.tints is not None:
+            tints = np.einsum("nc,ncd->nd", weights, self.tints[face])
+            colors = encode_srgb(decode_srgb(colors) * tints).astype(float)
+        return colors
 
 
 def _shrunk(image: Image.Image, size: int) -> Image.Image:
@@ -116,7 +165,14 @@ def _shrunk(image: Image.Image, size: int) -> Image.Image:
 
 
 def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
-    """Vertices merged by position, faces collapsed to the limit, wound outward."""
+    """Merge vertices by position, collapse faces to the limit, and wind them outward.
+
+    Edges can't be collapsed to the limit where a mesh has many holes or pieces. Up to six times as many faces are
+    accepted then; above that, vertices are merged on a grid.
+
+    Raises:
+        AssetError: no face is left.
+    """
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     body.merge_vertices(digits_vertex=None)
     center, size = body.bounds.mean(axis=0), float(np.linalg.norm(body.extents))
@@ -130,8 +186,12 @@ def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
             vertices, faces = fast_simplification.simplify(
                 np.ascontiguousarray(vertices), faces.astype(np.int32), target_count=target, agg=aggression
             )[:2]
-    if len(faces) > triangles or len(faces) == 0:
-        raise AssetError("can't simplify this mesh so far", expected=f"1 to {triangles} faces", found=len(faces))
+    for cells in GRIDS:
+        if len(faces) <= ENOUGH * triangles:
+            break
+        vertices, faces = _merged(vertices, faces, cells)
+    if len(faces) == 0:
+        raise AssetError("the mesh has no faces of any size", expected=f"1 to {triangles} faces", found=0)
     body = trimesh.Trimesh(vertices * size + center, faces, process=False)
     body.update_faces(body.nondegenerate_faces())
     body.remove_unreferenced_vertices()
@@ -140,6 +200,35 @@ def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     if body.volume < 0:
         body.invert()
     return body
+
+
+def _merged(vertices: Array, faces: NDArray, cells: int) -> tuple[Array, NDArray]:
+    """Return vertices and faces with one vertex, the mean, per cell of a grid with so many cells per unit."""
+    _, cell, counts = np.unique(np.floor(vertices * cells), axis=0, return_inverse=True, return_counts=True)
+    cell = cell.reshape(-1)
+    means = np.stack([np.bincount(cell, column) / counts for column in vertices.T], axis=1)
+    faces = cell[faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    return means, faces[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]]
+
+
+def _shaded(mesh: trimesh.Trimesh) -> tuple[Array, NDArray, Array, NDArray]:
+    """Return vertices, faces and normals of a mesh, and the vertex that each comes from.
+
+    Where the mesh has no normals of its own, vertices are split at sharp edges.
+    """
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    own = mesh._cache.cache.get("vertex_normals")
+    if own is not None:
+        return vertices, faces, np.array(own), np.arange(len(vertices))
+    welded = trimesh.Trimesh(vertices, faces, process=False)
+    welded.merge_vertices(digits_vertex=None)
+    normals = _crease_normals(welded).reshape(-1, 3)
+    keys = np.column_stack([faces.reshape(-1), np.rint(normals * 1e4)])
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    origin = faces.reshape(-1)[first]
+    return vertices[origin], inverse.reshape(-1, 3), normals[first], origin
 
 
 def _crease_normals(body: trimesh.Trimesh) -> Array:
@@ -186,15 +275,7 @@ def _baked(
     points = np.einsum("nc,ncd->nd", weights, np.asarray(body.triangles)[face])
     normals = np.einsum("nc,ncd->nd", weights, corner_normals[face])
     origin_face, origin_weights = _closest(mesh, points, normals)
-    if source.image is None:
-        colors = np.einsum("nc,ncd->nd", origin_weights, source.colors[origin_face])
-    else:
-        origin_uv = source.uv[mesh.faces]
-        spread = _double_area(origin_uv).sum() / 2 * source.image.width * source.image.height / max(1, len(points))
-        image = source.image.reduce(max(1, round(np.sqrt(spread))))  # finer detail would only alias
-        colors = _bilinear(
-            np.asarray(image, dtype=np.float32), np.einsum("nc,ncd->nd", origin_weights, origin_uv[origin_face])
-        )
+    colors = source.at(np.asarray(mesh.faces), origin_face, origin_weights)
     picture = np.zeros((size, size, 3), dtype=np.uint8)
     empty = np.ones((size, size), dtype=bool)
     picture[rows, columns] = np.clip(np.rint(colors), 0, 255)

@@ -14,10 +14,10 @@ from asset_tools.build import FEW_GRASPS, GRASPS, build_object
 from asset_tools.graspnet.catalogue import COUNT, ENTRIES, catalogue_entry
 from asset_tools.graspnet.labels import label_checksums, label_grasps
 from asset_tools.grasps import Grasps, sample_grasps
-from asset_tools.import_scans import estimate_mass, scan_files
+from asset_tools.import_scans import estimate_mass, failing_job
+from asset_tools.inspection import Inspection, ModelSource, inspect_models
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.prepare import prepare
-from asset_tools.scan import find_mesh
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
 from robocas_ms3.errors import AssetError
@@ -26,12 +26,13 @@ LICENCE = "CC BY-NC-SA 4.0"
 ATTRIBUTION = "GraspNet-1Billion (H.-S. Fang, C. Wang, M. Gou, C. Lu, CVPR 2020)"
 
 
-def graspnet_jobs(root: Path, ids: Sequence[int] = ()) -> list[Job]:
-    """What is to be made of the dataset.
+def graspnet_jobs(root: Path, ids: Sequence[int] = (), processes: int = 1) -> list[Job]:
+    """Return the jobs that import the dataset. A model that can't be read is a job that fails.
 
     Args:
         root: its folder.
-        ids: the dataset's numbers; none: the 46 that RoboCAS uses.
+        ids: the dataset's numbers; empty: the 46 that RoboCAS uses.
+        processes: how many models are read at a time, see `inspect_models`.
 
     Raises:
         AssetError: naming all numbers that there are none of, or whose models are missing.
@@ -50,7 +51,9 @@ def graspnet_jobs(root: Path, ids: Sequence[int] = ()) -> list[Job]:
             found=f"none for {_listed(missing)}",
             fix="Give the folder that holds models/, or choose with --ids.",
         )
-    return [_job(root, number) for number in numbers]
+    models = {str(number): ModelSource((_mesh(root, number),), root) for number in numbers}
+    inspected = inspect_models(models, processes)
+    return [_job(root, number, inspected[str(number)]) for number in numbers]
 
 
 def graspnet_source(root: Path, number: int) -> ObjectSource:
@@ -67,7 +70,7 @@ def graspnet_source(root: Path, number: int) -> ObjectSource:
         AssetError: the model or the label file is damaged, or the model is missing or can't be closed.
     """
     entry = catalogue_entry(number)
-    model = prepare(_model(root, number), up="z", unit="m")
+    model = prepare(_mesh(root, number), root=root, up="z", unit="m")
     grasps, notes = _grasps(_labels(root, number), model.closed, entry.id)
     return ObjectSource(
         id=entry.id,
@@ -99,19 +102,16 @@ def _grasps(labels: Path, closed: trimesh.Trimesh, id_: str) -> tuple[Grasps | N
     return found.joined(sampled), (note,)
 
 
-def _job(root: Path, number: int) -> Job:
-    labels = _labels(root, number)
-    return Job(
-        catalogue_entry(number).id,
-        partial(_make, root, number),
-        content_hash(
-            "graspnet",
-            number,
-            label_checksums(labels) if labels.is_file() else (),
-            files=scan_files(find_mesh(_model(root, number))),
-            packages=["graspnet"],
-        ),
-    )
+def _job(root: Path, number: int, inspected: Inspection) -> Job:
+    id_, labels = catalogue_entry(number).id, _labels(root, number)
+    if inspected.error is not None:
+        return failing_job(id_, inspected.error)
+    try:
+        checksums = label_checksums(labels) if labels.is_file() else ()
+    except AssetError as error:
+        return failing_job(id_, error)
+    content = content_hash("graspnet", number, checksums, files=inspected.files, packages=["graspnet"])
+    return Job(id_, partial(_make, root, number), content)
 
 
 def _make(root: Path, number: int, folder: Path) -> ObjectAsset:
@@ -120,6 +120,12 @@ def _make(root: Path, number: int, folder: Path) -> ObjectAsset:
 
 def _model(root: Path, number: int) -> Path:
     return root / "models" / catalogue_entry(number).folder
+
+
+def _mesh(root: Path, number: int) -> Path:
+    """Return the textured mesh of a model, or its folder where there is none of that name."""
+    textured = _model(root, number) / "textured.obj"
+    return textured if textured.is_file() else _model(root, number)
 
 
 def _labels(root: Path, number: int) -> Path:

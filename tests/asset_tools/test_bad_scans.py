@@ -203,7 +203,7 @@ def test_thousands_of_loose_bits(tmp_path):
     start = time.process_time()
     scan = prepare(path)
     assert time.process_time() - start < 20
-    assert scan.repairs == ("dropped 5000 loose or inner pieces",)
+    assert len(scan.repairs) == 1 and "5000" in scan.repairs[0]
     check_bottle(scan)
 
 
@@ -249,7 +249,7 @@ def test_colours_of_vertices_only(tmp_path):
     mesh.visual.vertex_colors = np.column_stack([colors, np.full(len(colors), 255)]).astype(np.uint8)
     mesh.export(tmp_path / "scan.ply")
     scan = prepare(tmp_path / "scan.ply", up="z")
-    assert "baked the vertices' colours into a texture" in scan.repairs
+    assert "baked colours into a texture" in scan.repairs
     check_bottle(scan, volume=0.01)
 
 

@@ -4,7 +4,7 @@ import trimesh
 
 from asset_tools.import_scans import ImportSettings, estimate_mass, find_scans, object_id, scan_jobs
 from asset_tools.pipeline import made_of, write_pack
-from asset_tools.scan import load_scan
+from asset_tools.reading.model import read_model
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.errors import AssetError
 
@@ -94,6 +94,8 @@ def test_missing_folder_texture_and_mesh(tmp_path):
         find_scans(tmp_path / "empty")
     (tmp_path / "thing").mkdir()
     (tmp_path / "thing" / "a.mtl").write_text("newmtl m\nmap_Kd lost.png\n")
-    (tmp_path / "thing" / "a.obj").write_text("mtllib a.mtl\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "thing" / "a.obj").write_text(
+        "mtllib a.mtl\nusemtl m\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 3/1\n"
+    )
     with pytest.raises(AssetError, match=r"lost\.png"):
-        load_scan(tmp_path / "thing" / "a.obj")
+        read_model(tmp_path / "thing" / "a.obj")

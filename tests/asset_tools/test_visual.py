@@ -202,10 +202,10 @@ def test_inward_mesh_is_turned_outward(cells):
 
 def test_plain_mesh_has_a_colour_and_no_texture():
     ball = trimesh.creation.icosphere(subdivisions=4)
-    ball.visual.face_colors = [10, 20, 30, 255]
+    ball.visual.face_colors = [124, 188, 255, 255]
     light = to_display(ball, triangles=500)
     assert light.visual.material.baseColorTexture is None
-    assert light.visual.material.baseColorFactor.tolist() == [10, 20, 30, 255]
+    assert light.visual.material.baseColorFactor.tolist() == [52, 128, 255, 255]  # linear, as glTF has it
 
 
 def test_texture_that_repeats_is_looked_up_with_its_wrap():

@@ -1,0 +1,75 @@
+"""A first look at models before they are imported: can they be read, how large are they, of which files are they."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from asset_tools.reading.limits import SECONDS, reading_limits
+from asset_tools.reading.model import read_model
+from robocas_ms3.errors import AssetError, RobocasError
+from robocas_ms3.processes import Calls, Limits, Pool
+
+GRACE = 5.0  # s after the limit of time, until a process that is stuck in native code is ended
+MEMORY_GB = 4.0  # of the process, with all that is imported
+
+
+@dataclass(frozen=True)
+class ModelSource:
+    """Where a model is.
+
+    Attributes:
+        paths: its folder, its file, or its files where there are several versions.
+        root: the imported folder.
+    """
+
+    paths: tuple[Path, ...]
+    root: Path
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What a first look found.
+
+    Attributes:
+        longest: longest side, in the unit of the file; 0 where it can't be read.
+        files: that were read.
+        error: why it can't be read; None: it can.
+    """
+
+    longest: float = 0.0
+    files: tuple[Path, ...] = ()
+    error: AssetError | None = None
+
+
+def inspect_models(models: Mapping[str, ModelSource], processes: int = 1) -> dict[str, Inspection]:
+    """Look at models, each within 30 s and 2 GB of memory.
+
+    Args:
+        models: by id.
+        processes: how many look at a time; with one it is this process.
+
+    Returns:
+        What was found, by id; models that can't be read have an error.
+    """
+    limits = Limits(SECONDS + GRACE, MEMORY_GB)
+    with Pool(partial(Calls, _inspect), processes, died=_died, limits=limits) as pool:
+        found = dict(pool.do(models.items()))
+    return {id_: found[id_] for id_ in models}
+
+
+def _inspect(task: tuple[str, ModelSource]) -> tuple[str, Inspection]:
+    id_, source = task
+    try:
+        with reading_limits(source.paths[0]):
+            model = read_model(list(source.paths), source.root)
+            return id_, Inspection(float(model.mesh.extents.max()), model.files)
+    except RobocasError as error:
+        return id_, Inspection(error=AssetError(str(error)))
+
+
+def _died(task: tuple[str, ModelSource], why: str) -> tuple[str, Inspection]:
+    id_, source = task
+    return id_, Inspection(error=AssetError("the process that read the model died", where=source.paths[0], found=why))

@@ -1,0 +1,68 @@
+"""Time and memory that reading a file of others may take."""
+
+from __future__ import annotations
+
+import re
+import resource
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+from robocas_ms3.errors import AssetError
+
+SECONDS = 25.0
+MEMORY = 2 * 2**30  # bytes
+
+
+@contextmanager
+def reading_limits(where: object) -> Iterator[None]:
+    """End what is inside after 25 s, or when it needs 2 GB of memory more than the process has.
+
+    Outside of the main thread, where no alarm can be set, there is no limit of time.
+
+    Args:
+        where: the model, for errors.
+
+    Raises:
+        AssetError: a limit was reached.
+    """
+    fix = "Reduce the mesh, or leave the model out."
+    limit = resource.getrlimit(resource.RLIMIT_DATA)
+    wanted = _data_size() + MEMORY
+    if limit[1] != resource.RLIM_INFINITY:
+        wanted = min(wanted, limit[1])
+    alarm = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGALRM, _too_slow) if alarm else None
+    try:
+        resource.setrlimit(resource.RLIMIT_DATA, (wanted, limit[1]))
+        if alarm:
+            signal.setitimer(signal.ITIMER_REAL, SECONDS)
+        yield
+    except MemoryError as error:
+        what = "reading the model needs too much memory"
+        raise AssetError(what, where=where, expected=f"at most {MEMORY >> 30} GB", fix=fix) from error
+    except _TooSlow as error:
+        what = "reading the model takes too long"
+        raise AssetError(what, where=where, expected=f"at most {SECONDS:.0f} s", fix=fix) from error
+    finally:
+        if alarm:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, handler)
+        resource.setrlimit(resource.RLIMIT_DATA, limit)
+
+
+class _TooSlow(BaseException):
+    """No parser swallows it as an error of the file."""
+
+
+def _too_slow(number: int, frame: FrameType | None) -> None:
+    raise _TooSlow
+
+
+def _data_size() -> int:
+    """Return the bytes that count against RLIMIT_DATA."""
+    found = re.search(r"^VmData:\s*(\d+) kB", Path("/proc/self/status").read_text(), flags=re.MULTILINE)
+    return int(found[1]) * 1024 if found else 0

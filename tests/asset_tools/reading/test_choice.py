@@ -1,0 +1,155 @@
+"""Which of several mesh files are the object: one rule for versions, parts and collision meshes."""
+
+import numpy as np
+import pytest
+import trimesh
+from models import Gltf, box, image_file, write_obj
+
+from asset_tools.import_scans import ImportSettings, find_scans, scan_jobs
+from asset_tools.reading.model import read_model
+from robocas_ms3.errors import AssetError
+
+
+def mug():
+    return box((0.08, 0.08, 0.1))
+
+
+def notes_of(model):
+    return " | ".join(model.notes)
+
+
+@pytest.mark.parametrize(
+    "name", ["collision", "a_col", "a_vhacd", "a_hull", "a_coll", "a_collision_0", "a_coacd", "convex_3"]
+)
+def test_a_collision_mesh_is_ignored_and_reported(tmp_path, name):
+    write_obj(tmp_path, "model", mug())
+    trimesh.creation.icosphere(subdivisions=3, radius=0.07).export(tmp_path / f"{name}.obj")
+    model = read_model(tmp_path)
+    assert len(model.mesh.faces) == 12
+    assert f"ignored {name}.obj" in notes_of(model) and "used model.obj" in notes_of(model)
+
+
+def test_collision_meshes_alone_are_read(tmp_path):
+    box().export(tmp_path / "collision.stl")
+    assert len(read_model(tmp_path).mesh.faces) == 12
+
+
+@pytest.mark.parametrize(
+    ("others", "used"),
+    [
+        (["mug.stl", "nontextured.ply"], "mug.obj"),
+        (["mug_low.glb"], "mug.obj"),
+        (["a_millimetres.stl"], "mug.obj"),
+    ],
+)
+def test_of_several_versions_the_textured_one_is_taken(tmp_path, others, used):
+    write_obj(tmp_path, "mug", mug())
+    for name in others:
+        mesh = mug().subdivide()
+        mesh.apply_scale(1000 if "milli" in name else 1)
+        mesh.export(tmp_path / name)
+    model = read_model(tmp_path)
+    assert len(model.mesh.faces) == 12 and f"used {used}" in notes_of(model)
+    assert all(f"ignored {name}" in notes_of(model) for name in others)
+
+
+def test_of_versions_without_texture_the_most_detailed_one_is_taken(tmp_path):
+    mug().export(tmp_path / "a.ply")
+    mug().subdivide().export(tmp_path / "b.ply")
+    assert len(read_model(tmp_path).mesh.faces) == 48
+
+
+def test_a_version_that_cannot_be_read_is_left_out(tmp_path):
+    write_obj(tmp_path, "mug", mug())
+    (tmp_path / "mug.ply").write_bytes(b"ply\nnonsense")
+    model = read_model(tmp_path)
+    assert len(model.mesh.faces) == 12
+    assert any(note.startswith("warning:") and "mug.ply" in note for note in model.notes)
+
+
+def test_parts_are_joined(tmp_path):
+    write_obj(tmp_path, "body", mug())
+    write_obj(tmp_path, "handle", box((0.03, 0.01, 0.06), (0.055, 0, 0)))
+    write_obj(tmp_path, "cork", box((0.03, 0.03, 0.04), (0, 0, 0.06)))
+    model = read_model(tmp_path)
+    np.testing.assert_allclose(model.mesh.bounds, [[-0.04, -0.04, -0.05], [0.07, 0.04, 0.08]])
+    assert len(model.mesh.faces) == 36
+    assert all(f"{name}.obj" in notes_of(model) for name in ("body", "handle", "cork"))
+
+
+def test_a_part_inside_the_box_of_another_is_joined(tmp_path):
+    cabinet = trimesh.creation.annulus(0.05, 0.06, 0.1)
+    cabinet.export(tmp_path / "wall.ply")
+    content = trimesh.creation.cylinder(0.045, 0.02)
+    content.apply_translation([0, 0, -0.03])
+    content.export(tmp_path / "content.ply")
+    assert read_model(tmp_path).mesh.volume == pytest.approx(cabinet.volume + np.pi * 0.045**2 * 0.02, rel=0.02)
+
+
+def test_what_another_file_shows_is_left_out(tmp_path):
+    both = trimesh.util.concatenate([mug(), box((0.03, 0.01, 0.06), (0.056, 0, 0))])
+    both.export(tmp_path / "whole.ply")
+    mug().export(tmp_path / "body.ply")
+    model = read_model(tmp_path)
+    assert len(model.mesh.faces) == 24 and "ignored body.ply" in notes_of(model)
+
+
+def test_several_objects_in_one_folder_are_an_error_that_names_them(tmp_path):
+    plate, cup = trimesh.creation.cylinder(0.1, 0.02), trimesh.creation.cylinder(0.03, 0.1)
+    for mesh, name in ((plate, "plate"), (cup, "cup")):
+        mesh.apply_translation([0, 0, -mesh.bounds[0, 2]])
+        mesh.export(tmp_path / f"{name}.ply")
+    with pytest.raises(AssetError) as caught:
+        read_model(tmp_path)
+    assert "plate.ply" in str(caught.value.found) and "cup.ply" in str(caught.value.found)
+    cup.apply_translation([1, 0, 0.3])
+    cup.export(tmp_path / "cup.ply")
+    with pytest.raises(AssetError):
+        read_model(tmp_path)
+
+
+def test_layouts_that_datasets_have(tmp_path):
+    """YCB, Google's scanned objects, and textures or archives' leftovers next to objects."""
+    write_obj(tmp_path / "ycb" / "google_16k", "textured", mug())
+    mug().export(tmp_path / "ycb" / "google_16k" / "nontextured.ply")
+    (tmp_path / "ycb" / "tsdf").mkdir()
+    mug().subdivide().export(tmp_path / "ycb" / "tsdf" / "textured.obj")
+    write_obj(tmp_path / "shoe" / "meshes", "model", mug(), color=None)
+    image_file(tmp_path / "shoe" / "materials" / "textures" / "skin.png")
+    image_file(tmp_path / "shoe" / "thumbnails" / "0.jpg")
+    image_file(tmp_path / "textures" / "wood.png")
+    image_file(tmp_path / "photos" / "1.png")
+    (tmp_path / "__MACOSX").mkdir()
+    box().export(tmp_path / "__MACOSX" / "x.ply")
+    write_obj(tmp_path, "cup", mug())
+    mug().export(tmp_path / "cup.stl")
+    mug().export(tmp_path / "cup_collision.stl")
+    (tmp_path / "soft").mkdir()
+    (tmp_path / "soft" / "soft.fbx").write_bytes(b"Kaydara")
+    found = find_scans(tmp_path)
+    assert sorted(found.models) == ["cup", "shoe", "soft", "ycb"]
+    assert not found.errors
+    skipped = " ".join(found.skipped)
+    assert all(name in skipped for name in ("textures", "photos", "__MACOSX", "cup_collision.stl"))
+    for name in ("ycb", "shoe", "cup"):
+        model = read_model(list(found.models[name].paths), tmp_path)
+        assert len(model.mesh.faces) == 12 and any(path.name == "skin.png" for path in model.files)
+    with pytest.raises(AssetError) as caught:
+        read_model(list(found.models["soft"].paths), tmp_path)
+    assert ".fbx" in str(caught.value.found)
+
+
+def test_two_scans_with_one_id_fail_alone(tmp_path):
+    write_obj(tmp_path, "mug")
+    write_obj(tmp_path / "Mug", "other")
+    write_obj(tmp_path / "cup")
+    jobs = {job.id: job for job in scan_jobs(tmp_path, ImportSettings())}
+    assert sorted(jobs) == ["cup", "mug"]
+    with pytest.raises(AssetError):
+        jobs["mug"].make(tmp_path / "out")
+
+
+def test_a_gltf_next_to_its_own_files_is_one_model(tmp_path):
+    Gltf(mug()).write(tmp_path / "mug.glb")
+    image_file(tmp_path / "preview.png")
+    assert len(read_model(tmp_path).mesh.faces) == 12

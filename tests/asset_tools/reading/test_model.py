@@ -1,0 +1,138 @@
+"""Reading a model: what is wrong with a file is one typed error, and what the format says is kept."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from models import GREEN, RED, Gltf, box, image_file, shown_colors, write_obj
+from PIL import Image
+
+from asset_tools.reading.model import read_model
+from robocas_ms3.errors import AssetError, RobocasError
+
+TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.obj", b""),
+        ("a.obj", TRIANGLE[:24].encode()),
+        ("a.obj", TRIANGLE.replace("v 1 0 0", "v nan 0 0").encode()),
+        ("a.obj", TRIANGLE.replace("v 1 0 0", "v 1e300 0 0").encode()),
+        ("a.obj", TRIANGLE.replace("v 1 0 0", "v 0 0 0").replace("v 0 1 0", "v 0 0 0").encode()),
+        ("a.stl", b"solid"),
+        ("a.stl", b"\0" * 80 + (10**9).to_bytes(4, "little")),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1000000000000\nproperty float x\nend_header\n"),
+        ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nend_header\n\0"),
+        ("a.off", b"OFF\n3 1 0\n0 0 0\n"),
+        ("a.3mf", b"PK"),
+        ("a.glb", b"glTF"),
+        ("a.gltf", b"[]"),
+        ("a.gltf", b"[" * 100_000),
+        ("a.fbx", b"Kaydara"),
+    ],
+    ids=str,
+)
+def test_a_damaged_file_is_one_typed_error(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(AssetError) as caught:
+        read_model(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_path(tmp_path):
+    with pytest.raises(AssetError):
+        read_model(tmp_path / "lost.obj")
+    with pytest.raises(AssetError):
+        read_model(tmp_path / "lost")
+
+
+def test_a_gltf_whose_image_is_missing(tmp_path):
+    gltf = Gltf()
+    gltf.attribute("TEXCOORD_0", np.zeros((gltf.count, 2), "<f4"))
+    gltf.tree["images"], gltf.tree["textures"] = [{"uri": "lost%20one.png"}], [{"source": 0}]
+    gltf.material(pbrMetallicRoughness={"baseColorTexture": {"index": 0}})
+    with pytest.raises(AssetError) as caught:
+        read_model(gltf.write(tmp_path / "mug.glb"))
+    assert str(caught.value.where).endswith("lost one.png")
+    image_file(tmp_path / "maps" / "lost one.png", GREEN)
+    assert shown_colors(read_model(tmp_path / "mug.glb").mesh)[0].tolist() == list(GREEN)
+
+
+def test_the_axis_that_a_format_says_is_up(tmp_path):
+    assert read_model(Gltf().write(tmp_path / "a.glb")).up == "y"
+    assert read_model(write_obj(tmp_path)).up is None
+
+
+def test_files_that_were_read_are_known(tmp_path):
+    path = write_obj(tmp_path)
+    image_file(tmp_path / "other.png")
+    assert {file.name for file in read_model(path).files} == {"mug.obj", "skin.mtl", "skin.png"}
+
+
+@pytest.mark.parametrize(
+    "comment", ["TextureFile skin.png", "  TextureFile    skin.png  ", "texturefile skin.png", "TEXTUREFILE SKIN.PNG"]
+)
+def test_textures_of_ply(tmp_path, comment):
+    image_file(tmp_path / "skin.png")
+    mesh = box()
+    head = f"ply\nformat ascii 1.0\ncomment {comment}\nelement vertex {len(mesh.vertices)}\n"
+    head += "".join(f"property float {name}\n" for name in "xyzst") + f"element face {len(mesh.faces)}\n"
+    head += "property list uchar int vertex_indices\nend_header\n"
+    rows = [" ".join(map(str, [*vertex, 0.5, 0.5])) for vertex in mesh.vertices]
+    rows += [" ".join(map(str, [3, *face])) for face in mesh.faces]
+    (tmp_path / "mug.ply").write_text(head + "\n".join(rows) + "\n")
+    assert (shown_colors(read_model(tmp_path / "mug.ply").mesh) == RED).all()
+    (tmp_path / "skin.png").unlink()
+    with pytest.raises(AssetError) as caught:
+        read_model(tmp_path / "mug.ply")
+    assert str(caught.value.where).lower().endswith("skin.png")
+
+
+def test_colours_of_vertices_and_faces(tmp_path):
+    mesh = box()
+    mesh.visual.face_colors = np.tile([*GREEN, 255], (12, 1)).astype(np.uint8)
+    mesh.export(tmp_path / "faces.ply")
+    assert (shown_colors(read_model(tmp_path / "faces.ply").mesh) == GREEN).all()
+    mesh.visual = trimesh.visual.ColorVisuals(vertex_colors=np.tile([*RED, 255], (8, 1)).astype(np.uint8))
+    mesh.export(tmp_path / "vertices.ply")
+    assert (shown_colors(read_model(tmp_path / "vertices.ply").mesh) == RED).all()
+
+
+def test_collada(tmp_path, monkeypatch):
+    """Read with pycollada; without it, the error names the extra."""
+    pytest.importorskip("collada")
+    (tmp_path / "box.dae").write_bytes(trimesh.exchange.dae.export_collada(box()))
+    model = read_model(tmp_path / "box.dae")
+    np.testing.assert_allclose(model.mesh.extents, [0.06, 0.05, 0.1], atol=1e-6)
+    assert model.up in ("y", "z")
+    monkeypatch.setattr("asset_tools.reading.exchange.find_spec", lambda name: None)
+    with pytest.raises(RobocasError) as caught:
+        read_model(tmp_path / "box.dae")
+    assert "robocas-ms3[assets]" in caught.value.fix
+
+
+@pytest.mark.parametrize(
+    ("mode", "dtype", "value"),
+    [("I;16", np.uint16, 51400), ("L", np.uint8, 200), ("F", np.float32, 200 / 255)],
+)
+def test_grey_textures_of_all_depths(tmp_path, mode, dtype, value):
+    path = write_obj(tmp_path, color=None, mtl=f"newmtl skin\nmap_Kd skin.{'tif' if mode == 'F' else 'png'}\n")
+    Image.fromarray(np.full((4, 4), value, dtype)).save(tmp_path / f"skin.{'tif' if mode == 'F' else 'png'}")
+    assert (shown_colors(read_model(path).mesh) == 200).all()
+
+
+@pytest.mark.parametrize("mode", ["P", "LA", "RGBA", "1", "CMYK"])
+def test_textures_of_all_modes(tmp_path, mode):
+    path = write_obj(tmp_path, color=None, mtl="newmtl skin\nmap_Kd skin.tif\n")
+    Image.new("RGB", (4, 4), (255, 255, 255)).convert(mode).save(tmp_path / "skin.tif")
+    assert (shown_colors(read_model(path).mesh) == 255).all()
+
+
+def test_json_of_gltf_may_hold_unknown_keys(tmp_path):
+    gltf = Gltf()
+    gltf.tree |= {"extras": {"deep": [{}]}, "unknown": 5, "asset": {"version": "2.0", "extras": 3}}
+    model = read_model(gltf.write(tmp_path / "mug.glb"))
+    assert json.dumps(model.notes) == "[]" and len(model.mesh.faces) == 12

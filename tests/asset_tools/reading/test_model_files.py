@@ -1,0 +1,109 @@
+"""What is read: regular files of bounded size below the imported folder, in bounded time and memory."""
+
+import json
+import os
+import time
+
+import numpy as np
+import pytest
+from models import Gltf, image_file, write_obj
+
+from asset_tools.inspection import ModelSource, inspect_models
+from asset_tools.reading.files import LARGEST_FILE, ModelFiles, read_file
+from asset_tools.reading.limits import reading_limits
+from asset_tools.reading.model import read_model
+from robocas_ms3.errors import AssetError
+
+
+def special(kind, path):
+    path.unlink(missing_ok=True)
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "loop":
+        path.symlink_to(path)
+    else:
+        with path.open("wb") as file:
+            file.truncate(LARGEST_FILE + 1)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "loop", "huge"])
+@pytest.mark.parametrize("name", ["mug.obj", "skin.mtl", "skin.png"])
+def test_only_regular_files_of_bounded_size_are_read(tmp_path, kind, name):
+    path = write_obj(tmp_path)
+    special(kind, tmp_path / name)
+    start = time.monotonic()
+    with pytest.raises(AssetError):
+        read_model(path)
+    assert time.monotonic() - start < 5
+
+
+@pytest.mark.parametrize("link", [False, True])
+@pytest.mark.parametrize("kind", ["map", "library", "image", "buffer"])
+def test_nothing_outside_of_the_imported_folder_is_read(tmp_path, kind, link):
+    root = tmp_path / "scans"
+    secret = image_file(tmp_path / "secret.png")
+    name = "../../secret.png"
+    if link:
+        (root / "mug").mkdir(parents=True)
+        (root / "mug" / "inside.png").symlink_to(secret)
+        name = "inside.png"
+    if kind == "map":
+        path = write_obj(root / "mug", mtl=f"newmtl skin\nmap_Kd {name}\n")
+    elif kind == "library":
+        path = write_obj(root / "mug", head=f"mtllib {name}")
+    else:
+        gltf = Gltf()
+        gltf.attribute("TEXCOORD_0", np.zeros((gltf.count, 2), "<f4"))
+        gltf.material(pbrMetallicRoughness={"baseColorTexture": {"index": 0}})
+        gltf.tree["images"], gltf.tree["textures"] = [{"uri": name}], [{"source": 0}]
+        path = gltf.write(root / "mug" / "mug.glb")
+        if kind == "buffer":
+            path = root / "mug" / "mug.gltf"
+            gltf.tree["buffers"][0]["uri"] = name
+            path.write_text(json.dumps(gltf.tree))
+    with pytest.raises(AssetError) as caught:
+        read_model(path, root)
+    assert name.rsplit("/", 1)[-1] in str(caught.value.where)
+
+
+def test_a_path_upwards_within_the_imported_folder(tmp_path):
+    image_file(tmp_path / "shared" / "skin.png")
+    path = write_obj(tmp_path / "mug", color=None, mtl="newmtl skin\nmap_Kd ../shared/skin.png\n")
+    assert tmp_path / "shared" / "skin.png" in read_model(path, tmp_path).files
+    with pytest.raises(AssetError):
+        read_model(path)  # alone, its own folder is the imported one
+
+
+def test_a_name_that_leads_outside_is_searched_below_the_model(tmp_path):
+    image_file(tmp_path / "maps" / "skin.png")
+    files = ModelFiles(tmp_path, tmp_path)
+    for name in ("../../skin.png", "/etc/skin.png", "C:\\me\\skin.png", "file:///me/skin.png"):
+        assert files.find(name, tmp_path) == tmp_path / "maps" / "skin.png"
+    assert files.find("nul\0.png", tmp_path) is None
+    with pytest.raises(AssetError):
+        read_file(tmp_path / "lost", tmp_path)
+
+
+def test_reading_is_bounded_in_memory():
+    with pytest.raises(AssetError) as caught, reading_limits("mug"):
+        bytearray(5 * 2**30)
+    assert caught.value.where == "mug"
+
+
+def test_reading_is_bounded_in_time(monkeypatch):
+    monkeypatch.setattr("asset_tools.reading.limits.SECONDS", 0.05)
+    with pytest.raises(AssetError), reading_limits("mug"):
+        while True:
+            pass
+
+
+def test_one_model_that_cannot_be_read_does_not_end_the_inspection(tmp_path):
+    write_obj(tmp_path / "good")
+    write_obj(tmp_path / "bad").write_text("v nonsense")
+    found = inspect_models({name: ModelSource((tmp_path / name,), tmp_path) for name in ("good", "bad")})
+    assert found["good"].longest == pytest.approx(0.1) and found["good"].error is None
+    assert isinstance(found["bad"].error, AssetError)

@@ -1,0 +1,138 @@
+"""OBJ and MTL as exporters write them: the texture is found, or its loss is said."""
+
+import numpy as np
+import pytest
+from models import BLUE, GREEN, RED, box, image_file, obj_text, shown_colors, write_obj
+
+from asset_tools.reading.model import read_model
+from asset_tools.reading.obj import parse_mtl, parse_obj
+from robocas_ms3.errors import AssetError
+
+
+def warnings(model):
+    return [note for note in model.notes if note.startswith("warning:")]
+
+
+@pytest.mark.parametrize(
+    ("mtl", "text"),
+    [
+        ("newmtl skin\nmap_Kd skin.png\n", {"use": ""}),
+        ("newmtl skin\nmap_Kd skin.png\n", {"use": "usemtl unknown"}),
+        ("newmtl skin\nmap_Kd skin.png\nnewmtl plain\nKd 0 1 0\n", {"use": "usemtl unknown"}),
+        ("newmtl Skin\nmap_Kd skin.png\n", {"use": "usemtl SKIN"}),
+        ("newmtl\tmy  skin\nmap_Kd\t skin.png\n", {"use": "usemtl   my skin "}),
+        ("NEWMTL skin\nKD 1 1 1\nMAP_KD skin.png\n", {}),
+        ("newmtl skin\nKd 0 0 0\nmap_Kd -clamp on -s 1 1 1 skin.png\n", {}),
+        ("newmtl skin\nmap_Ka skin.png\n", {}),
+        ("newmtl skin\nKd 0 0 0\nmap_Ke skin.png\n", {}),
+        ("newmtl skin\nmap_Kd SKIN.PNG\n", {}),
+        ("newmtl skin\nmap_Kd skin.png\nnewmtl unused\nmap_Kd lost.png\n", {}),
+        ("newmtl skin\nmap_Kd skin.png\n", {"head": "  mtllib  skin.mtl"}),
+        ("newmtl skin\nmap_Kd skin.png\n", {"head": "mtllib other.mtl skin.mtl"}),
+        ("newmtl skin\nmap_Kd skin.png\n", {"head": "mtllib lost.mtl skin.mtl"}),
+    ],
+)  # fmt: skip
+def test_the_texture_is_found(tmp_path, mtl, text):
+    path = write_obj(tmp_path, mtl=mtl, **text)
+    (tmp_path / "other.mtl").write_text("newmtl other\nKd 0 0 1\n")
+    model = read_model(path)
+    np.testing.assert_array_equal(shown_colors(model.mesh), np.tile(RED, (12, 1)))
+    assert warnings(model) == []
+
+
+def test_lines_indented_by_spaces_and_continued(tmp_path):
+    path = write_obj(tmp_path)
+    text = path.read_text().replace("\n", "\n   ").replace("usemtl skin", "usemtl \\\n skin")
+    path.write_text(text)
+    np.testing.assert_array_equal(shown_colors(read_model(path).mesh), np.tile(RED, (12, 1)))
+
+
+@pytest.mark.parametrize("substitute", ["mug.mtl", "mug.png"])
+def test_an_obvious_substitute_is_taken_and_reported(tmp_path, substitute):
+    path = write_obj(tmp_path, mtl=None, head="mtllib textured.mtl" if substitute == "mug.mtl" else "")
+    if substitute == "mug.mtl":
+        (tmp_path / "mug.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
+    else:
+        image_file(tmp_path / "mug.png")
+    model = read_model(path)
+    np.testing.assert_array_equal(shown_colors(model.mesh), np.tile(RED, (12, 1)))
+    assert any(substitute in note for note in model.notes)
+
+
+@pytest.mark.parametrize(
+    ("mtl", "text", "warns"),
+    [
+        ("newmtl a\nmap_Kd skin.png\nnewmtl b\nmap_Kd other.png\n", {"use": "usemtl c"}, True),
+        (None, {"head": "", "use": ""}, False),
+        (None, {"head": ""}, True),
+        (None, {"head": "", "uvs": False, "use": ""}, False),
+        ("newmtl skin\nmap_Kd skin.png\n", {"uvs": False}, True),
+    ],
+)
+def test_what_has_no_texture_is_white(tmp_path, mtl, text, warns):
+    path = write_obj(tmp_path, mtl=mtl, **text)
+    image_file(tmp_path / "other.png", GREEN)
+    model = read_model(path)
+    np.testing.assert_array_equal(shown_colors(model.mesh), np.full((12, 3), 255))
+    assert bool(warnings(model)) == warns
+
+
+def test_a_missing_texture_or_material_file_that_faces_need_is_an_error(tmp_path):
+    with pytest.raises(AssetError) as caught:
+        read_model(write_obj(tmp_path / "a", mtl="newmtl skin\nmap_Kd lost.png\n"))
+    assert str(caught.value.where).endswith("lost.png")
+    with pytest.raises(AssetError) as caught:
+        read_model(write_obj(tmp_path / "b", mtl=None))
+    assert str(caught.value.where).endswith("skin.mtl")
+
+
+def test_each_material_keeps_its_colour(tmp_path):
+    """Two textures, a plain colour and an unknown material in one file."""
+    image_file(tmp_path / "red.png", RED), image_file(tmp_path / "blue.png", BLUE)
+    (tmp_path / "m.mtl").write_text("newmtl r\nmap_Kd red.png\nnewmtl b\nmap_Kd blue.png\nnewmtl g\nKd 0 0.5 1\n")
+    lines = obj_text(box(), head="mtllib m.mtl", use="").splitlines()
+    faces = [i for i, line in enumerate(lines) if line.startswith("f ")]
+    for row, name in reversed(list(zip(faces[::3], "rbgx", strict=True))):
+        lines.insert(row, f"usemtl {name}")
+    (tmp_path / "m.obj").write_text("\n".join(lines))
+    colors = shown_colors(read_model(tmp_path / "m.obj").mesh)
+    expected = {RED: 3, BLUE: 3, (0, 128, 255): 3, (255, 255, 255): 3}
+    found = {
+        tuple(color): int(count) for color, count in zip(*np.unique(colors, axis=0, return_counts=True), strict=True)
+    }
+    assert found == expected
+
+
+def test_vertex_colours_of_an_obj(tmp_path):
+    mesh = box()
+    text = "".join(f"v {x} {y} {z} 0 0.5 1\n" for x, y, z in mesh.vertices)
+    text += "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in mesh.faces)
+    (tmp_path / "m.obj").write_text(text)
+    np.testing.assert_array_equal(shown_colors(read_model(tmp_path / "m.obj").mesh), np.tile([0, 128, 255], (12, 1)))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "v 0 0 0\nf 1 2 3\n",
+        "v a b c\nf 1 1 1\n",
+        "v 0 0\nf 1 1 1\n",
+        "f 0 1 2\n",
+        "v 0 0 0\nf -2 -1 1\n",
+        "v 0 0 0\nf 1/9 1 1\n",
+    ],
+)
+def test_numbers_and_indices_that_cannot_be_read(text):
+    with pytest.raises(AssetError) as caught:
+        parse_obj(text, "mug.obj")
+    assert caught.value.where == "mug.obj"
+
+
+def test_polygons_and_indices_counted_from_the_end():
+    mesh = parse_obj("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\nf -4 -3 -2\nl 1 2\nf 1 2\n", "m")
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2]]
+
+
+def test_options_of_a_map_statement():
+    found = parse_mtl("newmtl a\nmap_Kd -S 2 3 1 -o 0.5 -bm 1 my skin.png\n")["a"]
+    assert (found.image, found.uv_scale, found.uv_offset) == ("my skin.png", (2.0, 3.0), (0.5, 0.0))

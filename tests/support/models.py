@@ -1,0 +1,123 @@
+"""Small models of our own, written by hand in the formats that are imported."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+RED, GREEN, BLUE = (200, 30, 30), (30, 180, 40), (40, 60, 210)
+
+
+def image_file(path: Path, color=RED, size=(4, 4), mode="RGB") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new(mode, size, color).save(path)
+    return path
+
+
+def box(size=(0.06, 0.05, 0.1), at=(0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    mesh = trimesh.creation.box(size)
+    mesh.apply_translation(at)
+    return mesh
+
+
+def obj_text(mesh: trimesh.Trimesh, *, head="mtllib skin.mtl", use="usemtl skin", uvs=True) -> str:
+    """An OBJ with one vertex of texture per vertex, all in the middle of the image."""
+    lines = [head] if head else []
+    lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in mesh.vertices]
+    lines += ["vt 0.5 0.5"] if uvs else []
+    lines += [use] if use else []
+    lines += ["f " + " ".join(f"{i + 1}/1" if uvs else f"{i + 1}" for i in face) for face in mesh.faces]
+    return "\n".join(lines) + "\n"
+
+
+def write_obj(folder: Path, name="mug", mesh=None, *, mtl="newmtl skin\nmap_Kd skin.png\n", color=RED, **text) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{name}.obj").write_text(obj_text(box() if mesh is None else mesh, **text))
+    if mtl is not None:
+        (folder / "skin.mtl").write_text(mtl)
+    if color is not None:
+        image_file(folder / "skin.png", color)
+    return folder / f"{name}.obj"
+
+
+class Gltf:
+    """Builds a GLB: one primitive of one mesh, unless its JSON is changed."""
+
+    def __init__(self, mesh: trimesh.Trimesh | None = None) -> None:
+        mesh = box() if mesh is None else mesh
+        self.blob = b""
+        self.tree: dict = {
+            "asset": {"version": "2.0"},
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "accessors": [],
+            "bufferViews": [],
+        }
+        self.count = len(mesh.vertices)
+        self.primitive = {
+            "attributes": {"POSITION": self.array(np.asarray(mesh.vertices, "<f4"))},
+            "indices": self.array(np.asarray(mesh.faces, "<u2").reshape(-1, 1)),
+        }
+        self.tree["meshes"] = [{"primitives": [self.primitive]}]
+
+    def view(self, data: bytes, **more) -> int:
+        self.tree["bufferViews"].append({"buffer": 0, "byteOffset": len(self.blob), "byteLength": len(data), **more})
+        self.blob += data + b"\0" * (-len(data) % 4)
+        return len(self.tree["bufferViews"]) - 1
+
+    def array(self, values: np.ndarray, *, normalized=False, stride=0, **more) -> int:
+        kinds = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
+        data = values.tobytes()
+        if stride:
+            data = b"".join(row.tobytes().ljust(stride, b"\0") for row in values)
+        accessor = {
+            "bufferView": self.view(data, **({"byteStride": stride} if stride else {})),
+            "componentType": kinds[values.dtype.str[1:]],
+            "count": len(values),
+            "type": {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}[values.shape[1]],
+            **({"normalized": True} if normalized else {}),
+            **more,
+        }
+        self.tree["accessors"].append(accessor)
+        return len(self.tree["accessors"]) - 1
+
+    def attribute(self, name: str, values: np.ndarray, **more) -> None:
+        self.primitive["attributes"][name] = self.array(values, **more)
+
+    def texture(self, image: Image.Image) -> int:
+        """An image in the file, as a texture; its number."""
+        import io
+
+        stream = io.BytesIO()
+        image.save(stream, "PNG")
+        self.tree.setdefault("images", []).append({"bufferView": self.view(stream.getvalue()), "mimeType": "image/png"})
+        self.tree.setdefault("textures", []).append({"source": len(self.tree["images"]) - 1})
+        return len(self.tree["textures"]) - 1
+
+    def material(self, **material) -> None:
+        self.tree.setdefault("materials", []).append(material)
+        self.primitive["material"] = len(self.tree["materials"]) - 1
+
+    def write(self, path: Path) -> Path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.tree["buffers"] = [{"byteLength": len(self.blob)}]
+        head = json.dumps(self.tree).encode()
+        head += b" " * (-len(head) % 4)
+        chunks = (
+            struct.pack("<I4s", len(head), b"JSON") + head + struct.pack("<I4s", len(self.blob), b"BIN\0") + self.blob
+        )
+        path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+        return path
+
+
+def shown_colors(mesh: trimesh.Trimesh) -> np.ndarray:
+    """(F, 3) sRGB colour that the import shows in the middle of each face, 0 to 255."""
+    from asset_tools.visual import _Source
+
+    faces = np.arange(len(mesh.faces))
+    return np.rint(_Source(mesh).at(np.asarray(mesh.faces), faces, np.full((len(faces), 3), 1 / 3)))
