@@ -18,6 +18,8 @@ from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.glb import DEFAULT_ROUGHNESS
 from asset_tools.partnet.obj import Faces
+from asset_tools.reading.files import read_file
+from asset_tools.reading.images import open_texture
 from asset_tools.visual import _crease_normals
 from robocas_ms3.errors import AssetError
 
@@ -237,8 +239,4 @@ def _shelves(sizes: Array) -> tuple[Array, int, int]:
 
 @lru_cache(maxsize=16)
 def _opened(path: Path) -> Image.Image:
-    try:
-        with Image.open(path) as image:
-            return image.convert("RGB")
-    except OSError as error:
-        raise AssetError("this texture can't be read", where=path, found=error) from error
+    return open_texture(read_file(path, path.parent), path, [])
