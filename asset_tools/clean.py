@@ -1,4 +1,4 @@
-"""Cleaning the faces of a scan: double ones, dirt, shells inside of others, faces that look the wrong way."""
+"""Clean the faces of a scan: duplicates, walls between touching parts, dirt, inner shells, inward faces."""
 
 from __future__ import annotations
 
@@ -16,7 +16,12 @@ from robocas_ms3.errors import AssetError
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-LOOSE = 0.02  # share of the surface below which a separate piece is scanner dirt
+LOOSE = 0.02  # share of the surface below which a separate piece may be scanner dirt
+SPECK = 0.02  # of the diagonal: closed pieces of at least this size are parts, if they are near
+NEAR = 0.01  # of the diagonal: distance of a part from the bounding box of another part, at most
+STICKS_OUT = 0.05  # of the diagonal: change of the bounding box above which no piece or face is dropped
+DROPPED = 0.05  # share of the surface that dropped dirt may have, flat scraps not counted
+FLAT = 0.001  # second largest over largest eigenvalue of the normals' covariance of a flat piece
 # scans are written with 5 or 6 digits, so that corners of one point may differ in the last
 SAME = 1e-6  # of the diagonal
 
@@ -52,7 +57,12 @@ def clean(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
     if len(kept) < len(scan.faces):
         repairs.append(f"dropped {_count(len(scan.faces) - len(kept), 'double or degenerate face')}")
         welded.update_faces(kept)
-    outer = _outer_faces(welded, repairs)
+    if np.bincount(welded.edges_unique_inverse).max() > 2:
+        welded, outer = _outer_boundary(welded)
+        if len(outer) < len(kept):
+            repairs.append(f"dropped {_count(len(kept) - len(outer), 'face')} inside of touching parts")
+        kept = kept[outer]
+    outer = _object_faces(welded, repairs)
     kept = kept[outer]
     welded.update_faces(outer)
     turned = _inward_faces(welded)
@@ -80,32 +90,209 @@ def _welded(scan: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, inverse.reshape(-1)[scan.faces], process=False)
 
 
-def _outer_faces(mesh: trimesh.Trimesh, repairs: list[str]) -> Ints:
-    """Indices of the faces that are neither dirt nor a shell inside of another piece."""
-    links = np.asarray(mesh.face_adjacency).reshape(-1, 2)
+def _outer_boundary(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Ints]:
+    """Resolve edges of more than two faces: drop inner walls and fins, and separate parts that share an edge.
+
+    The faces divide space into cells: around an edge, the sides of two neighbouring faces that look at each other
+    belong to one cell. A face of the outer surface has the unbounded cell on exactly one side.
+
+    Returns:
+        Mesh of the outer faces, where no edge of a closed part has more than two faces, and their indices (K,).
+    """
     count = len(mesh.faces)
-    graph = coo_matrix((np.ones(len(links), bool), (links[:, 0], links[:, 1])), shape=(count, count))
-    number, piece = connected_components(graph, directed=False)
-    if number < 2:
-        return np.arange(count)
-    areas = np.bincount(piece, mesh.area_faces, number)
+    edge, face = np.asarray(mesh.edges_unique_inverse), np.asarray(mesh.edges_face)
+    upwards = np.asarray(mesh.edges)[:, 0] < np.asarray(mesh.edges)[:, 1]  # whether a face runs to the higher vertex
+    order = _around_edges(mesh, upwards ^ _inward_faces(mesh)[face])
+    ahead, behind = 2 * face + ~upwards, 2 * face + upwards  # sides that look ahead and back; 2 f is the front of f
+    one, other = _neighbours(order, edge)
+    cell = _components(ahead[one], behind[other], 2 * count)
+    component = _components(face[one], face[other], count)
+    tangled = np.unique(component[face[np.bincount(edge)[edge] > 2]])
+    outside, kept = np.zeros(2 * count, bool), np.ones(count, bool)
+    by_component = np.argsort(component, kind="stable")
+    starts = np.searchsorted(component[by_component], [tangled, tangled + 1])
+    for members in (by_component[low:high] for low, high in starts.T):
+        unbounded = cell[2 * members[:, None] + [0, 1]] == cell[_outermost_side(mesh, members)]
+        boundary = unbounded.sum(axis=1) == 1
+        if boundary.any() and _box_change(mesh, members, members[boundary]) <= STICKS_OUT:
+            outside[2 * members], outside[2 * members + 1] = unbounded.T
+            kept[members] = boundary
+    # corners of faces that hold the same part of the inside between them share a vertex
+    one, other = _neighbours(order[kept[face[order]]], edge)
+    within = ~outside[ahead[one]]
+    one, other = one[within], other[within]
+    place = np.arange(3 * count).reshape(-1, 3)
+    first, second = place.reshape(-1), np.roll(place, -1, axis=1).reshape(-1)
+    low, high = np.where(upwards, first, second), np.where(upwards, second, first)
+    vertex = _components(np.append(low[one], high[one]), np.append(low[other], high[other]), 3 * count)
+    vertices = np.empty((vertex.max() + 1, 3))
+    vertices[vertex] = np.asarray(mesh.vertices)[mesh.faces.reshape(-1)]
+    return trimesh.Trimesh(vertices, vertex.reshape(-1, 3)[kept], process=False), np.flatnonzero(kept)
+
+
+def _around_edges(mesh: trimesh.Trimesh, outside_ahead: NDArray[np.bool_]) -> Ints:
+    """Return the order (3 F,) of half-edges by edge, and around it by the angle of their faces.
+
+    Of two faces at one angle, one that has its outside ahead comes first: it ends a part, and the other face begins the
+    next part. Of two with one outside, the face of the larger surface is outermost.
+
+    Args:
+        mesh: its half-edges in the order of ``mesh.edges``.
+        outside_ahead: (3 F,) whether the outside of the half-edge's face is on the side of larger angles.
+    """
+    vertices, edges = np.asarray(mesh.vertices), np.asarray(mesh.edges_sorted)
+    start, end = vertices[edges[:, 0]], vertices[edges[:, 1]]
+    tip = vertices[np.asarray(mesh.faces).sum(axis=1)[mesh.edges_face] - edges.sum(axis=1)]
+    u = np.cross(end - start, np.eye(3)[np.abs(end - start).argmin(axis=1)])
+    v = np.cross(end - start, u) / np.linalg.norm(end - start, axis=1, keepdims=True)
+    angle = np.arctan2(((tip - start) * v).sum(axis=1), ((tip - start) * u).sum(axis=1))
+    angle = np.round(np.where(angle < 0.0005 - np.pi, np.pi, angle), 3)
+    piece = _pieces(mesh)
+    area = np.bincount(piece, mesh.area_faces)[piece][mesh.edges_face]
+    return np.lexsort((np.where(outside_ahead, area, -area), ~outside_ahead, angle, mesh.edges_unique_inverse))
+
+
+def _neighbours(order: Ints, edge: Ints) -> tuple[Ints, Ints]:
+    """Return each half-edge in an order and the next one around its edge (3 F,), without edges of one face."""
+    first = np.flatnonzero(np.diff(edge[order], prepend=-1))
+    following = np.arange(1, len(order) + 1)
+    following[np.append(first[1:], len(order)) - 1] = first
+    several = following != np.arange(len(order))
+    return order[several], order[following[several]]
+
+
+def _outermost_side(mesh: trimesh.Trimesh, faces: Ints) -> int:
+    """Return the side (2 f: front, 2 f + 1: back) through which a ray from the largest face leaves all faces."""
+    a, b, c = np.asarray(mesh.vertices)[mesh.faces[faces]].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    areas = np.linalg.norm(normals, axis=1)
+    largest = int(areas.argmax())
+    start = (a[largest] + b[largest] + c[largest]) / 3
+    ray = normals[largest] / areas[largest] + [0.0123, 0.0345, 0.0234]  # askew, so that it meets no edge
+    slope = normals @ ray
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = ((a - start) * normals).sum(axis=1) / slope
+        hits = start + distance[:, None] * ray
+        for p, q in ((a, b), (b, c), (c, a)):
+            distance[~((np.cross(q - p, hits - p) * normals).sum(axis=1) >= 0)] = -np.inf
+    last = int(distance.argmax())
+    return int(2 * faces[last] + (slope[last] < 0))
+
+
+def _box_change(mesh: trimesh.Trimesh, faces: Ints, kept: Ints) -> float:
+    """Return the change of the bounding box of faces if only some are kept, over its diagonal."""
+    corners, left = mesh.vertices[mesh.faces[faces]].reshape(-1, 3), mesh.vertices[mesh.faces[kept]].reshape(-1, 3)
+    change = np.maximum(left.min(axis=0) - corners.min(axis=0), corners.max(axis=0) - left.max(axis=0))
+    return float(change.max() / np.linalg.norm(np.ptp(corners, axis=0)))
+
+
+def _pieces(mesh: trimesh.Trimesh) -> Ints:
+    """Return the number of the piece (F,) of each face; edges of more than two faces connect none."""
+    one, other = np.asarray(mesh.face_adjacency).reshape(-1, 2).T
+    return _components(one, other, len(mesh.faces))
+
+
+def _components(one: Ints, other: Ints, count: int) -> Ints:
+    """Return the number of the connected component (N,) of each of N nodes, from pairs of nodes."""
+    graph = coo_matrix((np.ones(len(one), bool), (one, other)), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+@dataclass(frozen=True)
+class _Pieces:
+    """The connected pieces of a mesh. N pieces.
+
+    Attributes:
+        faces: indices of the faces of each.
+        low, high: (N, 3) corners of the bounding boxes.
+        shares: (N,) of the surface.
+        closed: (N,) whether it has no open edge.
+        flat: (N,) whether all its faces are parallel.
+    """
+
+    faces: list[Ints]
+    low: Array
+    high: Array
+    shares: Array
+    closed: NDArray[np.bool_]
+    flat: NDArray[np.bool_]
+
+
+def _object_faces(mesh: trimesh.Trimesh, repairs: list[str]) -> Ints:
+    """Return the indices of the faces that are neither dirt nor a shell inside of another piece."""
+    piece = _pieces(mesh)
+    if piece.max() == 0:
+        return np.arange(len(mesh.faces))
+    pieces = _measure_pieces(mesh, piece)
+    parts = _are_parts(pieces)
+    if not parts.all():
+        share = 100 * float(pieces.shares[~parts].sum())
+        repairs.append(f"dropped {_count(int((~parts).sum()), 'loose piece')} ({share:.2g} % of the surface)")
     kept: list[int] = []
-    shells: list[trimesh.Trimesh] = []
-    for i in np.argsort(-areas, kind="stable"):
-        if areas[i] < LOOSE * areas.sum():
-            break
-        faces = mesh.faces[piece == i]
-        corners = mesh.vertices[np.unique(faces)]
-        corners = corners[:: len(corners) // 50 + 1]
-        if any(shell.is_watertight and shell.contains(corners).all() for shell in shells):
+    shells: dict[int, trimesh.Trimesh] = {}
+    for i in np.argsort(-pieces.shares, kind="stable"):
+        if not parts[i]:
             continue
-        kept.append(int(i))
-        shells.append(trimesh.Trimesh(mesh.vertices, faces, process=False))
-    if not kept:
-        return np.arange(count)  # confetti, which closing will refuse
-    if len(kept) < number:
-        repairs.append(f"dropped {_count(number - len(kept), 'loose or inner piece')}")
-    return np.flatnonzero(np.isin(piece, kept))
+        around = np.flatnonzero((pieces.low <= pieces.low[i]).all(axis=1) & (pieces.high >= pieces.high[i]).all(axis=1))
+        corners = mesh.vertices[np.unique(mesh.faces[pieces.faces[i]])]
+        for k in [k for k in around if k in kept and pieces.closed[k]]:
+            if k not in shells:
+                shells[k] = trimesh.Trimesh(mesh.vertices, mesh.faces[pieces.faces[k]], process=False)
+            if shells[k].contains(corners[:: len(corners) // 50 + 1]).all():
+                break
+        else:
+            kept.append(int(i))
+    if len(kept) < parts.sum():
+        repairs.append(f"dropped {_count(int(parts.sum()) - len(kept), 'inner piece')}")
+    return np.sort(np.concatenate([pieces.faces[i] for i in kept]))
+
+
+def _measure_pieces(mesh: trimesh.Trimesh, piece: Ints) -> _Pieces:
+    """Measure the pieces of a mesh, whose numbers are given for each face (F,)."""
+    order = np.argsort(piece, kind="stable")
+    starts = np.flatnonzero(np.diff(piece[order], prepend=-1))
+    triangles, normals, areas = mesh.triangles[order], np.asarray(mesh.face_normals)[order], mesh.area_faces[order]
+    rim = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
+    spread = np.linalg.eigvalsh(np.add.reduceat(areas[:, None, None] * normals[:, :, None] * normals[:, None], starts))
+    return _Pieces(
+        faces=np.split(order, starts[1:]),
+        low=np.minimum.reduceat(triangles.min(axis=1), starts),
+        high=np.maximum.reduceat(triangles.max(axis=1), starts),
+        shares=np.add.reduceat(areas, starts) / areas.sum(),
+        closed=np.bincount(piece[mesh.edges_face[rim]], minlength=len(starts)) == 0,
+        flat=spread[:, 1] <= FLAT * spread[:, 2],
+    )
+
+
+def _are_parts(pieces: _Pieces) -> NDArray[np.bool_]:
+    """Tell the parts of an object from scanner dirt (N,).
+
+    Pieces of at least 2 % of the surface are parts. A smaller piece next to a part is a part as well if it is closed
+    and no speck, or sticks out. The rest is dirt. Where that is more than 5 % of the surface, its largest pieces are
+    parts. Flat scraps are always dirt.
+    """
+    shares = pieces.shares
+    parts = shares >= min(LOOSE, shares.max() / 2)
+    sizes = (pieces.high - pieces.low).max(axis=1)
+    growing = True
+    while growing:
+        low, high = pieces.low[parts].min(axis=0), pieces.high[parts].max(axis=0)
+        diagonal = np.linalg.norm(high - low)
+        sticks_out = np.maximum(low - pieces.low, pieces.high - high).max(axis=1) >= STICKS_OUT * diagonal
+        likely = ~parts & ~pieces.flat & (sticks_out | (pieces.closed & (sizes >= SPECK * diagonal)))
+        apart = [
+            np.maximum(pieces.low[parts] - pieces.high[i], pieces.low[i] - pieces.high[parts]).max(axis=1).min()
+            for i in np.flatnonzero(likely)
+        ]
+        near = np.flatnonzero(likely)[np.array(apart) <= NEAR * diagonal]
+        parts[near] = True
+        growing = len(near) > 0
+    dirt = np.flatnonzero(~parts & ~pieces.flat)
+    dirt = dirt[np.argsort(shares[dirt], kind="stable")]
+    above = np.flatnonzero(np.cumsum(shares[dirt]) > DROPPED)
+    if len(above):
+        parts[dirt[shares[dirt] > shares[dirt[above[0]]] / 2]] = True  # pieces of similar size stay together
+    return parts
 
 
 def _inward_faces(mesh: trimesh.Trimesh) -> NDArray[np.bool_]:

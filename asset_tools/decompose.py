@@ -7,11 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
+from sapien import physx
+from scipy.spatial import ConvexHull, QhullError
 
 from asset_tools.quality.hulls import hull_quality, volume_iou
 from asset_tools.solids import to_mesh, to_solid
-from robocas_ms3.assets.hulls import center_of
+from robocas_ms3.assets.cooking import OBLONG, SHRINKAGE, cook_hulls
+from robocas_ms3.assets.hulls import box_of, center_of, slenderness
+from robocas_ms3.assets.physics import cook
 from robocas_ms3.errors import AssetError, MissingExtraError
 
 Array = NDArray[np.float64]
@@ -31,6 +34,8 @@ WANTED_DISTANCE = 0.002  # m, 95th percentile between the surfaces of a hollow t
 BOX = 8  # vertices: as few are left as they are
 TRIES = 8  # mergers in a row that are too much
 LOST_OVERLAP = 0.02  # that merging the hulls of a hollow thing may cost
+SLIVER = 1e-4  # of the body's volume: parts below it are left out
+SLENDER = 0.95 * OBLONG  # slenderness that hulls are thickened to
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,15 @@ def decompose(closed: trimesh.Trimesh) -> Decomposition:
     """
     if not closed.is_watertight or closed.volume <= 0:
         raise AssetError("can't decompose a mesh that isn't closed", expected="watertight, volume > 0")
+    found = _decompose(closed)
+    hulls = [for_engine(hull) for hull in found.hulls]
+    if all(hull is old for hull, old in zip(hulls, found.hulls, strict=True)):
+        return found
+    return Decomposition(hulls, volume_iou(closed, hulls))
+
+
+def _decompose(closed: trimesh.Trimesh) -> Decomposition:
+    """Return one hull if it is close enough, or else CoACD's hulls, merged."""
     best: Decomposition | None = None
     if closed.volume / closed.convex_hull.volume >= WANTED_OVERLAP - 0.02:
         hulls = [few_vertices(np.asarray(closed.vertices))]
@@ -116,6 +130,31 @@ def few_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
     return center + (kept - center) * np.cbrt(hull.volume / ConvexHull(kept).volume)
 
 
+def for_engine(points: Array) -> Array:
+    """Return the vertices (V, 3) of a convex hull so that the physics engine builds it, on a CPU and a GPU.
+
+    A hull that is too slender is stretched along its thin axes. One that loses too much is what the engine makes of it.
+    One that the engine refuses becomes a box around it. Boxes stay as they are.
+    """
+    if box_of(points) is not None:
+        return points
+    center = center_of(points)
+    axes = np.linalg.svd(points - points.mean(axis=0))[2]
+    local = (points - center) @ axes.T
+    depths = np.abs(local).max(axis=0)
+    thin = depths < depths.max() / 10
+    while (excess := slenderness(points) / SLENDER) > 1:
+        local[:, thin] *= max(excess, 1.01)
+        points = center + local @ axes
+    try:
+        if cook_hulls([points])[0].lost > SHRINKAGE:
+            points = np.array(cook(points, physx.PhysxMaterial(1, 1, 0)).vertices, dtype=float)
+    except RuntimeError:
+        to_box, extents = trimesh.bounds.oriented_bounds(points)
+        points = trimesh.creation.box(extents, transform=np.linalg.inv(to_box)).vertices
+    return points
+
+
 def _without_bevels(points: Array, bevel: float) -> Array:
     """Points (P, 3) with those next to a broad face across x, y or z put into it."""
     squared, extents = np.array(points), np.ptp(points, axis=0)
@@ -129,8 +168,18 @@ def _without_bevels(points: Array, bevel: float) -> Array:
 
 
 def _outside(points: Array, corners: Array) -> Array:
-    """How far points (P, 3) lie outside of the convex hull of others (V, 3); negative within, m."""
-    planes = ConvexHull(corners).equations
+    """Return how far points (P, 3) are outside of the convex hull of others (V, 3); negative within, m.
+
+    Where the others are in one plane, so that their hull is flat, it is the distance from that plane plus 1 m.
+    """
+    try:
+        planes = ConvexHull(corners).equations
+    except QhullError:
+        middle = corners.mean(axis=0)
+        _, sizes, axes = np.linalg.svd(corners - middle)
+        axes = axes[: np.count_nonzero(sizes[:2] > 1e-6 * sizes[0])]
+        apart = points - middle
+        return 1 + np.linalg.norm(apart - apart @ axes.T @ axes, axis=1)
     return (points @ planes[:, :3].T + planes[:, 3]).max(axis=1)
 
 
@@ -189,6 +238,7 @@ def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
     except ImportError as error:
         raise MissingExtraError("CoACD is not installed", fix="pip install 'robocas-ms3[assets]'") from error
     coacd.set_log_level("error")
+    least = SLIVER * float(body.volume)
     parts = coacd.run_coacd(
         coacd.Mesh(np.asarray(body.vertices), np.asarray(body.faces)),
         threshold=threshold,
@@ -200,4 +250,12 @@ def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
         mcts_max_depth=1,  # cuts that are not looked ahead for are mended by merging, in a tenth of the time
         seed=0,
     )
-    return [few_vertices(np.asarray(vertices, dtype=float)) for vertices, _ in parts if len(vertices) >= 4]
+    return [few_vertices(points) for points in (np.array(vertices) for vertices, _ in parts) if _volume(points) > least]
+
+
+def _volume(points: Array) -> float:
+    """Return the volume of the convex hull of points (V, 3); 0 where they are in one plane."""
+    try:
+        return float(ConvexHull(points).volume)
+    except (QhullError, ValueError):
+        return 0.0

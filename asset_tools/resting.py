@@ -19,6 +19,7 @@ from asset_tools.stability import (
     stable_directions,
     toppling_angle,
 )
+from robocas_ms3.assets.hulls import box_of
 from robocas_ms3.assets.physics import (
     Solid,
     add_body,
@@ -114,7 +115,7 @@ def resting_poses(
     try:
         points = vertices[ConvexHull(vertices).vertices]
         # the engine drops corners of detailed hulls: what is stable is decided on the shapes it really has
-        hull = ConvexHull(np.concatenate([cook(piece, physx.PhysxMaterial(1, 1, 0)).vertices for piece in hulls]))
+        hull = ConvexHull(np.concatenate([_cooked(np.asarray(piece, float)) for piece in hulls]))
     except (QhullError, ValueError, RuntimeError) as error:
         raise AssetError("the convex hulls enclose no volume", found=str(error).split("\n")[0]) from error
     directions, probabilities, heights = stable_directions(hull, center)
@@ -138,6 +139,11 @@ def resting_poses(
     poses = np.array([body.rest(up) for up in directions])
     upright = np.flatnonzero(poses[:, 2, 2] > np.cos(np.radians(UPRIGHT_DEG)))
     return RestingPoses(poses, probabilities / probabilities.sum(), int(upright[0]) if len(upright) else -1)
+
+
+def _cooked(piece: Array) -> Array:
+    """Return the corners (V, 3) of the engine's shape of a convex hull; boxes are exact."""
+    return piece if box_of(piece) is not None else cook(piece, physx.PhysxMaterial(1, 1, 0)).vertices
 
 
 def _turn_up(up: Array) -> Array:
