@@ -1,0 +1,78 @@
+"""What comes from data moves no cursor and changes no colours, wherever a command prints it."""
+
+import io
+import subprocess
+import sys
+
+import pytest
+from rich.table import Table
+from rich.text import Text
+
+from robocas_ms3.cli import bars
+from robocas_ms3.cli import main as cli
+from robocas_ms3.cli.terminal import console, say, say_lines, tell
+from robocas_ms3.documents import DocumentError
+from robocas_ms3.errors import RobocasError
+
+HOSTILE = "a\x1b[2J\x9b31m\u202eb\n\rc[bold]d[/e] :smile:"
+SHOWN = "a\\u001b[2J\\u009b31m\\u202eb"
+
+
+def controls(text: str) -> set[str]:
+    """Characters of a text that are not printable, but for line breaks."""
+    return {character for character in text if not character.isprintable()} - {"\n"}
+
+
+def test_a_line_is_one_line(capsys):
+    say(HOSTILE)
+    tell(HOSTILE)
+    shown = capsys.readouterr()
+    assert shown.out == shown.err == f"{SHOWN}\\u000a\\u000dc[bold]d[/e] :smile:\n"
+    say_lines(f"one\n{SHOWN}\x1b\ntwo")
+    assert capsys.readouterr().out == f"one\n{SHOWN}\\u001b\ntwo\n"
+
+
+def test_tables_titles_and_styled_texts():
+    file = io.StringIO()
+    table = Table(HOSTILE, title=HOSTILE)
+    table.add_row(HOSTILE)
+    table.add_row(Text(HOSTILE))
+    console(file=file, width=200).print(table, HOSTILE, Text(HOSTILE))
+    assert not controls(file.getvalue())
+    assert file.getvalue().count(SHOWN) == 6
+    assert file.getvalue().count("c[bold]d[/e] :smile:") == 6
+
+
+def test_bars_and_their_notes(monkeypatch):
+    file = io.StringIO()
+    made = console(file=file, force_terminal=True, width=200, color_system=None)
+    monkeypatch.setattr(bars, "terminal_of_stderr", lambda: made)
+    with bars.bar(HOSTILE) as shown:
+        shown.start(2)
+        shown.note(HOSTILE)
+        shown.advance()
+    assert "\x1b[2J" not in file.getvalue()
+    assert not controls(file.getvalue()) - {"\x1b", "\r"}  # those that draw the bar
+    assert SHOWN in file.getvalue()
+
+
+@pytest.mark.parametrize("error", [RobocasError(HOSTILE, where=HOSTILE, found=HOSTILE), DocumentError(HOSTILE)])
+def test_an_error_is_one_line(monkeypatch, capsys, error):
+    def fail(arguments):
+        raise error
+
+    monkeypatch.setattr(cli, "_dispatch", fail)
+    assert cli.run(["list"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert not controls(line)
+    assert SHOWN in line
+
+
+def test_a_traceback(tmp_path):
+    script = "import sys; sys.excepthook = __import__('robocas_ms3.cli.terminal', fromlist=['x']).print_traceback\n"
+    done = subprocess.run(
+        [sys.executable, "-c", script + f"raise ValueError({HOSTILE!r})"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert SHOWN in done.stderr
+    assert not controls(done.stderr)

@@ -1,0 +1,95 @@
+"""A policy's description is checked at the start, and its texts do nothing but appear in reports."""
+
+from dataclasses import asdict
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from made_up_results import outcome, write
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.comparison import comparison
+from robocas_ms3.evaluation.outcomes import Outcome
+from robocas_ms3.evaluation.policy import Start, Wants, describe
+from robocas_ms3.evaluation.remote.server import PolicyServer
+from robocas_ms3.evaluation.report import write_report
+from robocas_ms3.evaluation.rollout import Rollout
+from robocas_ms3.evaluation.run import about
+
+HOSTILE = "\x1b]0;t\x07\x9b\u202e<script>alert(1)</script>|`a`\n[b](http://c)"
+
+
+class Policy:
+    """Its description is what it was made with."""
+
+    wants = Wants(rate_hz=5.0)
+
+    def __init__(self, description):
+        self.describe = lambda: description
+
+
+@pytest.mark.parametrize(
+    ("description", "key"),
+    [
+        ({"weights": {"scale": float("nan")}}, ", weights.scale"),
+        ({"weights": [1.0, float("-inf")]}, ", weights.1"),
+        ({"steps": 10**400}, ", steps"),
+        ({"seed": np.int64(1)}, ", seed"),
+        ({"file": "\udcff"}, ", file"),
+        (["weights"], ""),
+        (None, ""),
+    ],
+)
+def test_a_description_that_no_result_can_hold_is_refused(description, key):
+    for use in (describe, PolicyServer):
+        with pytest.raises(EvaluationError) as error:
+            use(Policy(description))
+        assert error.value.where == f"policy {__name__}:Policy, describe(){key}"
+
+
+def test_wants_of_a_policy_are_part_of_its_description():
+    policy = Policy({})
+    policy.wants = Wants(rate_hz=float("nan"))
+    with pytest.raises(EvaluationError) as error:
+        describe(policy)
+    assert error.value.where.endswith("wants.rate_hz")
+
+
+def test_what_a_description_says_is_read_back_and_does_not_rename_the_policy(tmp_path, monkeypatch):
+    monkeypatch.setattr("robocas_ms3.evaluation.run.load_pack", lambda name: SimpleNamespace(root=tmp_path))
+    monkeypatch.setattr("robocas_ms3.evaluation.run.sha256", lambda path: "ab")
+    rules = SimpleNamespace(pack="builtin", pack_hash="ab", name="made_up")
+    protocol = SimpleNamespace(rules=rules, hash="cd")
+    settings = SimpleNamespace(weld=False, backend="processes")
+    run = about(protocol, Policy({"name": 5, "sizes": (1, 2), "note": HOSTILE}), "mine", settings)
+    results.begin(tmp_path / "out", run, resume=False)
+    results.append(tmp_path / "out", outcome(0))
+    assert results.read(tmp_path / "out").run["policy"]["name"] == "mine"
+    assert results.begin(tmp_path / "out", run, resume=True)  # what was written is what is asked for again
+
+
+def test_an_error_text_of_a_policy_is_read_back(tmp_path):
+    start = Start(0, 0, "pick", "table", "", "builtin", 0, "")
+    episode = SimpleNamespace(episode=0, task="pick", config="table", seed=0, split="test", p_vis=None)
+    made = Outcome.of(Rollout(start, error=f"{HOSTILE}\udcff"), episode, [])
+    assert made.error.isprintable()
+    write(tmp_path / "out", [])
+    results.append(tmp_path / "out", made)
+    assert asdict(results.read(tmp_path / "out").outcomes[0]) == asdict(made)
+
+
+def test_reports_show_texts_as_they_are(tmp_path):
+    texts = {"config": HOSTILE, "split": HOSTILE, "failure_stage": HOSTILE, "error": HOSTILE}
+    outcomes = [outcome(0), outcome(1, came_to=2, **texts), outcome(2, split=HOSTILE)]
+    run = {"protocol": HOSTILE, "policy": {"name": HOSTILE, "note": HOSTILE}, "versions": {HOSTILE: HOSTILE}}
+    found = write(tmp_path / "out", outcomes, **run, protocol_hash=HOSTILE)
+    write_report(found, tmp_path / "report")
+    reports = {name: (tmp_path / "report" / name).read_text(encoding="utf-8") for name in ("report.md", "report.html")}
+    reports["comparison"] = comparison([found, found])
+    for name, text in reports.items():
+        assert all(character.isprintable() or character in "\n\t" for character in text), name
+        assert "<script>alert" not in text.replace("\\<", "")
+    for line in (reports["report.md"] + reports["comparison"]).splitlines():
+        if line.startswith("|"):  # a row of a table: as many cells as its head
+            assert line.replace("\\|", "").count("|") in (3, 4, 11, 12)
