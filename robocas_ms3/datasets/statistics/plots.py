@@ -14,7 +14,7 @@ from robocas_ms3.datasets.statistics.described import counted, histogram
 from robocas_ms3.datasets.statistics.layout_map import LayoutMap
 from robocas_ms3.errors import MissingExtraError
 from robocas_ms3.files import make_folder, replacing, write_json
-from robocas_ms3.words import called, count_of
+from robocas_ms3.words import called, count_of, printable
 
 DPI = 110
 BLUE, ORANGE, GREY = "#2f6fa8", "#e08a2e", "#9aa3ab"
@@ -81,8 +81,10 @@ def _shape(count: int, columns: int) -> tuple[int, int]:
     return -(-count // columns), columns
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= _TEXT else text[: _TEXT - 1].rstrip() + "…"
+def _label(text: str) -> str:
+    """Return a text of the dataset as a short label: on one line, no formula between dollars."""
+    text = printable(text)
+    return (text if len(text) <= _TEXT else text[: _TEXT - 1].rstrip() + "…").replace("$", r"\$")
 
 
 def _whole_numbers(axis: Any) -> None:
@@ -101,7 +103,7 @@ def draw_lengths(stats: Stats, figure_of: FigureOf) -> Any:
         median = float(np.median(lengths))
         axes.axvline(median, color=ORANGE, linestyle="--", linewidth=1)
         about = f"median {median:.0f} steps = {median / stats.rate_hz:.0f} s"
-        axes.set_title(f"{task}: {count_of(len(lengths), 'episode')}, {about}")
+        axes.set_title(f"{_label(task)}: {count_of(len(lengths), 'episode')}, {about}")
         axes.set(xlabel=f"steps of {stats.rate_hz:g} Hz", ylabel="episodes")
         _whole_numbers(axes.xaxis)
         _whole_numbers(axes.yaxis)
@@ -117,7 +119,7 @@ def draw_objects(stats: Stats, figure_of: FigureOf) -> Any:
     figure = figure_of(7, 1.2 + 0.2 * len(ids))
     axes = _axes(figure, 1, 1, 1)[0]
     rows = np.arange(len(ids))
-    names = [_short(called(i, stats.names.get(i, ""))) for i in ids]
+    names = [_label(called(i, stats.names.get(i, ""))) for i in ids]
     axes.barh(rows, [stats.objects[i] for i in ids], color=GREY, height=0.8, label="took part")
     axes.barh(rows, [stats.targets[i] for i in ids], color=ORANGE, height=0.45, label="was the target")
     axes.set_yticks(rows, names)
@@ -167,7 +169,7 @@ def _draw_layout(figure: Any, axes: Any, name: str, layout: LayoutMap) -> None:
     axes.set_ylim(layout.x_edges[0], layout.x_edges[-1])
     axes.locator_params(nbins=5)
     covered = "" if layout.coverage is None else f", {layout.coverage:.0%} covered"
-    axes.set_title(f"{_short(name)}\n{count_of(layout.episodes, 'episode')}{covered}")
+    axes.set_title(f"{_label(name)}\n{count_of(layout.episodes, 'episode')}{covered}")
     axes.set(xlabel=f"y of {layout.frame} (m)", ylabel="x (m)")
     bar = figure.colorbar(mesh, cax=axes.inset_axes((1.04, 0.0, 0.04, 1.0)))  # as high as the map
     bar.ax.set_ylim(0, max(1, layout.counts.max()))
@@ -189,7 +191,7 @@ def draw_instructions(stats: Stats, figure_of: FigureOf) -> Any:
         axes.spines[["top", "right"]].set_visible(False)
         places = np.arange(len(rows))
         axes.barh(places, [count for _, count in rows], color=BLUE, height=0.7)
-        axes.set_yticks(places, [_short(text) for text, _ in rows])
+        axes.set_yticks(places, [_label(text) for text, _ in rows])
         axes.set_ylim(len(rows) - 0.4, -0.6)
         _whole_numbers(axes.xaxis)
         axes.set_title(title, loc="left")
@@ -241,7 +243,7 @@ def draw_subgoals(stats: Stats, figure_of: FigureOf) -> Any:
     for box in boxes["boxes"]:
         box.set(facecolor="#b9d3ea", edgecolor=BLUE)
     labels = [
-        f"{kind}\n{count_of(len(s), 'time')}, median {np.median(s):.1f} s"
+        f"{_label(kind)}\n{count_of(len(s), 'time')}, median {np.median(s):.1f} s"
         for kind, s in zip(kinds, seconds, strict=True)
     ]
     axes.set_yticks(np.arange(1, len(kinds) + 1), labels)

@@ -123,6 +123,17 @@ def test_pictures_and_json(told, tmp_path, capsys):
     assert not (told / "preview").exists()
 
 
+def test_texts_with_dollars_and_control_characters_are_labels(told, tmp_path):
+    """Matplotlib takes what is between two dollars for a formula, and ends with an error where it is none."""
+    stats, text = collect(told), "for $5 and \\frac{ $6\x1b[31m\nmore"
+    stats.names["cup"] = text
+    stats.instructions[text] += 1
+    stats.lengths[text] = stats.lengths["pick"]
+    stats.subgoals[text] = stats.subgoals["move and grasp"]
+    names = [path.name for path in write_stats(stats, tmp_path / "out")]
+    assert names == ["stats.json", *(f"{name}.png" for name in PICTURES)]
+
+
 def test_default_folders(made, trajectory, tmp_path, capsys):
     for suffix in (".h5", ".json"):
         shutil.copy(trajectory.with_suffix(suffix), tmp_path / f"T{suffix}")
