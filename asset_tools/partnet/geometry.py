@@ -10,14 +10,16 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 
-from asset_tools.partnet.obj import GREY, Faces, Material, read_obj
+from asset_tools.partnet.obj import GREY, Faces, Material, has_area, read_obj
 from asset_tools.partnet.urdf import SIZES, URDF, Shape, Visual
+from asset_tools.reading.exchange import read_exchange
 from asset_tools.reading.files import ModelFiles
 from robocas_ms3.errors import AssetError
 
 Array = np.ndarray
 
 MOST_TRIANGLES = 3_000_000  # of a model: 0.4 GB
+FORMATS = (".obj", ".stl")  # of others, URDF readers disagree about the axis that points up
 SCHEMES = ("package://", "model://")
 SIDES = 32  # of a cylinder
 
@@ -89,9 +91,11 @@ class Geometry:
         path = self._path(shape)
         if path is None:
             return f"{shape.filename or 'a mesh without a file name'} is missing"
-        if path.suffix.lower() != ".obj":
-            fix = "Convert it to OBJ, and name that in the URDF."
-            raise AssetError("a mesh format that is not read", where=path, expected=".obj", found=path.suffix, fix=fix)
+        if path.suffix.lower() not in FORMATS:
+            expected, fix = " or ".join(FORMATS), "Convert it to OBJ, and name that in the URDF."
+            raise AssetError(
+                "a mesh format that is not read", where=path, expected=expected, found=path.suffix, fix=fix
+            )
         return ""
 
     def _path(self, shape: Shape) -> Path | None:
@@ -111,12 +115,20 @@ class Geometry:
         assert path is not None
         key = path, visual.color
         if key not in self._read:
-            self._read[key] = read_obj(path, self.files, visual.color)
+            read = read_obj if path.suffix.lower() == ".obj" else _read_stl
+            self._read[key] = read(path, self.files, visual.color)
         # a mirror image would show its inside
         order = slice(None, None, -1 if np.prod(shape.size) < 0 else 1)
         return [
             replace(one, corners=(one.corners * shape.size)[:, order], uv=one.uv[:, order]) for one in self._read[key]
         ]
+
+
+def _read_stl(path: Path, files: ModelFiles, color: tuple[float, float, float] | None) -> list[Faces]:
+    corners = [part.vertices[part.faces] for part in read_exchange(path, files)]
+    if not all(np.isfinite(one).all() for one in corners):
+        raise AssetError("the mesh has vertices that are NaN or infinite", where=path)
+    return [Faces(one, np.zeros((len(one), 3, 2)), Material(color or GREY)) for one in corners if has_area(one)]
 
 
 def _primitive(shape: Shape) -> Array:

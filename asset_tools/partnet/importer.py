@@ -21,6 +21,7 @@ from asset_tools.partnet.obj import Faces
 from asset_tools.partnet.urdf import URDF, Mobility, MovingLink, Visual, read_urdf
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.reading.files import LARGEST_FILE, files_below
+from asset_tools.reading.limits import reading_limits
 from asset_tools.sources import FurnitureSource, LinkSource
 from robocas_ms3.assets.manifest import BODY, FurnitureAsset, Handle, Joint, Surface
 from robocas_ms3.errors import AssetError
@@ -35,7 +36,7 @@ DAMPING = {"prismatic": 8.0, "revolute": 0.8}  # N s/m, N m s/rad
 SMALLEST = 0.01  # m of the longest side
 MOST_REPAIRS = 30  # lines in the manifest
 # of files that a model may be made of
-SUFFIXES = {".obj", ".mtl", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp", ".gif"}
+SUFFIXES = {".obj", ".stl", ".mtl", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp", ".gif"}
 EDGE = 0.002  # m that a surface may reach beyond the model
 
 
@@ -55,7 +56,8 @@ def read_partnet(folder: Path, annotation: Annotation) -> FurnitureSource:
     folder = folder.resolve()
     model = read_urdf(folder, annotation.joints, annotation.scale)
     geometry = Geometry(folder)
-    looks = {name: geometry.faces(name, visuals) for name, visuals in _groups(model)}
+    with reading_limits(folder):
+        looks = {name: geometry.faces(name, visuals) for name, visuals in _groups(model)}
     corners = np.concatenate(
         [np.zeros((0, 3))] + [faces.corners.reshape(-1, 3) for group in looks.values() for _, _, faces in group]
     )

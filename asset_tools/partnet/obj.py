@@ -64,8 +64,7 @@ def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | 
     corners = mesh.vertices[mesh.faces]
     if not np.isfinite(corners).all():
         raise AssetError("the mesh has vertices that are NaN or infinite", where=path)
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    if not len(areas) or not areas.max() > 0:
+    if not has_area(corners):
         return []
     uvs = np.concatenate([mesh.uvs, np.zeros((1, 2))])[mesh.face_uvs]  # index -1: the zeros
     found = _materials(mesh, path, files)
@@ -77,6 +76,12 @@ def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | 
         uv = uvs[own] if look is None else uvs[own] * look.uv_scale + look.uv_offset
         groups.append(Faces(corners[own], uv, material))
     return groups
+
+
+def has_area(corners: Array) -> bool:
+    """Whether triangles (F, 3, 3) are more than points and lines."""
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return len(areas) > 0 and bool(areas.max() > 0)
 
 
 def _materials(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[int, tuple[MtlMaterial, Path]]:

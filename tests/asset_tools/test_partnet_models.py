@@ -103,6 +103,13 @@ def test_a_model_in_millimetres_is_refused_until_its_scale_is_given(folder):
     assert source.links[0].joint.limits == pytest.approx((0, 0.2))
 
 
+def test_stl_meshes_have_the_colour_of_the_urdf(folder):
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(folder / "cube.STL", file_type="stl")
+    tray = mesh("cube.STL").replace("</visual>", '<material name="a"><color rgba="0 1 0 1"/></material></visual>')
+    (link,) = read(folder, urdf(tray=tray)).links
+    assert link.mesh.extents == pytest.approx([0.1, 0.1, 0.1]) and colors_of(link.mesh) == {(0, 255, 0)}
+
+
 @pytest.mark.parametrize("name", ["package://anything/cube.obj", "package://model/cube.obj", "./x/../cube.obj"])
 def test_paths_inside_the_model_are_found(folder, name):
     (link,) = read(folder, urdf(tray=mesh(name))).links
@@ -251,12 +258,14 @@ JOINT = '<joint name="fixed" type="fixed"><parent link="{}"/><child link="{}"/><
         urdf(body=f'<visual>{BOX}<material name="a"><color rgba="red"/></material></visual>'),
         urdf(body=mesh("cube.obj", 'scale="0 1 1"')),
         urdf(body=mesh("cube.stl")),
+        urdf(body=mesh("cube.glb")),
         urdf(body=""),
         f"<robot>{' ' * (17 * 2**20)}</robot>",
     ],
 )
 def test_what_is_no_model_is_one_error(folder, text):
-    (folder / "cube.stl").write_bytes(b"solid\n")
+    for name in ("cube.stl", "cube.glb"):
+        (folder / name).write_bytes(b"solid\n")
     with pytest.raises(AssetError):
         read(folder, text)
 
