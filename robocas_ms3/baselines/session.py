@@ -26,7 +26,16 @@ from robocas_ms3.baselines.table import find_baseline, need_extra
 from robocas_ms3.errors import EmptySplitError, OutputExistsError, TrainingError
 from robocas_ms3.exits import no_exit
 from robocas_ms3.files import make_folder
-from robocas_ms3.outputs import check_one_way, check_overwrite, check_run, claim_output, is_taken, locked_folder, sweep, while_there
+from robocas_ms3.outputs import (
+    check_one_way,
+    check_overwrite,
+    check_run,
+    claim_output,
+    is_taken,
+    locked_folder,
+    sweep,
+    while_there,
+)
 
 
 @dataclass

@@ -94,7 +94,7 @@ def check_policy(name: str) -> None:
     kind, _, rest = name.partition(":")
     known = [*POLICIES.builtin, *POLICIES.points]
     of_own = re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier()
-    if not (name in known or of_own or _opener(name) or (kind in ("ws", "wss", "replay") and rest)):
+    if not (name in known or of_own or (kind in ("ws", "wss", "replay") and rest) or _opener(name)):
         expected = (
             f"{', '.join(known)}, a folder of robocas train, replay:TRAJECTORY.h5, module:Class or ws://host:port"
         )

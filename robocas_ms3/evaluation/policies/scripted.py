@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack, PoseTrack, Track
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.recordings.motion import sample_stride
@@ -19,6 +20,7 @@ from robocas_ms3.robots.table import find_robot
 
 BESIDE = (0.01, 0.05)  # m sideways, least and most: a finger on top of what is meant, or what stands next to it
 _FREQ = 20  # Hz, at which it plans
+_MAX_GENERATORS = 4  # environments that are open at a time
 _BESIDE = 411  # stream of an episode's seed
 
 
@@ -38,7 +40,7 @@ class ScriptedPolicy:
     ) -> None:
         self._beside = beside
         self.wants = Wants(speaks, reference="tcp", rate_hz=20 if speaks == "joint_positions" else 5, language="none")
-        self._generators: dict[str, EpisodeGenerator] = {}
+        self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # the one used last is the last
         self._followers = Followers()
 
     def reset(self, starts: list[Start]) -> None:
@@ -51,18 +53,7 @@ class ScriptedPolicy:
         return self._followers.act(observations)
 
     def _plan(self, start: Start) -> Track:
-        generator = self._generators.get(start.config_file)
-        if generator is None:
-            settings = EpisodeSettings(
-                start.task,
-                start.config_file,
-                start.pack,
-                control_freq=_FREQ,
-                replay_rate=0,
-                layouts=start.layouts_file,
-                robot=start.robot,
-            )
-            generator = self._generators[start.config_file] = EpisodeGenerator(settings)
+        generator = self._generator_of(start)
         actions, states = np.zeros((0, 8)), np.zeros((1, 37))
         with tempfile.TemporaryDirectory() as folder:
             if generator.generate(start.seed, Path(folder), "episode").success:
@@ -78,6 +69,35 @@ class ScriptedPolicy:
         if self._beside:
             track.poses[:, :2, 3] += beside(start.seed)
         return track
+
+    def _generator_of(self, start: Start) -> EpisodeGenerator:
+        """Return the generator of a start's scenes; of several the one used longest ago is closed.
+
+        Raises:
+            EvaluationError: the start does not name files of this machine, as of a client of a server.
+        """
+        for name in ("config_file", "layouts_file", "pack"):
+            if not getattr(start, name):
+                what, fix = (
+                    "unknown configuration or scene",
+                    "Start the server with --protocol FOLDER.",
+                )
+                expected = "a file of a shipped protocol, or of one that the server was started with"
+                raise EvaluationError(what, where=f"start.{name}", expected=expected, fix=fix)
+        settings = EpisodeSettings(
+            start.task,
+            start.config_file,
+            start.pack,
+            control_freq=_FREQ,
+            replay_rate=0,
+            layouts=start.layouts_file,
+            robot=start.robot,
+        )
+        generator = self._generators.pop(settings, None) or EpisodeGenerator(settings)
+        self._generators[settings] = generator
+        if len(self._generators) > _MAX_GENERATORS:
+            self._generators.pop(next(iter(self._generators))).close()
+        return generator
 
     def close(self) -> None:
         """Close the environments that it plans in."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit, urlunsplit
@@ -11,6 +12,8 @@ from robocas_ms3.errors import EvaluationError
 
 SCHEMES = ("ws", "wss")
 _FLAGS = {"0": False, "1": True}
+_FORM = "ws://host:port, of IPv6 ws://[::1]:port"
+_COUNT = re.compile(r"[1-9][0-9]{0,8}", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -45,13 +48,13 @@ def read_address(text: str) -> Address:
     Raises:
         EvaluationError: it is no address, or has an option that is none.
     """
-    parts = urlsplit(text)
     try:
-        port_or_none = parts.port
-    except ValueError:
-        port_or_none = -1
-    if parts.scheme not in SCHEMES or not parts.hostname or port_or_none == -1:
-        raise EvaluationError("no address of a policy", where=text, expected="ws://host:port")
+        parts = urlsplit(text)
+        valid = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
+    except ValueError as error:  # of brackets or a port
+        raise EvaluationError("no address of a policy", where=text, expected=_FORM, found=error) from error
+    if not valid:
+        raise EvaluationError("no address of a policy", where=text, expected=_FORM)
     wants: dict[str, Any] = {}
     options: dict[str, Any] = {}
     for name, value in parse_qsl(parts.query, keep_blank_values=True):
@@ -65,13 +68,18 @@ def read_address(text: str) -> Address:
             wants[name] = {camera: _size(name, size) for camera, size in _pairs(name, value).items()}
         elif name == "rename":
             options[name] = _pairs(name, value)
-        elif name == "play" and value.isdecimal() and int(value) > 0:
+        elif name == "play" and _COUNT.fullmatch(value):
             options[name] = int(value)
         elif name in ("timeout_s", "connect_s"):
             options[name] = _number(name, value)
         else:
             raise EvaluationError("no such option of an address", where=f"{name}={value}", fix=_HELP)
     return Address(urlunsplit((parts.scheme, parts.netloc, parts.path, "", "")), wants, **options)
+
+
+def netloc(host: str, port: int) -> str:
+    """Return host and port as a URL has them: an IPv6 address in brackets."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 _HELP = (
@@ -89,7 +97,7 @@ def _pairs(name: str, text: str) -> dict[str, str]:
 
 def _size(name: str, text: str) -> list[int]:
     sides = text.split("x")
-    if len(sides) != 2 or not all(side.isdecimal() for side in sides):
+    if len(sides) != 2 or not all(map(_COUNT.fullmatch, sides)):
         raise EvaluationError("no size of pictures", where=name, expected="WIDTHxHEIGHT", found=text)
     return [int(side) for side in sides]
 

@@ -25,6 +25,7 @@ from robocas_ms3.evaluation.remote.messages import (
 from robocas_ms3.evaluation.remote.wire import pack
 
 _LOG = logging.getLogger(__name__)
+_MAX_DESCRIPTION = 2**20
 
 
 class RemotePolicy:
@@ -55,7 +56,7 @@ class RemotePolicy:
             )
         wants = wants_of(self._address.wants if self._said is None else self._said, self._address.url)
         self.wants: Wants = replace(wants, look_every=1) if self._address.play else wants  # it is asked more often
-        self._about = json.loads(json.dumps(metadata.get(POLICY), default=str))
+        self._about = _description(metadata.get(POLICY), self._address.url)
         self._spare: list[Link] = [link]
         self._links: dict[int, Link] = {}
         self._starts: dict[int, Start] = {}  # of episodes that no server was told of yet
@@ -143,3 +144,16 @@ class RemotePolicy:
     def _renamed(self, message: dict[str, Any]) -> dict[str, Any]:
         rename = self._address.rename
         return {rename.get(key.removeprefix(PREFIX), key): value for key, value in message.items()}
+
+
+def _description(said: Any, url: str) -> Any:
+    """Return what a server says of its policy as JSON values.
+
+    Raises:
+        EvaluationError: it is too long for a result.
+    """
+    text = json.dumps(said, default=str)
+    if len(text) > _MAX_DESCRIPTION:
+        expected = f"{_MAX_DESCRIPTION} characters of JSON at most"
+        raise EvaluationError("policy description too long", where=url, expected=expected, found=len(text))
+    return json.loads(text)

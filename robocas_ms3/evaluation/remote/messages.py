@@ -1,6 +1,6 @@
 """What client and server say: wants, observations of one env, actions. Plain maps, as `wire` packs them.
 
-A server begins with its metadata, then each observation is answered by ``{"actions": (H, A)}``, or by a text that says
+A server begins with its metadata, then each observation is answered by ``{"actions": (H, A)}``, or by a line that says
 what went wrong, after which it hangs up. Arrays of an observation have no axis for envs.
 """
 
@@ -16,11 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from robocas_ms3.errors import EvaluationError, WireError
+from robocas_ms3.errors import EvaluationError, RobocasError, WireError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.remote.served import ServedFiles, name_of
+from robocas_ms3.evaluation.remote.wire import MAX_BYTES
 from robocas_ms3.robots.table import DEFAULT
 from robocas_ms3.strict import refusal
+from robocas_ms3.words import printable
 
 WANTS, POLICY = "robocas_wants", "robocas_policy"  # keys of the metadata
 ENV, RESET, START, PROMPT, ACTIONS = "env_id", "reset", "start", "prompt", "actions"
@@ -28,6 +31,9 @@ PREFIX = "observation/"
 ROBOT = {"qpos": 12, "tcp_in_base": 7, "gripper_width": 1}
 _LARGEST = 1e3  # m or rad: physics of what is beyond would be broken, and nobody means it
 _MAX_PIXELS = 4096  # a side
+_MAX_TEXT = 10_000  # characters
+_LARGEST_NUMBER = 2**32 - 1  # of episodes and seeds
+_LONGEST_LINE = 300  # characters
 _WANTS = TypeAdapter(Wants)
 
 
@@ -71,6 +77,7 @@ def observation_message(observations: Observations, row: int, start: Start | Non
     message |= {PREFIX + name: array for name, array in arrays.items()}
     if start is not None:
         message[START] = {name: value for name, value in vars(start).items() if name != "env"}
+        message[START] |= {name: name_of(message[START][name]) for name in ("config_file", "layouts_file")}
         if start.robot == DEFAULT:  # a server may be older than that there are others
             del message[START]["robot"]
     return message
@@ -98,6 +105,7 @@ def observations_of(message: Mapping[str, Any], env: int, wants: Wants) -> Obser
     prompt = message.get(PROMPT, "")
     if not isinstance(prompt, str):
         raise WireError("an instruction is no text", where=PROMPT, found=type(prompt).__name__)
+    _check_length(PROMPT, prompt)
     sizes = {name: (height, width) for name, (width, height) in wants.cameras.items()}
     return Observations(
         envs=np.array([env]),
@@ -112,21 +120,30 @@ def observations_of(message: Mapping[str, Any], env: int, wants: Wants) -> Obser
     )
 
 
-def start_of(message: Mapping[str, Any], env: int) -> Start:
-    """The episode that begins; of a client that says nothing of it, the instruction alone.
+def start_of(message: Mapping[str, Any], env: int, files: ServedFiles) -> Start:
+    """Return the episode that starts; of a client that does not say more, the instruction alone.
+
+    Args:
+        message: of the client.
+        env: of the policy.
+        files: that the client may choose.
 
     Raises:
-        WireError: what it says is something else.
+        WireError: it is no start of an episode.
     """
-    prompt = message.get(PROMPT, "")
-    blank = Start(env, 0, "", "", "", "", 0, prompt if isinstance(prompt, str) else "")
+    blank = Start(env, 0, "", "", "", "", 0, message.get(PROMPT, ""))
     said = message.get(START, {})
     if not isinstance(said, dict) or not said.keys() <= vars(blank).keys() - {"env"}:
         raise WireError("no start of an episode", where=START, found=_line(said))
     for name, value in said.items():
         if type(value) is not type(getattr(blank, name)):
             raise WireError("no start of an episode", where=f"{START}.{name}", found=_line(repr(value)))
-    return Start(**{**vars(blank), **said})
+        if isinstance(value, int) and not 0 <= value <= _LARGEST_NUMBER:
+            expected = f"0 to {_LARGEST_NUMBER}"
+            raise WireError("number out of range", where=f"{START}.{name}", expected=expected, found=value)
+        if isinstance(value, str):
+            _check_length(f"{START}.{name}", value)
+    return files.resolved(Start(**{**vars(blank), **said}))
 
 
 def actions_of(reply: Any, convention: str) -> NDArray[np.float32]:
@@ -151,6 +168,23 @@ def actions_of(reply: Any, convention: str) -> NDArray[np.float32]:
     if not (np.abs(found.astype(np.float64)) <= _LARGEST).all():  # nor is what is not a number
         raise WireError("an action beyond all measure", expected=f"{_LARGEST:g} at most", found=_line(found.tolist()))
     return found.reshape(-1, size).astype(np.float32)
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error as a line without control characters, for the other end of a connection."""
+    said = str(error) if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}"
+    return printable(" ".join(said.split())[:_LONGEST_LINE])
+
+
+def message_bytes(wants: Wants) -> int:
+    """Return a size that no observation of a policy reaches: four times its pictures, and 8 MiB."""
+    pixels = sum(width * height for width, height in wants.cameras.values())
+    return min(MAX_BYTES, 4 * pixels * (5 if wants.depth else 3) + 8 * 2**20)
+
+
+def _check_length(where: str, text: str) -> None:
+    if len(text) > _MAX_TEXT:
+        raise WireError("text too long", where=where, expected=f"{_MAX_TEXT} characters at most", found=len(text))
 
 
 def _line(text: object) -> str:

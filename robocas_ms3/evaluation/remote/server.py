@@ -7,7 +7,6 @@ import http
 import itertools
 import json
 import logging
-import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -18,22 +17,26 @@ from websockets.http11 import Request, Response
 
 from robocas_ms3 import __version__
 from robocas_ms3.errors import EvaluationError, WireError
-from robocas_ms3.evaluation.policy import Policy, describe, said_of
+from robocas_ms3.evaluation.policy import Policy, describe, policy_code, said_of
+from robocas_ms3.evaluation.remote.address import netloc
 from robocas_ms3.evaluation.remote.messages import (
     ACTIONS,
     ENV,
     POLICY,
     RESET,
     WANTS,
+    message_bytes,
     observations_of,
+    one_line,
     start_of,
 )
-from robocas_ms3.evaluation.remote.wire import MAX_BYTES, pack, unpack
+from robocas_ms3.evaluation.remote.served import ServedFiles
+from robocas_ms3.evaluation.remote.wire import pack, unpack
 
 _LOG = logging.getLogger(__name__)
 HEALTH = "/healthz"
 MAX_CONNECTIONS = 256
-_MAX_ENVS = 1024  # of a connection
+_MAX_ENVS = 1024  # of all connections
 _IDLE = 3600.0  # s after which a client that says nothing is taken for gone
 _FAILED, _GARBAGE, _FULL = 1011, 1008, 1013  # close codes
 
@@ -48,10 +51,15 @@ class PolicyServer:
         policy: that acts.
         host: to listen on; there is no password, so others than loopback let in whoever can reach it.
         port: 0: any that is free.
+        files: that clients may choose; default: those of shipped protocols.
     """
 
-    def __init__(self, policy: Policy, host: str = "127.0.0.1", port: int = 8000) -> None:
+    def __init__(
+        self, policy: Policy, host: str = "127.0.0.1", port: int = 8000, files: ServedFiles | None = None
+    ) -> None:
         self._policy, self._host, self._port = policy, host, port
+        self._files = files or ServedFiles.of()
+        self._max_bytes = message_bytes(policy.wants)
         about = json.loads(json.dumps({**describe(policy), "robocas_ms3": __version__}, default=str))
         self._metadata = pack({WANTS: said_of(policy.wants), POLICY: about})
         self._taken: set[int] = set()  # envs of the policy
@@ -83,17 +91,18 @@ class PolicyServer:
             process_request=_health,
             origins=[None],  # no web page may talk to a server on its reader's machine
             compression=None,
-            max_size=MAX_BYTES,
+            max_size=self._max_bytes,
+            max_queue=1,
             ping_interval=None,  # who waits for a policy can't answer in time
             close_timeout=1,
         )
         try:
             running = await server
-        except OSError as error:
-            raise EvaluationError("can't listen", where=f"{self._host}:{self._port}", found=error) from error
+        except (OSError, UnicodeError) as error:
+            raise EvaluationError("can't listen", where=netloc(self._host, self._port), found=error) from error
         async with running:
             port = next(iter(running.sockets)).getsockname()[1]
-            listening(f"ws://{self._host}:{port}")
+            listening(f"ws://{netloc(self._host, port)}")
             await ended.wait()
 
     async def _talk(self, client: ServerConnection) -> None:
@@ -121,13 +130,13 @@ class PolicyServer:
             return pack({ACTIONS: self._actions(message, envs)}), 0
         except WireError as error:
             _LOG.warning("a client sent garbage: %s", error)
-            return str(error), _GARBAGE
-        except Exception:  # whatever a policy raises, its client is to hear of it, and others are to be served
+            return one_line(error), _GARBAGE
+        except Exception as error:  # whatever a policy raises, its client is to hear of it, and others are to be served
             _LOG.exception("the policy failed")
-            return traceback.format_exc(), _FAILED
+            return one_line(error), _FAILED
 
     def _actions(self, data: str | bytes, envs: dict[int, int]) -> np.ndarray:
-        message = unpack(data) if isinstance(data, bytes) else None
+        message = unpack(data, self._max_bytes) if isinstance(data, bytes) else None
         if not isinstance(message, dict):
             raise WireError("no observation", expected="a map")
         said, resets = message.get(ENV, 0), message.get(RESET)
@@ -136,15 +145,17 @@ class PolicyServer:
         if said not in envs:
             if resets is False:
                 raise WireError("no episode has begun", where=f"{ENV} {said}", expected=RESET)
-            if len(envs) >= _MAX_ENVS:
+            if len(self._taken) >= _MAX_ENVS:
                 raise WireError("too many envs", expected=f"{_MAX_ENVS} at most")
             resets, envs[said] = True, next(env for env in itertools.count() if env not in self._taken)
             self._taken.add(envs[said])
         env = envs[said]
         observations = observations_of(message, env, self._policy.wants)
-        if resets:
-            self._policy.reset([start_of(message, env)])
-        acted = np.asarray(self._policy.act(observations))
+        start = start_of(message, env, self._files) if resets else None
+        with policy_code(self._policy):
+            if start is not None:
+                self._policy.reset([start])
+            acted = np.asarray(self._policy.act(observations))
         return acted[0][None] if acted.ndim == 2 else acted[0]
 
 

@@ -11,12 +11,16 @@ import numpy as np
 
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.evaluation.tracking import SUMS
+from robocas_ms3.paths import protocols_dir
 
 CAMERA = (6, 4)  # width, height
+LAYOUTS = "layouts/pick_table_scattered.npy"
 
 
 def a_start(env: int = 0, episode: int = 3, seed: int = 7) -> Start:
-    return Start(env, episode, "pick", "a.yaml", "a.npy", "builtin", seed, "take the apple")
+    smoke = protocols_dir() / "smoke"
+    config, layouts = (str(smoke / name) for name in ("configs/pick_table_scattered.yaml", LAYOUTS))
+    return Start(env, episode, "pick", config, layouts, "builtin", seed, "take the apple")
 
 
 def some_observations(*envs: int, seed: int = 0, cameras: bool = False) -> Observations:
@@ -54,11 +58,11 @@ class Told:
 
 
 @contextmanager
-def serving(policy: Any, port: int = 0) -> Iterator[str]:
+def serving(policy: Any, port: int = 0, **options: Any) -> Iterator[str]:
     """Serve a policy of ours; gives the address."""
     from robocas_ms3.evaluation.remote.server import PolicyServer
 
-    server, addresses, ready = PolicyServer(policy, port=port), [], threading.Event()
+    server, addresses, ready = PolicyServer(policy, port=port, **options), [], threading.Event()
 
     def listening(url: str) -> None:
         addresses.append(url)

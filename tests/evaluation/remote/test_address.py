@@ -29,6 +29,11 @@ def test_options():
     [
         "ws://",
         "ws://host:99999",
+        "ws://host:0",
+        "ws://[::1",
+        "ws://[1]:2",
+        "ws://host:1?play=" + "9" * 5000,
+        "ws://host:1?cameras=base_camera:2x" + "9" * 5000,
         "ws://host:1?camera=base_camera:2x2",
         "ws://host:1?cameras=base_camera:2",
         "ws://host:1?cameras=base_camera",

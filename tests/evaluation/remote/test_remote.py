@@ -17,6 +17,7 @@ from robocas_ms3.evaluation.policies.plain import RandomPolicy
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.messages import observation_message, start_of
+from robocas_ms3.evaluation.remote.served import ServedFiles
 from robocas_ms3.evaluation.remote.wire import pack, unpack
 
 ALL = Wants(cameras={"base_camera": CAMERA}, depth=True, state=True, rate_hz=10, reference="tcp")
@@ -96,7 +97,7 @@ def test_a_start_names_the_robot_where_it_is_another():
         start = replace(a_start(), robot=robot)
         message = observation_message(some_observations(0), 0, start, reset=True)
         assert message["start"].keys() & {"robot"} == keys
-        assert start_of(message, 0) == start
+        assert start_of(message, 0, ServedFiles.of()) == start
 
 
 def test_openpis_client_asks_our_server():

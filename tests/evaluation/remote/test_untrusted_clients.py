@@ -1,0 +1,143 @@
+"""Clients of a policy server choose no path of its machine, and learn no more than one line of what went wrong."""
+
+import socket
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("websockets")
+pytest.importorskip("msgpack")
+
+from remote_ends import Told, a_start, serving, some_observations
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
+from robocas_ms3.evaluation.remote.client import RemotePolicy
+from robocas_ms3.evaluation.remote.messages import observation_message
+from robocas_ms3.evaluation.remote.served import ServedFiles, name_of
+from robocas_ms3.evaluation.remote.wire import pack
+
+GARBAGE = 1008
+
+
+class Failing(Told):
+    """A policy that raises something with several lines and a control character."""
+
+    def __init__(self, error: BaseException) -> None:
+        super().__init__()
+        self.error = error
+
+    def act(self, observations):
+        raise self.error
+
+
+class Reading(Told):
+    """A policy that reads the episode's configuration, as the scripted ones do."""
+
+    def reset(self, starts):
+        super().reset(starts)
+        ScriptedPolicy().reset(starts)
+
+
+def asked(url, changes=None, **more):
+    """The answer to a first message with a changed start; None where the server hangs up without one."""
+    message = observation_message(some_observations(0), 0, a_start(), reset=True)
+    message["start"] |= changes or {}
+    with connect(url, proxy=None, compression=None) as client:
+        client.recv()
+        try:
+            client.send(pack(message | more))
+            answer = client.recv(20)
+        except ConnectionClosed:
+            return None, client.close_code
+        if isinstance(answer, bytes):
+            return answer, 0
+        with pytest.raises(ConnectionClosed):
+            client.recv(20)
+        return answer, client.close_code
+
+
+@pytest.mark.parametrize("name", ["config_file", "layouts_file", "pack"])
+@pytest.mark.parametrize("path", ["{folder}/secret.yaml", "smoke/configs/../../{folder}/secret.yaml", "new", "a\0b"])
+def test_no_text_of_a_client_becomes_a_path(tmp_path, monkeypatch, name, path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "secret.yaml").write_text("hunter2: [")
+    (tmp_path / "new").mkdir()  # a folder where the server runs is not installed as a pack
+    policy = Reading()
+    with serving(policy) as url:
+        answer, _ = asked(url, {name: path.format(folder=tmp_path)})
+    assert getattr(policy.starts[0], name) == ""
+    assert isinstance(answer, str) and len(answer.splitlines()) == 1
+    assert "hunter2" not in answer
+    assert {entry.name for entry in tmp_path.iterdir()} == {"secret.yaml", "new"}
+
+
+def test_shipped_files_and_those_of_the_servers_own_protocols_are_served(tmp_path):
+    theirs = replace(a_start(), config_file="mine/configs/a.yaml", layouts_file="mine/layouts/a.npy", pack="packs/own")
+    for name in (theirs.config_file, theirs.layouts_file):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).touch()
+    ours = ServedFiles.of([tmp_path / "mine"], ["packs/own"]).resolved(theirs)
+    assert Path(ours.config_file) == tmp_path / theirs.config_file
+    assert Path(ours.layouts_file) == tmp_path / theirs.layouts_file
+    assert ours.pack == "packs/own"
+    assert ServedFiles.of().resolved(theirs) == replace(theirs, config_file="", layouts_file="", pack="")
+    assert name_of(a_start().config_file) == "smoke/configs/pick_table_scattered.yaml"
+    (tmp_path / "smoke").mkdir()
+    with pytest.raises(EvaluationError):
+        ServedFiles.of([tmp_path / "smoke"])
+    like_a_shipped_one = str(tmp_path / "smoke/configs/pick_table_scattered.yaml")
+    assert name_of(like_a_shipped_one) == like_a_shipped_one
+
+
+@pytest.mark.parametrize("error", [ValueError("a\nb\x1b[31m" + "c" * 9999), SystemExit(0), RecursionError()])
+def test_a_failing_policy_is_one_line_to_its_client_and_others_are_served(error):
+    policy = Failing(error)
+    with serving(policy) as url:
+        answer, code = asked(url)
+        assert isinstance(answer, str) and len(answer) < 1000
+        assert answer.isprintable() and code
+        assert isinstance(asked(url)[0], str)
+
+
+@pytest.mark.parametrize(
+    ("changes", "more"),
+    [
+        ({"seed": -1}, {}),
+        ({"seed": 2**62}, {}),
+        ({"episode": -1}, {}),
+        ({"instruction": "x" * 100_000}, {}),
+        ({}, {"prompt": "x" * 100_000}),
+        ({"env": 0}, {}),
+    ],
+)
+def test_numbers_and_texts_are_bounded(changes, more):
+    policy = Told()
+    with serving(policy) as url:
+        answer, code = asked(url, changes, **more)
+    assert (policy.starts, code) == ([], GARBAGE)
+    assert isinstance(answer, str) and answer.isprintable()
+
+
+def test_messages_are_no_larger_than_a_policys_pictures_need():
+    with serving(Told()) as url:
+        answer, code = asked(url, **{"observation/more": np.zeros(16 * 2**20, np.uint8)})
+    assert (answer, code) == (None, 1009)
+
+
+def test_an_ipv6_address_is_in_brackets():
+    try:
+        with socket.create_server(("::1", 0), family=socket.AF_INET6):
+            pass
+    except OSError:
+        pytest.skip("no IPv6 here")
+    with serving(Told(), host="::1") as url:
+        assert url.startswith("ws://[::1]:")
+        remote = RemotePolicy(url)
+        remote.reset([a_start()])
+        assert remote.act(some_observations(0)).shape == (1, 3, 7)
+        remote.close()
