@@ -9,7 +9,7 @@ import trimesh
 
 from asset_tools.grasps import Grasps
 from asset_tools.inertia import moments_of, piece_inertia, triple
-from robocas_ms3.assets.manifest import Handle, InnerBox, Joint, Link, Surface
+from robocas_ms3.assets.manifest import Handle, InnerBox, Joint, Link, Surface, check_asset_name
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,10 @@ class ObjectSource:
     grasps: Grasps | None = None
     hollow: bool = False
 
+    def __post_init__(self) -> None:
+        """Check the name before a folder gets it."""
+        check_asset_name(self.id, "id of an object")
+
 
 @dataclass(frozen=True)
 class LinkSource:
@@ -70,6 +74,10 @@ class LinkSource:
     pieces: list[np.ndarray]
     mass: float
     parent: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the name before a folder gets it."""
+        check_asset_name(self.name, "name of a link")
 
     def facts(self) -> Link:
         """What a pack says of it."""
@@ -121,3 +129,10 @@ class FurnitureSource:
     licence: str = "MIT"
     attribution: str = "robocas_ms3"
     repairs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the names before folders and files get them."""
+        check_asset_name(self.id, "id of a piece of furniture")
+        for part, finishes in self.finishes.items():
+            for name in (part, *finishes):
+                check_asset_name(name, "name of a finish")

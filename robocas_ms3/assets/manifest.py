@@ -17,11 +17,14 @@ frames of all links of a piece of furniture coincide with its own when every joi
 
 from __future__ import annotations
 
+import re
 from pathlib import PurePosixPath
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from robocas_ms3.errors import AssetError
+from robocas_ms3.names import LONGEST
 from robocas_ms3.strict import StrictModel
 
 SCHEMA_VERSION = 2
@@ -66,9 +69,20 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Moments = Annotated[
     tuple[Positive, Positive, Positive], Field(description="principal moments, kg m2"), AfterValidator(_of_a_body)
 ]
-Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
+Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$", max_length=LONGEST)]
 FilePath = Annotated[str, Field(pattern=r"^[a-z0-9_./-]+$"), AfterValidator(_inside)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+def check_asset_name(name: str, where: object) -> None:
+    """Check that a name can be that of an asset, a link or a finish, which are folders and files of a pack.
+
+    Raises:
+        AssetError: it can't.
+    """
+    if re.fullmatch("[a-z0-9_]+", name) is None or len(name) > LONGEST:
+        expected = f"1 to {LONGEST} small letters, digits and underscores"
+        raise AssetError("this name can't be used in a pack", where=where, expected=expected, found=repr(name)[:80])
 
 
 class Surface(StrictModel):

@@ -2,6 +2,7 @@
 
 import os
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -231,6 +232,18 @@ def test_other_names_become_names_of_a_pack(folder):
     assert find_annotation("model", folder).surfaces["left_tur_1"].link == "Left Tür 1"
     (clash,) = read(folder, urdf(link="body")).links  # what the fixed body is called in a pack
     assert clash.name != "body"
+
+
+@pytest.mark.parametrize("name", ["../x", "/x", "A", "", "x" * 300, "a\n"])
+def test_sources_refuse_names_that_are_no_folder_of_a_pack(folder, name):
+    source = read(folder, urdf())
+    for change in (
+        lambda: replace(source, id=name),
+        lambda: replace(source.links[0], name=name),
+        lambda: replace(source, finishes={"wall": {name: source.mesh}}),
+    ):
+        with pytest.raises(AssetError):
+            change()
 
 
 JOINT = '<joint name="fixed" type="fixed"><parent link="{}"/><child link="{}"/></joint>'
