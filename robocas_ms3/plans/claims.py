@@ -17,8 +17,10 @@ into place, and of two lines of a ledger the first counts.
 from __future__ import annotations
 
 import errno
+import glob
 import logging
 import os
+import re
 import socket
 import threading
 import time
@@ -32,6 +34,8 @@ from robocas_ms3.files import make_folder
 
 LEASE = 60.0
 """Seconds without news after which the holder of a claim counts as dead."""
+_LONGEST = 86400.0  # s; a damaged file must not stop a plan for ever
+_NUMBER = re.compile(r"[0-9]{1,9}")
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 # What the system says where a file can't have two names
 _NO_LINKS = frozenset({errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK})
@@ -79,11 +83,9 @@ def refuse_claimed(folder: Path) -> None:
     Raises:
         PlanError: somebody is.
     """
-    last: dict[Path, int] = {}
-    for path in folder.glob("*/*.[0-9]*"):
-        last[path.with_suffix("")] = max(int(path.suffix[1:]), last.get(path.with_suffix(""), 0))
-    for path, number in last.items():
-        claim = _numbered(path, number)
+    places = sorted({path.with_suffix("") for path in folder.glob("*/*.[0-9]*")})
+    for claims in filter(None, map(claims_of, places)):
+        claim = claims[max(claims)]
         with suppress(FileNotFoundError):
             if claim.stat().st_mtime > 0 and (age := age_of(claim)) < 2 * lease_of(claim):  # with room to spare
                 fix = "Go on with --on slurm, or cancel its jobs and wait until the claim is not renewed any more."
@@ -208,8 +210,9 @@ def _temporary(claim: Path) -> Path:
 
 
 def claims_of(path: Path) -> dict[int, Path]:
-    """Number -> file of the claims on something."""
-    return {int(name.suffix[1:]): name for name in path.parent.glob(f"{path.name}.[0-9]*")}
+    """Return the files of the claims on something, by number; other names in the folder are none."""
+    found = ((name.suffix[1:], name) for name in path.parent.glob(f"{glob.escape(path.name)}.[0-9]*"))
+    return {int(number): name for number, name in found if _NUMBER.fullmatch(number)}
 
 
 def _numbered(path: Path, number: int) -> Path:
@@ -217,11 +220,12 @@ def _numbered(path: Path, number: int) -> Path:
 
 
 def lease_of(claim: Path, default: float = LEASE) -> float:
-    """Seconds, as whoever made a claim said; one that was killed at that moment said nothing."""
+    """Return the lease of a claim in s; the default where its file is empty, as after a kill, or damaged."""
     try:
-        return float(claim.read_text(encoding="utf-8").split(" ")[3])
+        lease = float(claim.read_text(encoding="utf-8").split(" ")[3])
     except (OSError, ValueError, IndexError):
         return default
+    return lease if 0 < lease <= _LONGEST else default
 
 
 def is_of_here(text: str) -> bool:

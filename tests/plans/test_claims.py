@@ -12,7 +12,8 @@ from contextlib import ExitStack
 import pytest
 
 from robocas_ms3.errors import PlanError
-from robocas_ms3.plans.claims import claimed, refuse_claimed
+from robocas_ms3.plans.claims import LEASE as DEFAULT_LEASE
+from robocas_ms3.plans.claims import claimed, claims_of, lease_of, refuse_claimed
 from robocas_ms3.plans.driver import sole
 from robocas_ms3.plans.engines import open_engine
 from robocas_ms3.plans.units import CLAIMS
@@ -217,3 +218,20 @@ def test_who_runs_a_plan_leaves_if_another_does_not_if_the_folder_is_gone(tmp_pa
         else:
             (out / ".driver.2").touch()
         assert left.wait(1.0) != gone
+
+
+@pytest.mark.parametrize("lease", ["nan", "inf", "-1", "0", "1e308", "x"])
+def test_a_lease_beyond_all_bounds_is_the_default(tmp_path, lease):
+    claim = tmp_path / "unit.1"
+    claim.write_text(f"host 1 token {lease} -")
+    assert lease_of(claim) == DEFAULT_LEASE
+
+
+def test_other_names_next_to_claims_are_none(tmp_path):
+    for name in ("unit.2", "unit.2x", "unit.0\u00b2", "unit.9999999999"):
+        (tmp_path / name).write_text("host 1 token 2.0 -")
+    assert claims_of(tmp_path / "unit") == {2: tmp_path / "unit.2"}
+    os.utime(tmp_path / "unit.2", (0, 0))
+    refuse_claimed(tmp_path.parent)  # given back
+    with claimed(tmp_path / "unit", LEASE) as claim:
+        assert claim.name == "unit.3"
