@@ -228,10 +228,12 @@ def test_a_lease_beyond_all_bounds_is_the_default(tmp_path, lease):
 
 
 def test_other_names_next_to_claims_are_none(tmp_path):
+    units = tmp_path / "units"
+    units.mkdir()
     for name in ("unit.2", "unit.2x", "unit.0\u00b2", "unit.9999999999"):
-        (tmp_path / name).write_text("host 1 token 2.0 -")
-    assert claims_of(tmp_path / "unit") == {2: tmp_path / "unit.2"}
-    os.utime(tmp_path / "unit.2", (0, 0))
-    refuse_claimed(tmp_path.parent)  # given back
-    with claimed(tmp_path / "unit", LEASE) as claim:
+        (units / name).write_text("host 1 token 2.0 -")
+    assert claims_of(units / "unit") == {2: units / "unit.2"}
+    os.utime(units / "unit.2", (0, 0))
+    refuse_claimed(tmp_path)  # given back
+    with claimed(units / "unit", LEASE) as claim:
         assert claim.name == "unit.3"
