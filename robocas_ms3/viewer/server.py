@@ -16,6 +16,7 @@ from robocas_ms3.viewer.routes import Response, Routes
 from robocas_ms3.words import printable
 
 HOST = "127.0.0.1"
+MAX_CONNECTIONS = 256
 _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 
 
@@ -57,7 +58,9 @@ class Viewer(ThreadingHTTPServer):
         self._warming.start()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Note the connection, which a browser keeps open."""
+        """Note the connection, which a browser keeps open; refuse it where there are too many, as each has a thread."""
+        if len(self._connections) >= MAX_CONNECTIONS:
+            return self.shutdown_request(request)
         self._connections.add(request)
         super().process_request(request, client_address)
 

@@ -156,6 +156,17 @@ def test_it_ends_though_a_browser_keeps_its_connection(folder):
     connection.close()
 
 
+def test_the_number_of_connections_is_bounded(folder, monkeypatch):
+    monkeypatch.setattr("robocas_ms3.viewer.server.MAX_CONNECTIONS", 2)
+    with Viewer(open_source(folder)) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        address = HOST, server.server_port
+        connect = socket.create_connection
+        with connect(address), connect(address), connect(address, timeout=20) as third:
+            assert third.recv(1) == b""
+        server.shutdown()
+
+
 def test_a_port_that_is_taken(folder):
     with socket.socket() as taken:
         taken.bind((HOST, 0))

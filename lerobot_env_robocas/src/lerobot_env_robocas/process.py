@@ -19,6 +19,7 @@ import numpy as np
 MODULE = "robocas_ms3.evaluation.bridge"
 VARIABLE = "ROBOCAS_SIM_PYTHON"
 _LENGTH = 8  # bytes of a message's length, most significant first
+_MAX_BYTES = 2**32  # of a message
 _PATIENCE = 10.0  # s that a process which was told to leave may take
 _FIX = (
     f'Install "robocas-ms3[remote]" into an environment of its own, and pass --env.python=THAT/bin/python, or set '
@@ -76,8 +77,8 @@ class Process:
         """
         if not self.close.alive:
             raise RoboCASProcessError("the simulating process was closed")
+        data: bytes = msgpack.Packer(default=_written).pack(message)
         try:
-            data: bytes = msgpack.Packer(default=_written).pack(message)
             self._end.sendall(len(data).to_bytes(_LENGTH, "big") + data)
             answer = self._answer()
         except TimeoutError:
@@ -89,6 +90,11 @@ class Process:
             said = self._last_words()
             self.close()
             raise RoboCASProcessError(said) from None
+        except (ValueError, TypeError, KeyError, msgpack.UnpackException) as error:
+            self._child.kill()
+            self.close()
+            what = f"the simulating process sent no message: {' '.join(str(error).split())[:300]}"
+            raise RoboCASProcessError(f"{what}. It ran {self.python}. {_FIX}") from None
         if "error" in answer:
             self.close()
             raise RoboCASProcessError(answer["error"])
@@ -96,7 +102,12 @@ class Process:
 
     def _answer(self) -> dict[str, Any]:
         length = int.from_bytes(self._read(_LENGTH), "big")
-        return msgpack.unpackb(self._read(length), object_hook=_read, strict_map_key=False, max_bin_len=2**31 - 1)
+        if length > _MAX_BYTES:
+            raise ValueError(f"{length} bytes, expected {_MAX_BYTES} at most")
+        answer = msgpack.unpackb(self._read(length), object_hook=_read, strict_map_key=False, max_bin_len=2**31 - 1)
+        if not isinstance(answer, dict):
+            raise TypeError(f"expected a map, found {type(answer).__name__}")
+        return answer
 
     def _read(self, count: int) -> bytearray:
         data = bytearray(count)

@@ -13,6 +13,7 @@ from contextlib import suppress
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.evaluation.bridge.channel import Channel, leave_with_starter
+from robocas_ms3.exits import no_exit
 from robocas_ms3.processes import use_one_torch_thread
 
 
@@ -31,9 +32,10 @@ def main(fd: int, starter: int) -> int:
         from robocas_ms3.evaluation.bridge.server import open_bridge  # the simulator, which takes seconds
 
         use_one_torch_thread()
-        bridge = open_bridge(channel)
-        channel.send({"ready": bridge.ready()})
-        bridge.run()
+        with no_exit("the simulating process"):
+            bridge = open_bridge(channel)
+            channel.send({"ready": bridge.ready()})
+            bridge.run()
     except EOFError:
         return 0
     except Exception as error:  # whatever it is, the other end is to hear of it

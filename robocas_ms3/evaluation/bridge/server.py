@@ -47,7 +47,7 @@ class BridgeRequest(StrictModel):
     version: int
     protocol: str
     task: str
-    num_envs: Annotated[int, Field(ge=1)]
+    num_envs: Annotated[int, Field(ge=1, le=4096)]
     convention: str
     reference: Reference
     rate_hz: int
@@ -189,7 +189,11 @@ class Bridge:
     def _asked_for(self, message: dict[str, Any]) -> list[Episode]:
         numbers = message.get("play")
         known = range(len(self._episodes))
-        if not isinstance(numbers, list) or len(numbers) != self._count or any(one not in known for one in numbers):
+        if (
+            not isinstance(numbers, list)
+            or len(numbers) != self._count
+            or any(type(one) is not int or one not in known for one in numbers)
+        ):
             expected = f"{self._count} numbers of episodes below {len(known)} to play"
             raise WireError("no batch", expected=expected, found=str(message)[:200])
         return [self._episodes[number] for number in numbers]

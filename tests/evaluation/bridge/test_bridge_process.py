@@ -14,6 +14,10 @@ pytest.importorskip("msgpack")
 from bridge_ends import SOURCE, theirs
 
 process = theirs("process")
+# of a map: a key, and an array of Python objects
+OBJECTS = (
+    b"\xa1x\x84\xc4\x0b__ndarray__\xc3\xc4\x04data\xc4\x08" + bytes(8) + b"\xc4\x05dtype\xa2|O\xc4\x05shape\x91\x01"
+)
 
 
 def interpreter(folder, script: str) -> str:
@@ -57,6 +61,23 @@ def test_one_that_dies_is_one_clear_line(tmp_path, monkeypatch, script, said):
 def test_no_interpreter(tmp_path):
     with pytest.raises(process.RoboCASProcessError, match=r"no interpreter at .*nowhere.*--env.python="):
         process.Process(str(tmp_path / "nowhere"), {}, 30)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        (2**63).to_bytes(8, "big"),
+        bytes(7) + b"\x01\xc1",
+        bytes(7) + b"\x01\x05",
+        (len(OBJECTS) + 1).to_bytes(8, "big") + b"\x81" + OBJECTS,
+    ],
+    ids=["too large", "garbage", "no map", "objects"],
+)
+def test_one_that_sends_no_message_is_ended(tmp_path, data):
+    write = f"import os, sys; os.write(int(sys.argv[1]), {data!r}); sys.stdin.read()"
+    (tmp_path / "program.py").write_text(write)
+    with pytest.raises(process.RoboCASProcessError):
+        process.Process(interpreter(tmp_path, f"exec {sys.executable} {tmp_path}/program.py $5"), {}, 30)
 
 
 def test_one_that_hangs_is_ended(tmp_path):
