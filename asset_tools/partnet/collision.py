@@ -148,7 +148,7 @@ def _cut(triangles: Array, fine: bool, depth: int) -> list[Array]:
         body = _welded(half)
         for one in trimesh.graph.connected_components(body.face_adjacency, nodes=np.arange(len(body.faces)), min_len=1):
             part = body.triangles[np.sort(one)]
-            if np.ptp(part.reshape(-1, 3), axis=0).min() > FLAT:
+            if np.ptp(part.reshape(-1, 3), axis=0).min() > FLAT and _hull_volume(part) > 0:
                 pieces += _cut(part, fine, depth - 1)
     return pieces
 

@@ -18,7 +18,7 @@ from asset_tools.partnet.collision import Part, for_gpu, pieces_of
 from asset_tools.partnet.geometry import Geometry
 from asset_tools.partnet.looks import merged
 from asset_tools.partnet.obj import Faces
-from asset_tools.partnet.urdf import URDF, Mobility, MovingLink, Visual, read_urdf
+from asset_tools.partnet.urdf import URDF, Mobility, MovingLink, Visual, read_urdf, urdf_of
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.reading.files import LARGEST_FILE, files_below
 from asset_tools.reading.limits import reading_limits
@@ -171,6 +171,7 @@ def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> li
 
 
 def _job(name: str, folder: Path, annotations: Path | None) -> Job:
+    urdf_of(folder)  # else the annotation would be what is missing
     annotation = find_annotation(folder.name, annotations)
     model, geometry = read_urdf(folder, annotation.joints, annotation.scale), Geometry(folder)
     for link, visuals in _groups(model):

@@ -14,6 +14,7 @@ TEMPLATE = """\
 name: kitchen cabinet         # for language
 category: cabinet
 origin_lift: 0.5              # height of the model's origin above its lowest point
+# scale: 0.001                # metres of one unit of the model, where that is not 1
 surfaces:                     # where objects may stand
   top: {{min_xy: [-0.2, -0.4], max_xy: [0.2, 0.4], z: 0.5}}
 {surfaces}handles:                      # pose of the gripper's TCP: z approach, y closing (across the bar)

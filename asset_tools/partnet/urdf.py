@@ -325,11 +325,21 @@ class _Reader:
         return pose
 
 
-def _parse(folder: Path) -> ET.Element:
+def urdf_of(folder: Path) -> Path:
+    """Return the URDF of a model.
+
+    Raises:
+        AssetError: there is none.
+    """
     path = folder / URDF
     if not path.exists():
         expected = "the folder of a PartNet-Mobility model"
         raise AssetError("no such file", where=path, expected=expected, fix="Give its folder.")
+    return path
+
+
+def _parse(folder: Path) -> ET.Element:
+    path = urdf_of(folder)
     data = read_file(path, folder)
     if len(data) > URDF_LIMIT:
         expected, found = f"at most {URDF_LIMIT >> 20} MB", f"{len(data) >> 20} MB"
