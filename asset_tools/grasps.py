@@ -134,8 +134,8 @@ def _contact_pairs(mesh: trimesh.Trimesh, rng: np.random.Generator) -> _Pairs:
     order = np.lexsort((distance, ray))
     hit_faces, ray, distance = hit_faces[order], ray[order], distance[order]
     changes = ray[1:] != ray[:-1]
-    nearest_or_last = np.concatenate([[True], changes]) | np.concatenate([changes, [True]]) if len(ray) else []
-    keep = np.flatnonzero((distance <= MAX_WIDTH) & nearest_or_last)
+    nearest_or_last = np.append(True, changes) | np.append(changes, True)
+    keep = np.flatnonzero((distance <= MAX_WIDTH) & nearest_or_last[: len(ray)])
     hit_faces, ray, distance = hit_faces[keep], ray[keep], distance[keep]
     axes = rays[ray]
     cosines = np.minimum(

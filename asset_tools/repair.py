@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from manifold3d import Manifold, OpType
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
+from scipy.spatial import KDTree, QhullError
 from trimesh.visual.color import ColorVisuals
 from trimesh.visual.texture import TextureVisuals
 
@@ -23,7 +23,9 @@ Ints = NDArray[np.int64]
 FILLED = 0.35  # share of the surface that may be filled in
 HOPELESS = 0.4  # share of the edges that are open: no surface, but confetti
 LEAST_VOLUME = 0.01  # of the convex hull's: less is a sheet, not a body
+FOIL = 1e-5  # thickness over diagonal, below which a body is a sheet as well
 FACES = 5000  # of the solid at most; more only costs time
+SIMPLIFIED_VOLUME = 0.05  # share of the volume that simplifying may change: more removes thin parts
 TOLERANCES = (0.0005, 0.001, 0.0015, 0.002, 0.003)  # of the diagonal, tried in turn to get there
 CELLS = 64  # of the grid that a mesh is re-meshed on, along its longest side
 WINDING_SAMPLES, WINDING_CHUNK = 4000, 2048
@@ -65,15 +67,23 @@ def close(scan: trimesh.Trimesh) -> ClosedScan:
     if solid is None and _open_edges(mesh) <= HOPELESS * len(mesh.edges_unique):
         solid = _as_solid(_remeshed(mesh))
         repairs.append("meshed anew around the scan")
-    hull_volume = float(mesh.convex_hull.volume) if np.ptp(mesh.vertices, axis=0).min() > 0 else 0.0
-    if solid is None or solid.volume() < LEAST_VOLUME * hull_volume or hull_volume <= 0:
+    diagonal = float(np.linalg.norm(shown.extents))
+    if solid is None or solid.volume() < max(LEAST_VOLUME * _hull_volume(mesh), FOIL * shown.area * diagonal):
         raise AssetError(
             "the mesh can't be closed to a solid",
             expected="a surface around a volume, with at most small holes",
             found=f"{_open_edges(mesh)} open edges of {len(mesh.edges_unique)}",
             fix="Repair the scan, or leave it out.",
         )
-    return ClosedScan(_light(solid, float(np.linalg.norm(shown.extents))), shown, tuple(repairs))
+    return ClosedScan(_light(solid, diagonal), shown, tuple(repairs))
+
+
+def _hull_volume(mesh: trimesh.Trimesh) -> float:
+    """Return the volume of the convex hull, 0 for a flat mesh."""
+    try:
+        return float(mesh.convex_hull.volume)
+    except QhullError:
+        return 0.0
 
 
 def _filled(
@@ -156,10 +166,8 @@ def _as_solid(mesh: trimesh.Trimesh) -> Manifold | None:
     solid = to_solid(mesh)
     if solid is None or solid.volume() <= 0:
         return None
-    bodies = solid.decompose()
-    if len(bodies) > 1 and all(body.volume() > 0 for body in bodies):
-        solid = Manifold.batch_boolean(bodies, OpType.Add)  # where they overlap would count twice
-    return solid
+    bodies = [body for body in solid.decompose() if body.volume() > 0]
+    return Manifold.batch_boolean(bodies, OpType.Add)  # where they overlap would count twice
 
 
 def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -226,11 +234,14 @@ def winding_number(points: Array, samples: Array, normals: Array, area: float) -
 
 
 def _light(solid: Manifold, diagonal: float) -> trimesh.Trimesh:
-    """The solid with few faces; it stays closed, within a thousandth or so of its size."""
+    """Return the surface of the solid with few faces, closed, within a thousandth or so of its size."""
     for tolerance in TOLERANCES:
         if solid.num_tri() <= FACES:
             break
-        solid = solid.simplify(tolerance * diagonal)
+        lighter = solid.simplify(tolerance * diagonal)
+        if abs(lighter.volume() - solid.volume()) > SIMPLIFIED_VOLUME * solid.volume():
+            break
+        solid = lighter
     return to_mesh(solid)
 
 

@@ -13,10 +13,12 @@ from trimesh.creation import box, cone, cylinder, icosphere
 
 from asset_tools.build import build_object
 from asset_tools.decompose import decompose, few_vertices, for_engine
+from asset_tools.grasps import sample_grasps
 from asset_tools.repair import close
 from asset_tools.sources import ObjectSource
 from asset_tools.visual import simplified, to_display
 from robocas_ms3.assets.cooking import OBLONG, SHRINKAGE, cook_hulls, cooking_faults
+from robocas_ms3.errors import AssetError
 
 
 def moved(mesh, *by):
@@ -164,6 +166,30 @@ def test_dirt_is_dropped_and_its_share_reported(far):
     assert closed.mesh.volume == pytest.approx(union(mesh), rel=0.01)
     np.testing.assert_allclose(closed.mesh.bounds, mesh.bounds, atol=1e-6)
     assert str(len(specks) + len(scraps)) in closed.repairs[-1] and "%" in closed.repairs[-1]
+
+
+def test_flat_bodies_are_an_error():
+    tilted = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])
+    flat = trimesh.Trimesh(
+        [[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 1e-9]], [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]
+    )
+    for mesh in (flat, flat.copy().apply_transform(tilted)):
+        with pytest.raises(AssetError):
+            close(mesh)
+
+
+def test_thin_parts_of_a_solid_survive_its_simplification():
+    bristles = placed(
+        cylinder(0.0003, 0.025, sections=12), np.linspace(-0.07, 0.07, 30), np.linspace(-0.01, 0.01, 8), 0
+    )
+    brush = joined(box([0.15, 0.03, 0.004]), *bristles)
+    np.testing.assert_allclose(close(brush).mesh.bounds, brush.bounds, atol=2e-4)
+
+
+def test_a_sheet_thinner_than_the_gripper_sees_has_no_grasps():
+    sheet = icosphere(2, 0.05)
+    sheet.vertices[:, 2] *= 0.005
+    assert len(sample_grasps(sheet, np.zeros(3), np.random.default_rng(0))) == 0
 
 
 def test_pointed_parts_have_hulls():
