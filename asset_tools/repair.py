@@ -71,8 +71,8 @@ def close(scan: trimesh.Trimesh) -> ClosedScan:
     if solid is None or solid.volume() < max(LEAST_VOLUME * _hull_volume(mesh), FOIL * shown.area * diagonal):
         raise AssetError(
             "the mesh can't be closed to a solid",
-            expected="a surface around a volume, with at most small holes",
-            found=f"{_open_edges(mesh)} open edges of {len(mesh.edges_unique)}",
+            expected=f"at most small holes, and at least {LEAST_VOLUME:.0%} of the convex hull's volume",
+            found=f"{_open_edges(mesh)} open edges of {len(mesh.edges_unique)}, in {mesh.body_count} pieces",
             fix="Repair the scan, or leave it out.",
         )
     return ClosedScan(_light(solid, diagonal), shown, tuple(repairs))
