@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -12,10 +13,10 @@ from pathlib import Path
 import trimesh
 
 from asset_tools.build import build_object
-from asset_tools.inspection import ModelSource, inspect_models
+from asset_tools.inspection import Inspect, ModelSource, inspect_models
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.prepare import prepare
-from asset_tools.reading.choice import OTHER_FOLDERS, is_collision, is_mesh
+from asset_tools.reading.choice import is_collision, is_mesh
 from asset_tools.reading.files import files_below
 from asset_tools.scan import Unit, Up, guess_unit, guess_units
 from asset_tools.sources import ObjectSource
@@ -63,24 +64,32 @@ class FoundScans:
     skipped: list[str] = field(default_factory=list)
 
 
-def scan_jobs(source: Path, settings: ImportSettings, processes: int = 1) -> list[Job]:
+def scan_jobs(
+    source: Path,
+    settings: ImportSettings,
+    inspect: Inspect = inspect_models,
+    on_skipped: Callable[[str], None] = lambda reason: None,
+) -> list[Job]:
     """Return the jobs that import a folder of scans. One that can't be read is a job that fails when it is its turn.
 
     Args:
         source: the folder.
         settings: how scans are read.
-        processes: how many read at a time, see `inspect_models`.
+        inspect: looks at the models first; `inspect_models` with its options.
+        on_skipped: called with each entry of the folder that is no scan, and the reason.
 
     Raises:
         AssetError: there are none, or masses are given for others.
     """
     scans = find_scans(source)
+    for reason in scans.skipped:
+        on_skipped(reason)
     ids = sorted([*scans.models, *scans.errors])
     unknown = sorted(set(settings.masses) - set(ids))
     if unknown:
         expected = f"ids among {', '.join(ids)}"
         raise AssetError("masses are given for scans that are not there", expected=expected, found=", ".join(unknown))
-    inspected = inspect_models(scans.models, processes)
+    inspected = inspect(scans.models)
     errors = {**scans.errors, **{id_: found.error for id_, found in inspected.items() if found.error is not None}}
     units: dict[str, Unit] = {}
     # a scan that fits no unit says nothing about which one is usual
@@ -159,10 +168,9 @@ def estimate_mass(closed: trimesh.Trimesh) -> float:
 
 def _no_scan(folder: Path) -> str:
     """Return why a folder is no object; empty: it is one."""
-    if folder.name.lower() in OTHER_FOLDERS:
-        return "its name says that it holds no object"
-    files = list(files_below(folder))
-    if any(is_mesh(path) or path.suffix.lower() in UNREAD for path in files):
+    if folder.name.lower() == "__macosx":
+        return "what macOS adds to archives"
+    if any(is_mesh(path) or path.suffix.lower() in UNREAD for path in files_below(folder)):
         return ""
     return "no mesh is in it"
 

@@ -16,7 +16,7 @@ from typing import Any
 from asset_tools.build import build_object
 from asset_tools.graspnet.catalogue import ENTRIES, NUMBERS
 from asset_tools.import_scans import estimate_mass, failing_job
-from asset_tools.inspection import Inspection, ModelSource, inspect_models
+from asset_tools.inspection import Inspect, Inspection, ModelSource, inspect_models
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.prepare import prepare
 from asset_tools.sources import ObjectSource
@@ -74,13 +74,13 @@ def default_root() -> Path:
     return data / "assets" / "mani_skill2_ycb"
 
 
-def ycb_jobs(root: Path | None = None, ids: Sequence[str] = (), processes: int = 1) -> list[Job]:
+def ycb_jobs(root: Path | None = None, ids: Sequence[str] = (), inspect: Inspect = inspect_models) -> list[Job]:
     """Return the jobs that import ManiSkill's YCB folder. A model that can't be read is a job that fails.
 
     Args:
         root: the folder; None: where ManiSkill puts it.
         ids: names such as ``005_tomato_soup_can``; empty: all.
-        processes: how many models are read at a time, see `inspect_models`.
+        inspect: looks at the models first; `inspect_models` with its options.
 
     Raises:
         AssetError: it isn't there, or lacks objects, naming them all.
@@ -96,7 +96,7 @@ def ycb_jobs(root: Path | None = None, ids: Sequence[str] = (), processes: int =
     missing = [model for model in models if not _mesh(root, model).is_file()]
     if missing:
         raise AssetError("models of YCB objects are missing", where=root / MODELS, found=_listed(missing), fix=DOWNLOAD)
-    inspected = inspect_models({model: ModelSource((_mesh(root, model),), root) for model in models}, processes)
+    inspected = inspect({model: ModelSource((_mesh(root, model),), root) for model in models})
     return [_job(root, model, info[model], inspected[model]) for model in models]
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 from asset_tools.reading.limits import SECONDS, reading_limits
 from asset_tools.reading.model import read_model
 from robocas_ms3.errors import AssetError, RobocasError
 from robocas_ms3.processes import Calls, Limits, Pool
+
+Inspect: TypeAlias = "Callable[[Mapping[str, ModelSource]], Mapping[str, Inspection]]"
 
 GRACE = 5.0  # s after the limit of time, until a process that is stuck in native code is ended
 MEMORY_GB = 4.0  # of the process, with all that is imported
@@ -44,19 +47,25 @@ class Inspection:
     error: AssetError | None = None
 
 
-def inspect_models(models: Mapping[str, ModelSource], processes: int = 1) -> dict[str, Inspection]:
+def inspect_models(
+    models: Mapping[str, ModelSource], processes: int = 0, on_inspected: Callable[[], None] = lambda: None
+) -> dict[str, Inspection]:
     """Look at models, each within 30 s and 2 GB of memory.
 
     Args:
         models: by id.
-        processes: how many look at a time; with one it is this process.
+        processes: how many look at a time; 0: this process does, and a crash of native code ends it.
+        on_inspected: called after each model.
 
     Returns:
         What was found, by id; models that can't be read have an error.
     """
-    limits = Limits(SECONDS + GRACE, MEMORY_GB)
-    with Pool(partial(Calls, _inspect), processes, died=_died, limits=limits) as pool:
-        found = dict(pool.do(models.items()))
+    limits, found = Limits(SECONDS + GRACE, MEMORY_GB), {}
+    count = min(processes, len(models))
+    with Pool(partial(Calls, _inspect), count, died=_died, here=not count, limits=limits) as pool:
+        for id_, inspection in pool.do(models.items()):
+            found[id_] = inspection
+            on_inspected()
     return {id_: found[id_] for id_ in models}
 
 

@@ -15,7 +15,7 @@ from asset_tools.graspnet.catalogue import COUNT, ENTRIES, catalogue_entry
 from asset_tools.graspnet.labels import label_checksums, label_grasps
 from asset_tools.grasps import Grasps, sample_grasps
 from asset_tools.import_scans import estimate_mass, failing_job
-from asset_tools.inspection import Inspection, ModelSource, inspect_models
+from asset_tools.inspection import Inspect, Inspection, ModelSource, inspect_models
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.prepare import prepare
 from asset_tools.sources import ObjectSource
@@ -26,13 +26,13 @@ LICENCE = "CC BY-NC-SA 4.0"
 ATTRIBUTION = "GraspNet-1Billion (H.-S. Fang, C. Wang, M. Gou, C. Lu, CVPR 2020)"
 
 
-def graspnet_jobs(root: Path, ids: Sequence[int] = (), processes: int = 1) -> list[Job]:
+def graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = inspect_models) -> list[Job]:
     """Return the jobs that import the dataset. A model that can't be read is a job that fails.
 
     Args:
         root: its folder.
         ids: the dataset's numbers; empty: the 46 that RoboCAS uses.
-        processes: how many models are read at a time, see `inspect_models`.
+        inspect: looks at the models first; `inspect_models` with its options.
 
     Raises:
         AssetError: naming all numbers that there are none of, or whose models are missing.
@@ -52,7 +52,7 @@ def graspnet_jobs(root: Path, ids: Sequence[int] = (), processes: int = 1) -> li
             fix="Give the folder that holds models/, or choose with --ids.",
         )
     models = {str(number): ModelSource((_mesh(root, number),), root) for number in numbers}
-    inspected = inspect_models(models, processes)
+    inspected = inspect(models)
     return [_job(root, number, inspected[str(number)]) for number in numbers]
 
 

@@ -15,17 +15,17 @@ LARGEST_FILE = 200 * 2**20  # bytes
 MOST_ENTRIES = 20_000  # of a folder that is searched for a file
 
 
-def read_file(path: Path, root: Path) -> bytes:
+def read_file(path: Path, *roots: Path) -> bytes:
     """Return the content of a regular file below the imported folder.
 
     Args:
-        path: the file; a symbolic link may stay below ``root``.
-        root: the folder that the user imports.
+        path: the file.
+        roots: folders that may be read, see `check_inside`.
 
     Raises:
-        AssetError: the file is missing, outside of ``root``, not regular (a pipe, a device), or larger than 200 MB.
+        AssetError: the file is missing, outside of ``roots``, not regular (a pipe, a device), or larger than 200 MB.
     """
-    check_inside(path, root)
+    check_inside(path, *roots)
     try:
         # without O_NONBLOCK, opening a named pipe waits for a writer
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -46,21 +46,21 @@ def read_file(path: Path, root: Path) -> bytes:
         raise AssetError("can't read this file", where=path, found=error.strerror) from error
 
 
-def check_inside(path: Path, root: Path) -> None:
-    """Check that a path, its links followed, is below the imported folder.
+def check_inside(path: Path, *roots: Path) -> None:
+    """Check that a path, symbolic links followed, is below one of some folders, which may be links themselves.
 
     Raises:
         AssetError: it is outside.
     """
     try:
-        inside = path.resolve().is_relative_to(root.resolve())
+        inside = any(path.resolve().is_relative_to(root.resolve()) for root in roots)
     except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a null byte
         raise AssetError("can't read this file", where=path, found=error) from error
     if not inside:
         raise AssetError(
             "the path leaves the imported folder",
             where=path,
-            expected=f"a file below {root}",
+            expected=f"a file below {roots[0]}",
             fix="Copy the file into the folder, or import the folder that holds both.",
         )
 
@@ -70,8 +70,8 @@ class ModelFiles:
     """The files of one model.
 
     Attributes:
-        root: the folder that the user imports; nothing outside of it is read.
-        home: the model's own folder, below which files are searched by name.
+        root: the folder that the user imports; only files below it, or below ``home``, are read.
+        home: the model's own folder, below which files are searched by name; may be a link to another place.
         notes: one line per file that is not where the model says.
         used: the files that were read, for the content hash.
     """
@@ -83,7 +83,7 @@ class ModelFiles:
 
     def read(self, path: Path) -> bytes:
         """Return the content of a file, see `read_file`."""
-        data = read_file(path, self.root)
+        data = read_file(path, self.root, self.home)
         if path not in self.used:
             self.used.append(path)
         return data

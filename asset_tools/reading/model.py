@@ -14,7 +14,7 @@ import trimesh
 
 from asset_tools.reading.choice import FORMATS, Candidate, choose, is_mesh, mesh_files
 from asset_tools.reading.exchange import read_exchange
-from asset_tools.reading.files import ModelFiles, read_file
+from asset_tools.reading.files import ModelFiles
 from asset_tools.reading.gltf import read_gltf
 from asset_tools.reading.obj import MOST_FACES
 from asset_tools.reading.obj_model import read_obj
@@ -129,6 +129,6 @@ def _up(path: Path, files: ModelFiles) -> Literal["x", "y", "z"] | None:
     if suffix in (".glb", ".gltf"):
         return "y"
     if suffix == ".dae":
-        found = re.search(rb"<up_axis>\s*([XYZ])_UP", read_file(path, files.root))
+        found = re.search(rb"<up_axis>\s*([XYZ])_UP", files.read(path))
         return UPS[found[1]] if found else "y"  # which is the format's default
     return None

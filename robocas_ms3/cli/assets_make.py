@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +15,7 @@ from robocas_ms3.cli.assets_show import mesh_tools
 from robocas_ms3.cli.options import Maybe, Several
 from robocas_ms3.words import count_of
 
+SHEET = 60  # assets on the contact sheet of an import
 # `asset_tools.pipeline.Job`, which only loads when a command runs
 Job = Any
 
@@ -109,23 +112,33 @@ def import_scans(command: ImportScans) -> int:
     """Run ``import-scans``."""
     with mesh_tools():
         from asset_tools.import_scans import ImportSettings, scan_jobs
-    masses = _masses(command.masses)
+    out, masses = _target(command.pack), _masses(command.masses)
     settings = ImportSettings(command.units, command.up, masses, command.licence, command.attribution)
-    return _make(scan_jobs(command.source, settings), command, command.pack, "scan")
+    from robocas_ms3.cli.terminal import say
+
+    with _inspecting(command) as inspect:
+        jobs = scan_jobs(command.source, settings, inspect, lambda reason: say(f"skipped {reason}"))
+    return _make(jobs, command, out, "scan")
 
 
 def import_graspnet(command: ImportGraspNet) -> int:
     """Run ``import-graspnet``."""
     with mesh_tools():
         from asset_tools.graspnet.importer import graspnet_jobs
-    return _make(graspnet_jobs(command.root, command.ids), command, command.pack, "GraspNet object")
+    out = _target(command.pack)
+    with _inspecting(command) as inspect:
+        jobs = graspnet_jobs(command.root, command.ids, inspect)
+    return _make(jobs, command, out, "GraspNet object")
 
 
 def import_ycb(command: ImportYCB) -> int:
     """Run ``import-ycb``."""
     with mesh_tools():
         from asset_tools.import_ycb import ycb_jobs
-    return _make(ycb_jobs(command.root, command.ids), command, command.pack, "YCB object")
+    out = _target(command.pack)
+    with _inspecting(command) as inspect:
+        jobs = ycb_jobs(command.root, command.ids, inspect)
+    return _make(jobs, command, out, "YCB object")
 
 
 def import_partnet(command: ImportPartNet) -> int:
@@ -138,7 +151,7 @@ def import_partnet(command: ImportPartNet) -> int:
 
         say_lines(template(command.models[0]))
         return 0
-    return _make(partnet_jobs(command.models, command.annotations), command, command.pack, "PartNet model")
+    return _make(partnet_jobs(command.models, command.annotations), command, _target(command.pack), "PartNet model")
 
 
 def build(command: Build) -> int:
@@ -165,17 +178,44 @@ def build(command: Build) -> int:
     return _write(builtin_jobs(command.ids), making, out, DESCRIPTION, record=False)
 
 
-def _make(jobs: list[Job], command: _Making, name: str, what: str) -> int:
-    from asset_tools.pipeline import check_target, made_of
-    from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.cli.terminal import say
-    from robocas_ms3.errors import AssetError, OutputExistsError
+@contextmanager
+def _inspecting(command: _Making) -> Iterator[Any]:
+    """Yield what looks at models before they are imported, with a progress bar."""
+    from asset_tools.inspection import inspect_models
+    from robocas_ms3.cli.bars import bar
+
+    with bar("models read", transient=True) as shown:
+
+        def inspect(models: Mapping[str, Any]) -> Mapping[str, Any]:
+            shown.start(len(models))
+            return inspect_models(models, command.jobs or os.cpu_count() or 1, shown.advance)
+
+        yield inspect
+
+
+def _target(name: str) -> Path:
+    """Return the folder of an imported pack.
+
+    Raises:
+        AssetError: no imported pack may have this name.
+    """
+    from asset_tools.pipeline import check_target
+    from robocas_ms3.errors import AssetError
     from robocas_ms3.paths import builtin_packs_dir, data_dir
 
     if (builtin_packs_dir() / name).exists() or Path(name).name != name:
         raise AssetError("this can't be the name of an imported pack", found=name, fix="Choose another with --pack.")
     out = data_dir() / "packs" / name
     check_target(out)
+    return out
+
+
+def _make(jobs: list[Job], command: _Making, out: Path, what: str) -> int:
+    from asset_tools.pipeline import made_of
+    from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.errors import AssetError, OutputExistsError
+
     if made_of(jobs, out, skip_bad=command.skip_bad):
         try:
             load_pack(out)
@@ -204,6 +244,10 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
             shown.advance()
             if made.asset is None:
                 shown.note(f"left out: {made.error}")
+                return
+            for repair in made.asset.repairs:
+                if repair.startswith("warning:"):
+                    shown.note(f"{made.id}: {repair}")
 
         write_pack(
             jobs,
@@ -217,7 +261,29 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
         )
     info(Info(pack=str(out)))
     say(f"wrote {out}")
+    if record:
+        _draw_sheet(out)
     return 0
+
+
+def _draw_sheet(folder: Path) -> None:
+    """Draw the contact sheet of a new pack into its folder, if there is something to render with."""
+    from asset_tools.sheet import contact_sheet
+    from robocas_ms3.assets.pack import load_pack
+    from robocas_ms3.cli.bars import working
+    from robocas_ms3.cli.terminal import say
+    from robocas_ms3.errors import AssetError
+
+    pack = load_pack(folder)
+    ids = [asset.id for asset in pack.manifest.assets]
+    try:
+        with working(f"drawing {count_of(len(ids[:SHEET]), 'asset')}"):
+            contact_sheet(pack, folder / "contact_sheet.png", ids[:SHEET])
+    except AssetError as error:
+        say(f"no contact sheet: {error}")
+        return
+    rest = f"; `robocas assets sheet {folder.name}` draws all {len(ids)}" if len(ids) > SHEET else ""
+    say(f"contact sheet: {folder / 'contact_sheet.png'}{rest}")
 
 
 def _masses(path: Path | None) -> dict[str, float]:

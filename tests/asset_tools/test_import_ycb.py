@@ -86,11 +86,19 @@ def test_what_is_not_there_is_one_error(root, tmp_path, monkeypatch):
         ycb_source(root, "003_cracker_box")
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"003_cracker_box": 3}', '{"003_cracker_box": {"scales": []}}'])
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"003_cracker_box": 3}'])
 def test_a_damaged_list_is_one_error(root, text):
     (root / "info_pick_v0.json").write_text(text)
     with pytest.raises(AssetError, match=r"info_pick_v0\.json"):
         ycb_jobs(root)
+
+
+@pytest.mark.parametrize("scales", ["[]", '["x"]', "[0]", "[-1]", "null"])
+def test_an_invalid_scale_fails_that_object_alone(root, scales):
+    (root / "info_pick_v0.json").write_text(f'{{"003_cracker_box": {{"scales": {scales}}}}}')
+    (job,) = ycb_jobs(root)
+    with pytest.raises(AssetError):
+        job.make(root / "out")
 
 
 def test_the_default_folder_is_maniskills():

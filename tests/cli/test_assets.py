@@ -36,6 +36,7 @@ def test_import_verify_mend_and_replace(scans, tmp_path, capsys):
     code, shown = run(capsys, *importing)
     assert code == 0 and "red_box" in shown
     pack = tmp_path / "data" / "packs" / "mine"
+    assert (pack / "contact_sheet.png").is_file() or "no contact sheet" in shown
     assert run(capsys, *importing)[1].strip().endswith("is made of just this already")
     code, shown = run(capsys, "verify", "mine", "--physics", "--jobs", 1, "--json", tmp_path / "quality.json")
     measured = json.loads((tmp_path / "quality.json").read_text())
@@ -62,7 +63,7 @@ def test_scans_that_cannot_be_read_can_be_left_out(scans, capsys):
     code, shown = run(capsys, "import-scans", scans, "--pack", "mine", "--jobs", 1)
     assert code == 1 and "cut" in shown and "--skip-bad" in shown
     code, shown = run(capsys, "import-scans", scans, "--pack", "mine", "--jobs", 1, "--skip-bad")
-    assert code == 0 and "left out" in shown and "cut.ply" in shown and "no_mesh" in shown
+    assert code == 0 and "left out" in shown and "cut.ply" in shown and "skipped no_mesh/" in shown
     assert load_pack("mine").objects.keys() == {"red_box", "blue_box"}
 
 

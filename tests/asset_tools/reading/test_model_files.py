@@ -107,3 +107,11 @@ def test_one_model_that_cannot_be_read_does_not_end_the_inspection(tmp_path):
     found = inspect_models({name: ModelSource((tmp_path / name,), tmp_path) for name in ("good", "bad")})
     assert found["good"].longest == pytest.approx(0.1) and found["good"].error is None
     assert isinstance(found["bad"].error, AssetError)
+
+
+def test_a_folder_of_links_to_models_elsewhere(tmp_path):
+    """People keep datasets on another disk; what they link is theirs to read."""
+    write_obj(tmp_path / "disk" / "mug")
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / "mug").symlink_to(tmp_path / "disk" / "mug")
+    assert len(read_model(tmp_path / "scans" / "mug", tmp_path / "scans").files) == 3
