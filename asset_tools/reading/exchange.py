@@ -55,9 +55,8 @@ def read_exchange(path: Path, files: ModelFiles) -> list[Part]:
     except Exception as error:  # whatever trimesh's parsers trip over
         found = " ".join(f"{type(error).__name__}: {error}".split())
         raise AssetError("can't read this mesh", where=path, found=found, fix="Export it again.") from error
-    if textures.missing:
-        missing = path.parent / textures.missing[0]
-        raise AssetError("a texture that the mesh names is missing", where=missing, found=path.name)
+    if textures.error is not None:
+        raise textures.error
     if sum(len(part.faces) for part in parts) > MOST_FACES:
         expected = f"at most {MOST_FACES:,}"
         raise AssetError("the mesh has too many faces", where=path, expected=expected, fix="Reduce it.")
@@ -70,7 +69,6 @@ class _Textures(Resolver):
     def __init__(self, path: Path, files: ModelFiles) -> None:
         self._path, self._files = path, files
         self._images: dict[bytes, Image.Image] = {}
-        self.missing: list[str] = []
         self.error: AssetError | None = None
 
     def note(self, text: str) -> None:
@@ -79,14 +77,13 @@ class _Textures(Resolver):
 
     def get(self, name: str) -> bytes:
         """Return the image as BMP, 8 bits a channel."""
-        file = self._files.find(name, self._path.parent)
-        if file is None:
-            self.missing.append(name)
-            raise KeyError(name)
         try:
+            file = self._files.find(name, self._path.parent)
+            if file is None:
+                raise AssetError("a texture that the mesh names is missing", where=self._path.parent / name)
             image = open_texture(self._files.read(file), file, self._files.notes)
         except AssetError as error:
-            self.error = error  # trimesh swallows it
+            self.error = self.error or error  # trimesh goes on without the texture
             raise
         stream = io.BytesIO()
         image.save(stream, format="BMP")  # no time is lost by compressing it
@@ -148,8 +145,6 @@ def _parts(scene: trimesh.Scene, textures: _Textures) -> Iterator[Part]:
         pose, name = scene.graph[node]
         mesh = scene.geometry[name]
         if isinstance(mesh, trimesh.Trimesh):
-            if textures.error is not None:
-                raise textures.error
             part = _part(mesh, textures)
             part.vertices = part.vertices @ pose[:3, :3].T + pose[:3, 3]
             if not np.array_equal(pose, np.eye(4)):
@@ -189,7 +184,7 @@ def _plain(material: Any) -> tuple[float, float, float]:
     red, green, blue = (float(value) for value in decode_srgb(np.asarray(material.baseColorFactor)[:3]))
     glow = material.emissiveFactor
     if glow is not None and max(red, green, blue) < BLACK:
-        red, green, blue = (float(value) for value in np.clip(glow, 0, 1))
+        red, green, blue = (float(value) for value in decode_srgb(255 * np.clip(glow, 0, 1)))
     return red, green, blue
 
 

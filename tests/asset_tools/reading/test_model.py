@@ -101,16 +101,63 @@ def test_colours_of_vertices_and_faces(tmp_path):
     assert (shown_colors(read_model(tmp_path / "vertices.ply").mesh) == RED).all()
 
 
-def test_collada(tmp_path, monkeypatch):
-    """Read with pycollada; without it, the error names the extra."""
-    pytest.importorskip("collada")
-    (tmp_path / "box.dae").write_bytes(trimesh.exchange.dae.export_collada(box()))
-    model = read_model(tmp_path / "box.dae")
-    np.testing.assert_allclose(model.mesh.extents, [0.06, 0.05, 0.1], atol=1e-6)
-    assert model.up in ("y", "z")
+COLLADA = """<?xml version="1.0" encoding="utf-8"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="1"/><up_axis>Z_UP</up_axis></asset>
+<library_images><image id="i"><init_from>{image}</init_from></image></library_images>
+<library_effects><effect id="e"><profile_COMMON>
+<newparam sid="s"><surface type="2D"><init_from>i</init_from></surface></newparam>
+<newparam sid="p"><sampler2D><source>s</source></sampler2D></newparam>
+<technique sid="common"><lambert><diffuse>{diffuse}</diffuse></lambert></technique></profile_COMMON></effect>
+</library_effects>
+<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
+<library_geometries><geometry id="g"><mesh>
+<source id="x"><float_array id="xa" count="9">0 0 0 1 0 0 0 1 0</float_array><technique_common>
+<accessor source="#xa" count="3" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
+<source id="t"><float_array id="ta" count="2">0.5 0.5</float_array><technique_common>
+<accessor source="#ta" count="1" stride="2"><param name="S" type="float"/><param name="T" type="float"/></accessor>
+</technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#x"/></vertices>
+<triangles material="k" count="1"><input semantic="VERTEX" source="#v" offset="0"/>
+<input semantic="TEXCOORD" source="#t" offset="1" set="0"/><p>0 0 1 0 2 0</p></triangles></mesh></geometry>
+</library_geometries>
+<library_visual_scenes><visual_scene id="w"><node id="n"><instance_geometry url="#g"><bind_material><technique_common>
+<instance_material symbol="k" target="#m"/></technique_common></bind_material></instance_geometry></node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#w"/></scene></COLLADA>"""
+
+
+@pytest.mark.parametrize(
+    ("diffuse", "image", "color"),
+    [
+        ('<texture texture="p" texcoord="u"/>', "skin.png", RED),
+        ('<texture texture="p" texcoord="u"/>', "file:///home/me/SKIN.png", RED),
+        ("<color>0.2 0.6 1 1</color>", "skin.png", (51, 153, 255)),
+    ],
+)
+def test_collada(tmp_path, diffuse, image, color):
+    image_file(tmp_path / "skin.png")
+    (tmp_path / "mug.dae").write_text(COLLADA.format(diffuse=diffuse, image=image))
+    model = read_model(tmp_path / "mug.dae")
+    assert shown_colors(model.mesh).tolist() == [list(color)] and model.up == "z"
+
+
+@pytest.mark.parametrize("image", ["lost.png", "../../secret.png"])
+def test_a_collada_texture_that_is_missing_or_outside(tmp_path, image):
+    image_file(tmp_path / "secret.png")
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    path = tmp_path / "a" / "b" / "mug.dae"
+    path.write_text(COLLADA.format(diffuse='<texture texture="p" texcoord="u"/>', image=image))
+    with pytest.raises(AssetError) as caught:
+        read_model(path)
+    assert image in str(caught.value.where)
+
+
+def test_collada_without_pycollada_names_the_extra(tmp_path, monkeypatch):
+    (tmp_path / "mug.dae").write_text("<COLLADA/>")
     monkeypatch.setattr("asset_tools.reading.exchange.find_spec", lambda name: None)
     with pytest.raises(RobocasError) as caught:
-        read_model(tmp_path / "box.dae")
+        read_model(tmp_path / "mug.dae")
     assert "robocas-ms3[assets]" in caught.value.fix
 
 
