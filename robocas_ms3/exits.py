@@ -39,6 +39,20 @@ def deferred_interrupts() -> Iterator[None]:
 
 
 @contextmanager
+def responsive() -> Iterator[None]:
+    """Wait inside, in Python: a second SIGINT right after the first changes nothing."""
+    handler = signal.getsignal(signal.SIGINT)
+    armed = handler in _commands and threading.current_thread() is threading.main_thread()
+    if armed:
+        signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        if armed and not was_interrupted():
+            _let_second_end()
+
+
+@contextmanager
 def uninterrupted() -> Iterator[None]:
     """Hold Ctrl-C back for a moment; processes that are started during that inherit it."""
     with _deferred():

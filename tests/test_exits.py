@@ -30,6 +30,19 @@ with {around}:
     while True:
         hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
 """
+WAITING = """
+import os, signal, time
+from robocas_ms3.cli.interrupts import heed_ctrl_c
+from robocas_ms3.exits import responsive
+heed_ctrl_c()
+try:
+    with responsive():
+        print("ready", flush=True)
+        time.sleep(100)
+except KeyboardInterrupt:
+    print("handled", flush=True)
+os._exit(0)
+"""
 UNSIGNALLED = """
 from robocas_ms3.cli.interrupts import heed_ctrl_c
 from robocas_ms3.errors import ExtensionError
@@ -65,6 +78,14 @@ def test_the_second_ctrl_c_ends_a_long_native_call(around):
             assert process.returncode == -signal.SIGINT
         finally:
             process.kill()
+
+
+def test_the_first_of_two_at_once_is_handled_while_a_command_waits():
+    with python(WAITING) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        for _ in range(2):
+            process.send_signal(signal.SIGINT)
+        assert (process.communicate()[0], process.returncode) == ("handled\n", 0)
 
 
 def test_an_interrupt_that_no_signal_caused_is_an_error_of_its_source():

@@ -15,6 +15,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from robocas_ms3.errors import PlanError
+from robocas_ms3.exits import responsive
 from robocas_ms3.files import make_folder, write_json
 from robocas_ms3.outputs import (
     check_one_way,
@@ -252,7 +253,9 @@ def _do_units(plan: Plan, out: Path, engine: Engine, parts: Sequence[_Part], on_
 def _some_done(done: SimpleQueue[Future[Any]]) -> Iterator[Future[Any]]:
     """What is done by now; waits a moment for the first."""
     with suppress(Empty):
-        yield done.get(timeout=_LOOK)
+        with responsive():
+            first = done.get(timeout=_LOOK)
+        yield first
         while True:
             yield done.get_nowait()
 

@@ -22,7 +22,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.exits import uninterrupted
+from robocas_ms3.exits import responsive, uninterrupted
 from robocas_ms3.processes.child import NO_LIMITS, Child, ChildDied, Limits, NotBegun
 from robocas_ms3.processes.worker import Worker
 
@@ -164,5 +164,5 @@ def _next_done(done: SimpleQueue[Future[Any]]) -> Future[Any]:
     signal that another thread got wakes nobody here.
     """
     while True:
-        with suppress(Empty):
+        with suppress(Empty), responsive():
             return done.get(timeout=_LOOK)

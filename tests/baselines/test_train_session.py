@@ -249,6 +249,16 @@ def test_a_baseline_can_not_end_the_process(made_up, data, tmp_path, monkeypatch
     assert caught.value.where == "baseline made-up"
 
 
+def test_a_baseline_that_changes_the_working_directory(made_up, data, tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    model = made_up.model
+    monkeypatch.setattr(made_up, "model", lambda *args: os.chdir(tmp_path / "elsewhere") or model(*args))
+    assert run(["train", "made-up", "--data", data.name, "--out", "run", "--steps", "4", "--device", "cpu"]) == 0
+    assert (tmp_path / "run" / "run.json").is_file()
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
 def test_without_validation(made_up, data, tmp_path):
     data.write_text("few")
     notes = []

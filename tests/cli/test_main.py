@@ -286,6 +286,13 @@ def test_interrupt(failing, capsys):
     assert capsys.readouterr().err == "interrupted\n"
 
 
+@pytest.mark.parametrize("how", [SystemExit(), SystemExit(0), SystemExit("done")])
+def test_code_that_exits_inside_a_command_is_an_error(failing, capsys, how):
+    failing(how)
+    assert cli.run(["list"]) == 1
+    assert capsys.readouterr().err.startswith("error: robocas list: ")
+
+
 def test_a_full_disk_is_one_line_but_a_bug_is_not(failing, capsys):
     failing(OSError(errno.ENOSPC, "No space left on device", "out/x.h5"))
     assert cli.run(["list"]) == 1

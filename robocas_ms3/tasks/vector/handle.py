@@ -18,6 +18,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import VectorEnvError, WorkerDied
+from robocas_ms3.exits import responsive
 from robocas_ms3.processes import NO_LIMITS, is_too_large, uninterrupted
 
 STEP, LEAVE = b"s", b"q"  # messages; all others are pickled
@@ -124,7 +125,9 @@ class WorkerHandle:
             if why:
                 self.process.kill()
                 raise self._died(why)
-            if self.connection.poll(_LOOK):
+            with responsive():
+                answered = self.connection.poll(_LOOK)
+            if answered:
                 return
 
     def _died(self, why: str = "") -> WorkerDied:
