@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, model_validator
 
 from robocas_ms3.documents import DocumentError, json_values
 from robocas_ms3.errors import RobocasError
@@ -39,10 +39,29 @@ _FOUND_LENGTH = 80  # of a wrong value in a message
 _OUT_OF_RANGE = re.compile(rb"NaN|Infinity|\d[eE]\+?\d{3}|\d{19}")  # may be a number that `json_values` refuses
 
 
+GREATEST_NUMBER = 1e12
+"""No number of a declared form is larger: products of numbers like 1e308 are infinite."""
+
+
 class StrictModel(BaseModel):
-    """Unknown keys, and numbers that aren't finite, are errors; nothing changes after loading."""
+    """Refuse unknown keys and numbers beyond `GREATEST_NUMBER`; nothing changes after loading."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _numbers_are_bounded(self) -> StrictModel:
+        for name, value in self:
+            if (wrong := _too_large(value)) is not None:
+                raise ValueError(f"{name}: expected numbers of at most {GREATEST_NUMBER:g}, found {wrong:g}")
+        return self
+
+
+def _too_large(value: Any) -> float | None:
+    """Return a number beyond the greatest that is in a value, or None; models inside check their own."""
+    if isinstance(value, int | float):
+        return value if abs(value) > GREATEST_NUMBER else None
+    inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
+    return next((wrong for one in inside if (wrong := _too_large(one)) is not None), None)
 
 
 @dataclass(frozen=True)

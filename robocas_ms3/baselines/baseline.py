@@ -41,8 +41,8 @@ class TrainSettings(StrictModel):
         check_samples: of the validation split at most, the same each time.
     """
 
-    steps: int = Field(default=20_000, ge=1)
-    batch_size: int = Field(default=128, ge=1)
+    steps: int = Field(default=20_000, ge=1, le=10**9)
+    batch_size: int = Field(default=128, ge=1, le=10**6)
     learning_rate: float = Field(default=1e-3, gt=0)
     min_learning_rate: float = Field(default=0.0, ge=0)
     weight_decay: float = Field(default=1e-4, ge=0)
@@ -55,11 +55,11 @@ class TrainSettings(StrictModel):
     ema: float = Field(default=0.999, ge=0, lt=1)
     seed: int = Field(default=0, ge=0)
     precision: Precision = "auto"
-    workers: int = Field(default=0, ge=0)
+    workers: int = Field(default=0, ge=0, le=1024)
     log_every: int = Field(default=50, ge=1)
     check_every: int = Field(default=1000, ge=1)
     save_every: int = Field(default=500, ge=1)
-    check_samples: int = Field(default=2048, ge=1)
+    check_samples: int = Field(default=2048, ge=1, le=10**9)
 
 
 class BaselineConfig(StrictModel):
@@ -81,8 +81,8 @@ class TrialSettings(StrictModel):
         save_every: steps between checkpoints.
     """
 
-    steps: int = Field(default=100_000, ge=1)
-    batch_size: int = Field(default=512, ge=2)
+    steps: int = Field(default=100_000, ge=1, le=10**9)
+    batch_size: int = Field(default=512, ge=2, le=10**6)
     learning_rate: float = Field(default=7e-4, gt=0)
     clip_norm: float = Field(default=0.5, ge=0)
     seed: int = Field(default=0, ge=0)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -70,12 +72,38 @@ def load(path: Path, expected: Mapping[str, str]) -> tuple[dict[str, torch.Tenso
             about = file.metadata() or {}
             for key, value in expected.items():
                 if about.get(key) != value:
-                    found = about.get(key, "nothing of the kind")
+                    found = about.get(key, "nothing of the kind")[:80]
                     raise TrainingError(f"of another {key.replace('_', ' ')}", where=path, expected=value, found=found)
             return {name: file.get_tensor(name) for name in file.keys()}, about  # noqa: SIM118  (no mapping)
     except (SafetensorError, OSError) as error:
         hint = _HINTS.get(path.name, _HINTS[CHECKPOINT])
         raise TrainingError("can't be read", where=path, found=error, fix=hint) from error
+
+
+@contextmanager
+def facts_of(path: Path) -> Iterator[None]:
+    """Turn what a baseline raises for facts or sizes that make no model into an error that names their file.
+
+    Raises:
+        TrainingError: the facts of a ``run.json`` are not those of the baseline.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
+        found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise TrainingError("its configuration and facts make no model", where=path, found=found) from error
+
+
+def step_of(about: Mapping[str, str], path: Path) -> int:
+    """Return the step that a checkpoint was written at, by the texts in it.
+
+    Raises:
+        TrainingError: they do not say.
+    """
+    step = about.get("step", "")
+    if not re.fullmatch(r"[0-9]{1,12}", step):
+        raise TrainingError("no step of a training", where=path, expected="a whole number", found=repr(step[:40]))
+    return int(step)
 
 
 def put_in(model: torch.nn.Module, tensors: Mapping[str, torch.Tensor], where: object) -> None:

@@ -45,12 +45,14 @@ class RunPolicy:
             )
         config = parse(baseline.Config, record.config, TrainingError, where=folder / RUN)
         chosen = device if device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
-        model = baseline.model(config, record.facts)
         expected = {"baseline": record.baseline, "version": str(record.version), "dataset": record.data.hash}
         tensors, about = checkpoints.load(folder / WEIGHTS, expected)
-        checkpoints.put_in(model, tensors, folder / WEIGHTS)
-        self._policy: Policy = baseline.policy(config, record.facts, model.to(chosen).eval())
-        self._about = {**_about(record, int(about["step"])), "weights": hash_of_weights(folder)}
+        with checkpoints.facts_of(folder / RUN):
+            model = baseline.model(config, record.facts)
+            checkpoints.put_in(model, tensors, folder / WEIGHTS)
+            self._policy: Policy = baseline.policy(config, record.facts, model.to(chosen).eval())
+        step = checkpoints.step_of(about, folder / WEIGHTS)
+        self._about = {**_about(record, step), "weights": hash_of_weights(folder)}
 
     @property
     def wants(self) -> Wants:

@@ -278,7 +278,7 @@ class Trainer:
         mine = float(self._accelerator.is_main_process)  # they are those of all
         self._sums = {name: mine * value.to(device) for name, value in checkpoints.part(tensors, "sums.").items()}
         self._set_random(checkpoints.part(tensors, "random."), path)
-        self.step = int(about["step"])
+        self.step = checkpoints.step_of(about, path)
         if self._accelerator.is_main_process:
             checkpoints.mend_weights(self._folder, self._acting().state_dict(), about)
         return checkpoints.part(tensors, "optimizer.")

@@ -80,7 +80,7 @@ class RandomisationConfig(StrictModel):
     object_sets: Annotated[list[Ids], Field(min_length=1)] | None = Field(
         default=None, description="one of them in place of `ids`"
     )
-    count: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] | None = Field(
+    count: tuple[Annotated[int, Field(ge=1, le=64)], Annotated[int, Field(ge=1, le=64)]] | None = Field(
         default=None, description="number of objects, at most objects.count"
     )
     distractors: DistractorConfig | None = None

@@ -13,15 +13,18 @@ from robocas_ms3.errors import ConfigError, ExtensionError
 from robocas_ms3.extensions import load
 from robocas_ms3.strict import StrictModel
 
-Vec2 = tuple[float, float]
-Vec3 = tuple[float, float, float]
+Coordinate = Annotated[float, Field(ge=-100, le=100)]
+Vec2 = tuple[Coordinate, Coordinate]
+Vec3 = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class PoseConfig(StrictModel):
     """A pose in the world: position, and a turn about the vertical."""
 
     position: Vec3 = Field(description="x, y, z, m")
-    yaw_deg: float = Field(default=0.0, description="counter-clockwise, seen from above")
+    yaw_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
+        default=0.0, description="counter-clockwise, seen from above"
+    )
 
 
 class RoomConfig(StrictModel):
@@ -50,7 +53,9 @@ class PlacedConfig(StrictModel):
 class FurnitureConfig(PlacedConfig):
     """A piece of furniture."""
 
-    joints: dict[str, float] = Field(default={}, description="where doors and drawers stand at first, m or rad; else 0")
+    joints: dict[str, Coordinate] = Field(
+        default={}, description="where doors and drawers stand at first, m or rad; else 0"
+    )
 
 
 class BasketConfig(PlacedConfig):
@@ -79,7 +84,9 @@ class ScatteredLayout(StrictModel):
 
     kind: Literal["scattered"]
     min_gap: Annotated[float, Field(ge=0, le=0.2)] = Field(default=0.01, description="space between two objects, m")
-    max_tries: Annotated[int, Field(ge=1)] = Field(default=40_000, description="poses drawn before a seed is given up")
+    max_tries: Annotated[int, Field(ge=1, le=10**7)] = Field(
+        default=40_000, description="poses drawn before a seed is given up"
+    )
 
 
 class OrderlyLayout(StrictModel):

@@ -99,6 +99,8 @@ def check_same_run(path: Path, run: dict[str, Any]) -> None:
     if not path.is_file():
         return
     before = load_json(path)
+    if not isinstance(before, dict):
+        raise RobocasError("this file is damaged", where=path, expected="an object", found=type(before).__name__)
     if isinstance(before.get("settings"), dict):  # a setting that is newer than the output had its default then
         defaults = {one.name: one.default for one in fields(EpisodeSettings) if one.default is not MISSING}
         before["settings"] = {**json.loads(json.dumps(defaults)), **before["settings"]}

@@ -6,8 +6,12 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 from robocas_ms3 import ledger
+from robocas_ms3.recordings.seeds import GREATEST_SEED
 
 FAILURES_FILE = "failures.jsonl"
 
@@ -24,11 +28,11 @@ class Failure:
         seconds: wall-clock time the attempt took; 0 where a kill has come before it was noted.
     """
 
-    seed: int
-    attempt: int
+    seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)]
+    attempt: Annotated[int, Field(ge=-1, le=10**6)]
     stage: str
     reason: str
-    seconds: float
+    seconds: Annotated[float, Field(ge=0, le=1e9)]
 
     @property
     def gave_up(self) -> bool:

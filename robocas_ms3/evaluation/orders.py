@@ -3,10 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
+
+from robocas_ms3.strict import mistakes
+
+
+class _Move(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    object: str
+    step: NonNegativeInt
+    needed: bool
+    in_order: bool
+
+
+class _Order(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    moved: list[_Move]
+    needed: list[str]
+    left: NonNegativeInt
+    score: Annotated[float, Field(ge=0, le=1)] | None
+
+
+def check_order(order: dict[str, Any]) -> dict[str, Any]:
+    """Return what `order_of` made, as it is.
+
+    Raises:
+        ValueError: a key is missing, or a value is of another type or out of range.
+    """
+    try:
+        _Order.model_validate(order)
+    except ValidationError as error:
+        wrong = mistakes(error, _Order)[0]
+        raise ValueError(f"{wrong.what}, expected {wrong.expected}, found {wrong.found}") from error
+    return order
 
 
 def order_of(

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator
 
 from robocas_ms3.benchmark import TASKS
 from robocas_ms3.benchmark.spec import STAGES as STAGES_ON_THE_WAY
-from robocas_ms3.evaluation.orders import order_of
+from robocas_ms3.evaluation.orders import check_order, order_of
 from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.words import printable
 
@@ -26,8 +26,10 @@ def _as_written(value: Any, check: ValidatorFunctionWrapHandler) -> Any:
     return value
 
 
-Number = Annotated[float, WrapValidator(_as_written)]
+Number = Annotated[float, Field(ge=-1e12, le=1e12), WrapValidator(_as_written)]
 """Whole if the file has it whole: what is written again says the same."""
+Measure = Annotated[float, Field(ge=0, le=1e12), WrapValidator(_as_written)]
+Count = Annotated[int, Field(ge=0, le=10**12)]
 
 
 @dataclass(frozen=True)
@@ -55,24 +57,24 @@ class Outcome:
         retrieval: in tasks with obstacles to clear: what was moved before the target, see `orders.order_of`.
     """
 
-    episode: int
+    episode: Count
     task: str
     config: str
-    seed: int
+    seed: Count
     split: str
     success: bool
     success_at_end: bool
     success_v0: bool
-    steps: int
-    seconds: Number
+    steps: Count
+    seconds: Measure
     failure_stage: str
     error: str = ""
-    flags: dict[str, int | None] = field(default_factory=dict)
-    flag_seconds: dict[str, Number | None] = field(default_factory=dict)
+    flags: dict[str, Count | None] = field(default_factory=dict)
+    flag_seconds: dict[str, Measure | None] = field(default_factory=dict)
     measures: dict[str, Number] = field(default_factory=dict)
-    inference_ms: Number = 0.0
-    p_vis: Number | None = None
-    retrieval: dict[str, Any] | None = None
+    inference_ms: Measure = 0.0
+    p_vis: Annotated[float, Field(ge=0, le=1), WrapValidator(_as_written)] | None = None
+    retrieval: Annotated[dict[str, Any], AfterValidator(check_order)] | None = None
 
     @classmethod
     def of(cls, played: Rollout, episode: Episode, objects: Sequence[str]) -> Outcome:

@@ -29,6 +29,7 @@ from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.names import LONGEST, FileName
 from robocas_ms3.paths import protocols_dir
+from robocas_ms3.recordings.seeds import GREATEST_SEED
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
 from robocas_ms3.strict import StrictModel, nearest, parse, parse_json
 
@@ -49,8 +50,10 @@ class Protocol(StrictModel):
     stepping: Literal["timed", "upstream"] = Field(
         default="timed", description="a step is one action of 1 / rate_hz s; or gripper, then motion, as upstream's"
     )
-    max_steps: Annotated[int, Field(ge=1)] | None = Field(default=None, description="actions an episode may have")
-    max_seconds: dict[str, Annotated[float, Field(gt=0)]] = Field(
+    max_steps: Annotated[int, Field(ge=1, le=10**7)] | None = Field(
+        default=None, description="actions an episode may have"
+    )
+    max_seconds: dict[str, Annotated[float, Field(gt=0, le=10**6)]] = Field(
         default={}, description="by task, s of the scene an episode may have; max_steps, if given, ends it earlier"
     )
     conventions: list[str] = Field(default=sorted(CONVENTIONS), description="of actions that a policy may speak")
@@ -60,7 +63,7 @@ class Protocol(StrictModel):
     ends_on: list[Literal["success", "fail", "success_v0"]] = Field(
         default=["success", "fail"], description="flags at which an episode ends"
     )
-    max_v0_steps: Annotated[int, Field(ge=1)] | None = Field(
+    max_v0_steps: Annotated[int, Field(ge=1, le=10**7)] | None = Field(
         default=None, description="it also ends when upstream's success has held after so many actions"
     )
     robot: str = Field(default=DEFAULT_ROBOT, description="that acts")
@@ -124,16 +127,18 @@ class Protocol(StrictModel):
 class Episode(StrictModel):
     """One episode of a protocol's list."""
 
-    episode: Annotated[int, Field(ge=0)] = Field(description="its number, from 0 on")
+    episode: Annotated[int, Field(ge=0, le=10**7)] = Field(description="its number, from 0 on")
     task: str
     config: Annotated[str, Field(pattern=CONFIG_NAME, max_length=LONGEST)] = Field(
         description="name of a file in configs/"
     )
-    seed: Annotated[int, Field(ge=0)]
+    seed: Annotated[int, Field(ge=0, le=GREATEST_SEED)]
     split: str = Field(default="test", description="what it belongs to, such as a suite's")
     instruction: str = Field(description="what the policy is told")
     target: str = Field(description="id of the object that is meant")
-    p_vis: float | None = Field(default=None, description="share of it that is seen from above; search")
+    p_vis: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        default=None, description="share of it that is seen from above; search"
+    )
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, ConfigDict
+
 from robocas_ms3.documents import load_json
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.outcomes import Outcome
@@ -23,20 +25,36 @@ from robocas_ms3.evaluation.statistics import Share, share
 from robocas_ms3.files import make_folder, replacing_folder, write_json
 from robocas_ms3.ledger import Ledger
 from robocas_ms3.outputs import check_absent, check_run
+from robocas_ms3.strict import parse
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
-_SAME = {  # of parts of one result, and what each is
-    "protocol": str,
-    "protocol_hash": str,
-    "policy": dict,
-    "weld": bool,
-    "backend": str,
-    "versions": dict,
-    "pack_hashes": dict,
-}
+_SAME = ("protocol", "protocol_hash", "policy", "weld", "backend", "versions", "pack_hashes")  # in parts of one result
+_NO_RESULT = "no result of an evaluation"
 _ADDRESSES = ("ws://", "wss://")
 _BEFORE = {"weld": False}  # of results that were written before there was one
+
+
+class _PolicyRecord(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    name: str
+    server: dict[str, Any] | None = None
+
+
+class _RunRecord(BaseModel):
+    """``run.json``, as far as results are told apart by it."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    protocol: str
+    protocol_hash: str
+    policy: _PolicyRecord
+    weld: bool
+    backend: str
+    versions: dict[str, str]
+    pack_hashes: dict[str, str]
+    machine: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -98,7 +116,7 @@ def begin(folder: Path, run: dict[str, Any], *, resume: bool, again: bool = Fals
         return {}
     if not path.is_file():
         raise EvaluationError("episodes of nobody knows what", where=folder, expected=RUN, fix="Choose another --out.")
-    before = {**_BEFORE, **load_json(path)}
+    before = _read_run(folder)
     if not resume:
         raise EvaluationError(
             "there is a result already", where=folder, fix="Pass --resume to go on, or another --out."
@@ -195,18 +213,22 @@ def _ledger(folder: Path) -> Ledger[Outcome]:
 
 
 def _read(folder: Path) -> Result:
+    run = _read_run(folder)
     try:
-        run = load_json(folder / RUN)
         outcomes = dict(sorted(_outcomes(folder).items()))
     except (OSError, ValueError) as error:
-        raise EvaluationError("no result of an evaluation", where=folder, found=error) from error
-    run = {**_BEFORE, **run} if isinstance(run, dict) else {}
-    missing = [key for key, kind in _SAME.items() if not isinstance(run.get(key), kind)]
-    if not missing and not isinstance(run["policy"].get("name"), str):
-        missing = ["policy.name"]
-    if missing:
-        raise EvaluationError("no result of an evaluation", where=folder / RUN, expected=", ".join(missing))
+        raise EvaluationError(_NO_RESULT, where=folder, found=error) from error
     return Result(folder, run, outcomes)
+
+
+def _read_run(folder: Path) -> dict[str, Any]:
+    try:
+        run = load_json(folder / RUN)
+    except (OSError, ValueError) as error:
+        raise EvaluationError(_NO_RESULT, where=folder, found=error) from error
+    run = {**_BEFORE, **run} if isinstance(run, dict) else run
+    parse(_RunRecord, run, EvaluationError, where=folder / RUN, about=_NO_RESULT)
+    return run
 
 
 def _outcomes(folder: Path) -> dict[int, Outcome]:

@@ -24,6 +24,7 @@ from robocas_ms3.plans.claims import LEASE, age_of, claimed, claims_of, is_of_he
 from robocas_ms3.plans.units import DRIVER
 
 RUN = f"{DRIVER}.run"
+_LONGEST = 3600.0  # s that a file may have this process wait for
 _SEEN = 10.0  # s that a file may take until another machine sees it
 _log = logging.getLogger(__name__)
 
@@ -147,7 +148,7 @@ def is_current(out: Path, name: str | None, seconds: float = _SEEN) -> bool:
 def wait_for_killed(out: Path) -> None:
     """Wait until what a run began elsewhere has ended, if the run was killed a moment ago."""
     claims, lingers = claims_of(out / DRIVER), _read(out).get("lingers")
-    if not claims or not isinstance(lingers, float) or lingers <= 0:
+    if not claims or not isinstance(lingers, float) or not 0 < lingers <= _LONGEST:
         return
     claim = claims[max(claims)]
     with suppress(FileNotFoundError):
@@ -164,4 +165,4 @@ def _read(out: Path) -> dict[str, Any]:
         about = load_json(out / RUN)
     except (OSError, DocumentError):
         return {}
-    return about if isinstance(about, dict) else {}
+    return about if isinstance(about, dict) and isinstance(about.get("run"), str) else {}

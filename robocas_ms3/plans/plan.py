@@ -33,8 +33,8 @@ class Plan(StrictModel):
     formats: list[Literal["robocas", "lerobot"]] = ["robocas"]
     recording: RecordingConfig = RecordingConfig()
     pictures: PicturesConfig = PicturesConfig()
-    rate: Annotated[float, Field(gt=0)] = Field(default=5.0, description="steps of a dataset a second")
-    control_freq: int = 20
+    rate: Annotated[float, Field(gt=0, le=100)] = Field(default=5.0, description="steps of a dataset a second")
+    control_freq: Annotated[int, Field(ge=1, le=100)] = 20
     embeddings: bool = True
     split: SplitConfig | None = Field(default=None, description="default: as `robocas convert` has it, 90 : 10 by seed")
     block: Annotated[int, Field(ge=1, le=1000)] = Field(default=10, description="seeds of a unit of work")

@@ -34,13 +34,15 @@ class RecordingConfig(StrictModel):
 
     planner: str | None = None
     robot: str | None = None
-    max_attempts: int | None = None
+    max_attempts: Annotated[int, Field(ge=1, le=10_000)] | None = None
     keep_recoveries: bool | None = None
-    replay_rate: int | None = Field(default=None, description="Hz; default: the dataset's rate")
-    noisy_trials: int | None = None
-    noisy_failures: int | None = None
-    noise_mm: float | None = None
-    noise_deg: float | None = None
+    replay_rate: Annotated[int, Field(ge=0, le=100)] | None = Field(
+        default=None, description="Hz; default: the dataset's rate"
+    )
+    noisy_trials: Annotated[int, Field(ge=0, le=10_000)] | None = None
+    noisy_failures: Annotated[int, Field(ge=0, le=10_000)] | None = None
+    noise_mm: Annotated[float, Field(ge=0, le=1000)] | None = None
+    noise_deg: Annotated[float, Field(ge=0, le=180)] | None = None
 
     def chosen(self) -> dict[str, Any]:
         """What was said."""
@@ -50,7 +52,7 @@ class RecordingConfig(StrictModel):
 class PicturesConfig(StrictModel):
     """What is rendered."""
 
-    size: tuple[Annotated[int, Field(ge=16)], Annotated[int, Field(ge=16)]] = (640, 480)
+    size: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] = (640, 480)
     depth: bool = True
     image_format: Literal["png", "jpg", "webp"] = "png"
     cameras: list[str] | None = None
@@ -64,9 +66,9 @@ class PicturesConfig(StrictModel):
 class LimitsConfig(StrictModel):
     """What an episode may take; beyond it, its process is ended, and it is tried once more."""
 
-    record_seconds: Annotated[float, Field(gt=0)] = 1800.0
-    render_seconds: Annotated[float, Field(gt=0)] = 3600.0
-    memory_gb: Annotated[float, Field(gt=0)] = Field(default=8.0, description="of each process")
+    record_seconds: Annotated[float, Field(gt=0, le=10**7)] = 1800.0
+    render_seconds: Annotated[float, Field(gt=0, le=10**7)] = 3600.0
+    memory_gb: Annotated[float, Field(gt=0, le=10**5)] = Field(default=8.0, description="of each process")
 
 
 class SplitConfig(StrictModel):

@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from robocas_ms3.files import write_json
-from robocas_ms3.plans.units import UNITS, Outcome
+from robocas_ms3.plans.units import UNITS, Count, Outcome, Seconds
 from robocas_ms3.strict import validate_json
 
 RECENT = 600.0  # s that a rate is taken over
@@ -30,14 +30,14 @@ class Tally:
             that a machine's clock puts far ahead: they would outlast all others.
     """
 
-    blocks: set[int] = field(default_factory=set)
-    tried: int = 0
-    good: int = 0
-    failed: dict[str, int] = field(default_factory=dict)
-    record_seconds: float = 0.0
-    render_seconds: float = 0.0
-    size: int = 0
-    times: list[float] = field(default_factory=list)
+    blocks: set[Count] = field(default_factory=set)
+    tried: Count = 0
+    good: Count = 0
+    failed: dict[str, Count] = field(default_factory=dict)
+    record_seconds: Seconds = 0.0
+    render_seconds: Seconds = 0.0
+    size: Count = 0
+    times: list[Seconds] = field(default_factory=list)
 
     @classmethod
     def read(cls, path: Path) -> Tally:

@@ -10,10 +10,14 @@ import shutil
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.ledger import Ledger
 from robocas_ms3.plans.plan import Plan
+from robocas_ms3.recordings.seeds import GREATEST_SEED
 
 PLAN, REPORT = "plan.json", "report.json"
 UNITS, LEDGER, DEATHS, DONE = "units", "seeds.jsonl", "deaths.jsonl", "done.json"
@@ -23,6 +27,11 @@ DRIVER = ".driver"
 """Claim in the plan's folder, of who runs it."""
 EPISODES = "episodes"
 """Folder of a unit with its rendered episodes."""
+
+
+Seed = Annotated[int, Field(ge=0, le=GREATEST_SEED)]
+Count = Annotated[int, Field(ge=0, le=10**15)]
+Seconds = Annotated[float, Field(ge=0, le=1e12)]
 
 
 @dataclass(frozen=True, order=True)
@@ -109,21 +118,21 @@ class Outcome:
         at: when it was done, s since 1970, of the machine that did it.
     """
 
-    seed: int
+    seed: Seed
     success: bool
-    steps: int = 0
+    steps: Count = 0
     failures: list[str] = field(default_factory=list)
-    record_seconds: float = 0.0
-    render_seconds: float = 0.0
-    size: int = 0
-    at: float = 0.0
+    record_seconds: Seconds = 0.0
+    render_seconds: Seconds = 0.0
+    size: Count = 0
+    at: Seconds = 0.0
 
 
 @dataclass(frozen=True)
 class Death:
     """A process that ended at a seed, and why."""
 
-    seed: int
+    seed: Seed
     stage: str
     why: str
 

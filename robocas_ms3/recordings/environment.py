@@ -175,7 +175,7 @@ def _refusal(error: ValidationError, where: object) -> DatasetError:
         expected = "a name, no path"
         if name in ("pack", "furniture_pack"):
             fix = "Pass the pack with --pack, if you trust it." if name == "pack" else "Install that pack by name."
-    what = "the recorded environment can't be read"
+    what = first.what if first.kind == "value_error" else "the recorded environment can't be read"
     where = f"{where}, {first.key}" if first.key else where
     return DatasetError(what, where=where, expected=expected, found=first.found, fix=fix)
 

@@ -22,7 +22,7 @@ def test_the_page_is_the_declared_forms():
         "| `task` | `pick`, `select`, `search`, `open_pick` | required |",
         "| `count` | whole number, 1 to 64 | 10 | how many of them |",
         "| `drop_height` | number, above 0 and at most 1 | 0.3 | above the surface or heap, m |",
-        "| `min_xy` | 2 numbers | none | a corner of the part, m; none: the whole surface |",
+        "| `min_xy` | 2 numbers, each -100 to 100 | none | a corner of the part, m; none: the whole surface |",
         "| `ids` | list of strings or whole numbers or `all` | `all` |",
         "| `count` | 2 whole numbers, each 0 to 16 | [1, 3] |",
         "| `furniture` | mapping: NAME to block | required | A piece of furniture. |",

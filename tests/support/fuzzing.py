@@ -9,8 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-SCALARS = [None, True, -1, 0, 2**70, 1.5, float("nan"), float("inf"), "", "x", "../up", "a:b", "\x00"]
-VALUES = [*SCALARS, [], [[]], {}, {"x": 1}]
+NUMBERS = [-1, 0, 2**62, 2**63, 10**400, -1.5, 1e308, -1e308, 5e-324, float("nan"), float("inf")]
+TEXTS = ["", "x", "../up", "/etc/passwd", "a:b", "\x00", "\x1b[31m", "1", "{0.__class__}"]
+SCALARS = [None, True, *NUMBERS, *TEXTS]
+VALUES = [*SCALARS, [], [[]], {}, {"x": 1}, [None], json.loads("[" * 150 + "]" * 150)]
 
 
 def flipped(whole: bytes, seed: int) -> bytes:
@@ -52,3 +54,15 @@ def twist_file(path: Path, whole: Any, seed: int) -> str:
     text = json.dumps(twisted(whole, seed))
     path.write_text(text)
     return text
+
+
+def changed(whole: Any, most: int) -> Iterator[tuple[tuple, Any, Any]]:
+    """Yield place, value and JSON of a document with another of `VALUES` in that place; the same ones each time."""
+    pairs = [(place, value) for place in _places(whole) for value in VALUES]
+    for (*way, last), value in random.Random(0).sample(pairs, min(most, len(pairs))):
+        data = copy.deepcopy(whole)
+        parent = data
+        for key in way:
+            parent = parent[key]
+        parent[last] = value
+        yield (*way, last), value, data

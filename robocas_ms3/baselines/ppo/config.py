@@ -49,6 +49,6 @@ class PpoConfig(TrialConfig):
     trace: float = Field(default=0.9, ge=0, le=1)
     clip: float = Field(default=0.2, gt=0)
     entropy: float = Field(default=1e-3, ge=0)
-    width: int = Field(default=128, ge=1)
+    width: int = Field(default=128, ge=1, le=16384)
     trials: int = Field(default=50, ge=0)
     train: TrialSettings = TrialSettings(steps=102_400, batch_size=512, learning_rate=7e-4, clip_norm=0.5)

@@ -165,7 +165,7 @@ class PpoTraining:
         checkpoints.put_in(self.agent, checkpoints.part(tensors, "model."), path)
         checkpoints.put_in_optimizer(self.optimizer, checkpoints.part(tensors, "optimizer."))
         self.played = int(tensors["episodes.played"]), tensors["episodes.last"]
-        self.step, self._tried_out = int(about["step"]), bool(tensors["tried_out"])
+        self.step, self._tried_out = checkpoints.step_of(about, path), bool(tensors["tried_out"])
         checkpoints.mend_weights(self._folder, self.agent.state_dict(), about)
         torch.set_rng_state(tensors["random.cpu"])
         if "random.cuda" in tensors and self.agent.mean.is_cuda:

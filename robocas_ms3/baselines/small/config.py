@@ -79,12 +79,12 @@ class SmallConfig(BaselineConfig):
         "gripper_camera": View(),
     }
     language: bool = True
-    rate_hz: float = Field(default=5.0, gt=0)
-    chunk: int = Field(default=8, ge=1)
-    channels: int = Field(default=32, ge=8, multiple_of=8)
-    width: int = Field(default=128, ge=8)
-    heads: int = Field(default=4, ge=1)
-    layers: int = Field(default=3, ge=1)
+    rate_hz: float = Field(default=5.0, gt=0, le=100)
+    chunk: int = Field(default=8, ge=1, le=1000)
+    channels: int = Field(default=32, ge=8, multiple_of=8, le=4096)
+    width: int = Field(default=128, ge=8, le=16384)
+    heads: int = Field(default=4, ge=1, le=1024)
+    layers: int = Field(default=3, ge=1, le=1000)
     dropout: float = Field(default=0.1, ge=0, lt=1)
     keys_weight: float = Field(default=0.5, ge=0)
     gripper_weight: float = Field(default=0.5, ge=0)
@@ -93,9 +93,9 @@ class SmallConfig(BaselineConfig):
     name_weight: float = Field(default=0.1, ge=0)
     lift: bool = True
     lift_weight: float = Field(default=0.1, ge=0)
-    shift: int = Field(default=3, ge=0)
+    shift: int = Field(default=3, ge=0, le=1000)
     brightness: float = Field(default=0.2, ge=0, lt=1)
-    play: int = Field(default=7, ge=1)
+    play: int = Field(default=7, ge=1, le=1000)
     fade: float = Field(default=0.15, ge=0)
     reopen: float = Field(default=0.02, ge=0)
     train: TrainSettings = TrainSettings(steps=3_500, batch_size=96, learning_rate=6e-4, weight_decay=0.01)

@@ -59,7 +59,7 @@ def _times(rows: list[dict[str, Any]], prefix: str, fps: int) -> Iterator[Violat
 
 def _video(path: Path, name: str, frames: int, fps: int, shape: list[int], decode: bool) -> Iterator[Violation]:
     try:
-        times, about = packet_times(path)
+        times, about = packet_times(path, frames)
     except DatasetError as error:
         yield Violation(name, "", "a readable video", str(error))
         return

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.datasets.lerobot.records import ConversionRecord
 from robocas_ms3.datasets.lerobot.schema import CONVERSION_FILE, INFO_FILE
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.writing.plan import LEFT_OUT, check_versions
@@ -15,6 +16,7 @@ from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.outputs import check_same, is_taken
 from robocas_ms3.recordings.versions import versions
+from robocas_ms3.strict import parse
 from robocas_ms3.words import count_of
 
 PARTS = ".parts"
@@ -81,6 +83,7 @@ def check_resume(out: Path, plan: dict[str, Any]) -> None:
             return  # killed before it wrote what it was to do
         what = "can't resume: no conversion to LeRobot was begun here"
         raise DatasetError(what, where=path, fix="Pass --overwrite.") from error
+    parse(ConversionRecord, before, DatasetError, where=path)
     check_same(
         before.get("settings", {}),
         plan["settings"],
@@ -103,12 +106,12 @@ def check_resume(out: Path, plan: dict[str, Any]) -> None:
 def _are_same(before: Mapping[str, Any], plan: Mapping[str, Any]) -> bool:
     """Whether a plan is of the same episodes; one that could not be read then may have been mended."""
     listed, now = [*before.get("episodes", []), *before.get(LEFT_OUT, [])], plan["episodes"]
-    listed = sorted(listed, key=lambda entry: entry["source"])
+    listed = sorted(listed, key=lambda entry: entry.get("source") or 0)
     return len(listed) == len(now) and all(map(_is_same, listed, now))
 
 
 def _is_same(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     keys = ["source", "trajectory", "trajectory_episode", "seed"]
-    if before["recording"] is not None:
+    if before.get("recording") is not None:
         keys.append("recording")
-    return all(before[key] == now[key] for key in keys)
+    return all(before.get(key) == now[key] for key in keys)

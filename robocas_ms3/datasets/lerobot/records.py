@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, StringConstra
 
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.tables import INTEGER, NUMBER, NUMBERS, TEXT, TEXTS, Column
+from robocas_ms3.datasets.sources.provenance import EntryRecord
 
 MAX_EPISODES = 10**6
 MAX_FRAMES = 10**9
@@ -63,17 +64,6 @@ class InfoRecord(_Record):
         if self.video_path is None and any(feature.dtype == "video" for feature in self.features.values()):
             raise ValueError("video_path: expected a pattern, as there are videos")
         return self
-
-
-class EntryRecord(_Record):
-    """The recording that an episode is of, see `provenance.recording_entry`."""
-
-    trajectory: str | None = None
-    trajectory_episode: int | None = None
-    seed: int | list[int] | None = None
-    success: bool | None = None
-    recording: str | None = None
-    source: NonNegativeInt | None = None
 
 
 class ConversionRecord(_Record):

@@ -143,7 +143,9 @@ def camera_of(key: str) -> str:
 
 def robot_type(scene: dict[str, Any]) -> str:
     """LeRobot's word for the robot of an episode's scene."""
-    named = ((scene.get("env_info") or {}).get("env_kwargs") or {}).get("robot_uids")
+    env_info = scene.get("env_info")
+    kwargs = env_info.get("env_kwargs") if isinstance(env_info, dict) else None
+    named = kwargs.get("robot_uids") if isinstance(kwargs, dict) else None
     return ROBOT_TYPE if named in (None, DEFAULT) else str(named)
 
 

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,9 @@ CODINGS = {
     # Lossless, 16 bits, a checksum in every slice, every frame by itself.
     "depth": Coding("ffv1", "gray16le", ".mkv", {"level": "3", "slices": "4", "slicecrc": "1", "g": "1"}),
 }
+MAX_PIXELS = 2**26
+"""Pixels of a frame that is decoded: 8192 x 8192."""
+_BAD_VIDEO = (FFmpegError, IndexError, TypeError)  # no stream of video, or no times
 _CONTAINER = {"fflags": "+bitexact"}  # no dates and random numbers in the file
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
@@ -199,6 +203,7 @@ def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArr
     try:
         with av.open(str(path)) as video:
             stream: Any = video.streams.video[0]
+            stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
             layout = "gray16le" if stream.codec_context.pix_fmt == "gray16le" else "rgb24"
             video.seek(round(Fraction(first, fps) / stream.time_base), stream=stream, backward=True)
             for frame in video.decode(stream) if count > 0 else ():
@@ -211,14 +216,18 @@ def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArr
                 given += 1
                 if given == count:
                     break
-    except FFmpegError as error:
-        raise DatasetError("can't read this video", where=path, found=error.strerror) from error
+    except _BAD_VIDEO as error:
+        raise DatasetError("can't read this video", where=path, found=getattr(error, "strerror", error)) from error
     if given < count:
         raise DatasetError("frames are missing in this video", where=path, expected=first + count, found=first + given)
 
 
-def packet_times(path: Path) -> tuple[list[Fraction], dict[str, Any]]:
-    """Times of a video's frames in s, without decoding them, and what ``info.json`` says of it.
+def packet_times(path: Path, most: int | None = None) -> tuple[list[Fraction], dict[str, Any]]:
+    """Return the times of a video's frames in s, without decoding them, and the video's entry in ``info.json``.
+
+    Args:
+        path: of the video.
+        most: frames that are expected; one more is read at most.
 
     Raises:
         DatasetError: the file is missing or damaged.
@@ -226,9 +235,10 @@ def packet_times(path: Path) -> tuple[list[Fraction], dict[str, Any]]:
     try:
         with av.open(str(path)) as video:
             stream: Any = video.streams.video[0]
-            times = [p.pts * p.time_base for p in video.demux(stream) if p.pts is not None]
+            packets = (p.pts * p.time_base for p in video.demux(stream) if p.pts is not None)
+            times = list(packets if most is None else islice(packets, most + 1))
             return sorted(times), describe(stream)
-    except (FFmpegError, IndexError) as error:
+    except _BAD_VIDEO as error:
         raise DatasetError("can't read this video", where=path, found=getattr(error, "strerror", error)) from error
 
 

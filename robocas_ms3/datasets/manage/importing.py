@@ -18,6 +18,7 @@ from robocas_ms3.datasets.manage.parts import schema_version
 from robocas_ms3.datasets.manage.reading import read_episode
 from robocas_ms3.datasets.manage.survey import Survey, read_info
 from robocas_ms3.datasets.sources.episode import Overview
+from robocas_ms3.datasets.sources.provenance import ConversionRecord
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays
 from robocas_ms3.datasets.writing.frames import CameraModel
@@ -27,6 +28,7 @@ from robocas_ms3.datasets.writing.plan import dataset_settings
 from robocas_ms3.datasets.writing.writer import write_cameras
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import json_text, replacing_folder, write_json
+from robocas_ms3.strict import parse
 from robocas_ms3.words import count_of
 
 Embed = Callable[[list[str]], NDArray[np.float32]]
@@ -100,6 +102,7 @@ def import_robocas(
 def _plan(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any]:
     assert surveyed.pictures is not None
     unknown = dict.fromkeys(("trajectory", "trajectory_episode", "seed", "success", "target", "recording"))
+    parse(ConversionRecord, dataset.settings, DatasetError, where=dataset.root / schema.CONVERSION_FILE)
     before = dataset.settings.get("episodes", {})  # of one that is ours
     name = surveyed.root.resolve().name
     episodes = {

@@ -10,9 +10,11 @@ from typing import Any
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.episode import Overview
+from robocas_ms3.datasets.sources.provenance import ConversionRecord
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.strict import parse
 
 Sides = tuple[list[int], list[int]]
 """Training and validation episodes."""
@@ -62,6 +64,7 @@ def open_part(root: Path) -> Part:
     dataset = Dataset(root)
     schema.check_version(schema_version(dataset), root)
     check_whole(dataset)
+    parse(ConversionRecord, dataset.settings, DatasetError, where=root / schema.CONVERSION_FILE)
     ledger = {int(number): entry for number, entry in dataset.settings.get("episodes", {}).items()}
     unlisted = [number for number in dataset.numbers if number not in ledger]
     if unlisted:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.checks.scene_values import sound
 from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.datasets.sources.provenance import task_of
 from robocas_ms3.errors import DatasetError
@@ -78,10 +79,14 @@ def facts_of(episode: SourceEpisode) -> Facts:
         DatasetError: what is said of the scene is damaged.
     """
     instruction = str(episode.read(["language_goal"])["language_goal"])
+    scene = episode.scene
+    if not scene:
+        return Facts(instruction)
+    _, wrong = sound(scene)
+    if wrong:
+        where, fix = f"{episode.where}/{schema.SCENE_FILE}", "robocas validate says what is wrong."
+        raise DatasetError("this description of a scene is damaged", where=where, found=wrong[:200], fix=fix)
     try:
-        scene = episode.scene
-        if not scene:
-            return Facts(instruction)
         layout, said, target = episode.layout, scene.get("recorded") or {}, scene.get("target") or {}
         ids = layout.get("object_ids", [])
         poses = np.array(layout.get("poses", []), dtype=np.float64).reshape(-1, 7)

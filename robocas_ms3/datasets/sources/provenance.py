@@ -6,12 +6,40 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, NonNegativeInt, StringConstraints
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.recordings.reading import Recording, TrajectoryFile
+
+
+class EntryRecord(BaseModel):
+    """The recording that an episode is of, in ``conversion.json``; see `recording_entry`."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    trajectory: str | None = None
+    trajectory_episode: int | None = None
+    seed: int | list[int] | None = None
+    success: bool | None = None
+    recording: str | None = None
+    source: NonNegativeInt | None = None
+
+
+Number = Annotated[str, StringConstraints(pattern=r"^[0-9]{1,7}$")]
+"""An episode's, as a key of JSON."""
+
+
+class ConversionRecord(BaseModel):
+    """``conversion.json``, as far as datasets are continued, merged and divided by it."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    made_with: dict[str, str] = {}
+    episodes: dict[Number, EntryRecord] = {}
+    left_out: dict[Number, EntryRecord] = {}
 
 
 def fingerprint(recording: Recording) -> str:
@@ -30,12 +58,13 @@ def recording_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
 def unread_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
     """The same of one that can't be read, which has no fingerprint."""
     episode = file.episodes[index]
+    said = episode.get("robocas")
     return {
         "trajectory": file.path.name,
         "trajectory_episode": episode["episode_id"],
         "seed": episode.get("episode_seed"),
         "success": succeeded(episode),
-        "target": episode.get("robocas", {}).get("target"),
+        "target": said.get("target") if isinstance(said, dict) else None,
         "recording": None,
     }
 
@@ -79,7 +108,8 @@ def scene_record(
 
 def succeeded(episode: dict[str, Any]) -> bool:
     """Whether a trajectory's entry ended in success."""
-    return bool(np.all(episode.get("success", False)))
+    found = episode.get("success", False)
+    return found is True or (isinstance(found, list) and bool(found) and all(one is True for one in found))
 
 
 def task_of(env_id: str | None) -> str | None:

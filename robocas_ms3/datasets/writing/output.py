@@ -128,6 +128,10 @@ def _check_begun(out: Path, plan: Mapping[str, Any]) -> None:
         before = load_json(path)
     except (OSError, ValueError) as error:
         raise DatasetError("can't resume: nothing was begun here", where=path, fix="Pass --overwrite.") from error
+    if not isinstance(before, dict):
+        raise DatasetError(
+            "can't resume: this JSON is damaged", where=path, expected="an object", fix="Pass --overwrite."
+        )
     different = sorted(key for key in plan if key != "made_with" and before.get(key) != plan[key])
     if different:
         raise DatasetError(

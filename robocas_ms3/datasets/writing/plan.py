@@ -13,12 +13,14 @@ from typing import Any
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.provenance import ConversionRecord
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
 from robocas_ms3.documents import load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.outputs import check_same, is_taken
 from robocas_ms3.recordings.seeds import one_seed
 from robocas_ms3.recordings.versions import versions
+from robocas_ms3.strict import parse
 
 Entries = Sequence[dict[str, Any]]
 """What is to be converted, see `players.Player.entries`."""
@@ -106,8 +108,8 @@ def _divided(
     Also gives (number, number in the source) of the episodes that are planned already, and the entries that are not.
     """
     episodes, left_out = dict(before["episodes"]), dict(before.get(LEFT_OUT, {}))
-    planned = {entry["recording"]: number for number, entry in episodes.items() if entry["recording"]}
-    unread = {number: entry for number, entry in episodes.items() if not entry["recording"]}
+    planned = {entry["recording"]: number for number, entry in episodes.items() if entry.get("recording")}
+    unread = {number: entry for number, entry in episodes.items() if not entry.get("recording")}
     again = {_place(entry): number for number, entry in {**unread, **left_out}.items()}
     known, new = [], []
     for entry in entries:
@@ -227,5 +229,7 @@ def _read(out: Path, missing: str, fix: str) -> dict[str, Any]:
         content = load_json(path)
     except (OSError, ValueError) as error:
         raise DatasetError(missing, where=path, fix=fix) from error
-    schema.check_version(content.get("schema_version", 1), path)
-    return content
+    if isinstance(content, dict):
+        schema.check_version(content.get("schema_version", 1), path)
+    parse(ConversionRecord, content, DatasetError, where=path)
+    return {**content, "episodes": content.get("episodes", {})}

@@ -255,7 +255,8 @@ def _choose(file: TrajectoryFile, include_failed: bool) -> list[int]:
 
 def _warn_untried(file: TrajectoryFile, chosen: list[int], rate_hz: float) -> None:
     """Say so where the recordings' actions were tried open loop, but at another rate than the dataset's."""
-    said = [file.episodes[index].get("robocas", {}).get("replay_rate") for index in chosen]
+    entries = [file.episodes[index].get("robocas") for index in chosen]
+    said = [entry.get("replay_rate") for entry in entries if isinstance(entry, dict)]
     tried = {float(rate) for rate in said if isinstance(rate, int | float) and rate}  # else not tried, or not known
     others = sorted(rate for rate in tried if abs(rate - rate_hz) > 1e-9)
     if others:
