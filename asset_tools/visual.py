@@ -25,7 +25,8 @@ CREASE = np.cos(np.deg2rad(40))  # faces that meet more sharply get an edge, not
 DENSE = 3  # times as many faces as are wanted
 STUCK = 0.9  # of the faces left by a step of simplifying: a rougher one is needed
 ENOUGH = 6  # times as many faces as are wanted are accepted of a mesh with many holes or pieces
-GRIDS = (512, 362, 256, 181, 128, 91, 64, 45, 32, 16)  # cells along the diagonal, to merge vertices in, fine first
+LEFT = 0.8  # share of area and volume that simplifying has to leave: with less, parts are lost or holes torn
+GRIDS = (512, 362, 256, 181, 128, 91, 64, 45, 32, 16, 8)  # cells along the diagonal, to merge vertices in, fine first
 SAMPLES = 150_000  # on the original surface, to find the face that a texel shows
 NORMAL_WEIGHT = 0.02  # of the diagonal; keeps the two sides of a thin shell apart, hardly moves anything else
 
@@ -167,8 +168,8 @@ def _shrunk(image: Image.Image, size: int) -> Image.Image:
 def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     """Merge vertices by position, collapse faces to the limit, and wind them outward.
 
-    Edges can't be collapsed to the limit where a mesh has many holes or pieces. Up to six times as many faces are
-    accepted then; above that, vertices are merged on a grid.
+    A mesh with many holes or pieces can't be collapsed to the limit, or loses parts on the way. Up to six times as many
+    faces are accepted then; where that is not enough, vertices are merged on a grid.
 
     Raises:
         AssetError: no face is left.
@@ -176,20 +177,23 @@ def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     body.merge_vertices(digits_vertex=None)
     center, size = body.bounds.mean(axis=0), float(np.linalg.norm(body.extents))
-    vertices, faces = (np.asarray(body.vertices) - center) / size, np.asarray(body.faces)
-    gentle = (2, 3) if len(faces) > DENSE * triangles else ()
-    for aggression in (*gentle, 5, 7, 9, 12, 16, 20):  # it may stop above the limit
-        before = np.inf
-        while triangles < len(faces) < STUCK * before:
-            before = len(faces)  # by halves: a dense mesh that loses most of its faces at once folds over
-            target = max(triangles, before // 2) if gentle else triangles
-            vertices, faces = fast_simplification.simplify(
-                np.ascontiguousarray(vertices), faces.astype(np.int32), target_count=target, agg=aggression
-            )[:2]
-    for cells in GRIDS:
-        if len(faces) <= ENOUGH * triangles:
+    whole = (np.asarray(body.vertices) - center) / size, np.asarray(body.faces)
+    most, area = ENOUGH * triangles, float(body.area)
+    volume = abs(float(body.volume)) if body.is_watertight else 0.0
+
+    def keeps_parts(vertices: Array, faces: NDArray) -> bool:
+        light = trimesh.Trimesh(vertices * size, faces, process=False)
+        return bool(light.area >= LEFT * area and abs(light.volume) >= LEFT * volume)
+
+    found: list[tuple[Array, NDArray]] = []
+    for limit in (triangles, 2 * triangles, 4 * triangles, most):
+        found.append(_collapsed(*whole, limit))
+        if len(found[-1][1]) > most or keeps_parts(*found[-1]):
             break
-        vertices, faces = _merged(vertices, faces, cells)
+    if len(found[-1][1]) > most or not keeps_parts(*found[-1]):
+        found += [_merged(*whole, cells) for cells in GRIDS]
+    found = [part for part in found if len(part[1]) <= most]
+    vertices, faces = next((part for part in found if keeps_parts(*part)), found[-1])
     if len(faces) == 0:
         raise AssetError("the mesh has no faces of any size", expected=f"1 to {triangles} faces", found=0)
     body = trimesh.Trimesh(vertices * size + center, faces, process=False)
@@ -200,6 +204,20 @@ def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     if body.volume < 0:
         body.invert()
     return body
+
+
+def _collapsed(vertices: Array, faces: NDArray, triangles: int) -> tuple[Array, NDArray]:
+    """Return vertices and faces after edges were collapsed to the limit, or as near to it as it goes."""
+    gentle = (2, 3) if len(faces) > DENSE * triangles else ()
+    for aggression in (*gentle, 5, 7, 9, 12, 16, 20):  # it may stop above the limit
+        before = np.inf
+        while triangles < len(faces) < STUCK * before:
+            before = len(faces)  # by halves: a dense mesh that loses most of its faces at once folds over
+            target = max(triangles, before // 2) if gentle else triangles
+            vertices, faces = fast_simplification.simplify(
+                np.ascontiguousarray(vertices), faces.astype(np.int32), target_count=target, agg=aggression
+            )[:2]
+    return vertices, faces
 
 
 def _merged(vertices: Array, faces: NDArray, cells: int) -> tuple[Array, NDArray]:

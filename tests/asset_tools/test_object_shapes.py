@@ -168,6 +168,17 @@ def test_dirt_is_dropped_and_its_share_reported(far):
     assert str(len(specks) + len(scraps)) in closed.repairs[-1] and "%" in closed.repairs[-1]
 
 
+def test_simplifying_keeps_a_large_part_of_few_faces():
+    """Edges of a box among bristles that can't be simplified are the first to collapse."""
+    bristles = placed(
+        cylinder(0.0006, 0.025, sections=6), np.linspace(-0.06, 0.06, 20), np.linspace(-0.01, 0.01, 8), 0.02
+    )
+    brush = joined(box([0.15, 0.03, 0.015]), *bristles)
+    light = to_display(brush, triangles=1000)
+    assert light.area == pytest.approx(brush.area, rel=0.1)
+    np.testing.assert_allclose(light.bounds, brush.bounds, atol=1e-3)
+
+
 def test_flat_bodies_are_an_error():
     tilted = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])
     flat = trimesh.Trimesh(
