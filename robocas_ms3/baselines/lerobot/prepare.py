@@ -10,11 +10,10 @@ policy read no text. Of the actions only ``action`` is left, of the rest LeRobot
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,11 @@ from robocas_ms3.baselines.lerobot.observations import (
     scaled,
     state_of,
 )
-from robocas_ms3.datasets.lerobot.schema import FEATURES, INDICES, INFO_FILE, STATS_FILE, TASKS_FILE
+from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
+from robocas_ms3.datasets.lerobot.records import episode_columns, frame_columns
+from robocas_ms3.datasets.lerobot.schema import FEATURES, INDICES, INFO_FILE, STATS_FILE
+from robocas_ms3.datasets.lerobot.tables import Column, check_columns, numbers, open_table, read_columns
+from robocas_ms3.datasets.sources.files import read_json
 from robocas_ms3.errors import DatasetError, RobocasError
 from robocas_ms3.files import replacing_folder, write_json
 from robocas_ms3.outputs import check_absent
@@ -60,28 +63,28 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
     info = _info(source)
     with replacing_folder(out) as part:
         shutil.copytree(source, part, ignore=_ignored, copy_function=_link, dirs_exist_ok=True)
-        vectors = None if embed is None else scaled(embed(_texts(source)))
+        vectors = None if embed is None else scaled(embed(LeRobotDataset(source).tasks))
         kept: dict[str, list[NDArray]] = {}
         for path in sorted((source / "data").rglob("*.parquet")):
-            columns, indices = _columns(path, vectors)
+            columns, indices = _columns(path, info["features"], vectors)
             table = pa.table({**{key: _rows(values) for key, values in columns.items()}, **indices})
             _write(table, part / path.relative_to(source))
             for key, values in columns.items():
                 kept.setdefault(key, []).append(values)
         for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
+            _table(path, episode_columns((), info["features"]))  # bounded and checked, with texts as dictionaries
             table = pq.read_table(path)  # LeRobot reads no statistics of episodes, and these are of other columns
-            names = [name for name in table.column_names if not name.startswith("stats/")]
             _write(table.select(names), part / path.relative_to(source))
         _write_meta(source, part, info, {key: np.concatenate(values) for key, values in kept.items()})
 
 
 def _info(source: Path) -> dict[str, Any]:
     try:
-        info = json.loads((source / INFO_FILE).read_text(encoding="utf-8"))
+        info = LeRobotDataset(source).info
         widths = {key: info["features"][key]["shape"] for key in _WIDTHS}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (DatasetError, KeyError) as error:
         fix = "Make one: robocas convert F.h5 --to lerobot --out DIR"
-        raise DatasetError("no LeRobot dataset of ours", where=source, found=repr(error), fix=fix) from error
+        raise DatasetError("no LeRobot dataset of ours", where=source, found=error, fix=fix) from error
     if widths != {key: [width] for key, width in _WIDTHS.items()}:
         raise DatasetError("another LeRobot dataset's columns", where=source, expected=_WIDTHS, found=widths)
     if not any(key.startswith("observation.images.") for key in info["features"]):
@@ -89,9 +92,11 @@ def _info(source: Path) -> dict[str, Any]:
     return info
 
 
-def _columns(path: Path, vectors: NDArray | None) -> tuple[dict[str, NDArray], dict[str, pa.ChunkedArray]]:
+def _columns(
+    path: Path, features: Mapping[str, Any], vectors: NDArray | None
+) -> tuple[dict[str, NDArray], dict[str, pa.ChunkedArray]]:
     """The numbers (N, D) of a file by key, and the columns that stay as they are."""
-    table = pq.read_table(path)
+    table = _table(path, frame_columns(features))
     said = {key: _numbers(table, key) for key in (STATE, ACTION, "action.base")}
     for key, values in said.items():
         if not np.isfinite(values).all():
@@ -103,23 +108,32 @@ def _columns(path: Path, vectors: NDArray | None) -> tuple[dict[str, NDArray], d
     state = said[STATE]
     found = {STATE: state_of(state[:, :3], state[:, 3:7], state[:, 7:14], state[:, 14:15]), ACTION: said[ACTION]}
     if vectors is not None:
-        found[EMBEDDING] = vectors[table["task_index"].to_numpy()]
+        places = table["task_index"].to_numpy()
+        if len(places) and places.max() >= len(vectors):
+            expected = f"0 to {len(vectors) - 1}"
+            raise DatasetError(
+                "no such instruction", where=f"{path}, task_index", expected=expected, found=places.max()
+            )
+        found[EMBEDDING] = vectors[places]
     return found, {key: table[key] for key in INDICES}
 
 
+def _table(path: Path, columns: Mapping[str, Column]) -> pa.Table:
+    with open_table(path) as file:
+        table = read_columns(file, path)
+        check_columns(table, columns, path)
+    return table
+
+
 def _numbers(table: pa.Table, key: str) -> NDArray[np.float32]:
-    flat = table[key].combine_chunks().flatten().to_numpy(zero_copy_only=False)
-    return flat.astype(np.float32).reshape(len(table), _WIDTHS[key])
+    values = numbers(table[key]).astype(np.float32)
+    if values.shape[1] != _WIDTHS[key]:
+        raise DatasetError("another width of a column", where=key, expected=_WIDTHS[key], found=values.shape[1])
+    return values
 
 
 def _rows(values: NDArray[np.float32]) -> pa.FixedSizeListArray:
     return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
-
-
-def _texts(source: Path) -> list[str]:
-    table = pq.read_table(source / TASKS_FILE).to_pydict()
-    numbers, texts = table["task_index"], table["__index_level_0__"]
-    return [texts[numbers.index(number)] for number in range(len(numbers))]
 
 
 def _write_meta(source: Path, part: Path, info: dict[str, Any], columns: dict[str, NDArray]) -> None:
@@ -131,7 +145,7 @@ def _write_meta(source: Path, part: Path, info: dict[str, Any], columns: dict[st
     features |= {
         key: said for key, said in info["features"].items() if key.startswith("observation.images.") or key in INDICES
     }
-    stats = json.loads((source / STATS_FILE).read_text(encoding="utf-8"))
+    stats = read_json(source / STATS_FILE)
     stats = {key: said for key, said in stats.items() if key in features} | {
         key: _stats(values.astype(np.float64)) for key, values in columns.items()
     }

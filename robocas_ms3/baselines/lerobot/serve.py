@@ -9,7 +9,6 @@ websockets, pydantic, scipy, PyYAML and platformdirs.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -18,6 +17,7 @@ from typing import Any
 
 from robocas_ms3.baselines.lerobot.policy import LeRobotPolicy
 from robocas_ms3.datasets.lerobot.schema import checksum
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import EvaluationError, RobocasError
 from robocas_ms3.evaluation.remote.server import PolicyServer
 from robocas_ms3.words import printable
@@ -78,9 +78,13 @@ def rate_of(info: Path) -> float:
         EvaluationError: it does not say.
     """
     try:
-        return float(json.loads(info.read_text(encoding="utf-8"))["fps"])
+        rate_hz = load_json(info)["fps"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise EvaluationError("no rate known", where=info, found=repr(error), fix="Pass --rate HZ.") from error
+    if type(rate_hz) not in (int, float) or not 0 < rate_hz <= 1000:
+        found, fix = str(rate_hz)[:80], "Pass --rate HZ."
+        raise EvaluationError("no rate known", where=info, expected="fps from 0 to 1000", found=found, fix=fix)
+    return float(rate_hz)
 
 
 def main(words: Sequence[str] | None = None) -> int:
