@@ -74,6 +74,7 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
         for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
             _table(path, episode_columns((), info["features"]))  # bounded and checked, with texts as dictionaries
             table = pq.read_table(path)  # LeRobot reads no statistics of episodes, and these are of other columns
+            names = [name for name in table.column_names if not name.startswith("stats/")]
             _write(table.select(names), part / path.relative_to(source))
         _write_meta(source, part, info, {key: np.concatenate(values) for key, values in kept.items()})
 
