@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +15,8 @@ from robocas_ms3.errors import AssetError, RobocasError
 from robocas_ms3.processes import Calls, Limits, Pool
 
 Inspect: TypeAlias = "Callable[[Mapping[str, ModelSource]], Mapping[str, Inspection]]"
+
+log = logging.getLogger(__name__)
 
 GRACE = 5.0  # s after the limit of time, until a process that is stuck in native code is ended
 MEMORY_GB = 4.0  # of the process, with all that is imported
@@ -77,6 +80,10 @@ def _inspect(task: tuple[str, ModelSource]) -> tuple[str, Inspection]:
             return id_, Inspection(float(model.mesh.extents.max()), model.files)
     except RobocasError as error:
         return id_, Inspection(error=AssetError(str(error)))
+    except Exception as error:  # whatever a parser trips over: one model fails, not the import
+        log.exception("%s can't be read", source.paths[0])
+        found = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        return id_, Inspection(error=AssetError("can't read this model", where=source.paths[0], found=found))
 
 
 def _died(task: tuple[str, ModelSource], why: str) -> tuple[str, Inspection]:

@@ -30,36 +30,46 @@ def reading_limits(where: object) -> Iterator[None]:
         AssetError: a limit was reached.
     """
     fix = "Reduce the mesh, or leave the model out."
+    too_slow = AssetError("reading the model takes too long", where=where, expected=f"at most {SECONDS:.0f} s", fix=fix)
     limit = resource.getrlimit(resource.RLIMIT_DATA)
     wanted = _data_size() + MEMORY
     if limit[1] != resource.RLIM_INFINITY:
         wanted = min(wanted, limit[1])
-    alarm = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGALRM, _too_slow) if alarm else None
+    main_thread = threading.current_thread() is threading.main_thread()
+    alarm = _Alarm()
+    handler = signal.signal(signal.SIGALRM, alarm.ring) if main_thread else None
     try:
         resource.setrlimit(resource.RLIMIT_DATA, (wanted, limit[1]))
-        if alarm:
+        if main_thread:
             signal.setitimer(signal.ITIMER_REAL, SECONDS)
         yield
     except MemoryError as error:
         what = "reading the model needs too much memory"
         raise AssetError(what, where=where, expected=f"at most {MEMORY >> 30} GB", fix=fix) from error
     except _TooSlow as error:
-        what = "reading the model takes too long"
-        raise AssetError(what, where=where, expected=f"at most {SECONDS:.0f} s", fix=fix) from error
+        raise too_slow from error
+    except Exception as error:
+        if alarm.rung:  # native code has made another error of it
+            raise too_slow from error
+        raise
     finally:
-        if alarm:
+        if main_thread:
             signal.setitimer(signal.ITIMER_REAL, 0)
             signal.signal(signal.SIGALRM, handler)
         resource.setrlimit(resource.RLIMIT_DATA, limit)
 
 
 class _TooSlow(BaseException):
-    """No parser swallows it as an error of the file."""
+    """No parser takes it for an error of the file."""
 
 
-def _too_slow(number: int, frame: FrameType | None) -> None:
-    raise _TooSlow
+class _Alarm:
+    def __init__(self) -> None:
+        self.rung = False
+
+    def ring(self, number: int, frame: FrameType | None) -> None:
+        self.rung = True
+        raise _TooSlow
 
 
 def _data_size() -> int:

@@ -18,6 +18,7 @@ Ints = NDArray[np.int64]
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp")
 BLACK = 0.02  # linear
+MOST_MATERIALS = 1000
 
 
 def read_obj(path: Path, files: ModelFiles) -> list[Part]:
@@ -39,15 +40,20 @@ def read_obj(path: Path, files: ModelFiles) -> list[Part]:
     materials = _libraries(mesh, path, files)
     images: dict[str, Image.Image] = {}
     parts = []
-    for index in np.unique(mesh.face_materials).tolist():
-        rows = np.flatnonzero(mesh.face_materials == index)
+    order = np.argsort(mesh.face_materials, kind="stable")
+    used, starts = np.unique(mesh.face_materials[order], return_index=True)
+    if len(used) > MOST_MATERIALS:
+        expected = f"at most {MOST_MATERIALS}"
+        fix = "Bake its materials into one texture."
+        raise AssetError("the mesh has too many materials", where=path, expected=expected, found=len(used), fix=fix)
+    for index, rows in zip(used.tolist(), np.split(order, starts[1:]), strict=True):
         name = mesh.material_names[index] if index >= 0 else ""
         has_uvs = bool((mesh.face_uvs[rows] >= 0).any())
         found = _material(name, materials, has_uvs, path, files)
         with_uvs = (mesh.face_uvs[rows] >= 0).all(axis=1)
         if found is not None and (found[0].image or found[0].emission_image) and not with_uvs.all() and with_uvs.any():
             parts.append(_part(mesh, rows[~with_uvs], MtlMaterial(name, found[0].color), found[1], images, files))
-            rows = rows[with_uvs]
+            rows = rows[with_uvs]  # noqa: PLW2901
         parts.append(_part(mesh, rows, *(found or (None, path)), images, files))
     return parts
 

@@ -136,3 +136,10 @@ def test_polygons_and_indices_counted_from_the_end():
 def test_options_of_a_map_statement():
     found = parse_mtl("newmtl a\nmap_Kd -S 2 3 1 -o 0.5 -bm 1 my skin.png\n")["a"]
     assert (found.image, found.uv_scale, found.uv_offset) == ("my skin.png", (2.0, 3.0), (0.5, 0.0))
+
+
+def test_too_many_materials(tmp_path):
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "".join(f"usemtl m{i}\nf 1 2 3\n" for i in range(2000))
+    (tmp_path / "mug.obj").write_text(text)
+    with pytest.raises(AssetError):
+        read_model(tmp_path / "mug.obj")
