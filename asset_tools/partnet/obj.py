@@ -14,6 +14,8 @@ from robocas_ms3.errors import AssetError
 Array = np.ndarray
 
 GREY = (0.7, 0.7, 0.7)
+MOST_REPEATS = 1000  # of a texture on faces of one material; it is written out as often as it repeats
+FARTHEST_UV = 1e6
 OBJ_LIMIT = 64 * 2**20  # bytes; the largest of PartNet-Mobility have some 10 MB
 
 
@@ -74,6 +76,9 @@ def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | 
         look, folder = found.get(index, (None, path.parent))
         material = Material(color or GREY) if look is None else _material(look, folder, files)
         uv = uvs[own] if look is None else uvs[own] * look.uv_scale + look.uv_offset
+        if not (np.abs(uv) <= FARTHEST_UV).all() or np.ptp(uv) > MOST_REPEATS:  # NaN is not
+            files.notes.append(f"{path.name}: texture coordinates that can't be used; the faces are plain")
+            uv, material = np.zeros_like(uv), Material(material.color)
         groups.append(Faces(corners[own], uv, material))
     return groups
 

@@ -368,6 +368,16 @@ def test_a_lost_texture_is_reported(folder, mtl):
     assert source.repairs
 
 
+@pytest.mark.parametrize("value", ["1e300", "nan", "-inf", "20000"])
+def test_texture_coordinates_without_bounds_show_a_plain_colour(folder, value):
+    Image.new("RGB", (4, 4), (10, 150, 20)).save(folder / "wood.png")
+    (folder / "paint.mtl").write_text("newmtl red\nKd 0 0 1\nmap_Kd wood.png\n")
+    text = OBJ.format("mtllib paint.mtl\nusemtl red\n").replace("vt 1 0", f"vt {value} 0")
+    (folder / "cube.obj").write_text(text)
+    source = read(folder, urdf(tray=mesh("cube.obj")))
+    assert colors_of(source.links[0].mesh) == {(0, 0, 255)} and len(source.repairs) == 1
+
+
 def test_a_bad_model_does_not_stop_the_others(folder, tmp_path):
     (folder / "mobility.urdf").write_text(urdf())
     bad = tmp_path / "bad"
