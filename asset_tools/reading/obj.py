@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from manifold3d import triangulate
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import AssetError
@@ -46,7 +47,7 @@ class MtlMaterial:
 
 @dataclass
 class ObjMesh:
-    """The content of an OBJ file; polygons are fans of triangles.
+    """The content of an OBJ file, polygons as triangles.
 
     Attributes:
         vertices: (V, 3).
@@ -173,6 +174,7 @@ def parse_obj(text: str, where: object) -> ObjMesh:
                 raise ValueError(f"a face names {what} {int(column.max()) + 1} of {count}")
         if len(table) and table[:, 0].min() < 0:
             raise ValueError("a face names vertex 0")
+        triangles = _with_concave(triangles, source, np.array(counts, np.int64), vertices[table[:, 0]])
         return ObjMesh(
             vertices,
             colors,
@@ -218,6 +220,34 @@ def _fans(counts: Ints) -> tuple[Ints, Ints]:
     step = np.arange(len(source)) - np.repeat(np.cumsum(many) - many, many)
     first = starts[source]
     return np.column_stack([first, first + step + 1, first + step + 2]), source
+
+
+def _with_concave(triangles: Ints, source: Ints, counts: Ints, points: Array) -> Ints:
+    """Return triangles with those of concave polygons, whose fans reach outside of them, replaced.
+
+    Args:
+        triangles: (F, 3) fans, of corners.
+        source: (F,) polygon of each.
+        counts: (P,) corners of the polygons.
+        points: (C, 3) of the corners.
+    """
+    if (counts <= 3).all():
+        return triangles
+    corners = points[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sums = np.stack([np.bincount(source, axis, len(counts)) for axis in normals.T], axis=1)
+    backwards = np.einsum("fi,fi->f", normals, sums[source]) < -1e-6 * (sums[source] ** 2).sum(axis=1)
+    starts = np.cumsum(counts) - counts
+    triangles = triangles.copy()
+    for polygon in np.unique(source[backwards]).tolist():
+        normal = sums[polygon] / np.linalg.norm(sums[polygon])
+        across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+        plane = np.stack([across, np.cross(normal, across)], axis=1)
+        own = int(starts[polygon]) + np.arange(int(counts[polygon]))
+        ears = np.asarray(triangulate([points[own] @ plane]), np.int64)
+        if len(ears) == counts[polygon] - 2:  # else it crosses itself
+            triangles[source == polygon] = own[ears]
+    return triangles
 
 
 def _numbers(rows: list[str], columns: int, fill: float | None = None) -> Array:

@@ -143,3 +143,13 @@ def test_too_many_materials(tmp_path):
     (tmp_path / "mug.obj").write_text(text)
     with pytest.raises(AssetError):
         read_model(tmp_path / "mug.obj")
+
+
+def test_a_concave_polygon():
+    """The outline of an L, which a fan of triangles from its first corner would leave."""
+    outline = [(3, 0), (3, 1), (1, 1), (1, 3), (0, 3), (0, 0)]
+    text = "".join(f"v {x} {y} 0\n" for x, y in outline) + "f 1 2 3 4 5 6\n"
+    mesh = parse_obj(text, "L.obj")
+    sides = mesh.vertices[mesh.faces]
+    areas = np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])[:, 2] / 2
+    assert len(mesh.faces) == 4 and (areas > 0).all() and areas.sum() == pytest.approx(5)
