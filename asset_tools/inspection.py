@@ -81,7 +81,7 @@ def _inspect(task: tuple[str, ModelSource]) -> tuple[str, Inspection]:
     except RobocasError as error:
         return id_, Inspection(error=AssetError(str(error)))
     except Exception as error:  # whatever a parser trips over: one model fails, not the import
-        log.exception("%s can't be read", source.paths[0])
+        log.debug("%s can't be read", source.paths[0], exc_info=True)
         found = f"{type(error).__name__}: {' '.join(str(error).split())}"
         return id_, Inspection(error=AssetError("can't read this model", where=source.paths[0], found=found))
 

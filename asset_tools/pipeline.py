@@ -14,7 +14,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
-from scipy.spatial import QhullError
 
 from robocas_ms3.assets.cooking import cooking_faults
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, Asset, FurnitureAsset, ObjectAsset, PackManifest
@@ -153,10 +152,8 @@ def _make(task: tuple[Job, Path]) -> tuple[JobResult, Path]:
             (tmp / ENTRY).write_text(asset.model_dump_json(), encoding="utf-8")
     except RobocasError as error:
         made = _failed(job, str(error))
-    except QhullError:
-        made = _failed(job, "it is flat, or has too few points")
     except Exception as error:  # whatever a mesh library trips over: one asset fails, with its name, not the run
-        log.exception("%s failed", job.id)
+        log.debug("%s failed", job.id, exc_info=True)
         made = _failed(job, f"{type(error).__name__}: {' '.join(str(error).split())}")
     else:
         made = JobResult(job.id, asset, seconds=time.perf_counter() - start)

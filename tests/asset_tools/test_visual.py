@@ -205,7 +205,7 @@ def test_plain_mesh_has_a_colour_and_no_texture():
     ball.visual.face_colors = [124, 188, 255, 255]
     light = to_display(ball, triangles=500)
     assert light.visual.material.baseColorTexture is None
-    assert light.visual.material.baseColorFactor.tolist() == [52, 128, 255, 255]  # linear, as glTF has it
+    assert light.visual.material.baseColorFactor.tolist() == [51, 128, 255, 255]  # linear, as glTF has it
 
 
 def test_texture_that_repeats_is_looked_up_with_its_wrap():
