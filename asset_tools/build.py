@@ -23,7 +23,17 @@ from asset_tools.visual import to_display
 from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.hulls import read_hulls, write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, ObjectAsset
-from robocas_ms3.assets.pack import ANNOTATIONS, FINISHES, HULLS, LINKS, VISUALS, LoadedFurniture, Part, sha256
+from robocas_ms3.assets.pack import (
+    ANNOTATIONS,
+    FINISHES,
+    HULLS,
+    LINKS,
+    VISUALS,
+    LoadedFurniture,
+    Part,
+    VisualLevel,
+    sha256,
+)
 from robocas_ms3.assets.physics import Solid
 from robocas_ms3.errors import AssetError
 
@@ -56,7 +66,7 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
     mesh, closed = source.mesh.copy(include_cache=True), source.closed.copy()
     mesh.apply_translation(shift)
     closed.apply_translation(shift)
-    write_visuals(mesh, folder)
+    repairs = (*source.repairs, *write_visuals(mesh, folder))
 
     if source.pieces is None:
         parts = decompose(closed)
@@ -112,7 +122,7 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
         attribution=source.attribution,
         extents=triple(mesh.extents),
         friction=source.friction,
-        repairs=source.repairs,
+        repairs=repairs,
         files=_hashes(folder),
         graspnet_id=source.graspnet_id,
         mass=source.mass,
@@ -168,11 +178,19 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
     return asset.model_copy(update={"quality": measure_furniture(LoadedFurniture(folder, asset=asset, links=parts))})
 
 
-def write_visuals(mesh: trimesh.Trimesh, folder: Path) -> None:
-    """Write a textured mesh at both levels of detail."""
-    fast = to_display(mesh, triangles=FAST_ENOUGH if len(mesh.faces) <= FAST_ENOUGH else FAST)
-    write_glb(fast, folder / VISUALS["fast"])
-    write_glb(to_display(mesh, triangles=FULL, texture_size=FULL_TEXTURE), folder / VISUALS["full"])
+def write_visuals(mesh: trimesh.Trimesh, folder: Path) -> list[str]:
+    """Write a textured mesh at both levels of detail; return a line per level that kept more faces than it should."""
+    levels: dict[VisualLevel, tuple[int, int]] = {
+        "fast": (FAST_ENOUGH if len(mesh.faces) <= FAST_ENOUGH else FAST, 512),
+        "full": (FULL, FULL_TEXTURE),
+    }
+    notes = []
+    for level, (triangles, size) in levels.items():
+        shown = to_display(mesh, triangles=triangles, texture_size=size)
+        write_glb(shown, folder / VISUALS[level])
+        if len(shown.faces) > max(triangles, FAST_ENOUGH):
+            notes.append(f"kept {len(shown.faces)} instead of {triangles} faces ({level}): many holes or pieces")
+    return notes
 
 
 def _write_body(mesh: trimesh.Trimesh, pieces: list[np.ndarray], folder: Path) -> None:
