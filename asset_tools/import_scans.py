@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import unicodedata
 import zlib
@@ -26,6 +27,7 @@ from robocas_ms3.errors import AssetError
 # Filled packages weigh about what water does, half-empty ones and boxes of cereal far less.
 DENSITY = 600.0  # kg/m3 of the whole body
 MASS_RANGE = (0.03, 0.8)  # kg
+LONGEST_ID = 50
 # mesh formats that are not read; a folder with one of them is an object, not a folder of textures
 UNREAD = {".fbx", ".blend", ".usd", ".usda", ".usdc", ".usdz", ".3ds", ".max", ".ma", ".mb", ".step", ".stp", ".wrl"}
 
@@ -156,9 +158,10 @@ def failing_job(id_: str, error: AssetError) -> Job:
 
 
 def object_id(name: str) -> str:
-    """Return a name as an id: small letters, digits and underscores; one that has none of these gets a number."""
+    """Return a name as an id: small letters, digits and underscores; one without any, or too long, gets a number."""
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
-    return re.sub(r"[^a-z0-9]+", "_", plain.lower()).strip("_") or f"object_{zlib.crc32(name.encode()):08x}"
+    id_, number = re.sub(r"[^a-z0-9]+", "_", plain.lower()).strip("_"), f"{zlib.crc32(os.fsencode(name)):08x}"
+    return f"{id_[:LONGEST_ID]}_{number}" if len(id_) > LONGEST_ID else id_ or f"object_{number}"
 
 
 def estimate_mass(closed: trimesh.Trimesh) -> float:

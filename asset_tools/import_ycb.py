@@ -15,7 +15,7 @@ from typing import Any
 
 from asset_tools.build import build_object
 from asset_tools.graspnet.catalogue import ENTRIES, NUMBERS
-from asset_tools.import_scans import estimate_mass, failing_job
+from asset_tools.import_scans import estimate_mass, failing_job, object_id
 from asset_tools.inspection import Inspect, Inspection, ModelSource, inspect_models
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.prepare import prepare
@@ -23,6 +23,7 @@ from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
 from robocas_ms3.documents import load_json
 from robocas_ms3.errors import AssetError
+from robocas_ms3.names import check_name
 
 INFO, MODELS = "info_pick_v0.json", "models"
 DOWNLOAD = "Run `python -m mani_skill.utils.download_asset ycb`, or give the folder that holds it."
@@ -140,9 +141,9 @@ def ycb_id(model: str) -> str:
     """A model's name as an id, the same as GraspNet-1Billion's object has here: 072-a_toy_airplane: toy_airplane_a."""
     found = re.fullmatch(r"\d+(?:-([a-z]))?_(\w+)", model)
     if found is None:
-        return re.sub(r"[^a-z0-9]+", "_", model.lower()).strip("_")
+        return object_id(model)
     letter, name = found.groups()
-    return f"{name}_{letter}" if letter else name
+    return object_id(f"{name}_{letter}" if letter else name)
 
 
 def _job(root: Path, model: str, info: dict[str, Any], inspected: Inspection) -> Job:
@@ -174,6 +175,8 @@ def _info(root: Path) -> dict[str, dict[str, Any]]:
         raise AssetError("can't read the list of YCB objects", where=path, found=error, fix=DOWNLOAD) from error
     if not isinstance(info, dict) or not info or not all(isinstance(entry, dict) for entry in info.values()):
         raise AssetError("can't read the list of YCB objects", where=path, expected="name: facts", fix=DOWNLOAD)
+    for name in info:
+        check_name(name, AssetError, where=path, fix=DOWNLOAD)
     return info
 
 

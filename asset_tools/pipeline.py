@@ -16,7 +16,14 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from robocas_ms3.assets.cooking import cooking_faults
-from robocas_ms3.assets.manifest import SCHEMA_VERSION, Asset, FurnitureAsset, ObjectAsset, PackManifest
+from robocas_ms3.assets.manifest import (
+    SCHEMA_VERSION,
+    Asset,
+    FurnitureAsset,
+    ObjectAsset,
+    PackManifest,
+    check_asset_name,
+)
 from robocas_ms3.assets.pack import MANIFEST, sha256
 from robocas_ms3.documents import load_json
 from robocas_ms3.errors import AssetError, RobocasError
@@ -54,6 +61,9 @@ class Job:
     id: str
     make: Callable[[Path], ObjectAsset | FurnitureAsset]
     content: str
+
+    def __post_init__(self) -> None:
+        check_asset_name(self.id, "an asset's id")
 
 
 @dataclass(frozen=True)

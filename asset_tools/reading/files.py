@@ -7,6 +7,7 @@ import stat
 import unicodedata
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from robocas_ms3.errors import AssetError
@@ -81,6 +82,11 @@ class ModelFiles:
     notes: list[str] = field(default_factory=list)
     used: list[Path] = field(default_factory=list)
 
+    @cached_property
+    def listing(self) -> list[Path]:
+        """All files below ``home``."""
+        return list(files_below(self.home))
+
     def read(self, path: Path) -> bytes:
         """Return the content of a file, see `read_file`."""
         data = read_file(path, self.root, self.home)
@@ -113,10 +119,11 @@ class ModelFiles:
                 self._note(f"read {name} as {plain}")
             return path
         wanted = _letters(plain.rsplit("/", 1)[-1])
-        alike = [found for found in files_below(self.home) if _letters(found.name) == wanted]
+        alike = [found for found in self.listing if _letters(found.name) == wanted]
         if alike:
             found = min(alike, key=lambda path: (len(path.parts), path.as_posix()))
-            self._note(f"took {found.relative_to(self.home).as_posix()} for {name}")
+            taken = found.relative_to(self.home).as_posix()
+            self._note(f"took {taken} for {name if name != taken else folder.name + '/' + name}")
             return found
         if outside:
             check_inside(folder / plain, self.root)

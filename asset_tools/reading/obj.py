@@ -193,8 +193,9 @@ def parse_obj(text: str, where: object) -> ObjMesh:
 
 def _statements(text: str) -> Iterator[tuple[str, str]]:
     """Yield keyword and rest of each line; comments left out, continued lines joined."""
-    for line in re.sub(r"\\\r?\n", " ", text).splitlines():
-        words = line.split(None, 1)
+    # one line at a time: a list of them takes ten times the memory of the text
+    for line in re.finditer(r"[^\r\n]+", re.sub(r"\\\r?\n", " ", text)):
+        words = line[0].split(None, 1)
         if len(words) == 2 and not words[0].startswith("#"):
             yield words[0], words[1].rstrip()
 

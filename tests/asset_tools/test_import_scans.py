@@ -20,6 +20,12 @@ def test_names_become_ids():
     assert object_id("可乐") != object_id("牛奶") and object_id("可乐").startswith("object_")
 
 
+def test_ids_are_bounded_and_different():
+    assert len(object_id("a" * 250)) < 100 and object_id("a" * 250) != object_id("a" * 251)
+    assert object_id("../../x") == "x" and object_id("..").startswith("object_")
+    assert object_id("scan\udcff") == "scan"  # a file name that is no UTF-8
+
+
 def test_mass_is_estimated_from_volume_within_limits():
     assert estimate_mass(trimesh.creation.box([0.1, 0.1, 0.05])) == pytest.approx(0.3)  # 0.5 l at 600 kg/m3
     assert estimate_mass(trimesh.creation.box([0.01] * 3)) == 0.03

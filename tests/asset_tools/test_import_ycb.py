@@ -86,7 +86,7 @@ def test_what_is_not_there_is_one_error(root, tmp_path, monkeypatch):
         ycb_source(root, "003_cracker_box")
 
 
-@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"003_cracker_box": 3}'])
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"003_cracker_box": 3}', '{"../..": {}}', '{"/etc": {}}'])
 def test_a_damaged_list_is_one_error(root, text):
     (root / "info_pick_v0.json").write_text(text)
     with pytest.raises(AssetError, match=r"info_pick_v0\.json"):
