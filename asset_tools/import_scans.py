@@ -126,7 +126,7 @@ def find_scans(source: Path) -> FoundScans:
     found = FoundScans()
     entries = [path for path in sorted(source.iterdir()) if not path.name.startswith(".")]
     meshes = [path for path in entries if is_mesh(path)]
-    shown = [path for path in meshes if not is_collision(path)]
+    shown = [path for path in meshes if not is_collision(path, source)]
     if shown:
         found.skipped += [f"{path.name}: a collision mesh" for path in meshes if path not in shown]
     versions: dict[str, list[Path]] = {}

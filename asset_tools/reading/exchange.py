@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import logging
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,8 @@ from asset_tools.reading.surface import Material, Part, decode_srgb
 from robocas_ms3.errors import AssetError, MissingExtraError
 
 TEXTURE_COMMENT = re.compile(rb"comment\s+TextureFile\s+(.*)", re.IGNORECASE)
+PLY_UVS = {b"s", b"t", b"u", b"v", b"texture_u", b"texture_v", b"texcoord"}
+PLY_COLORS = {b"diffuse_red": b"red", b"diffuse_green": b"green", b"diffuse_blue": b"blue"}
 LONGEST_HEADER = 65536  # bytes of a PLY file
 BLACK = 0.02  # linear
 
@@ -43,24 +48,42 @@ def read_exchange(path: Path, files: ModelFiles) -> list[Part]:
     if suffix == "dae" and find_spec("collada") is None:
         raise MissingExtraError("pycollada is not installed", where=path, fix="pip install 'robocas-ms3[assets]'")
     if suffix == "3mf":
-        _check_archive(data, path)
-    textures = _Textures(path, files)
+        _check_archive(data, path, files)
+    textures, faces = _Textures(path, files), 0
     if suffix == "ply":
-        data = _ply_checked(data, path, textures)
+        data, faces = _ply_checked(data, path, textures)
+    elif suffix == "off":
+        faces = _off_faces(data, path, files)
     try:
-        scene = trimesh.load_scene(io.BytesIO(data), suffix, resolver=textures, process=False)
+        with _quiet():
+            scene = trimesh.load_scene(io.BytesIO(data), suffix, resolver=textures, process=False)
         parts = [part for part in _parts(scene, textures) if len(part.faces)]
     except AssetError:
         raise
     except Exception as error:  # whatever trimesh's parsers trip over
-        found = " ".join(f"{type(error).__name__}: {error}".split())
+        found = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise AssetError("can't read this mesh", where=path, found=found, fix="Export it again.") from error
     if textures.error is not None:
         raise textures.error
-    if sum(len(part.faces) for part in parts) > MOST_FACES:
+    count = sum(len(part.faces) for part in parts)
+    if count < faces:
+        found, fix = f"{count} faces", "Copy or export it again."
+        raise AssetError("the file is cut short", where=path, expected=f"{faces} faces", found=found, fix=fix)
+    if count > MOST_FACES:
         expected = f"at most {MOST_FACES:,}"
         raise AssetError("the mesh has too many faces", where=path, expected=expected, fix="Reduce it.")
     return parts
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep trimesh's log lines, with tracebacks, from the terminal: what is wrong is said by errors and notes."""
+    logger = logging.getLogger("trimesh")
+    disabled, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = disabled
 
 
 class _Textures(Resolver):
@@ -80,11 +103,11 @@ class _Textures(Resolver):
         try:
             file = self._files.find(name, self._path.parent)
             if file is None:
-                raise AssetError("a texture that the mesh names is missing", where=self._path.parent / name)
+                where, fix = self._path.parent / name, "Put it next to the mesh."
+                raise AssetError("a texture that the mesh names is missing", where=where, fix=fix)
             image = open_texture(self._files.read(file), file, self._files.notes)
         except AssetError as error:
-            self.error = self.error or error  # trimesh goes on without the texture
-            raise
+            self.error, image = self.error or error, Image.new("RGB", (1, 1))  # raised when trimesh is done
         stream = io.BytesIO()
         image.save(stream, format="BMP")  # no time is lost by compressing it
         return stream.getvalue()
@@ -107,37 +130,66 @@ class _Textures(Resolver):
         return self._images.setdefault(image.tobytes(), image)
 
 
-def _check_archive(data: bytes, path: Path) -> None:
-    """Check what a 3MF unpacks to before it is unpacked."""
+def _check_archive(data: bytes, path: Path, files: ModelFiles) -> None:
+    """Check what a 3MF unpacks to before it is unpacked; warn about colours, which are not read."""
     try:
-        size = sum(info.file_size for info in zipfile.ZipFile(io.BytesIO(data)).infolist())
-    except (zipfile.BadZipFile, ValueError, OSError) as error:
+        archive = zipfile.ZipFile(io.BytesIO(data))
+        size = sum(info.file_size for info in archive.infolist())
+        if size > LARGEST_FILE:
+            expected, found = f"at most {LARGEST_FILE >> 20} MB unpacked", f"{size >> 20} MB"
+            raise AssetError(
+                "the file is too large", where=path, expected=expected, found=found, fix="Reduce the mesh."
+            )
+        models = [archive.read(info) for info in archive.infolist() if info.filename.lower().endswith(".model")]
+    except (zipfile.BadZipFile, zlib.error, ValueError, OSError, RuntimeError, EOFError) as error:
         raise AssetError("can't read this mesh", where=path, found=error, fix="Export it again.") from error
-    if size > LARGEST_FILE:
-        expected, found = f"at most {LARGEST_FILE >> 20} MB unpacked", f"{size >> 20} MB"
-        raise AssetError("the file is too large", where=path, expected=expected, found=found, fix="Reduce the mesh.")
+    if any(b"basematerials" in model or b"colorgroup" in model for model in models):
+        files.notes.append(f"warning: {path.name}: ignored the colours of a 3MF file")
 
 
-def _ply_checked(data: bytes, path: Path, textures: _Textures) -> bytes:
-    """Return a PLY file with bounded counts, whose header is in the one order that trimesh reads."""
+def _ply_checked(data: bytes, path: Path, textures: _Textures) -> tuple[bytes, int]:
+    """Return a PLY file with bounded counts, whose header is as trimesh reads it, and its number of faces."""
     end = data.find(b"end_header", 0, LONGEST_HEADER)
     if end < 0:
         raise AssetError("can't read this mesh", where=path, expected="a PLY header", fix="Export it again.")
     lines = [line.strip() for line in data[:end].splitlines()]
-    wanted = [line for line in lines if line.startswith((b"element", b"property"))]
-    for line in wanted:
-        kind, count = ([*line.split(), b"", b""])[1:3]
-        limit = MOST_FACES if kind == b"face" else MOST_VERTICES
-        if line.startswith(b"element") and not (count.isdigit() and len(count) < 12 and int(count) <= limit):
-            what = f"the mesh has too many elements {decode_text(kind)[:20]!r}"
-            found = decode_text(count)[:20]
-            raise AssetError(what, where=path, expected=f"at most {limit:,}", found=found, fix="Reduce it.")
     names = [decode_text(match[1]).strip('"') for line in lines if (match := TEXTURE_COMMENT.match(line))]
     if len(names) > 1:
         textures.note(f"warning: {path.name}: ignored textures after the first, of {len(names)}")
-    encoding = [line for line in lines if line.startswith(b"format")]
-    comments = [f"comment TextureFile {name}".encode() for name in names[:1]]
-    return b"\n".join([b"ply", *encoding[:1], *comments, *wanted, data[end:]])
+    header = [b"ply", *[line for line in lines if line.startswith(b"format")][:1]]
+    header += [f"comment TextureFile {name}".encode() for name in names[:1]]
+    faces = 0
+    for line in lines:
+        words = line.split()
+        if words[:1] == [b"element"]:
+            kind, count = [*words[1:], b"", b""][:2]
+            limit = MOST_FACES if kind == b"face" else MOST_VERTICES
+            if not (count.isdigit() and len(count) < 12 and int(count) <= limit):
+                what = f"the mesh has too many elements {decode_text(kind)[:20]!r}"
+                found = decode_text(count)[:20]
+                raise AssetError(what, where=path, expected=f"at most {limit:,}", found=found, fix="Reduce it.")
+            faces = int(count) if kind == b"face" else faces
+            header.append(line)
+        elif words[:1] == [b"property"]:
+            name = words[-1]
+            # trimesh shows coordinates without an image in grey, and drops the colours
+            name = PLY_COLORS.get(name, name) if names or name not in PLY_UVS else b"unused_" + name
+            header.append(b" ".join([*words[:-1], name]))
+    return b"\n".join([*header, data[end:]]), faces
+
+
+def _off_faces(data: bytes, path: Path, files: ModelFiles) -> int:
+    """Return the number of faces in the header of an OFF file; warn about colours, which are not read."""
+    words = re.sub(rb"#[^\n]*", b"", data[:LONGEST_HEADER]).split()
+    if words and words[0].upper().startswith(b"C"):
+        files.notes.append(f"warning: {path.name}: ignored vertex colours of an OFF file")
+    counts = words[1:3] if words and words[0].upper().endswith(b"OFF") else words[:2]
+    if len(counts) < 2 or not all(count.isdigit() and len(count) < 12 for count in counts):
+        raise AssetError("can't read this mesh", where=path, expected="an OFF header", fix="Export it again.")
+    if int(counts[0]) > MOST_VERTICES or int(counts[1]) > MOST_FACES:
+        expected = f"at most {MOST_FACES:,} faces"
+        raise AssetError("the mesh has too many faces or vertices", where=path, expected=expected, fix="Reduce it.")
+    return int(counts[1])
 
 
 def _parts(scene: trimesh.Scene, textures: _Textures) -> Iterator[Part]:

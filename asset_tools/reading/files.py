@@ -9,10 +9,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from urllib.parse import unquote
 
 from robocas_ms3.errors import AssetError
 
 LARGEST_FILE = 200 * 2**20  # bytes
+TEXTURE_FOLDERS = {"textures", "texture", "tex", "materials", "images", "maps", "thumbnails"}
 MOST_ENTRIES = 20_000  # of a folder that is searched for a file
 
 
@@ -73,19 +75,25 @@ class ModelFiles:
     Attributes:
         root: the folder that the user imports; only files below it, or below ``home``, are read.
         home: the model's own folder, below which files are searched by name; may be a link to another place.
+        stem: of a mesh file that shares ``home`` with other models; None: ``home`` is the model's own.
         notes: one line per file that is not where the model says.
         used: the files that were read, for the content hash.
     """
 
     root: Path
     home: Path
+    stem: str | None = None
     notes: list[str] = field(default_factory=list)
     used: list[Path] = field(default_factory=list)
 
     @cached_property
     def listing(self) -> list[Path]:
-        """All files below ``home``."""
-        return list(files_below(self.home))
+        """Files in which others are searched: all below ``home``, or next to the model and in folders for it."""
+        if self.stem is None:
+            return list(files_below(self.home))
+        entries = sorted(path for path in self.home.iterdir() if not path.name.startswith("."))
+        own = [path for path in entries if path.is_dir() and _is_for(path.name, self.stem)]
+        return [path for path in entries if not path.is_dir()] + [file for path in own for file in files_below(path)]
 
     def read(self, path: Path) -> bytes:
         """Return the content of a file, see `read_file`."""
@@ -123,8 +131,11 @@ class ModelFiles:
         if alike:
             found = min(alike, key=lambda path: (len(path.parts), path.as_posix()))
             taken = found.relative_to(self.home).as_posix()
-            self._note(f"took {taken} for {name if name != taken else folder.name + '/' + name}")
+            text = f"took {taken} for {name if name != taken else folder.name + '/' + name}"
+            self._note(f"warning: {text}, of {len(alike)} files of this name" if len(alike) > 1 else text)
             return found
+        if "%" in name and unquote(name) != name:
+            return self.find(unquote(name), folder)
         if outside:
             check_inside(folder / plain, self.root)
         return None
@@ -145,6 +156,11 @@ def files_below(folder: Path) -> Iterator[Path]:
                 return
             if not name.startswith("."):
                 yield Path(place, name)
+
+
+def _is_for(folder: str, stem: str) -> bool:
+    """Return whether a folder may hold the textures of a mesh file next to it."""
+    return folder.lower() in TEXTURE_FOLDERS or _letters(folder).startswith(_letters(stem))
 
 
 def _letters(name: str) -> str:

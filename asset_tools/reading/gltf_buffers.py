@@ -42,12 +42,13 @@ class Buffers:
         """Return what a URI stands for, and the file that holds it."""
         if uri.startswith("data:"):
             try:
-                return base64.b64decode(uri.partition(",")[2]), self._path
+                return base64.b64decode(unquote(uri.partition(",")[2]), validate=True), self._path
             except binascii.Error as error:
                 raise ValueError(f"a data URI that can't be read: {error}") from error
         file = self._files.find(unquote(uri), self._path.parent)
         if file is None:
-            raise AssetError("a file this mesh names is missing", where=self._path.parent / unquote(uri))
+            where, fix = self._path.parent / unquote(uri), "Put it next to the mesh."
+            raise AssetError("a file this mesh names is missing", where=where, fix=fix)
         return self._files.read(file), file
 
     def view(self, index: int) -> tuple[bytes, schema.BufferView]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from robocas_ms3.errors import AssetError
 
@@ -42,7 +42,8 @@ def open_texture(data: bytes, where: object, notes: list[str]) -> Image.Image:
         expected = "at most 16384 x 16384 pixels"
         raise AssetError("the texture is too large", where=where, expected=expected) from error
     except (OSError, SyntaxError, ValueError, EOFError, ArithmeticError, LookupError, TypeError) as error:
-        raise AssetError("can't read the texture", where=where, found=" ".join(str(error).split())) from error
+        found = "no image" if isinstance(error, UnidentifiedImageError) else " ".join(str(error).split())
+        raise AssetError("can't read the texture", where=where, found=found, fix="Save it as PNG.") from error
 
 
 @contextmanager
@@ -71,7 +72,7 @@ def _shrunk(image: Image.Image, notes: list[str]) -> Image.Image:
 def _rgb(image: Image.Image) -> Image.Image:
     """Return an image as RGB; Pillow itself cuts 16-bit greys off at 255."""
     if image.mode.startswith("I") or image.mode == "F":
-        values = np.asarray(image)
+        values = np.nan_to_num(np.asarray(image))
         wide = image.mode.startswith("I;16") or (len(values) > 0 and float(values.max()) > 255)
         scale = 255 / 65535 if wide else 255.0 if image.mode == "F" and float(values.max()) <= 1 else 1.0
         grey = np.clip(np.rint(values * np.float32(scale)), 0, 255).astype(np.uint8)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 import trimesh
 
-from asset_tools.reading.choice import FORMATS, Candidate, choose, is_mesh, mesh_files
+from asset_tools.reading.choice import FORMATS, Candidate, choose, is_collision, is_mesh, mesh_files
 from asset_tools.reading.exchange import read_exchange
 from asset_tools.reading.files import ModelFiles
 from asset_tools.reading.gltf import read_gltf
@@ -28,6 +28,7 @@ READERS: dict[str, Callable[[Path, ModelFiles], list[Part]]] = {
 }  # the others are trimesh's
 
 
+LARGEST_UV = 1e4  # an image that repeats more often is an error of the file
 UPS: dict[bytes, Literal["x", "y", "z"]] = {b"X": "x", b"Y": "y", b"Z": "z"}
 
 
@@ -60,42 +61,45 @@ def read_model(path: Path | list[Path], root: Path | None = None) -> Model:
             finite; or a folder holds several objects.
     """
     paths = [Path(os.path.abspath(one)) for one in (path if isinstance(path, list) else [path])]
-    whole, home = paths[0], paths[0] if paths[0].is_dir() else paths[0].parent
-    files = ModelFiles(Path(os.path.abspath(root or home)), home)
-    if len(paths) == 1 and not whole.is_dir():
-        chosen = [_candidate(whole, files)]
+    is_folder = paths[0].is_dir()
+    home = paths[0] if is_folder else paths[0].parent
+    files = ModelFiles(Path(os.path.abspath(root or home)), home, None if is_folder else paths[0].stem)
+    if len(paths) == 1 and not is_folder:
+        chosen = [_candidate(paths[0], files)]
     else:
-        shown, collision = mesh_files(whole) if whole.is_dir() else (paths, [])
-        chosen = _chosen(shown, collision, home, files)
+        chosen = _chosen(mesh_files(home) if is_folder else paths, files)
     mesh = to_mesh([part for candidate in chosen for part in candidate.parts])
-    _check(mesh, whole)
+    _check(mesh, paths[0])
     return Model(mesh, _up(chosen[0].path, files), tuple(files.used), tuple(dict.fromkeys(files.notes)))
 
 
-def _chosen(shown: list[Path], collision: list[Path], home: Path, files: ModelFiles) -> list[Candidate]:
-    """Return the candidates that are the object; only what they need counts as read."""
+def _chosen(paths: list[Path], files: ModelFiles) -> list[Candidate]:
+    """Return the candidates that are the object; notes are those of the files that are used."""
+    collision = [path for path in paths if is_collision(path, files.home)]
+    if len(collision) == len(paths):
+        collision = []
+    shown = [path for path in paths if path not in collision]
     candidates: list[tuple[Candidate, ModelFiles]] = []
     errors: dict[Path, RobocasError] = {}
     for path in shown:
-        own = ModelFiles(files.root, files.home)
+        own = ModelFiles(files.root, files.home, files.stem)
         try:
-            candidate = _candidate(path, own)
+            candidates.append((_candidate(path, own), own))
         except RobocasError as error:
             errors[path] = error
-        else:
-            candidates.append((candidate, own))
     if not candidates:
         raise next(iter(errors.values()))
-    chosen = choose([candidate for candidate, _ in candidates], home, files.notes)
-    names = {path: path.relative_to(home).as_posix() for path in (*shown, *collision)}
-    if not files.notes and len(names) > 1:
+    chosen = choose([candidate for candidate, _ in candidates], files.home, files.notes)
+    names = {path: path.relative_to(files.home).as_posix() for path in paths}
+    if not files.notes and len(paths) > 1:
         files.notes.append(f"used {names[chosen[0].path]}")
     files.notes.extend(f"ignored {names[path]}: a collision mesh" for path in collision)
     files.notes.extend(f"warning: ignored {names[path]}: {error}" for path, error in errors.items())
     for candidate, own in candidates:
+        # those that were not chosen count too: without them the notes would be others
+        files.used.extend(path for path in own.used if path not in files.used)
         if candidate in chosen:
             files.notes.extend(own.notes)
-            files.used.extend(path for path in own.used if path not in files.used)
     return chosen
 
 
@@ -105,23 +109,47 @@ def _candidate(path: Path, files: ModelFiles) -> Candidate:
     if not is_mesh(path):
         raise AssetError("not a mesh file", where=path, expected=f"one of {', '.join(FORMATS)}", found=path.suffix)
     parts = READERS.get(path.suffix.lower(), read_exchange)(path, files)
-    parts = [part for part in parts if len(part.faces)]
+    parts = [_clean(part, path, files) for part in parts if len(part.faces)]
     if not parts:
-        raise AssetError("the mesh is empty", where=path, expected="triangles", found="none")
+        fix = "Export it again, with its faces."
+        raise AssetError("the mesh is empty", where=path, expected="triangles", found="none", fix=fix)
     return Candidate(path, parts)
+
+
+def _clean(part: Part, path: Path, files: ModelFiles) -> Part:
+    """Return a part without unused vertices, and without coordinates and colours that are not finite.
+
+    Raises:
+        AssetError: the faces have vertices that are not finite.
+    """
+    used, faces = np.unique(part.faces, return_inverse=True)
+    vertices, uvs, colors, normals = (
+        None if values is None else values[used] for values in (part.vertices, part.uvs, part.colors, part.normals)
+    )
+    assert vertices is not None
+    if not np.isfinite(vertices).all():
+        found = f"{int((~np.isfinite(vertices).all(axis=1)).sum())} of {len(vertices)}"
+        fix = "Export it again."
+        raise AssetError("the mesh has vertices that are not finite", where=path, found=found, fix=fix)
+    if uvs is not None and not (np.abs(uvs) < LARGEST_UV).all():
+        files.notes.append(f"warning: {path.name}: left out a texture, whose coordinates are not finite")
+        uvs = None
+    if colors is not None and not np.isfinite(colors).all():
+        files.notes.append(f"warning: {path.name}: left out vertex colours that are not finite")
+        colors = None
+    if normals is not None and not (np.isfinite(normals).all() and (np.abs(normals) <= 1.01).all()):
+        normals = None
+    return Part(vertices, faces.reshape(-1, 3), uvs, colors, normals, part.material)
 
 
 def _check(mesh: trimesh.Trimesh, path: Path) -> None:
     if len(mesh.faces) > MOST_FACES:
         expected = f"at most {MOST_FACES:,}"
         raise AssetError("the mesh has too many faces", where=path, expected=expected, fix="Reduce it.")
-    finite = np.isfinite(mesh.vertices).all(axis=1)
-    if not finite.all():
-        found = f"{int((~finite).sum())} of {len(finite)}"
-        raise AssetError("the mesh has vertices that are not finite", where=path, found=found)
-    size = np.ptp(mesh.vertices[np.unique(mesh.faces)], axis=0).max()
+    size, fix = float(mesh.extents.max()), "Export it again, in metres."
     if not 1e-9 < size < 1e9:
-        raise AssetError("the mesh has no usable size", where=path, expected="1e-9 to 1e9 units", found=f"{size:g}")
+        expected, found = "1e-9 to 1e9 units", f"{size:g}"
+        raise AssetError("the mesh has no usable size", where=path, expected=expected, found=found, fix=fix)
 
 
 def _up(path: Path, files: ModelFiles) -> Literal["x", "y", "z"] | None:

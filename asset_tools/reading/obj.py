@@ -34,6 +34,7 @@ class MtlMaterial:
         emission_image: name of the emissive texture (``map_Ke``).
         uv_scale: of the colour texture (``-s``).
         uv_offset: of the colour texture (``-o``).
+        transparent: the material lets light through (``d``, ``Tr``, ``map_d``).
     """
 
     name: str
@@ -43,6 +44,7 @@ class MtlMaterial:
     emission_image: str = ""
     uv_scale: tuple[float, float] = (1.0, 1.0)
     uv_offset: tuple[float, float] = (0.0, 0.0)
+    transparent: bool = False
 
 
 @dataclass
@@ -51,7 +53,7 @@ class ObjMesh:
 
     Attributes:
         vertices: (V, 3).
-        colors: (V, 3) 0 to 1, sRGB; None where no vertex has a colour.
+        colors: (V, 3) 0 to 1, sRGB; None: no vertex has a colour.
         uvs: (T, 2), v upward.
         normals: (N, 3).
         faces: (F, 3) indices of vertices.
@@ -100,6 +102,12 @@ def parse_mtl(text: str) -> dict[str, MtlMaterial]:
             current.emission = _color(rest)
         elif key == "map_kd":
             current.image, current.uv_scale, current.uv_offset = _map(rest)
+        elif key in ("d", "tr"):
+            opaque = 1.0 if key == "d" else 0.0
+            last = rest.split()[-1]
+            current.transparent |= _is_number(last) and float(last) != opaque
+        elif key == "map_d":
+            current.transparent = True
         elif key == "map_ka":
             ambient[current.name] = _map(rest)[0]
         elif key == "map_ke":
@@ -141,11 +149,11 @@ def parse_obj(text: str, where: object) -> ObjMesh:
     try:
         for key, rest in _statements(text):
             if key in rows:
-                rows[key].append(rest)
+                rows[key].append(rest.partition("#")[0])
                 if len(rows[key]) > MOST_VERTICES:
                     raise _too_many("vertices", MOST_VERTICES, where)
             elif key == "f":
-                words = rest.split()
+                words = rest.partition("#")[0].split()
                 if len(words) < 3:
                     continue
                 for word in words:
@@ -164,7 +172,7 @@ def parse_obj(text: str, where: object) -> ObjMesh:
             elif key == "mtllib":
                 libraries.append(rest.strip())
         vertices = _numbers(points, 3)
-        colors = _numbers([row.split(None, 3)[3] for row in points], 3) if points and _colored(points) else None
+        colors = _colors(points)
         triangles, source = _fans(np.array(counts, np.int64))
         if len(triangles) > MOST_FACES:
             raise _too_many("faces", MOST_FACES, where)
@@ -238,7 +246,7 @@ def _with_concave(triangles: Ints, source: Ints, counts: Ints, points: Array) ->
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     sums = np.stack([np.bincount(source, axis, len(counts)) for axis in normals.T], axis=1)
     backwards = np.einsum("fi,fi->f", normals, sums[source]) < -1e-6 * (sums[source] ** 2).sum(axis=1)
-    starts = np.cumsum(counts) - counts
+    starts, first = np.cumsum(counts) - counts, np.cumsum(counts - 2) - (counts - 2)
     triangles = triangles.copy()
     for polygon in np.unique(source[backwards]).tolist():
         normal = sums[polygon] / np.linalg.norm(sums[polygon])
@@ -247,7 +255,7 @@ def _with_concave(triangles: Ints, source: Ints, counts: Ints, points: Array) ->
         own = int(starts[polygon]) + np.arange(int(counts[polygon]))
         ears = np.asarray(triangulate([points[own] @ plane]), np.int64)
         if len(ears) == counts[polygon] - 2:  # else it crosses itself
-            triangles[source == polygon] = own[ears]
+            triangles[first[polygon] : first[polygon] + len(ears)] = own[ears]
     return triangles
 
 
@@ -262,9 +270,14 @@ def _numbers(rows: list[str], columns: int, fill: float | None = None) -> Array:
     return found
 
 
-def _colored(rows: list[str]) -> bool:
-    """Whether all vertices have a colour: x y z r g b."""
-    return len(rows[0].split()) in (6, 7) and all(len(row.split()) in (6, 7) for row in rows)
+def _colors(rows: list[str]) -> Array | None:
+    """Return the colours of vertices (x y z r g b), white where some have none; None: no vertex has one."""
+    if len(rows) == 0 or not any(len(row.split()) in (6, 7) for row in (rows[0], rows[len(rows) // 2], rows[-1])):
+        return None
+    words = [row.split()[3:6] for row in rows]
+    found = np.array([line if len(line) == 3 else ("nan",) * 3 for line in words], dtype=float)
+    top = 255.0 if np.nanmax(found) > 1 else 1.0
+    return np.where(np.isnan(found), 1.0, found / top)
 
 
 def _color(rest: str) -> tuple[float, float, float] | None:
@@ -284,24 +297,29 @@ def _map(rest: str) -> tuple[str, tuple[float, float], tuple[float, float]]:
     vectors: dict[str, list[float]] = {}
     left = rest.strip()
     while left.startswith("-"):
-        option, _, tail = left.partition(" ")
-        option, tail = option.lower(), tail.strip()
-        if option in FLAGS:
-            left = tail.partition(" ")[2].strip()
-        elif option in VECTORS:
-            values = []
-            while len(values) < VECTORS[option] and tail:
-                word, _, after = tail.partition(" ")
-                try:
-                    values.append(float(word))
-                except ValueError:
-                    break
-                tail = after.strip()
-            vectors[option], left = values, tail
-        else:
-            break
+        option, *tail = left.split(None, 1)
+        option, left = option.lower(), tail[0] if tail else ""
+        if option not in FLAGS and option not in VECTORS:
+            return rest.strip(), (1.0, 1.0), (0.0, 0.0)
+        count = VECTORS.get(option, 1)
+        values: list[str] = []
+        while left and len(values) < count:
+            word, *tail = left.split(None, 1)
+            if option in VECTORS and not _is_number(word):
+                break
+            values.append(word)
+            left = tail[0] if tail else ""
+        vectors[option] = [float(word) for word in values if _is_number(word)]
     scale, offset = (vectors.get(option, []) for option in ("-s", "-o"))
     return left, _pair(scale, 1.0), _pair(offset, 0.0)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _pair(values: list[float], default: float) -> tuple[float, float]:

@@ -11,13 +11,14 @@ from PIL import Image
 from asset_tools.reading.files import ModelFiles
 from asset_tools.reading.images import open_texture
 from asset_tools.reading.obj import MtlMaterial, ObjMesh, decode_text, find_material, parse_mtl, parse_obj
-from asset_tools.reading.surface import Material, Part, decode_srgb
+from asset_tools.reading.surface import WHITE, Material, Part, decode_srgb
 from robocas_ms3.errors import AssetError
 
 Ints = NDArray[np.int64]
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp")
 BLACK = 0.02  # linear
+COLOURED = 0.05  # difference of the channels of a colour that is no grey
 MOST_MATERIALS = 1000
 
 
@@ -70,19 +71,34 @@ def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[str, tuple[
                 places.append(file)
             else:
                 missing.append(name if len(line.split()) == 1 else line)
-    if not places and (missing or (not mesh.libraries and len(mesh.uvs))):
-        beside = path.with_suffix(".mtl")
-        if beside.is_file():
+    if not places and (missing or mesh.material_names or (not mesh.libraries and len(mesh.uvs))):
+        beside = _beside(path, (".mtl",)) or _only_library(mesh, path, files)
+        if beside is not None:
             places.append(beside)
             files.notes.append(f"took {beside.name} for {missing[0] if missing else 'the material file'}")
         elif missing and (len(mesh.uvs) or mesh.material_names):
-            what = "the material file that the mesh names is missing"
-            raise AssetError(what, where=path.parent / missing[0], found=path.name)
+            what, fix = "the material file that the mesh names is missing", "Put it next to the mesh."
+            raise AssetError(what, where=path.parent / missing[0], fix=fix)
     found: dict[str, tuple[MtlMaterial, Path]] = {}
     for place in dict.fromkeys(places):
         materials = parse_mtl(decode_text(files.read(place)))
         found |= {name: (material, place) for name, material in materials.items() if name not in found}
     return found
+
+
+def _beside(path: Path, suffixes: tuple[str, ...]) -> Path | None:
+    """Return the file next to another one that has its name, in whatever letter case, and one of some suffixes."""
+    alike = {file.suffix.lower(): file for file in path.parent.iterdir() if file.stem.lower() == path.stem.lower()}
+    return next((alike[suffix] for suffix in suffixes if suffix in alike), None)
+
+
+def _only_library(mesh: ObjMesh, path: Path, files: ModelFiles) -> Path | None:
+    """Return the only MTL file next to an OBJ, if it has all materials of its faces."""
+    found = [file for file in path.parent.iterdir() if file.suffix.lower() == ".mtl"]
+    if len(found) != 1 or not mesh.material_names:
+        return None
+    materials = parse_mtl(decode_text(files.read(found[0])))
+    return found[0] if all(find_material(name, materials) for name in mesh.material_names) else None
 
 
 def _material(
@@ -99,7 +115,7 @@ def _material(
     if only is not None and (has_uvs or not only[0].image):
         files.notes.append(f"took the material {only[0].name} for faces {f'of {name}' if name else 'without one'}")
         return only
-    image = next((place for end in IMAGES if (place := path.with_suffix(end)).is_file()), None)
+    image = _beside(path, IMAGES)
     if has_uvs and image is not None and not materials:
         files.notes.append(f"took {image.name} for faces {f'of {name}' if name else 'without a material'}")
         return MtlMaterial(name, image=image.name), path
@@ -132,9 +148,10 @@ def _part(
     colors = None
     if mesh.colors is not None:
         values = mesh.colors[corners[:, 0]]
-        colors = decode_srgb(values if mesh.colors.max() > 1 else 255 * values)
         if shown.image is None:
-            shown = Material()  # Kd next to vertex colours is a mere default
+            colors, shown = decode_srgb(255 * values), Material()  # Kd next to vertex colours is a mere default
+        elif (values != 1).any():
+            files.notes.append("warning: ignored vertex colours next to a texture")
     normals = mesh.normals[corners[:, 2]] if use_normals else None
     if normals is not None:
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -148,6 +165,8 @@ def _look(
     plain = (1.0, 1.0), (0.0, 0.0)
     if material is None:
         return Material(), plain
+    if material.transparent:
+        files.notes.append("warning: ignored transparency")
     name = material.image
     if material.emission_image and (not name or (material.color is not None and max(material.color) < BLACK)):
         name = material.emission_image
@@ -156,10 +175,13 @@ def _look(
             file = files.find(name, place.parent)
             if file is None:
                 where = place.parent / name.replace("\\", "/")
-                raise AssetError("the texture file that the material names is missing", where=where, found=place.name)
+                what, fix = "the texture file that the material names is missing", "Put it next to the mesh."
+                raise AssetError(what, where=where, fix=fix)
             images[name] = open_texture(files.read(file), file, files.notes)
-        # Kd next to a texture is a mere default in most files: scanners write 0.8, some write 0
-        return Material(image=images[name]), (material.uv_scale, material.uv_offset)
+        # a grey Kd next to a texture is a mere default: scanners write 0.8, some write 0
+        tinted = material.color is not None and np.ptp(material.color) > COLOURED and name == material.image
+        color = _linear(material.color) if tinted and material.color is not None else WHITE
+        return Material(color, images[name]), (material.uv_scale, material.uv_offset)
     if name:
         files.notes.append(f"warning: left out the texture {name}: faces without texture coordinates")
     color = material.color
@@ -167,5 +189,9 @@ def _look(
         color = material.emission
     if color is None:
         return Material(), plain
+    return Material(_linear(color)), plain
+
+
+def _linear(color: tuple[float, float, float]) -> tuple[float, float, float]:
     red, green, blue = (float(value) for value in decode_srgb(255 * np.array(color)))
-    return Material((red, green, blue)), plain
+    return red, green, blue
