@@ -27,6 +27,10 @@ def folder(tmp_path, protocol):
     return tmp_path / "result"
 
 
+MOVE = {"object": "lid", "step": 5, "needed": True, "in_order": True}
+ORDER = {"moved": [MOVE], "needed": ["lid"], "left": 1, "score": 0.5}
+
+
 def tamper(folder, line, **values):
     path = folder / OUTCOMES
     lines = path.read_text().splitlines()
@@ -62,9 +66,7 @@ def test_nothing_is_wrong_with_a_whole_result(folder, protocol):
         ({"flag_seconds": {"success": 3.6}}, "episode 0: success held first after its 3.5 s"),
         ({"flag_seconds": {}}, "episode 0: flag_seconds are not of its flags"),
         ({"measures": {"path_length": -1.0}}, "episode 0: a measure is no number from 0 on"),
-        ({"inference_ms": -1.0}, "episode 0: a measure is no number from 0 on"),
         ({"episode": 99}, "episode 99: the protocol has none of this number"),
-        ({"episode": -1}, "episode -1: the protocol has none of this number"),
     ],
 )
 def test_a_changed_episode_is_found(folder, protocol, values, said):
@@ -72,10 +74,21 @@ def test_a_changed_episode_is_found(folder, protocol, values, said):
     assert said in problems(read(folder), protocol)
 
 
-@pytest.mark.parametrize("values", [{"inference_ms": math.nan}, {"measures": {"path_length": math.inf}}])
-def test_a_measure_that_is_not_finite_makes_no_result(folder, values):
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"inference_ms": math.nan},
+        {"inference_ms": -1.0},
+        {"measures": {"path_length": math.inf}},
+        {"episode": -1},
+        *({"retrieval": {**ORDER, **changed}} for changed in ({"score": 7.5}, {"left": -1}, {"moved": 3})),
+        {"retrieval": {**ORDER, "moved": [{"object": "lid"}]}},
+    ],
+    ids=str,
+)
+def test_a_value_out_of_range_makes_no_result(folder, values):
     tamper(folder, 0, **values)
-    with pytest.raises(EvaluationError, match=f"{OUTCOMES}:1: no outcome of an episode: .* is no number of JSON"):
+    with pytest.raises(EvaluationError, match=f"{OUTCOMES}:1: "):
         read(folder)
 
 
@@ -129,20 +142,12 @@ def test_the_command_fails_where_something_is_wrong(folder, capsys):
     assert "episode 3: seed is 5, not 110001" in capsys.readouterr().out
 
 
-MOVE = {"object": "lid", "step": 5, "needed": True, "in_order": True}
-ORDER = {"moved": [MOVE], "needed": ["lid"], "left": 1, "score": 0.5}
-
-
 @pytest.mark.parametrize(
     ("changed", "well"),
     [
         ({}, True),
-        ({"score": 7.5}, False),
         ({"score": None}, False),
-        ({"left": -1}, False),
         ({"moved": [{**MOVE, "step": 10**6}]}, False),
-        ({"moved": [{"object": "lid"}]}, False),
-        ({"moved": 3}, False),
     ],
 )
 def test_an_order_of_retrieval_agrees_with_itself(folder, protocol, changed, well):
