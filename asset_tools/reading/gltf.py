@@ -19,7 +19,7 @@ from asset_tools.reading.files import ModelFiles
 from asset_tools.reading.gltf_buffers import Buffers, entry
 from asset_tools.reading.gltf_materials import READ_EXTENSIONS, Materials
 from asset_tools.reading.obj import MOST_FACES
-from asset_tools.reading.surface import Part
+from asset_tools.reading.surface import Material, Part
 from robocas_ms3.documents import json_values
 from robocas_ms3.errors import AssetError
 
@@ -54,6 +54,8 @@ def read_gltf(path: Path, files: ModelFiles) -> list[Part]:
     ignored = {f"the extension {name}" for name in set(model.extensionsRequired) - READ_EXTENSIONS}
     try:
         parts = _parts(model, blob, path, files, ignored)
+    except ValidationError as error:
+        raise _damaged(path, f"an extension: {error.errors()[0]['msg']}") from error
     except (ValueError, IndexError, OverflowError) as error:
         raise _damaged(path, " ".join(str(error).split())) from error
     files.notes.extend(f"warning: {path.name}: ignored {what}" for what in sorted(ignored))
@@ -130,6 +132,9 @@ def _part(primitive: schema.Primitive, buffers: Buffers, materials: Materials, i
     attributes = primitive.attributes
     if "POSITION" not in attributes:
         raise ValueError("a primitive without POSITION")
+    compressed = COMPRESSED & set(primitive.extensions)
+    if compressed and not buffers.has_data(attributes["POSITION"]):
+        raise ValueError(f"its triangles are compressed ({', '.join(compressed)})")
     vertices = buffers.vectors(attributes["POSITION"], 3)
     if primitive.indices is None:
         faces = _triangles(np.arange(len(vertices)), primitive.mode)
@@ -145,6 +150,9 @@ def _part(primitive: schema.Primitive, buffers: Buffers, materials: Materials, i
     uvs = None
     if material.image is not None:
         uvs = mapping.apply(buffers.coordinates(attributes[f"TEXCOORD_{mapping.uv_set}"]))
+        if np.isfinite(uvs).all():
+            image, uvs = mapping.repeating(material.image, uvs)
+            material = material if image is material.image else Material(material.color, image)
         uvs[:, 1] = 1 - uvs[:, 1]
     for name, values in (("normals", normals), ("vertex colours", colors), ("texture coordinates", uvs)):
         if values is not None and len(values) != len(vertices):
@@ -179,4 +187,5 @@ def _triangles(indices: Ints, mode: int) -> Ints:
 
 
 def _damaged(path: Path, found: str) -> AssetError:
-    return AssetError("can't read this mesh", where=path, found=found, fix="Export it again.")
+    found = found if len(found) <= 200 else f"{found[:200]}..."
+    return AssetError("can't read this mesh", where=path, found=found, fix="Export it again, without compression.")

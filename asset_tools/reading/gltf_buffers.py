@@ -54,6 +54,8 @@ class Buffers:
     def view(self, index: int) -> tuple[bytes, schema.BufferView]:
         """Return the bytes of a buffer view, and its entry."""
         view = entry(self._model.bufferViews, index, "bufferViews")
+        if any("meshopt" in name for name in view.extensions):
+            raise ValueError("its data is compressed (meshopt)")
         if view.buffer not in self._buffers:
             buffer = entry(self._model.buffers, view.buffer, "buffers")
             self._buffers[view.buffer] = self._blob if buffer.uri is None else self.content(buffer.uri)[0]
@@ -82,6 +84,11 @@ class Buffers:
             values[where.reshape(-1).astype(np.int64)] = _rows(new_data, new_offset, None, dtype, width, sparse.count)
         return _normalised(values) if accessor.normalized else values
 
+    def has_data(self, index: int) -> bool:
+        """Return whether an accessor has values of its own, not only zeros for an extension to fill."""
+        accessor = entry(self._model.accessors, index, "accessors")
+        return accessor.bufferView is not None or accessor.sparse is not None
+
     def vectors(self, index: int, width: int) -> Array:
         """Return the (V, width) vectors of an accessor.
 
@@ -99,7 +106,7 @@ class Buffers:
         return (values if self._quantised else _normalised(values)).astype(float)[:, :2]
 
     def colors(self, index: int) -> Array:
-        """Return (V, 3) linear vertex colours; integers are always normalised."""
+        """Return (V, 3) linear vertex colours, which may be NaN; integers are always normalised."""
         values = self.values(index)
         if values.shape[1] not in (3, 4):
             raise ValueError(f"accessors.{index} has {values.shape[1]} components, expected 3 or 4")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,15 +33,23 @@ class Mapping:
     Attributes:
         uv_set: the number N of ``TEXCOORD_N``.
         transform: of the coordinates, v downward: ((a, b, shift), (c, d, shift)).
+        wrap: how the image continues across and down: repeated, mirrored, or by its edges.
     """
 
     uv_set: int
     transform: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1, 0, 0), (0, 1, 0))
+    wrap: tuple[int, int] = (schema.REPEAT, schema.REPEAT)
 
     def apply(self, uvs: Array) -> Array:
         """Return transformed coordinates (V, 2)."""
         matrix = np.array(self.transform)
         return uvs @ matrix[:, :2].T + matrix[:, 2]
+
+    def repeating(self, image: Image.Image, uvs: Array) -> tuple[Image.Image, Array]:
+        """Return an image and coordinates that show the same where images repeat."""
+        for axis, wrap in enumerate(self.wrap):
+            image, uvs[:, axis] = _repeating(image, uvs[:, axis], wrap, axis)
+        return image, uvs
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +66,6 @@ class Materials:
     Args:
         model: the JSON.
         buffers: reads the images.
-        path: the file.
         notes: gets a line per texture that was shrunk.
         ignored: gets what a viewer would show and is left out.
     """
@@ -125,13 +132,18 @@ class Materials:
         return Material(image=Image.fromarray(encode_srgb(np.asarray(total)))), shown.mapping
 
     def _image(self, info: schema.TextureInfo, uv_sets: frozenset[int]) -> MappedImage | None:
+        texture = entry(self._model.textures, info.index, "textures")
         mapping = _mapping(info)
+        if texture.sampler is not None:
+            sampler = entry(self._model.samplers, texture.sampler, "samplers")
+            mapping = replace(mapping, wrap=(sampler.wrapS, sampler.wrapT))
         if mapping.uv_set not in uv_sets:
             self._ignored.add(f"a texture without coordinates (TEXCOORD_{mapping.uv_set})")
             return None
-        texture = entry(self._model.textures, info.index, "textures")
         webp = texture.extensions.get("EXT_texture_webp")
         source = texture.source if webp is None else schema.Texture.model_validate(webp).source
+        if source is None and texture.extensions:
+            raise ValueError(f"the image of a texture is compressed ({', '.join(texture.extensions)})")
         if source is None:
             self._ignored.add("a texture without an image")
             return None
@@ -162,3 +174,23 @@ def _mapping(info: schema.TextureInfo) -> Mapping:
 def _triple(color: Array) -> tuple[float, float, float]:
     red, green, blue = (float(value) for value in np.clip(color, 0, 1))
     return red, green, blue
+
+
+def _repeating(image: Image.Image, values: Array, wrap: int, axis: int) -> tuple[Image.Image, Array]:
+    """Return an image that repeats along an axis (0: across), and coordinates on it, for one that is wrapped otherwise.
+
+    A mirrored image is joined to its mirror image. Edges continue for at most one width of the image.
+    """
+    if wrap not in (schema.MIRROR, schema.CLAMP) or len(values) == 0:
+        return image, values
+    pixels = np.asarray(image)
+    size, along = image.size[axis], 1 - axis  # rows are the first axis of pixels
+    if wrap == schema.MIRROR:
+        return Image.fromarray(np.concatenate([pixels, np.flip(pixels, along)], axis=along)), values / 2
+    margins = np.clip([-values.min(), values.max() - 1], 0, 1)
+    before, after = np.ceil(margins * size).astype(int) + 1  # a pixel, so that opposite edges never mix
+    widths = [(0, 0)] * 3
+    widths[along] = (int(before), int(after))
+    padded = np.pad(pixels, widths, mode="edge")
+    inside = np.clip(values, -margins[0], 1 + margins[1])
+    return Image.fromarray(padded), (inside * size + before) / padded.shape[along]

@@ -16,6 +16,7 @@ from asset_tools.reading.obj import MOST_VERTICES
 
 MOST_NODES = 100_000
 TRIANGLES = 4
+REPEAT, CLAMP, MIRROR = 10497, 33071, 33648
 
 
 class Schema(BaseModel):
@@ -66,6 +67,7 @@ class BufferView(Schema):
     byteOffset: NonNegativeInt = 0
     byteLength: NonNegativeInt
     byteStride: int | None = Field(default=None, ge=1, le=1024)
+    extensions: dict[str, Any] = {}
 
 
 class Buffer(Schema):
@@ -81,10 +83,18 @@ class Image(Schema):
     bufferView: NonNegativeInt | None = None
 
 
+class Sampler(Schema):
+    """How an image continues outside of 0 to 1."""
+
+    wrapS: int = REPEAT
+    wrapT: int = REPEAT
+
+
 class Texture(Schema):
-    """An image with a sampler; the sampler is not read."""
+    """An image with a sampler."""
 
     source: NonNegativeInt | None = None
+    sampler: NonNegativeInt | None = None
     extensions: dict[str, Any] = {}
 
 
@@ -195,6 +205,7 @@ class Gltf(Schema):
     materials: list[Material] = []
     textures: list[Texture] = []
     images: list[Image] = []
+    samplers: list[Sampler] = []
     accessors: list[Accessor] = []
     bufferViews: list[BufferView] = []
     buffers: list[Buffer] = []
