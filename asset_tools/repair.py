@@ -27,6 +27,9 @@ FOIL = 1e-5  # thickness over diagonal, below which a body is a sheet as well
 FACES = 5000  # of the solid at most; more only costs time
 SIMPLIFIED_VOLUME = 0.05  # share of the volume that simplifying may change: more removes thin parts
 TOLERANCES = (0.0005, 0.001, 0.0015, 0.002, 0.003)  # of the diagonal, tried in turn to get there
+LOST = 0.03  # of the diagonal: how far from the mesh's ends the solid may end
+MOST_PIECES = 1000
+CRUMB = 0.001  # of the largest body's volume: smaller ones of a new mesh are noise
 CELLS = 64  # of the grid that a mesh is re-meshed on, along its longest side
 WINDING_SAMPLES, WINDING_CHUNK = 4000, 2048
 NEIGHBOURS = 6  # samples that tell on which side of the surface a point near it lies
@@ -64,9 +67,11 @@ def close(scan: trimesh.Trimesh) -> ClosedScan:
     if not mesh.is_watertight:
         mesh, shown = _filled(mesh, shown, repairs)
     solid = _as_solid(mesh)
+    if solid is None:
+        solid = _union_of_pieces(mesh, repairs)
     if solid is None and _open_edges(mesh) <= HOPELESS * len(mesh.edges_unique):
         solid = _as_solid(_remeshed(mesh))
-        repairs.append("meshed anew around the scan")
+        repairs.append("remeshed around the scan")
     diagonal = float(np.linalg.norm(shown.extents))
     if solid is None or solid.volume() < max(LEAST_VOLUME * _hull_volume(mesh), FOIL * shown.area * diagonal):
         raise AssetError(
@@ -75,7 +80,16 @@ def close(scan: trimesh.Trimesh) -> ClosedScan:
             found=f"{_open_edges(mesh)} open edges of {len(mesh.edges_unique)}, in {mesh.body_count} pieces",
             fix="Repair the scan, or leave it out.",
         )
-    return ClosedScan(_light(solid, diagonal), shown, tuple(repairs))
+    closed = _light(solid, diagonal)
+    lost = float(np.abs(closed.bounds - shown.bounds).max())
+    if lost > LOST * diagonal:
+        raise AssetError(
+            "closing the mesh would lose a part of it",
+            expected=f"a solid that ends within {LOST:.0%} of where the mesh does",
+            found=f"{lost / diagonal:.0%} of its diagonal missing",
+            fix="Repair the mesh: join its parts to one closed surface.",
+        )
+    return ClosedScan(closed, shown, tuple(repairs))
 
 
 def _hull_volume(mesh: trimesh.Trimesh) -> float:
@@ -170,6 +184,25 @@ def _as_solid(mesh: trimesh.Trimesh) -> Manifold | None:
     return Manifold.batch_boolean(bodies, OpType.Add)  # where they overlap would count twice
 
 
+def _union_of_pieces(mesh: trimesh.Trimesh, repairs: list[str]) -> Manifold | None:
+    """Return the union of closed pieces that share edges and parts of faces; None where a piece is not closed.
+
+    Pieces are joined by edges of exactly two faces: at an edge that two boxes share there are four.
+    """
+    count = len(mesh.faces)
+    pieces = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(count), min_len=1)
+    if not 1 < len(pieces) <= MOST_PIECES:
+        return None
+    solids = []
+    for piece in pieces:
+        solid = _as_solid(trimesh.Trimesh(mesh.vertices, mesh.faces[np.sort(piece)], process=False))
+        if solid is None:
+            return None
+        solids.append(solid)
+    repairs.append(f"united {len(pieces)} closed pieces")
+    return Manifold.batch_boolean(solids, OpType.Add)
+
+
 def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Zero level of the distance to the surface, signed by the winding number, on a grid."""
     try:
@@ -206,7 +239,10 @@ def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(pitch,) * 3)
     closed = trimesh.Trimesh(vertices + low, faces, process=True)
     bodies = closed.split(only_watertight=True)
-    return max(bodies, key=lambda body: abs(body.volume)) if len(bodies) else closed
+    largest = max((abs(body.volume) for body in bodies), default=0.0)
+    kept = [body for body in bodies if abs(body.volume) >= CRUMB * largest]
+    joined: Any = trimesh.util.concatenate(kept) if kept else closed
+    return joined
 
 
 def winding_number(points: Array, samples: Array, normals: Array, area: float) -> Array:

@@ -153,3 +153,72 @@ def test_a_gltf_next_to_its_own_files_is_one_model(tmp_path):
     Gltf(mug()).write(tmp_path / "mug.glb")
     image_file(tmp_path / "preview.png")
     assert len(read_model(tmp_path).mesh.faces) == 12
+
+
+def test_a_collision_mesh_above_the_folder_of_the_visual_one(tmp_path):
+    write_obj(tmp_path / "visual", "mug", mug())
+    box().export(tmp_path / "collision.obj")
+    model = read_model(tmp_path)
+    assert any(path.name == "skin.png" for path in model.files) and "ignored collision.obj" in notes_of(model)
+
+
+def test_versions_in_several_folders(tmp_path):
+    write_obj(tmp_path / "meshes", "mug", mug())
+    mug().export(tmp_path / "mug.stl")
+    (tmp_path / "collision").mkdir()
+    mug().export(tmp_path / "collision" / "a.stl")
+    model = read_model(tmp_path)
+    assert "used meshes/mug.obj" in notes_of(model)
+    assert "ignored mug.stl" in notes_of(model) and "ignored collision/a.stl" in notes_of(model)
+
+
+@pytest.mark.parametrize(
+    ("names", "sizes", "middles"),
+    [
+        (("body/mesh", "lid/mesh"), ((0.06, 0.06, 0.1), (0.06, 0.06, 0.01)), ((0, 0, 0), (0, 0, 0.055))),
+        (("drawer_low", "drawer_high"), ((0.06, 0.06, 0.05), (0.06, 0.06, 0.05)), ((0, 0, 0), (0, 0, 0.05))),
+        (("cube", "knob"), ((0.1, 0.1, 0.1), (0.01, 0.01, 0.01)), ((0, 0, 0), (0, 0, 0.055))),
+        (("base", "pole"), ((0.1, 0.1, 0.02), (0.02, 0.02, 0.4)), ((0, 0, 0.01), (0, 0, 0.2))),
+        (("boat_hull", "boat_cabin"), ((0.2, 0.06, 0.05), (0.05, 0.04, 0.04)), ((0, 0, 0), (0.02, 0, 0.045))),
+    ],
+    ids=lambda value: value[0] if isinstance(value[0], str) else "",
+)
+def test_parts_that_look_like_versions(tmp_path, names, sizes, middles):
+    parts = [box(size, at) for size, at in zip(sizes, middles, strict=True)]
+    for name, part in zip(names, parts, strict=True):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        part.export(tmp_path / f"{name}.ply")
+    model = read_model(tmp_path)
+    assert len(model.mesh.faces) == 24
+    np.testing.assert_allclose(model.mesh.area, sum(part.area for part in parts), rtol=1e-5)
+
+
+def test_a_textured_label_around_a_can(tmp_path):
+    trimesh.creation.cylinder(0.03, 0.1, sections=48).export(tmp_path / "can.ply")
+    wall = trimesh.creation.cylinder(0.03, 0.1, sections=48)
+    wall.update_faces(np.abs(wall.face_normals[:, 2]) < 0.5)
+    write_obj(tmp_path, "label", wall)
+    model = read_model(tmp_path)
+    assert len(model.mesh.faces) > len(wall.faces) and any(path.name == "skin.png" for path in model.files)
+
+
+@pytest.mark.parametrize("name", ["UCX_mug", "mug_decomp_3", "mug_cvx"])
+def test_more_names_of_collision_meshes(tmp_path, name):
+    write_obj(tmp_path, "mug", mug())
+    mug().export(tmp_path / f"{name}.stl")
+    assert f"ignored {name}.stl: a collision mesh" in notes_of(read_model(tmp_path))
+
+
+def test_only_a_folder_of_collision_meshes(tmp_path):
+    (tmp_path / "collision").mkdir()
+    mug().export(tmp_path / "collision" / "a.stl")
+    assert len(read_model(tmp_path).mesh.faces) == 12
+
+
+def test_versions_with_other_units_and_axes(tmp_path):
+    write_obj(tmp_path, "mug", box((0.05, 0.06, 0.1), (0, 0, 0.05)))
+    turned = box((0.05, 0.06, 0.1), (0, 0, 0.05))
+    turned.vertices = 100 * turned.vertices[:, [0, 2, 1]] * [1, 1, -1]
+    turned.export(tmp_path / "mug.glb")
+    model = read_model(tmp_path)
+    assert "used mug.obj" in notes_of(model) and "ignored mug.glb: another version" in notes_of(model)

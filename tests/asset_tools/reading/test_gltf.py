@@ -1,5 +1,8 @@
 """glTF is decoded by the format's rules: what a viewer shows, or a warning per feature that is left out."""
 
+import base64
+import json
+
 import numpy as np
 import pytest
 from models import BLUE, GREEN, RED, Gltf, box, shown_colors
@@ -236,3 +239,45 @@ def test_a_file_cut_short(tmp_path, size):
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(AssetError):
         read_model(path)
+
+
+@pytest.mark.parametrize(
+    ("u", "wrap", "color"),
+    [
+        (1.125, 10497, RED),
+        (1.125, 33071, (250, 250, 10)),
+        (-0.125, 33071, RED),
+        (1.125, 33648, (250, 250, 10)),
+        (1.375, 33648, BLUE),
+        (1.0, 33071, (250, 250, 10)),
+        (0.0, 33071, RED),
+    ],
+)
+def test_samplers(tmp_path, u, wrap, color):
+    gltf, _ = with_uvs(u)
+    gltf.tree["samplers"] = [{"wrapS": wrap}]
+    gltf.tree["textures"][0]["sampler"] = 0
+    check(gltf, tmp_path, color)
+
+
+def test_compression_that_is_not_required_is_an_error_all_the_same(tmp_path):
+    gltf, _ = with_uvs(0.125)
+    gltf.tree["textures"][0] = {"extensions": {"KHR_texture_basisu": {"source": 0}}}
+    with pytest.raises(AssetError):
+        read_model(gltf.write(tmp_path / "a.glb"))
+    gltf = Gltf()
+    gltf.primitive["extensions"] = {"KHR_draco_mesh_compression": {}}
+    assert len(read_model(gltf.write(tmp_path / "b.glb")).mesh.faces) == 12  # with a fallback
+    del gltf.tree["accessors"][gltf.primitive["attributes"]["POSITION"]]["bufferView"]
+    with pytest.raises(AssetError):
+        read_model(gltf.write(tmp_path / "b.glb"))
+
+
+def test_data_in_uris(tmp_path):
+    gltf, _ = with_uvs(0.125)
+    path = gltf.write(tmp_path / "a.glb")
+    data = base64.b64encode(gltf.blob).decode().replace("+", "%2B").replace("/", "%2F")
+    gltf.tree["buffers"] = [{"byteLength": len(gltf.blob), "uri": f"data:application/octet-stream;base64,{data}"}]
+    path = tmp_path / "b.gltf"
+    path.write_text(json.dumps(gltf.tree))
+    assert (shown_colors(read_model(path).mesh) == RED).all()

@@ -183,3 +183,78 @@ def test_json_of_gltf_may_hold_unknown_keys(tmp_path):
     gltf.tree |= {"extras": {"deep": [{}]}, "unknown": 5, "asset": {"version": "2.0", "extras": 3}}
     model = read_model(gltf.write(tmp_path / "mug.glb"))
     assert json.dumps(model.notes) == "[]" and len(model.mesh.faces) == 12
+
+
+PLY = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+property float s
+property float t
+{colors}element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0 0 0{color}
+1 0 0 1 0{color}
+0 1 0 0 1{color}
+3 0 1 2
+"""
+
+
+@pytest.mark.parametrize(
+    ("names", "color", "shown"),
+    [
+        ("", "", (255, 255, 255)),
+        ("red green blue", " 200 30 30", RED),
+        ("diffuse_red diffuse_green diffuse_blue", " 200 30 30", RED),
+    ],
+)
+def test_ply_with_coordinates_and_no_image(tmp_path, names, color, shown):
+    colors = "".join(f"property uchar {name}\n" for name in names.split())
+    (tmp_path / "mug.ply").write_text(PLY.format(colors=colors, color=color))
+    model = read_model(tmp_path / "mug.ply")
+    assert shown_colors(model.mesh).tolist() == [list(shown)] and model.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.ply", PLY.format(colors="", color="").replace("face 1", "face 9")),
+        ("a.ply", PLY.format(colors="", color="").replace("3 0 1 2\n", "")),
+        ("a.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"),
+    ],
+)
+def test_a_text_file_cut_short(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(AssetError):
+        read_model(tmp_path / name)
+
+
+def test_the_texture_of_another_object_is_not_taken(tmp_path):
+    image_file(tmp_path / "banana" / "skin.png", GREEN)
+    path = write_obj(tmp_path, color=None)
+    with pytest.raises(AssetError):
+        read_model(path, tmp_path)
+    image_file(tmp_path / "mug_textures" / "skin.png", RED)
+    assert shown_colors(read_model(path, tmp_path).mesh)[0].tolist() == list(RED)
+
+
+def test_several_textures_of_the_name_that_is_searched_are_a_warning(tmp_path):
+    for name in ("a", "b"):
+        image_file(tmp_path / name / "skin.png")
+    write_obj(tmp_path, color=None)
+    assert any(note.startswith("warning:") for note in read_model(tmp_path).notes)
+
+
+def test_values_that_are_not_finite(tmp_path):
+    """Coordinates and colours are left out with a warning; vertices that no face uses do not count."""
+    path = write_obj(tmp_path)
+    path.write_text(path.read_text().replace("vt 0.5 0.5", "vt nan 1e300").replace("usemtl", "v nan 0 0\nusemtl"))
+    model = read_model(path)
+    assert (shown_colors(model.mesh) == 255).all() and any(note.startswith("warning:") for note in model.notes)
+    gltf = Gltf()
+    gltf.attribute("COLOR_0", np.full((gltf.count, 3), np.nan, "<f4"))
+    model = read_model(gltf.write(tmp_path / "cup.glb"))
+    assert (shown_colors(model.mesh) == 255).all() and any(note.startswith("warning:") for note in model.notes)
