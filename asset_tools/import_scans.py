@@ -15,7 +15,7 @@ import trimesh
 
 from asset_tools.build import build_object
 from asset_tools.inspection import Inspect, ModelSource, inspect_models
-from asset_tools.pipeline import Job, content_hash
+from asset_tools.pipeline import Job, content_hash, failing_job
 from asset_tools.prepare import prepare
 from asset_tools.reading.choice import is_collision, is_mesh
 from asset_tools.reading.files import files_below
@@ -121,6 +121,10 @@ def find_scans(source: Path) -> FoundScans:
     Raises:
         AssetError: there is no such folder, or no scan in it.
     """
+    if source.exists() and not source.is_dir():
+        raise AssetError(
+            "not a folder", where=source, expected="a folder of scans", fix="Give the folder that holds it."
+        )
     if not source.is_dir():
         raise AssetError("no such folder of scans", where=source)
     found = FoundScans()
@@ -152,11 +156,6 @@ def find_scans(source: Path) -> FoundScans:
     return found
 
 
-def failing_job(id_: str, error: AssetError) -> Job:
-    """Return a job that raises an error when it is its turn, so that it can be left out as any other."""
-    return Job(id_, partial(_fail, error), content_hash(str(error)))
-
-
 def object_id(name: str) -> str:
     """Return a name as an id: small letters, digits and underscores; one without any, or too long, gets a number."""
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
@@ -184,10 +183,6 @@ def _in_some_unit(side: float) -> bool:
     except AssetError:
         return False
     return True
-
-
-def _fail(error: AssetError, folder: Path) -> ObjectAsset:
-    raise error
 
 
 def _make(id_: str, model: ModelSource, unit: Unit, settings: ImportSettings, folder: Path) -> ObjectAsset:

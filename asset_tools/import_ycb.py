@@ -15,9 +15,9 @@ from typing import Any
 
 from asset_tools.build import build_object
 from asset_tools.graspnet.catalogue import ENTRIES, NUMBERS
-from asset_tools.import_scans import estimate_mass, failing_job, object_id
+from asset_tools.import_scans import estimate_mass, object_id
 from asset_tools.inspection import Inspect, Inspection, ModelSource, inspect_models
-from asset_tools.pipeline import Job, content_hash
+from asset_tools.pipeline import Job, content_hash, failing_job
 from asset_tools.prepare import prepare
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset

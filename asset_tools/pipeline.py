@@ -40,6 +40,7 @@ TOOLS = ("coacd", "trimesh", "manifold3d", "numpy", "scipy", "sapien", "xatlas",
     "scikit-image",
     "shapely",
 )
+SKIP = "Pass --skip-bad to leave it out."
 PACK_NAME = r"[a-z0-9_\-]+"
 NOT_INVOLVED = ("inspection", "pipeline", "sheet", "studio")  # files that do not change what an asset is made into
 
@@ -56,11 +57,13 @@ class Job:
         id: of the asset.
         make: makes its files in a folder and says what the manifest says of it; must survive pickling.
         content: hash of everything the asset depends on besides this code, see `content_hash`.
+        error: why it can't be made, where that is known beforehand.
     """
 
     id: str
     make: Callable[[Path], ObjectAsset | FurnitureAsset]
     content: str
+    error: AssetError | None = None
 
     def __post_init__(self) -> None:
         check_asset_name(self.id, "an asset's id")
@@ -83,6 +86,26 @@ class JobResult:
     error: str = ""
     reused: bool = False
     seconds: float = 0.0
+
+
+def failing_job(id_: str, error: AssetError) -> Job:
+    """Return a job that raises an error when it is its turn, so that it can be left out as any other."""
+    return Job(id_, partial(_fail, error), content_hash(str(error)), error)
+
+
+def _fail(error: AssetError, folder: Path) -> ObjectAsset:
+    raise error
+
+
+def check_jobs(jobs: Iterable[Job]) -> None:
+    """Raise the error of the first job that is known to fail.
+
+    Raises:
+        AssetError: it, with its id.
+    """
+    for job in jobs:
+        if job.error is not None:
+            raise AssetError(_failed(job, str(job.error)).error.rstrip("."), fix=SKIP)
 
 
 def make_assets(jobs: Sequence[Job], out: Path, kept: Path, *, processes: int = 1) -> Iterator[JobResult]:
@@ -226,7 +249,7 @@ def write_pack(
     with replacing_folder(folder) as tmp:
         for made in make_assets(jobs, tmp, kept, processes=processes):
             if made.asset is None and not skip_bad:
-                raise AssetError(made.error.rstrip("."), fix="Mend it, or pass --skip-bad to leave it out.")
+                raise AssetError(made.error.rstrip("."), fix=SKIP)
             results.append(made)
             on_made(made)
         results = _without_miscooked(results, tmp, skip_bad)
@@ -247,7 +270,7 @@ def _without_miscooked(results: list[JobResult], folder: Path, skip_bad: bool) -
     for fault in cooking_faults(folder):
         faults.setdefault(fault.asset.partition("/")[0], str(fault))
     if faults and not skip_bad:
-        raise AssetError("; ".join(faults.values()), fix="Mend it, or pass --skip-bad to leave it out.")
+        raise AssetError("; ".join(faults.values()), fix=SKIP)
     for name in faults:
         shutil.rmtree(folder / name)
     return [JobResult(made.id, None, faults[made.id]) if made.id in faults else made for made in results]

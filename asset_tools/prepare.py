@@ -58,9 +58,10 @@ def prepare(
     solid = close(model.mesh)
     repairs += solid.repairs
     repairs += _about_colours(solid.scan)
-    up = up or model.up or guess_up(solid.mesh)
+    known = up or model.up
+    up = known or guess_up(solid.mesh)
     if up != "z":
-        repairs.append(f"turned {up} up")
+        repairs.append(f"turned {up} up" if known else f"turned {up} up, a guess")
     longest = float(solid.mesh.extents.max())
     unit = unit or guess_unit([longest])
     if not PLAUSIBLE[0] <= longest * METRES[unit] <= PLAUSIBLE[1]:
@@ -69,7 +70,7 @@ def prepare(
             where=path if isinstance(path, Path) else path[0],
             expected=f"{PLAUSIBLE[0]} to {PLAUSIBLE[1]} m for the longest side",
             found=f"{longest * METRES[unit]:g} m, taking its {longest:g} for {NAMES.get(unit, 'metres')}",
-            fix="Pass --units.",
+            fix="Pass --units with the unit of the file.",
         )
     if unit != "m":
         repairs.append(f"scaled from {NAMES[unit]}")

@@ -28,6 +28,7 @@ ENOUGH = 6  # times as many faces as are wanted are accepted of a mesh with many
 LEFT = 0.8  # share of area and volume that simplifying has to leave: with less, parts are lost or holes torn
 GRIDS = (512, 362, 256, 181, 128, 91, 64, 45, 32, 16, 8)  # cells along the diagonal, to merge vertices in, fine first
 SAMPLES = 150_000  # on the original surface, to find the face that a texel shows
+NEAR = 20  # samples whose faces are compared where looks are layered
 NORMAL_WEIGHT = 0.02  # of the diagonal; keeps the two sides of a thin shell apart, hardly moves anything else
 
 
@@ -62,13 +63,14 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
         uv = None if source.plain else source.uv[origin]
         texture = None if source.single is None else _shrunk(source.single, texture_size)
     else:
-        body = simplified(mesh, triangles)
+        kept = source.layered and len(mesh.faces) <= triangles
+        body = _outward(mesh) if kept else simplified(mesh, triangles)
         corner_normals = _crease_normals(body)
         faces, uv, texture = np.asarray(body.faces), None, None
         origin = np.arange(len(body.vertices))
         if not source.plain:
             origin, faces, uv = _unwrapped(body, texture_size)
-            texture = _baked(mesh, source, body, uv[faces], corner_normals, texture_size)
+            texture = _baked(mesh, source, body, uv[faces], corner_normals, texture_size, same_faces=kept)
         # a vertex for every different pair of UV vertex and normal
         keys = np.column_stack([faces.reshape(-1), np.rint(corner_normals.reshape(-1, 3) * 1e4)])
         _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -128,6 +130,11 @@ class _Source:
             self.factor = 255 * decode_srgb(self.colors[0, 0])
 
     @property
+    def layered(self) -> bool:
+        """Whether surfaces of different looks may be close together."""
+        return len(self.images) > 1 or self.tints is not None
+
+    @property
     def single(self) -> Image.Image | None:
         """The image, where it is all there is to see."""
         return self.images[0] if len(self.images) == 1 and self.tints is None else None
@@ -174,8 +181,7 @@ def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     Raises:
         AssetError: no face is left.
     """
-    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    body.merge_vertices(digits_vertex=None)
+    body = _welded(mesh)
     center, size = body.bounds.mean(axis=0), float(np.linalg.norm(body.extents))
     whole = (np.asarray(body.vertices) - center) / size, np.asarray(body.faces)
     most, area = ENOUGH * triangles, float(body.area)
@@ -203,6 +209,21 @@ def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
         trimesh.repair.fix_winding(body)
     if body.volume < 0:
         body.invert()
+    return body
+
+
+def _welded(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the faces of a mesh, in the same order, over vertices merged by position."""
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    body.merge_vertices(digits_vertex=None)
+    return body
+
+
+def _outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a welded mesh with its faces outwards, in the same order."""
+    body = _welded(mesh)
+    if body.volume < 0:
+        body.faces = np.array(body.faces)[:, ::-1]
     return body
 
 
@@ -286,13 +307,34 @@ def _unwrapped(body: trimesh.Trimesh, size: int) -> tuple[NDArray[np.int64], NDA
 
 
 def _baked(
-    mesh: trimesh.Trimesh, source: _Source, body: trimesh.Trimesh, corner_uv: Array, corner_normals: Array, size: int
+    mesh: trimesh.Trimesh,
+    source: _Source,
+    body: trimesh.Trimesh,
+    corner_uv: Array,
+    corner_normals: Array,
+    size: int,
+    *,
+    same_faces: bool = False,
 ) -> Image.Image:
-    """The new texture: every texel shows the point of the original surface next to it."""
+    """Return the new texture: every texel shows the point of the original surface next to it.
+
+    Args:
+        mesh: the original.
+        source: what it looks like.
+        body: what the texture is for.
+        corner_uv: (F, 3, 2) of it.
+        corner_normals: (F, 3, 3) of it.
+        size: of the texture, pixels.
+        same_faces: the faces of ``body`` are those of ``mesh``, in the same order.
+    """
     rows, columns, face, weights = _rasterised(corner_uv, size)
-    points = np.einsum("nc,ncd->nd", weights, np.asarray(body.triangles)[face])
-    normals = np.einsum("nc,ncd->nd", weights, corner_normals[face])
-    origin_face, origin_weights = _closest(mesh, points, normals)
+    if same_faces:
+        turned = (np.asarray(body.faces)[:, 0] != np.asarray(_welded(mesh).faces)[:, 0]).any()
+        origin_face, origin_weights = face, weights[:, ::-1] if turned else weights
+    else:
+        points = np.einsum("nc,ncd->nd", weights, np.asarray(body.triangles)[face])
+        normals = np.einsum("nc,ncd->nd", weights, corner_normals[face])
+        origin_face, origin_weights = _closest(mesh, points, normals, layered=source.layered)
     colors = source.at(np.asarray(mesh.faces), origin_face, origin_weights)
     picture = np.zeros((size, size, 3), dtype=np.uint8)
     empty = np.ones((size, size), dtype=bool)
@@ -325,8 +367,15 @@ def _rasterised(corner_uv: Array, size: int) -> tuple[NDArray, NDArray, NDArray,
     return row[keep], column[keep], face[keep], _clamped(weights[keep])
 
 
-def _closest(mesh: trimesh.Trimesh, points: Array, normals: Array) -> tuple[NDArray, Array]:
-    """Face of the original next to each point, among those that look the same way, and (N, 3) weights there."""
+def _closest(mesh: trimesh.Trimesh, points: Array, normals: Array, *, layered: bool) -> tuple[NDArray, Array]:
+    """Return the face of the original next to each point, and (N, 3) weights of its corners.
+
+    Args:
+        mesh: the original.
+        points: (N, 3).
+        normals: (N, 3); faces that look another way are far.
+        layered: surfaces of different looks may be close together, such as a label on a bottle.
+    """
     triangles = np.asarray(mesh.triangles)
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     areas = np.linalg.norm(cross, axis=1)
@@ -339,8 +388,17 @@ def _closest(mesh: trimesh.Trimesh, points: Array, normals: Array) -> tuple[NDAr
     places = np.einsum("nc,ncd->nd", spots, triangles[face])
     tree = KDTree(np.hstack([places, reach * facing[face]]), balanced_tree=False)
     lengths = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    found = face[tree.query(np.hstack([points, reach * normals / lengths]))[1]]
-    return found, _clamped(_barycentric(triangles, found, points))
+    near = tree.query(np.hstack([points, reach * normals / lengths]), k=NEAR if layered else 1)[1]
+    if not layered:
+        return face[near], _clamped(_barycentric(triangles, face[near], points))
+    best, weights = np.zeros(len(points), int), np.zeros((len(points), 3))
+    shortest = np.full(len(points), np.inf)
+    for candidates in face[near].T:  # samples tell layers apart only where they are dense
+        spread = _clamped(_barycentric(triangles, candidates, points))
+        distance = np.linalg.norm(np.einsum("nc,ncd->nd", spread, triangles[candidates]) - points, axis=1)
+        nearer = distance < shortest
+        best[nearer], weights[nearer], shortest[nearer] = candidates[nearer], spread[nearer], distance[nearer]
+    return best, weights
 
 
 def _barycentric(triangles: Array, face: NDArray, points: Array) -> Array:

@@ -14,9 +14,9 @@ from asset_tools.build import FEW_GRASPS, GRASPS, build_object
 from asset_tools.graspnet.catalogue import COUNT, ENTRIES, catalogue_entry
 from asset_tools.graspnet.labels import label_checksums, label_grasps
 from asset_tools.grasps import Grasps, sample_grasps
-from asset_tools.import_scans import estimate_mass, failing_job
+from asset_tools.import_scans import estimate_mass
 from asset_tools.inspection import Inspect, Inspection, ModelSource, inspect_models
-from asset_tools.pipeline import Job, content_hash
+from asset_tools.pipeline import Job, content_hash, failing_job
 from asset_tools.prepare import prepare
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
@@ -48,8 +48,8 @@ def graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = inspec
             "models of GraspNet-1Billion are missing",
             where=root,
             expected=f"models/NNN for {len(numbers)} objects",
-            found=f"none for {_listed(missing)}",
-            fix="Give the folder that holds models/, or choose with --ids.",
+            found=f"no folder for the numbers {_listed(missing)}",
+            fix="Give the folder that holds models/, not models/ itself; choose objects with --ids.",
         )
     models = {str(number): ModelSource((_mesh(root, number),), root) for number in numbers}
     inspected = inspect(models)

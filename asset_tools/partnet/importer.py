@@ -19,7 +19,7 @@ from asset_tools.partnet.geometry import Geometry
 from asset_tools.partnet.looks import merged
 from asset_tools.partnet.obj import Faces
 from asset_tools.partnet.urdf import URDF, Mobility, MovingLink, Visual, read_urdf, urdf_of
-from asset_tools.pipeline import Job, content_hash
+from asset_tools.pipeline import Job, content_hash, failing_job
 from asset_tools.reading.files import LARGEST_FILE, files_below
 from asset_tools.reading.limits import reading_limits
 from asset_tools.sources import FurnitureSource, LinkSource
@@ -166,7 +166,7 @@ def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> li
             good[name] = _job(name, folder, annotations)
         except AssetError as error:
             label = name if name not in good and name not in bad else object_id(str(folder))
-            bad[label] = Job(label, partial(_fail, error), content_hash(str(error)))
+            bad[label] = failing_job(label, error)
     return [*bad.values(), *good.values()]
 
 
@@ -188,10 +188,6 @@ def _files(folder: Path) -> list[Path]:
         if inside and path.stat().st_size <= LARGEST_FILE:  # larger ones are not read
             found.append(path)
     return found
-
-
-def _fail(error: AssetError, out: Path) -> FurnitureAsset:
-    raise error
 
 
 def _make(folder: Path, annotation: Annotation, out: Path) -> FurnitureAsset:

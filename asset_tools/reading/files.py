@@ -145,6 +145,12 @@ class ModelFiles:
             self.notes.append(text)
 
 
+def missing_path(name: str, folder: Path) -> Path:
+    """Return the path to name in an error for a file that `ModelFiles.find` did not find."""
+    plain = name.replace("\\", "/")
+    return Path(plain) if ":" in plain else folder / plain
+
+
 def files_below(folder: Path) -> Iterator[Path]:
     """Yield all files below a folder, hidden ones and links to folders left out; the order is that of names."""
     count = 0

@@ -266,6 +266,8 @@ def _numbers(rows: list[str], columns: int, fill: float | None = None) -> Array:
         words = [row.split() for row in rows[start : start + 100_000]]
         if fill is not None:
             words = [line + [str(fill)] * (columns - len(line)) for line in words]
+        if any(len(line) < columns for line in words):
+            raise ValueError(f"a vertex, normal or coordinate with fewer than {columns} numbers")
         found[start : start + len(words)] = np.array([line[:columns] for line in words], dtype=float)
     return found
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from asset_tools.reading.files import ModelFiles
+from asset_tools.reading.files import ModelFiles, missing_path
 from asset_tools.reading.images import open_texture
 from asset_tools.reading.obj import MtlMaterial, ObjMesh, decode_text, find_material, parse_mtl, parse_obj
 from asset_tools.reading.surface import WHITE, Material, Part, decode_srgb
@@ -174,7 +174,7 @@ def _look(
         if name not in images:
             file = files.find(name, place.parent)
             if file is None:
-                where = place.parent / name.replace("\\", "/")
+                where = missing_path(name, place.parent)
                 what, fix = "the texture file that the material names is missing", "Put it next to the mesh."
                 raise AssetError(what, where=where, fix=fix)
             images[name] = open_texture(files.read(file), file, files.notes)

@@ -15,6 +15,7 @@ from robocas_ms3.cli.assets_show import mesh_tools
 from robocas_ms3.cli.options import Maybe, Several
 from robocas_ms3.words import count_of
 
+CONTACT_SHEET = "contact_sheet.png"
 SHEET = 60  # assets on the contact sheet of an import
 # `asset_tools.pipeline.Job`, which only loads when a command runs
 Job = Any
@@ -25,18 +26,20 @@ class _Making:
     jobs: Maybe[int] = None
     """Processes. Default: one for each CPU core."""
     skip_bad: bool = False
-    """Leave out what can't be made, instead of giving up."""
+    """Leave out models with errors, instead of stopping at the first one."""
     overwrite: bool = False
-    """Replace the pack if it exists and was made from something else."""
+    """Replace a pack of this name that was made from other files or settings; unchanged assets are reused."""
 
 
 @dataclass(kw_only=True)
 class ImportScans(_Making):
     """Make a pack from a folder of raw scans: one object for each mesh file or subfolder.
 
-    Each scan is mended, closed, decomposed into convex hulls, decimated for rendering, and annotated with resting
-    poses and grasps; then it is dropped, grasped and shaken in simulation, and the outcome stored. Finished objects
-    are kept, so an interrupted import goes on where it stopped.
+    Each scan is repaired, closed, decomposed into convex hulls, decimated for rendering, and annotated with resting
+    poses and grasps. Then it is dropped, grasped and shaken in simulation, and the outcome is stored. Finished objects
+    are cached, so an interrupted import continues where it stopped.
+
+    Example: robocas assets import-scans scans/ --pack mine --units cm
     """
 
     source: Annotated[Path, tyro.conf.Positional]
@@ -143,9 +146,13 @@ def import_ycb(command: ImportYCB) -> int:
 
 def import_partnet(command: ImportPartNet) -> int:
     """Run ``import-partnet``."""
+    from robocas_ms3.errors import AssetError
+
     with mesh_tools():
         from asset_tools.partnet.importer import partnet_jobs
         from asset_tools.partnet.template import template
+    if not command.models:
+        raise AssetError("no model given", expected="folders with a mobility.urdf", fix="Give at least one.")
     if command.template:
         from robocas_ms3.cli.terminal import say_lines
 
@@ -211,22 +218,27 @@ def _target(name: str) -> Path:
 
 
 def _make(jobs: list[Job], command: _Making, out: Path, what: str) -> int:
-    from asset_tools.pipeline import made_of
+    from asset_tools.pipeline import check_jobs, made_of
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.errors import AssetError, OutputExistsError
 
+    if not command.skip_bad:
+        check_jobs(jobs)
     if made_of(jobs, out, skip_bad=command.skip_bad):
         try:
             load_pack(out)
         except AssetError as error:
             say(f"making it again: {error}")
         else:
-            say(f"{out} is made of just this already")
+            say(f"{out} is up to date")
+            if not (out / CONTACT_SHEET).exists():
+                _draw_sheet(out)
             return 0
     elif out.exists() and not command.overwrite:
-        fix = "Pass --overwrite to replace it, or choose another name with --pack."
-        raise OutputExistsError("there is such a pack already, made from something else", where=out, fix=fix)
+        what = "a pack of this name exists; its files, settings or versions were others"
+        fix = "Pass --overwrite to update it, or choose another name with --pack."
+        raise OutputExistsError(what, where=out, fix=fix)
     return _write(jobs, command, out, count_of(len(jobs), what))
 
 
@@ -237,7 +249,7 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.paths import cache_dir
 
-    with bar(f"assets of {out.name} made") as shown:
+    with bar(f"assets of {out.name} processed") as shown:
         shown.start(len(jobs))
 
         def on_made(made: JobResult) -> None:
@@ -249,7 +261,7 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
                 if repair.startswith("warning:"):
                     shown.note(f"{made.id}: {repair}")
 
-        write_pack(
+        results = write_pack(
             jobs,
             out,
             cache_dir() / "assets",
@@ -260,7 +272,9 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
             on_made=on_made,
         )
     info(Info(pack=str(out)))
-    say(f"wrote {out}")
+    bad = [made.id for made in results if made.asset is None]
+    left_out = f"; {len(bad)} left out: {', '.join(bad)}" if bad else ""
+    say(f"wrote {out}: {count_of(len(results) - len(bad), 'asset')}{left_out}")
     if record:
         _draw_sheet(out)
     return 0
@@ -278,12 +292,12 @@ def _draw_sheet(folder: Path) -> None:
     ids = [asset.id for asset in pack.manifest.assets]
     try:
         with working(f"drawing {count_of(len(ids[:SHEET]), 'asset')}"):
-            contact_sheet(pack, folder / "contact_sheet.png", ids[:SHEET])
+            contact_sheet(pack, folder / CONTACT_SHEET, ids[:SHEET])
     except AssetError as error:
         say(f"no contact sheet: {error}")
         return
     rest = f"; `robocas assets sheet {folder.name}` draws all {len(ids)}" if len(ids) > SHEET else ""
-    say(f"contact sheet: {folder / 'contact_sheet.png'}{rest}")
+    say(f"contact sheet: {folder / CONTACT_SHEET}{rest}")
 
 
 def _masses(path: Path | None) -> dict[str, float]:

@@ -135,7 +135,7 @@ def test_a_good_scan_has_nothing_to_mend(tmp_path):
 def test_other_units_and_y_up(tmp_path, scale, unit, words):
     scan = prepare(write_obj(tmp_path, scale=scale, y_up=True))
     assert (scan.up, scan.unit) == ("y", unit)
-    assert scan.repairs == ("turned y up", f"scaled from {words}")
+    assert scan.repairs == ("turned y up, a guess", f"scaled from {words}")
     turned = scan.mesh.copy(include_cache=True), scan.closed.copy()
     # y up by [1, 2, 0] and back by a quarter turn about x leaves a quarter turn about z
     for mesh in turned:

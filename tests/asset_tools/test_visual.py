@@ -19,6 +19,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.glb import write_glb
+from asset_tools.reading.surface import Material, Part, to_mesh
 from asset_tools.visual import simplified, to_display
 from robocas_ms3.errors import AssetError
 
@@ -280,3 +281,29 @@ def test_scan_keeps_its_shape_and_mean_colour():
         mesh.visual.material = PBRMaterial(baseColorTexture=getattr(image, "image", None) or image.baseColorTexture)
         means.append(np.average(seen_colors(mesh)[1], axis=0, weights=areas))
     np.testing.assert_allclose(means[0], means[1], atol=4)
+
+
+@pytest.mark.parametrize("triangles", [2000, 400])
+def test_a_label_close_to_a_bottle_keeps_its_colour(triangles):
+    """Two layers half a millimetre apart, each with its image; also where faces are simplified."""
+    parts = []
+    for radius, height, color in ((0.03, 0.1, (200, 0, 0)), (0.0305, 0.05, (255, 255, 255))):
+        wall = trimesh.creation.cylinder(radius, height, sections=96)
+        uvs = np.full((len(wall.vertices), 2), 0.5)
+        image = Image.new("RGB", (4, 4), color)
+        parts.append(Part(np.array(wall.vertices), np.array(wall.faces), uvs, material=Material(image=image)))
+    light = to_display(to_mesh(parts), triangles=triangles, texture_size=256)
+    points, faces = trimesh.sample.sample_surface(light, 3000, seed=0)[:2]
+    radius = np.linalg.norm(points[:, :2], axis=1)
+    side = np.abs(light.face_normals[faces, 2]) < 0.3
+    label = side & (radius > 0.0303) & (np.abs(points[:, 2]) < 0.022)
+    bottle = side & (np.abs(points[:, 2]) > 0.028)
+    weights = trimesh.triangles.points_to_barycentric(light.triangles[faces], points)
+    uv = np.einsum("nc,ncd->nd", weights, light.visual.uv[light.faces[faces]])
+    pixels = np.asarray(light.visual.material.baseColorTexture)
+    size = len(pixels)
+    seen = pixels[
+        ((1 - uv[:, 1]) * size).astype(int).clip(0, size - 1), (uv[:, 0] * size).astype(int).clip(0, size - 1)
+    ]
+    assert label.sum() > 200 and bottle.sum() > 200
+    assert (seen[label, 1] > 200).mean() > 0.99 and (seen[bottle, 1] < 60).mean() > 0.99

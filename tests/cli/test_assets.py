@@ -37,7 +37,7 @@ def test_import_verify_mend_and_replace(scans, tmp_path, capsys):
     assert code == 0 and "red_box" in shown
     pack = tmp_path / "data" / "packs" / "mine"
     assert (pack / "contact_sheet.png").is_file() or "no contact sheet" in shown
-    assert run(capsys, *importing)[1].strip().endswith("is made of just this already")
+    assert run(capsys, *importing)[1].strip().endswith("is up to date")
     code, shown = run(capsys, "verify", "mine", "--physics", "--jobs", 1, "--json", tmp_path / "quality.json")
     measured = json.loads((tmp_path / "quality.json").read_text())
     assert code == 0, shown
@@ -80,6 +80,12 @@ def test_bad_flags_are_refused_before_any_work(scans, tmp_path, capsys, words, m
     code, shown = run(capsys, "import-scans", scans, *words)
     assert code == 1 and message in shown
     assert not (tmp_path / "data").exists() and not (tmp_path / "cache").exists()
+
+
+@pytest.mark.parametrize("words", [(), ("--template",)])
+def test_partnet_without_a_model(capsys, words):
+    code, shown = run(capsys, "import-partnet", *words)
+    assert code == 1 and "Traceback" not in shown
 
 
 def test_masses_must_be_positive(scans, tmp_path, capsys):

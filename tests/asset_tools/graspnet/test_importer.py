@@ -66,7 +66,7 @@ def test_an_object_without_a_name_is_weighed_by_its_volume(tmp_path):
 
 def test_what_is_missing_is_named_at_once(tmp_path):
     write_models(tmp_path, [1, 3])
-    with pytest.raises(AssetError, match="none for 2, 4"):
+    with pytest.raises(AssetError, match="numbers 2, 4"):
         graspnet_jobs(tmp_path, [4, 1, 2])
     with pytest.raises(AssetError, match="found 88, 90"):
         graspnet_jobs(tmp_path, [1, 88, 90])
