@@ -169,7 +169,9 @@ def _moved(part: Part, pose: Array) -> Part:
     if part.normals is not None:
         turned = part.normals @ np.linalg.pinv(linear)
         part.normals = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
-    if np.linalg.det(linear) < 0:
+    with np.errstate(over="ignore"):  # of absurd scales, which the size tells
+        mirrored = np.linalg.det(linear) < 0
+    if mirrored:
         part.faces = part.faces[:, ::-1]
     return part
 
@@ -188,4 +190,5 @@ def _triangles(indices: Ints, mode: int) -> Ints:
 
 def _damaged(path: Path, found: str) -> AssetError:
     found = found if len(found) <= 200 else f"{found[:200]}..."
-    return AssetError("can't read this mesh", where=path, found=found, fix="Export it again, without compression.")
+    fix = "Export it again, without compression." if "compressed" in found else "Export it again."
+    return AssetError("can't read this mesh", where=path, found=found, fix=fix)

@@ -103,7 +103,9 @@ class Buffers:
     def coordinates(self, index: int) -> Array:
         """Return (V, 2) texture coordinates, v downward; integers are normalised unless the file is quantised."""
         values = self.values(index)
-        return (values if self._quantised else _normalised(values)).astype(float)[:, :2]
+        if values.shape[1] != 2:
+            raise ValueError(f"accessors.{index} has {values.shape[1]} components, expected 2")
+        return (values if self._quantised else _normalised(values)).astype(float)
 
     def colors(self, index: int) -> Array:
         """Return (V, 3) linear vertex colours, which may be NaN; integers are always normalised."""
