@@ -7,6 +7,7 @@ A file with wrong content raises `DocumentError`, which is a ``ValueError``. A f
 from __future__ import annotations
 
 import json
+import re
 import stat
 import tokenize
 import zipfile
@@ -29,6 +30,9 @@ INTEGER_LIMIT = 2**63
 _NUMBER_LENGTH = 64  # characters of a YAML number; the time to read base 60 ("1:1:1") grows with their square
 JSON_DEPTH = YAML_DEPTH = 64
 _TOO_DEEP = f"nested more than {JSON_DEPTH} deep"
+_SHOWN_KEYS = 8  # of the way to a wrong value
+_CONTAINERS = (dict, list, tuple)
+_SURROGATE = re.compile(r"[\ud800-\udfff]")  # no encoding has one
 YAML_NODES = 500_000
 """Values, those that aliases stand for counted each time: nine aliases of nine aliases of ... are a billion."""
 
@@ -68,14 +72,14 @@ def load_json(path: Path) -> Any:
         OSError: the file cannot be read.
     """
     with _of(path):
-        return json_values(_text(path, JSON_LIMIT))
+        return json_values(read_text(path, JSON_LIMIT))
 
 
 def json_values(text: str | bytes) -> Any:
-    """Read the values of a JSON text. NaN, infinity and integers beyond 64 bits are refused.
+    """Read the values of a JSON text. NaN, infinity, integers beyond 64 bits and lone surrogates are refused.
 
     Raises:
-        DocumentError: the text is not JSON, is nested too deeply, or has a number out of range.
+        DocumentError: the text is not JSON, is nested too deeply, or has a value that `json_fault` names.
     """
     try:
         values = json.loads(text, parse_constant=_no_number, parse_float=_finite, parse_int=_integer)
@@ -83,19 +87,43 @@ def json_values(text: str | bytes) -> Any:
         raise DocumentError(str(error)) from error
     except RecursionError as error:
         raise DocumentError(_TOO_DEEP) from error
-    _check_depth(values)
+    if fault := json_fault(values):
+        keys, found = fault
+        raise DocumentError(f"{'.'.join(map(repr, keys[:_SHOWN_KEYS]))}: {found}" if keys else found)
     return values
 
 
-def _check_depth(values: Any) -> None:
-    """Refuse nesting that would exhaust the stack of functions that call themselves per level."""
-    level = [values] if isinstance(values, list | dict) else []
-    for _ in range(JSON_DEPTH):
-        inside = (node.values() if isinstance(node, dict) else node for node in level)
-        level = [child for children in inside for child in children if isinstance(child, list | dict)]
-        if not level:
-            return
-    raise DocumentError(_TOO_DEEP)
+def json_fault(values: Any, depth: int = 0) -> tuple[tuple[Any, ...], str] | None:
+    """Return keys and description of the first value that the package does not keep in JSON, or None.
+
+    Args:
+        values: from a JSON text, or to be written as one.
+        depth: number of lists and dicts around them.
+    """
+    if not isinstance(values, _CONTAINERS):
+        return ((), found) if (found := _scalar_fault(values)) else None
+    if depth == JSON_DEPTH:
+        return (), _TOO_DEEP
+    is_dict = isinstance(values, dict)
+    for key, value in values.items() if is_dict else enumerate(values):
+        if is_dict and (found := _scalar_fault(key)):
+            return (), f"key {found}"
+        if isinstance(value, _CONTAINERS):
+            if fault := json_fault(value, depth + 1):
+                return (key, *fault[0]), fault[1]
+        elif found := _scalar_fault(value):
+            return (key,), found
+    return None
+
+
+def _scalar_fault(value: Any) -> str:
+    if isinstance(value, str):
+        return "" if value.isascii() or not _SURROGATE.search(value) else f"{value!r:.80} is not Unicode text"
+    if isinstance(value, float):
+        return "" if isfinite(value) else f"{value} is not finite"
+    if isinstance(value, int):
+        return "" if abs(value) < INTEGER_LIMIT else f"an integer of {value.bit_length()} bits"
+    return "" if value is None else f"{value!r:.80} ({type(value).__name__})"
 
 
 def load_yaml(path: Path) -> Any:
@@ -107,7 +135,7 @@ def load_yaml(path: Path) -> Any:
         OSError: the file cannot be read.
     """
     with _of(path):
-        text = _text(path, YAML_LIMIT)
+        text = read_text(path, YAML_LIMIT)
         try:
             return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
         except (yaml.YAMLError, ValueError, AttributeError, LookupError, TypeError, OverflowError) as error:
@@ -141,9 +169,7 @@ def load_array(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
     """
     import numpy as np  # not for every command
 
-    check_regular(path)
-    if path.stat().st_size > limit:
-        raise DocumentError(f"more than {limit} bytes")
+    check_regular(path, limit)
     array = np.load(path, allow_pickle=False)
     if not isinstance(array, np.ndarray):
         array.close()
@@ -151,16 +177,56 @@ def load_array(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
     return array
 
 
-def check_regular(path: Path) -> None:
+def check_regular(path: Path, limit: int | None = None) -> None:
     """Refuse a pipe, a device or a socket, on which a read may never end; a folder is left to ``open``.
 
+    Args:
+        path: of the file.
+        limit: bytes that the file may have; None: any number.
+
     Raises:
-        DocumentError: the path leads to one of these.
+        DocumentError: the path leads to one of these, or the file is larger.
         OSError: the path cannot be read.
     """
-    mode = path.stat().st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+    status = path.stat()
+    if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
         raise DocumentError("not a regular file")
+    if limit is not None and status.st_size > limit:
+        raise DocumentError(_too_large(limit))
+
+
+def read_bytes(path: Path, limit: int) -> bytes:
+    """Read a file of at most ``limit`` bytes.
+
+    Raises:
+        DocumentError: the file is not regular or is larger.
+        OSError: the file cannot be read.
+    """
+    with _of(path):
+        check_regular(path, limit)
+        with path.open("rb") as file:
+            content = file.read(limit + 1)
+        if len(content) > limit:  # it grows
+            raise DocumentError(_too_large(limit))
+        return content
+
+
+def read_text(path: Path, limit: int) -> str:
+    """Read a text in UTF-8 of at most ``limit`` bytes.
+
+    Raises:
+        DocumentError: the file is not regular or not UTF-8, or is larger.
+        OSError: the file cannot be read.
+    """
+    with _of(path):
+        try:
+            return read_bytes(path, limit).decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise DocumentError(str(error)) from error
+
+
+def _too_large(limit: int) -> str:
+    return f"more than {limit >> 20} MB" if limit >= 2**20 else f"more than {limit} bytes"
 
 
 def _no_number(word: str) -> float:
@@ -177,18 +243,6 @@ def _integer(word: str) -> int:
     if abs(number) >= INTEGER_LIMIT:
         raise DocumentError(f"integer {word[:24]}{'...' if len(word) > 24 else ''} has more than 64 bits")
     return number
-
-
-def _text(path: Path, limit: int) -> str:
-    check_regular(path)
-    with path.open("rb") as file:
-        content = file.read(limit + 1)
-    if len(content) > limit:
-        raise DocumentError(f"more than {limit >> 20} MB")
-    try:
-        return content.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise DocumentError(str(error)) from error
 
 
 class _Loader(yaml.SafeLoader):

@@ -23,7 +23,8 @@ from robocas_ms3.paths import variable_of
 
 _Error = TypeVar("_Error", bound=RobocasError)
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT})  # what the system says of a disk without room
-_KEY_DEPTH = 8  # of the key that a message names
+_SHOWN_KEYS = 8  # of the way to a wrong value, in a message
+_NAME_BYTES = 96  # of stem and of suffix that a temporary name repeats: file systems allow 255 in all
 ABANDONED = 86400.0  # s without a change: what a killed run left
 
 
@@ -55,7 +56,7 @@ def replacing(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
     """
     path = Path(path)
     make_folder(path.parent)
-    tmp = path.parent / f".{path.stem}.{secrets.token_hex(8)}.tmp{path.suffix}"
+    tmp = path.parent / f".{_shortened(path.stem)}.{secrets.token_hex(8)}.tmp{_shortened(path.suffix)}"
     try:
         with naming(path):
             yield tmp
@@ -69,6 +70,10 @@ def replacing(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
             shutil.rmtree(tmp, ignore_errors=True)
         else:
             tmp.unlink(missing_ok=True)
+
+
+def _shortened(name: str) -> str:
+    return os.fsencode(name)[:_NAME_BYTES].decode(errors="ignore")
 
 
 def open_for_append(path: Path) -> BufferedRandom:
@@ -253,28 +258,11 @@ def json_text(
     Raises:
         RobocasError: ``error``: they would refuse a value, such as NaN; ``where`` names its key.
     """
-    if problem := _refused(data):
-        key, found = _first_refused(data) or ("", problem)
-        place, expected = f"{where}, {key}" if key else where, "finite numbers of 64 bits, Unicode text, JSON types"
+    from robocas_ms3.documents import json_fault  # with YAML, for which `robocas --help` need not wait
+
+    if fault := json_fault(data):
+        keys, found = fault
+        place = f"{where}, {'.'.join(map(str, keys[:_SHOWN_KEYS]))}" if keys else where
+        expected = "finite numbers of 64 bits, Unicode text, JSON types"
         raise error("this value can't be written as JSON", where=place, expected=expected, found=found)
-    return json.dumps(data, indent=indent, ensure_ascii=ascii_only)
-
-
-def _refused(data: Any) -> str:
-    """Return why a reader of JSON would refuse values; empty if it takes them."""
-    from robocas_ms3.documents import json_values  # with YAML, for which `robocas --help` need not wait
-
-    try:
-        json_values(json.dumps(data, ensure_ascii=False, allow_nan=False).encode())
-    except (TypeError, ValueError, RecursionError) as problem:
-        return " ".join(str(problem).split())
-    return ""
-
-
-def _first_refused(data: Any, key: str = "") -> tuple[str, str] | None:
-    """Return key and text of the first value that a reader of JSON would refuse; None if only the whole is refused."""
-    if not isinstance(data, dict | list | tuple) or key.count(".") > _KEY_DEPTH:
-        return (key, f"{data!r:.80} ({type(data).__name__})") if _refused(data) else None
-    inner = data.items() if isinstance(data, dict) else enumerate(data)
-    places = ((f"{key}.{name}" if key else f"{name}", value) for name, value in inner)
-    return next((found for place, value in places if (found := _first_refused(value, place))), None)
+    return json.dumps(data, indent=indent, ensure_ascii=ascii_only, allow_nan=False)

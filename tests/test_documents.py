@@ -12,10 +12,13 @@ from robocas_ms3.documents import (
     JSON_DEPTH,
     YAML_DEPTH,
     DocumentError,
+    json_values,
     load_array,
     load_json,
     load_yaml,
     open_arrays,
+    read_bytes,
+    read_text,
 )
 
 
@@ -94,7 +97,19 @@ def test_long_yaml_numbers_are_refused_at_once(file, number):
     assert load_yaml(file("a: [1:30, 0x10, 1:30.5, .inf]")) == {"a": [90, 16, 90.5, float("inf")]}
 
 
-@pytest.mark.parametrize("load", [load_json, load_yaml, open_arrays, load_array])
+@pytest.mark.parametrize("text", ['["\\ud800"]', '{"\\udfff": 1}', '"\\uD83Dx"', b'"\xed\xa0\x80"'])
+def test_lone_surrogates_of_json_are_refused(file, text):
+    with pytest.raises(DocumentError):
+        load_json(file(text))
+    with pytest.raises(DocumentError):
+        json_values(text)
+    assert load_json(file('"\\ud83d\\ude00"')) == "\U0001f600"
+
+
+@pytest.mark.parametrize(
+    "load",
+    [load_json, load_yaml, open_arrays, load_array, lambda path: read_bytes(path, 9), lambda path: read_text(path, 9)],
+)
 def test_only_regular_files_are_read(tmp_path, load):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "zero").symlink_to("/dev/zero")

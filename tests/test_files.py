@@ -134,6 +134,18 @@ def test_a_temporary_name_is_another_each_time(tmp_path):
     assert (tmp_path / "target").read_text() == "kept"
 
 
+@pytest.mark.parametrize("name", ["a" * 250 + ".json", "é" * 125 + ".json", "a." + "b" * 253, "." + "b" * 254])
+def test_a_name_as_long_as_the_file_system_allows(tmp_path, name):
+    write_json(tmp_path / name, {"n": 1})
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    with pytest.raises(OSError, match=name[:20]):
+        write_json(tmp_path / f"a{name}", {})
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+_DEEP: list = []
+for _ in range(3000):
+    _DEEP = [_DEEP]
 _CYCLE: dict = {}
 _CYCLE["a"] = _CYCLE
 
@@ -147,6 +159,11 @@ _CYCLE["a"] = _CYCLE
         ({"a": -(2**70)}, "a"),
         ({"a": "\udcff"}, "a"),
         ({"a": {1, 2}}, "a"),
+        ({"a": "\ud800"}, "a"),
+        ({"a": 10**5000}, "a"),
+        ({"b": {"\udcff": 1}}, "b"),
+        ({"b": {float("nan"): 1}}, "b"),
+        ({"a": _DEEP}, "a.0"),
         (_CYCLE, "a.a"),
         ({(1, 2): 3}, ""),
     ],
