@@ -22,10 +22,10 @@ from robocas_ms3.documents import load_json
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import Share, share
-from robocas_ms3.files import make_folder, replacing_folder, write_json
+from robocas_ms3.files import json_text, make_folder, replacing_folder, write_json
 from robocas_ms3.ledger import Ledger
 from robocas_ms3.outputs import check_absent, check_run
-from robocas_ms3.strict import parse
+from robocas_ms3.strict import parse, parse_json
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
@@ -106,9 +106,12 @@ def begin(folder: Path, run: dict[str, Any], *, resume: bool, again: bool = Fals
         What is there already.
 
     Raises:
-        EvaluationError: it was measured with something else, or the folder is no evaluation's.
+        EvaluationError: it was measured with something else, the folder is no evaluation's, or ``run`` has a value that
+            `read` would refuse.
     """
     path = folder / RUN
+    text = json_text({**_BEFORE, **run}, path, error=EvaluationError)
+    parse_json(_RunRecord, text, EvaluationError, where=path, about="this evaluation can't be recorded")
     check_run(path, "protocol_hash", "eval", EvaluationError)
     make_folder(folder)
     if not (folder / OUTCOMES).is_file():  # without an episode it is of nothing yet

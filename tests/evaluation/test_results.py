@@ -38,11 +38,33 @@ def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
         read(tmp_path / "a")
 
 
-@pytest.mark.parametrize("key", ["protocol_hash", "policy", "weld", "versions", "pack_hashes", "backend"])
-def test_resuming_with_something_else_is_refused(tmp_path, key):
+@pytest.mark.parametrize(
+    "said", [{"server": 5}, {"server": ["x"]}, {"name": 3}, {"notes": float("nan")}, {"notes": "\ud800"}]
+)
+def test_a_run_that_could_not_be_read_does_not_begin(tmp_path, said):
+    run = {**RUN_OF, "policy": {**RUN_OF["policy"], **said}}
+    with pytest.raises(EvaluationError) as error:
+        begin(tmp_path / "a", run, resume=False)
+    assert str(error.value.where).startswith(str(tmp_path / "a" / RUN))
+    assert not (tmp_path / "a").exists()
+    begin(tmp_path / "a", RUN_OF, resume=False)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("protocol_hash", "other"),
+        ("policy", {"name": "other"}),
+        ("weld", True),
+        ("versions", {"numpy": "other"}),
+        ("pack_hashes", {"builtin": "other"}),
+        ("backend", "other"),
+    ],
+)
+def test_resuming_with_something_else_is_refused(tmp_path, key, value):
     write(tmp_path / "a", [outcome(0)])
     with pytest.raises(EvaluationError, match=f"another {key}"):
-        begin(tmp_path / "a", {**RUN_OF, key: {"name": "other"} if key == "policy" else "other"}, resume=True)
+        begin(tmp_path / "a", {**RUN_OF, key: value}, resume=True)
 
 
 def test_a_result_from_before_there_was_a_weld_is_one_without_it(tmp_path):
