@@ -15,13 +15,14 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from robocas_ms3.documents import check_regular
+from robocas_ms3.documents import read_bytes
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.files import json_text, naming, open_for_append, replacing
 from robocas_ms3.strict import refusal, validate_json
 
 Record = TypeVar("Record")
 _Error = TypeVar("_Error", bound=RobocasError)
+_LIMIT = 2**30  # bytes of a file: a million lines have 300 MB
 
 
 @dataclass(frozen=True)
@@ -63,11 +64,10 @@ class Ledger(Generic[Record]):
 
         Raises:
             OSError: the file cannot be read.
-            DocumentError: the path leads to a pipe or a device.
+            DocumentError: the path leads to a pipe or a device, or the file is too large.
         """
         try:
-            check_regular(self.path)
-            pieces = self.path.read_bytes().split(b"\n")
+            pieces = read_bytes(self.path, _LIMIT).split(b"\n")
         except FileNotFoundError:
             return []
         return [self._read(number, piece, len(pieces)) for number, piece in enumerate(pieces, 1) if piece.strip()]

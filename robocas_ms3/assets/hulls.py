@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from robocas_ms3.documents import read_text
 from robocas_ms3.errors import AssetError
 from robocas_ms3.words import count_of
 
 Array = NDArray[np.float64]
 
+_LIMIT = 2**26  # bytes of a file: hulls of 64 vertices have 5 kB each
 # Points of one hull count as hidden when they lie deeper than this in another, m
 _HIDDEN_DEPTH = 0.0005
 # How far the corners of a box may be from where they ought to be, m: files round to a ten thousandth of a millimetre
@@ -57,7 +59,7 @@ def read_hulls(path: Path) -> list[Hull]:
     vertices: list[list[float]] = []
     groups: list[list[list[int]]] = []
     try:
-        for line in path.read_text(encoding="ascii").splitlines():
+        for line in read_text(path, _LIMIT).splitlines():
             if line.startswith("v "):
                 vertices.append([float(word) for word in line.split()[1:4]])
             elif line.startswith("o "):

@@ -17,6 +17,7 @@ from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import Array, Hull, read_hulls, sample_surface
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, FurnitureAsset, ObjectAsset, PackManifest
+from robocas_ms3.documents import JSON_LIMIT, DocumentError, check_regular, read_bytes
 from robocas_ms3.errors import AssetError
 from robocas_ms3.paths import builtin_packs_dir, data_dir
 from robocas_ms3.strict import mistakes, refusal, validate_json
@@ -27,6 +28,7 @@ MANIFEST, HULLS, ANNOTATIONS = "manifest.json", "hulls.obj", "annotations.npz"
 VISUALS: dict[VisualLevel, str] = {"fast": "visual_fast.glb", "full": "visual_full.glb"}
 LINKS, FINISHES = "links", "finishes"
 
+_FILE_LIMIT = 2**31  # bytes
 # (path, size, mtime) -> sha256, so that only changed files are read again within a process
 _hashes: dict[tuple[str, int, int], str] = {}
 # (manifest path, size, mtime) -> pack, so that its lazy geometry is worked out once a process
@@ -215,7 +217,10 @@ def verify(pack: Pack) -> None:
                 raise AssetError("this file of the asset pack is missing", where=path, fix=fix)
             if path.stat().st_size == 0:
                 raise AssetError("this file of the asset pack is empty", where=path, fix=fix)
-            found = sha256(path)
+            try:
+                found = sha256(path)
+            except (OSError, DocumentError) as error:
+                raise AssetError("can't read this file of the asset pack", where=path, found=error, fix=fix) from error
             if found != expected:
                 raise AssetError(
                     "this file of the asset pack was changed or cut short",
@@ -227,7 +232,13 @@ def verify(pack: Pack) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Hash of a file, from memory if its size and time of change are those of the last call."""
+    """Return the hash of a file, from memory if its size and time of change are those of the last call.
+
+    Raises:
+        DocumentError: the file is not regular or is too large.
+        OSError: the file cannot be read.
+    """
+    check_regular(path, _FILE_LIMIT)
     status = path.stat()
     key = (str(path), status.st_size, status.st_mtime_ns)
     if key not in _hashes:
@@ -255,7 +266,9 @@ def _files(folder: str, prefix: str = "") -> Iterator[str]:
 
 def _read(folder: Path, path: Path) -> Pack:
     try:
-        manifest = validate_json(PackManifest, path.read_bytes())
+        manifest = validate_json(PackManifest, read_bytes(path, JSON_LIMIT))
+    except (OSError, DocumentError) as error:
+        raise AssetError("can't read the manifest of the asset pack", where=path, found=error) from error
     except ValidationError as error:
         raise _damaged(path, error) from error
     if "schema_version" not in manifest.model_fields_set:

@@ -23,7 +23,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from robocas_ms3.benchmark import TASKS
-from robocas_ms3.documents import DocumentError, load_yaml
+from robocas_ms3.documents import ARRAYS_LIMIT, JSON_LIMIT, DocumentError, load_yaml, read_bytes, read_text
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Wants
@@ -157,10 +157,17 @@ class LoadedProtocol:
 
     @cached_property
     def hash(self) -> str:
-        """Hex sha256 of its files, by their names."""
+        """Hex sha256 of its files, by their names.
+
+        Raises:
+            EvaluationError: one of them can't be read or is too large.
+        """
         digest = hashlib.sha256()
         for path in files_of(self.folder):
-            content = hashlib.sha256(path.read_bytes()).hexdigest()
+            try:
+                content = hashlib.sha256(read_bytes(path, ARRAYS_LIMIT)).hexdigest()
+            except (OSError, DocumentError) as error:
+                raise EvaluationError("can't read a file of the protocol", where=path, found=error) from error
             digest.update(f"{path.relative_to(self.folder).as_posix()} {content}\n".encode())
         return digest.hexdigest()
 
@@ -231,8 +238,8 @@ def _rules(path: Path) -> Protocol:
 
 def _episodes(path: Path) -> Iterator[Episode]:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = read_text(path, JSON_LIMIT).splitlines()
+    except (OSError, DocumentError) as error:
         raise EvaluationError("can't read the episodes", where=path, found=error) from error
     for number, line in enumerate(lines):
         episode = parse_json(Episode, line, EvaluationError, where=f"{path}:{number + 1}", about="no episode")

@@ -22,12 +22,14 @@ import logging
 import os
 import re
 import socket
+import stat
 import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from robocas_ms3.errors import PlanError
 from robocas_ms3.files import make_folder
@@ -35,6 +37,7 @@ from robocas_ms3.files import make_folder
 LEASE = 60.0
 """Seconds without news after which the holder of a claim counts as dead."""
 _LONGEST = 86400.0  # s; a damaged file must not stop a plan for ever
+_TEXT_LIMIT = 4096  # bytes of a claim
 _NUMBER = re.compile(r"[0-9]{1,9}")
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 # What the system says where a file can't have two names
@@ -68,7 +71,7 @@ def claimed(
     finally:
         keeper.end()
         with suppress(OSError):  # then it ends with its lease
-            if claim.read_text(encoding="utf-8") == token:
+            if read_claim(claim) == token:
                 os.utime(claim, (0, 0))
                 if not stays:
                     claim.unlink()
@@ -89,7 +92,7 @@ def refuse_claimed(folder: Path) -> None:
         with suppress(FileNotFoundError):
             if claim.stat().st_mtime > 0 and (age := age_of(claim)) < 2 * lease_of(claim):  # with room to spare
                 fix = "Go on with --on slurm, or cancel its jobs and wait until the claim is not renewed any more."
-                found = f"{claim.read_text(encoding='utf-8').split(' ')[0]}, {age:.0f} s ago"
+                found = f"{read_claim(claim).split(' ')[0]}, {age:.0f} s ago"
                 raise PlanError("jobs of Slurm are at this plan", where=claim, found=found, fix=fix)
 
 
@@ -115,7 +118,7 @@ class _Keeper:
         while not self._ended.wait(self._lease / 10):
             before = time.monotonic()
             try:
-                if following.exists() or self._claim.read_text(encoding="utf-8") != self._token:
+                if following.exists() or read_claim(self._claim) != self._token:
                     self._lose("somebody else has it", self._on_lost)
                     return
                 os.utime(self._claim)
@@ -187,7 +190,7 @@ def _make(claim: Path, token: str) -> bool:
         os.link(new, claim)
         return True
     except FileExistsError:
-        return claim.read_text(encoding="utf-8") == token  # its answer was lost, and the file server asked again
+        return read_claim(claim) == token  # its answer was lost, and the file server asked again
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
@@ -202,6 +205,26 @@ def _make(claim: Path, token: str) -> bool:
         claim.unlink(missing_ok=True)
         raise
     return True
+
+
+def read_claim(claim: Path) -> str:
+    """Return the text of a claim: machine, process, id, lease and start of the machine.
+
+    Raises:
+        PlanError: its file is a pipe or a device.
+        OSError: its file cannot be read.
+    """
+    with _open(claim) as file:
+        return file.read(_TEXT_LIMIT).decode(errors="replace")
+
+
+def _open(claim: Path) -> BinaryIO:
+    descriptor = os.open(claim, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        what, fix = "this claim is not a regular file", "Remove it."
+        raise PlanError(what, where=claim, expected="a regular file", found="a pipe, a device or a folder", fix=fix)
+    return os.fdopen(descriptor, "rb")
 
 
 def _temporary(claim: Path) -> Path:
@@ -222,7 +245,7 @@ def _numbered(path: Path, number: int) -> Path:
 def lease_of(claim: Path, default: float = LEASE) -> float:
     """Return the lease of a claim in s; the default where its file is empty, as after a kill, or damaged."""
     try:
-        lease = float(claim.read_text(encoding="utf-8").split(" ")[3])
+        lease = float(read_claim(claim).split(" ")[3])
     except (OSError, ValueError, IndexError):
         return default
     return lease if 0 < lease <= _LONGEST else default
@@ -254,5 +277,5 @@ def age_of(claim: Path) -> float:
         now = probe.stat().st_mtime
     finally:
         probe.unlink(missing_ok=True)
-    with claim.open(encoding="utf-8") as file:  # to open a file asks the server; to look at its name may not
+    with _open(claim) as file:  # to open a file asks the server; to look at its name may not
         return now - os.fstat(file.fileno()).st_mtime

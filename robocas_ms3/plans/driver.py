@@ -20,7 +20,7 @@ from uuid import uuid4
 from robocas_ms3.documents import DocumentError, load_json
 from robocas_ms3.errors import PlanError
 from robocas_ms3.files import write_json
-from robocas_ms3.plans.claims import LEASE, age_of, claimed, claims_of, is_of_here, lease_of
+from robocas_ms3.plans.claims import LEASE, age_of, claimed, claims_of, is_of_here, lease_of, read_claim
 from robocas_ms3.plans.units import DRIVER
 
 RUN = f"{DRIVER}.run"
@@ -65,10 +65,10 @@ def refuse_other(path: Path, *, locked: bool = True) -> None:
         return
     claim = claims[max(claims)]
     with suppress(FileNotFoundError):
-        text = claim.read_text(encoding="utf-8")
+        text = read_claim(claim)
         if not text:
             time.sleep(1.0)  # where files can't be linked, one that is made now is empty for a moment
-            text = claim.read_text(encoding="utf-8")
+            text = read_claim(claim)
         here, lease = is_of_here(text), lease_of(claim)
         if not text or (here and locked):
             return
@@ -85,7 +85,7 @@ def who_runs(path: Path) -> str | None:
     with suppress(OSError):
         claim = claims[max(claims, default=0)] if claims else None
         if claim and time.time() - claim.stat().st_mtime < lease_of(claim):  # writes nothing to ask the file server
-            return claim.read_text(encoding="utf-8").split(" ")[0] or None
+            return read_claim(claim).split(" ")[0] or None
     return None
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from robocas_ms3.documents import JSON_LIMIT, DocumentError, read_bytes
 from robocas_ms3.files import write_json
 from robocas_ms3.plans.units import UNITS, Count, Outcome, Seconds
 from robocas_ms3.strict import validate_json
@@ -43,8 +44,8 @@ class Tally:
     def read(cls, path: Path) -> Tally:
         """What a file says; of none, or a damaged one, nothing."""
         try:
-            return validate_json(_FORM, path.read_bytes())
-        except (OSError, ValidationError):
+            return validate_json(_FORM, read_bytes(path, JSON_LIMIT))
+        except (OSError, DocumentError, ValidationError):
             return cls()
 
     def write(self, path: Path) -> None:

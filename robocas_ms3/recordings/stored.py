@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.documents import DocumentError, check_regular
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.entries import reason
 
@@ -48,10 +49,11 @@ def open_trajectory(path: Path) -> h5py.File:
         DatasetError: it is missing, damaged or no HDF5 file.
     """
     try:
+        check_regular(path)
         return h5py.File(path, "r")
     except FileNotFoundError as error:
         raise DatasetError("no such trajectory file", where=path) from error
-    except OSError as error:
+    except (OSError, DocumentError) as error:
         raise DatasetError(
             "can't read this HDF5 file: it is cut off, damaged, or no HDF5",
             where=path,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.pictures.headers import read_picture_bytes
 from robocas_ms3.datasets.sources.episode import DEFAULT_RATE
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.errors import DatasetError
@@ -41,9 +42,10 @@ class FolderContent(PageContent):
         """A picture's file, not decoded."""
         path = inside(self.dataset.episode(number).image_path(camera, "rgb", step), self.root)
         try:
-            return Picture(MEDIA_TYPES[path.suffix], path.read_bytes())
-        except OSError as error:
-            raise DatasetError("no such picture", where=path, found=error.strerror) from error
+            return Picture(MEDIA_TYPES[path.suffix], read_picture_bytes(path))
+        except (OSError, ValueError) as error:
+            found = getattr(error, "strerror", None) or error
+            raise DatasetError("can't read this picture", where=path, found=found) from error
 
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
         """A picture's file, decoded: (H, W) mm, 0 = nothing."""

@@ -7,7 +7,6 @@ the script.
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets.actions import ActionScale
+from robocas_ms3.documents import load_json
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 
@@ -157,7 +157,7 @@ def scale_of(data_info: Path) -> ActionScale:
         DatasetError: it has no ranges.
     """
     try:
-        info = json.loads(data_info.read_text(encoding="utf-8"))
+        info = load_json(data_info)
     except (OSError, ValueError) as error:
         raise EvaluationError("no data_info.json of a RoboCAS dataset", where=data_info, found=error) from error
     return ActionScale.of(info.get("action_space", {}) if isinstance(info, dict) else {}, where=data_info)

@@ -157,6 +157,6 @@ def _depth(folder: Path, headers: Headers, steps: int) -> dict[int, dict[str, ND
         for step in chosen if kind == "depth" else ():
             path = schema.image_path(folder, camera, "depth", step)
             if isinstance(inside.get(path.name), PictureHeader):
-                image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+                image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # `read_header` has checked file and size
                 found[step][camera] = None if image is None else np.asarray(image, dtype=np.uint16)
     return found

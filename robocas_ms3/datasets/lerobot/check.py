@@ -22,6 +22,8 @@ from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_videos import TOLERANCE, check_videos
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import (
+    MAX_EPISODES,
+    MAX_FRAMES,
     ConversionRecord,
     InfoRecord,
     episode_columns,
@@ -32,6 +34,7 @@ from robocas_ms3.datasets.lerobot.records import (
 from robocas_ms3.datasets.lerobot.stats import QUANTILES, shape_of
 from robocas_ms3.datasets.lerobot.tables import faults, numbers, open_table, read_rows
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
+from robocas_ms3.documents import DocumentError
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.words import count_of
 
@@ -87,12 +90,13 @@ def check_lerobot(
         return wrong
     try:
         dataset = LeRobotDataset(root)
+        totals = list(_check_counts(dataset))
         wrong = list(_check_rows(dataset))
         if wrong:
-            return wrong
+            return [*totals, *wrong]
+        totals += _check_totals(dataset)
         subtasks = dataset.subtasks if schema.SUBTASK_INDEX.key in dataset.info["features"] else []
         texts = {"task_index": dataset.tasks, schema.SUBTASK_INDEX.key: subtasks}
-        totals = list(_check_totals(dataset))
     except DatasetError as error:
         return [_violation("meta", "readable tables", error)]
     data, ranges = _check_data(dataset, texts, on_episode or (lambda *_: None))
@@ -119,6 +123,23 @@ def _check_info(info: Mapping[str, Any]) -> Iterator[Violation]:
         yield Violation(schema.INFO_FILE, key, str(expected), str(found))
 
 
+def _check_counts(dataset: LeRobotDataset) -> Iterator[Violation]:
+    """Compare numbers of rows with ``info.json``; readers and later checks then expect those of the tables."""
+    episodes = sorted((dataset.root / "meta/episodes").glob("*/*.parquet"))
+    for key, paths in (("total_episodes", episodes), ("total_tasks", [dataset.root / schema.TASKS_FILE])):
+        count = 0
+        for path in paths:
+            with open_table(path) as file:
+                count += file.metadata.num_rows
+        yield from _check_total(dataset, key, count, MAX_EPISODES)
+
+
+def _check_total(dataset: LeRobotDataset, key: str, found: int, greatest: int) -> Iterator[Violation]:
+    if dataset.info[key] != found:
+        yield Violation(schema.INFO_FILE, key, str(found), str(dataset.info[key]))
+        dataset.info[key] = min(found, greatest)
+
+
 def _check_rows(dataset: LeRobotDataset) -> Iterator[Violation]:
     """Check the columns of ``meta/episodes``, on which the other checks rely."""
     numbers: list[int] = []
@@ -132,15 +153,12 @@ def _check_rows(dataset: LeRobotDataset) -> Iterator[Violation]:
 
 
 def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
-    rows, info, tasks = dataset.rows, dataset.info, dataset.tasks
-    found = {"total_episodes": len(rows), "total_frames": sum(row["length"] for row in rows), "total_tasks": len(tasks)}
-    for key, value in found.items():
-        if info[key] != value:
-            yield Violation(schema.INFO_FILE, key, str(value), str(info[key]))
-    if len(set(tasks)) != len(tasks):
+    frames = sum(sum(table.column("length").to_pylist()) for _, table in dataset.tables_of_episodes())
+    yield from _check_total(dataset, "total_frames", frames, MAX_FRAMES)
+    if len(set(dataset.tasks)) != len(dataset.tasks):
         yield Violation(schema.TASKS_FILE, "", "each text once", "some twice")
     start = 0
-    for index, row in enumerate(rows):
+    for index, row in enumerate(dataset.rows):
         end = start + row["length"]
         for key, value in (("episode_index", index), ("dataset_from_index", start), ("dataset_to_index", end)):
             if row[key] != value:
@@ -325,8 +343,16 @@ def _check_checksums(root: Path) -> Iterator[Violation]:
             yield Violation(schema.CHECKSUMS_FILE, name, f"a file in {', '.join(schema.CONTENT)}", "another path")
         elif not (root / name).is_file():
             yield Violation(name, "", "a file", "none")
-        elif (found := schema.checksum(root / name)) != expected:
-            yield Violation(name, "", f"the bytes that were written, SHA-256 {expected[:12]}", found[:12])
+        elif (found := _checksum(root / name)) != expected:
+            yield Violation(name, "", f"the bytes that were written, SHA-256 {expected}", found)
+
+
+def _checksum(path: Path) -> str:
+    """Return the SHA-256 of a file, or why it cannot be read."""
+    try:
+        return schema.checksum(path)
+    except (OSError, DocumentError) as error:
+        return first_line(error)
 
 
 def _check_conversion(dataset: LeRobotDataset) -> Iterator[Violation]:

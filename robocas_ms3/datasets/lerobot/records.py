@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, StringConstraints, model_validator
 
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.tables import INTEGER, NUMBER, NUMBERS, TEXT, TEXTS, Column
+from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBERS, TEXT, TEXTS, Column, Kind
 from robocas_ms3.datasets.sources.provenance import EntryRecord
 
 MAX_EPISODES = 10**6
@@ -129,10 +129,15 @@ def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[s
 
 def frame_columns(features: Mapping[str, Any]) -> dict[str, Column]:
     """Return the columns that the data have to have; numbers themselves are checked per episode."""
-    kinds = {"string": TEXT, "image": None, "video": None}
-    found = {key: kinds.get(feature["dtype"], NUMBERS) for key, feature in features.items()}
-    columns = {key: Column(kind) for key, kind in found.items() if kind}
+    stored = {key: feature["dtype"] for key, feature in features.items() if feature["dtype"] not in ("image", "video")}
+    columns = {key: Column(_kind_of(dtype)) for key, dtype in stored.items()}
     return {**columns, **{key: Column(INTEGER, greatest=MAX_FRAMES) for key in schema.INDICES if key != "timestamp"}}
+
+
+def _kind_of(dtype: str) -> Kind:
+    if dtype == "string":
+        return TEXT
+    return NUMBERS if dtype.startswith("float") else INTEGERS  # booleans too
 
 
 def of_our_shapes(features: Mapping[str, Any]) -> bool:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.schema import EPISODE_INFO
+from robocas_ms3.documents import check_regular
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw
 from robocas_ms3.recordings.motion import relative_motion
@@ -51,6 +52,7 @@ EPISODES_PATH = f"meta/episodes/{_FILE}.parquet"
 VIDEO_PATH = f"videos/{{video_key}}/{_FILE}.mp4"
 DEPTH_PATH = f"depth/{{camera}}/{_FILE}.mkv"
 CHUNK_FILES = 1000  # files a chunk
+_FILE_LIMIT = 2**34  # bytes
 
 
 @dataclass(frozen=True)
@@ -249,7 +251,13 @@ def require_extra() -> None:
 
 
 def checksum(path: Path) -> str:
-    """SHA-256 of a file."""
+    """Return the SHA-256 of a file.
+
+    Raises:
+        DocumentError: the file is not regular or is too large.
+        OSError: the file cannot be read.
+    """
+    check_regular(path, _FILE_LIMIT)
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(2**20):

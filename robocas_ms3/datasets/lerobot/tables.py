@@ -24,8 +24,16 @@ ARRAYS_LIMIT = 2**29
 """Bytes that the columns of one reading may have as arrays: 40 million rows of one value are 1 MB as a file."""
 OBJECTS_LIMIT = 2**26
 """The same where the values become Python objects, each of which takes about ten times as much."""
-INTEGER, NUMBER, NUMBERS, TEXT, TEXTS = "integers", "numbers", "numbers or lists of numbers", "texts", "lists of texts"
-Kind = Literal["integers", "numbers", "numbers or lists of numbers", "texts", "lists of texts"]
+INTEGER, NUMBER, TEXT = "integers", "numbers", "texts"
+INTEGERS, NUMBERS, TEXTS = "integers or lists of integers", "numbers or lists of numbers", "lists of texts"
+Kind = Literal[
+    "integers",
+    "numbers",
+    "texts",
+    "integers or lists of integers",
+    "numbers or lists of numbers",
+    "lists of texts",
+]
 TEXT_INDEX = "__index_level_0__"  # pandas' name of an index without one
 _EPISODE = "episode_index"
 _SEE_VALIDATE = "robocas validate lists all that is wrong."
@@ -162,13 +170,13 @@ def is_numeric(kind: pa.DataType) -> bool:
 
 def _is_kind(found: pa.DataType, kind: Kind) -> bool:
     lists = pa.types.is_list, pa.types.is_fixed_size_list, pa.types.is_large_list
-    if kind in (NUMBERS, TEXTS):
+    if kind in (INTEGERS, NUMBERS, TEXTS):
         depth = 0
         while any(is_list(found) for is_list in lists):
             found, depth = found.value_type, depth + 1
         if kind == TEXTS:
             return depth == 1 and _is_kind(found, TEXT)
-        return pa.types.is_boolean(found) or _is_kind(found, NUMBER)
+        return pa.types.is_boolean(found) or _is_kind(found, NUMBER if kind == NUMBERS else INTEGER)
     if pa.types.is_dictionary(found):
         found = found.value_type
         return kind == TEXT and (pa.types.is_string(found) or pa.types.is_large_string(found))

@@ -17,6 +17,7 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets.lerobot.schema import CHUNK_FILES
+from robocas_ms3.documents import DocumentError, check_regular
 from robocas_ms3.errors import DatasetError
 
 
@@ -52,7 +53,7 @@ CODINGS = {
 }
 MAX_PIXELS = 2**26
 """Pixels of a frame that is decoded: 8192 x 8192."""
-_BAD_VIDEO = (FFmpegError, IndexError, TypeError)  # no stream of video, or no times
+_BAD_VIDEO = (FFmpegError, OSError, DocumentError, IndexError, TypeError)  # no stream of video, or no times
 _CONTAINER = {"fflags": "+bitexact"}  # no dates and random numbers in the file
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
@@ -201,6 +202,7 @@ def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArr
     """
     given = 0
     try:
+        check_regular(path)
         with av.open(str(path)) as video:
             stream: Any = video.streams.video[0]
             stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}
@@ -233,6 +235,7 @@ def packet_times(path: Path, most: int | None = None) -> tuple[list[Fraction], d
         DatasetError: the file is missing or damaged.
     """
     try:
+        check_regular(path)
         with av.open(str(path)) as video:
             stream: Any = video.streams.video[0]
             packets = (p.pts * p.time_base for p in video.demux(stream) if p.pts is not None)

@@ -17,6 +17,7 @@ from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import SPECS, read_arrays
+from robocas_ms3.documents import check_regular
 from robocas_ms3.errors import DatasetError
 
 _TAIL = 32  # bytes at the end of a picture that are looked at
@@ -69,9 +70,10 @@ def look_at_ends(path: Path) -> PictureHeader | None:
     """Look at both ends of a picture; what is not as it should be there is read whole.
 
     Raises:
-        ValueError: it is damaged.
+        ValueError: it is damaged or not a regular file.
         OSError: it can't be read.
     """
+    check_regular(path)
     with path.open("rb") as file:
         head = file.read(_TAIL)
         size = os.fstat(file.fileno()).st_size

@@ -1,16 +1,23 @@
-"""Reads a picture's header and checks that it is whole: a PNG by its checksums, without decoding it."""
+"""Reads a picture's bytes and header within bounds, and checks that it is whole: a PNG without decoding it."""
 
 from __future__ import annotations
 
 import struct
 import zlib
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
 from robocas_ms3.datasets.pictures.png import SIGNATURE
+from robocas_ms3.documents import DocumentError, read_bytes
 
+LARGEST = 8192
+"""Pixels per side."""
+BYTES_LIMIT = 2**28
+"""Of a file: the largest picture without compression has 200 MB."""
+_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".webp": "WEBP"}
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 
 
@@ -31,25 +38,43 @@ def read_header(path: Path) -> PictureHeader:
     """Read a picture's header.
 
     Raises:
-        ValueError: the file is of another format than its suffix says, cut off, or damaged.
+        ValueError: the file is of another format than its suffix says, cut off, damaged, or see `read_picture_bytes`.
+        OSError: the file cannot be read.
     """
-    return _read_png(path) if path.suffix == ".png" else _decode(path)
+    data = read_picture_bytes(path)
+    return _read_png(data) if path.suffix == ".png" else _decode(data, _FORMATS[path.suffix])
 
 
-def _decode(path: Path) -> PictureHeader:
-    wanted = {".jpg": "JPEG", ".webp": "WEBP"}[path.suffix]
+def read_picture_bytes(path: Path) -> bytes:
+    """Read a file that a decoder can be given: its picture has at most `LARGEST` pixels per side.
+
+    Raises:
+        DocumentError: the file is not regular, too large, or of another format than its suffix says.
+        OSError: the file cannot be read.
+    """
+    data, wanted = read_bytes(path, BYTES_LIMIT), _FORMATS[path.suffix]
     try:
-        with Image.open(path, formats=[wanted]) as picture:
+        with Image.open(BytesIO(data), formats=[wanted]) as picture:
+            size = picture.size
+    except Image.DecompressionBombError as error:
+        raise DocumentError(str(error)) from error
+    except (UnidentifiedImageError, SyntaxError) as error:  # the latter of a damaged PNG
+        raise DocumentError(f"not a {wanted}, or damaged") from error
+    if max(size) > LARGEST:
+        raise DocumentError(f"{size[0]} x {size[1]} pixels, more than {LARGEST} per side")
+    return data
+
+
+def _decode(data: bytes, wanted: str) -> PictureHeader:
+    try:
+        with Image.open(BytesIO(data), formats=[wanted]) as picture:
             picture.load()
             return PictureHeader(*picture.size, 8, len(picture.getbands()))
-    except UnidentifiedImageError as error:
-        raise ValueError(f"not a {wanted}") from error
     except OSError as error:
         raise ValueError(f"damaged {wanted}: {error}") from error
 
 
-def _read_png(path: Path) -> PictureHeader:
-    data = path.read_bytes()
+def _read_png(data: bytes) -> PictureHeader:
     if not data.startswith(SIGNATURE):
         raise ValueError("not a PNG")
     offset, header, filled = len(SIGNATURE), None, False

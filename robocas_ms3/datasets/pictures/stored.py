@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
+from robocas_ms3.datasets.pictures.headers import LARGEST, read_picture_bytes
 from robocas_ms3.datasets.pictures.png import encode_png
 from robocas_ms3.errors import DatasetError
 
@@ -18,10 +19,6 @@ _QUALITY = {
     "jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],
     "webp": [cv2.IMWRITE_WEBP_QUALITY, 90],
 }
-
-
-LARGEST = 8192
-"""Pixels a side."""
 
 
 @dataclass(frozen=True)
@@ -107,15 +104,15 @@ def read_picture(path: Path) -> NDArray:
     """Decode a picture: (H, W, 3) RGB uint8 or (H, W) uint16.
 
     Raises:
-        DatasetError: it is missing or damaged.
+        DatasetError: it is missing, damaged, too large, or not a regular file.
     """
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise DatasetError(
-            "can't read this picture", where=path, found=error.strerror, fix="robocas validate lists all that is wrong."
-        ) from error
-    picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        data = np.frombuffer(read_picture_bytes(path), np.uint8)
+    except (OSError, ValueError) as error:
+        found = getattr(error, "strerror", None) or error
+        fix = "robocas validate lists all that is wrong."
+        raise DatasetError("can't read this picture", where=path, found=found, fix=fix) from error
+    picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if picture is None:
         raise DatasetError("this picture is damaged", where=path, fix="robocas validate lists all that is wrong.")
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if picture.ndim == 3 else picture

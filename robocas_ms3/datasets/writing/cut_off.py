@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import numpy as np
-
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
+from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.datasets.sources.tolerant import read_arrays
-from robocas_ms3.documents import DAMAGED, load_json
+from robocas_ms3.documents import DAMAGED, DocumentError, check_regular, load_array, load_json
 
 _ENDS = {".png": b"\0\0\0\0IEND\xaeB\x60\x82", ".jpg": b"\xff\xd9"}
 
@@ -41,7 +40,7 @@ def cut_off(folder: Path, pictures: Pictures) -> Path | None:
 
 def _is_readable(path: Path) -> bool:
     try:
-        load_json(path) if path.suffix == ".json" else np.load(path, allow_pickle=False)
+        load_json(path) if path.suffix == ".json" else load_array(path, CAMERA_LIMIT)
     except DAMAGED:
         return False
     return True
@@ -49,6 +48,7 @@ def _is_readable(path: Path) -> bool:
 
 def _has_end(path: Path) -> bool:
     try:
+        check_regular(path)
         with path.open("rb", buffering=0) as file:
             size = file.seek(0, os.SEEK_END)
             if path.suffix == ".webp":  # its header says how much follows
@@ -57,5 +57,5 @@ def _has_end(path: Path) -> bool:
             end = _ENDS[path.suffix]
             file.seek(max(0, size - len(end)))
             return file.read() == end
-    except OSError:
+    except (OSError, DocumentError):
         return False

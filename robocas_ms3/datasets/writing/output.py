@@ -14,7 +14,7 @@ from typing import Any
 
 from robocas_ms3 import outputs
 from robocas_ms3.datasets import schema
-from robocas_ms3.documents import load_json
+from robocas_ms3.documents import check_regular, load_json
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import make_folder, write_json
 from robocas_ms3.outputs import claim_output, is_taken, kept_if_begun, locked_folder, sweep
@@ -48,6 +48,7 @@ class Placer:
                 if error.errno not in _NO_LINKS:
                     raise
                 self.link = error.errno == errno.EMLINK  # a limit of this file alone
+        check_regular(source)
         shutil.copyfile(source, target)
         self.copied += 1
 

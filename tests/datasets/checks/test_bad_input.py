@@ -78,10 +78,11 @@ def test_pictures_through_the_reader(dataset):
     (rgb / "0001.png").unlink()
     (rgb / "0002.png").write_bytes((rgb / "0003.png").read_bytes()[:100])
     (rgb / "0004.png").write_bytes(b"")
-    with pytest.raises(DatasetError, match="0001.png: can't read this picture .found No such file"):
+    with pytest.raises(DatasetError) as error:
         episode.rgb("base_camera", 1)
+    assert error.value.where == rgb / "0001.png"
     for step in (2, 4):
-        with pytest.raises(DatasetError, match=f"000{step}.png: this picture is damaged"):
+        with pytest.raises(DatasetError) as error:
             episode.rgb("base_camera", step)
     assert episode.rgb("base_camera", 0).shape == (48, 64, 3)
 

@@ -4,6 +4,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
+from irregular import KINDS, replace_file
 from synthetic import RayCaster
 
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
@@ -201,36 +202,82 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("make", WRONG.values(), ids=WRONG)
 @pytest.mark.parametrize(
-    ("file", "key"),
+    ("file", "key", "wrong"),
     [
-        *((EPISODES, key) for key in ("episode_index", "length", "data/chunk_index", "tasks")),
-        *((EPISODES, f"videos/observation.images.base_camera/{key}") for key in ("file_index", "from_timestamp")),
-        *((DATA, key) for key in ("episode_index", "timestamp", "subtask_index", "subgoal_type", "action")),
-        (schema.TASKS_FILE, "task_index"),
-        (schema.SUBTASKS_FILE, "subtask_index"),
-        (schema.SCENES_FILE, "episode_index"),
-        (schema.SCENES_FILE, "cameras"),
+        (EPISODES, "episode_index", "nulls"),
+        (EPISODES, "length", "negative"),
+        (EPISODES, "data/chunk_index", "strings"),
+        (EPISODES, "tasks", "structures"),
+        (EPISODES, "videos/observation.images.base_camera/file_index", "huge"),
+        (EPISODES, "videos/observation.images.base_camera/from_timestamp", "NaN"),
+        (DATA, "episode_index", "strings"),
+        (DATA, "timestamp", "NaN"),
+        (DATA, "subtask_index", "huge"),
+        (DATA, "subgoal_type", "nulls"),
+        (DATA, "action", "ragged lists"),
+        (schema.TASKS_FILE, "task_index", "negative"),
+        (schema.SUBTASKS_FILE, "subtask_index", "ragged lists"),
+        (schema.SCENES_FILE, "episode_index", "nulls"),
+        (schema.SCENES_FILE, "cameras", "structures"),
     ],
 )
-def test_columns_of_wrong_values(spoiled, file, key, make):
-    table_of(spoiled, file, key, make)
+def test_columns_of_wrong_values(spoiled, file, key, wrong):
+    table_of(spoiled, file, key, WRONG[wrong])
     assert [violation for violation in check_lerobot(spoiled) if "SHA-256" not in violation.expected]
-    unused = key == "timestamp" or file == schema.TASKS_FILE or (key, make) == ("subgoal_type", WRONG["strings"])
+    unused = key == "timestamp"
     with suppress(DatasetError) if unused else pytest.raises(DatasetError):
         read_all(spoiled)
+
+
+@pytest.mark.parametrize("dtype", ["int64", "uint8", "bool", "string"])
+def test_stored_types_other_than_declared(spoiled, dtype):
+    edit_json(spoiled, schema.INFO_FILE, lambda info: info["features"]["action"].update(dtype=dtype))
+    assert (DATA, "action") in {(violation.file, violation.key) for violation in check_lerobot(spoiled)}
+    with pytest.raises(DatasetError):
+        read_all(spoiled)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        *((VIDEO, kind) for kind in KINDS),
+        (DEPTH, "pipe"),
+        (DATA, "pipe"),
+        (EPISODES, "huge"),
+        (schema.TASKS_FILE, "device"),
+        (schema.STATS_FILE, "pipe"),
+    ],
+)
+def test_irregular_files(spoiled, name, kind):
+    (spoiled / schema.CHECKSUMS_FILE).unlink()
+    replace_file(spoiled / name, kind)
+    expected = "meta" if name in (EPISODES, schema.TASKS_FILE) else name
+    assert [violation.file for violation in check_lerobot(spoiled)] == [expected]
+    if name != schema.STATS_FILE:
+        with pytest.raises(DatasetError):
+            read_all(spoiled)
+
+
+@pytest.mark.parametrize("count", [0, 10**6])
+def test_totals_that_the_tables_contradict(spoiled, count):
+    totals = "total_episodes", "total_frames", "total_tasks"
+    edit_json(spoiled, schema.INFO_FILE, lambda info: info.update(dict.fromkeys(totals, count)))
+    found = [(violation.file, violation.key) for violation in check_lerobot(spoiled)]
+    assert found == [(schema.INFO_FILE, key) for key in ("total_episodes", "total_tasks", "total_frames")]
 
 
 def read_all(root):
     dataset = LeRobotDataset(root)
     assert dataset.goals
+    assert dataset.tasks
     for number in dataset.numbers:
         episode = dataset.episode(number)
         assert episode.arrays
         assert episode.scene
         episode.intrinsic("base_camera")
         episode.rgb("base_camera", 0)
+        episode.depth("base_camera", 0)
 
 
 @pytest.mark.parametrize("file", [DATA, EPISODES, schema.TASKS_FILE, schema.SCENES_FILE])
