@@ -82,7 +82,7 @@ def load(path: Path, expected: Mapping[str, str]) -> tuple[dict[str, torch.Tenso
 
 @contextmanager
 def facts_of(path: Path) -> Iterator[None]:
-    """Turn what a baseline raises for facts or sizes that make no model into an error that names their file.
+    """Turn errors of building a model or policy from the facts of a run into one that names their file.
 
     Raises:
         TrainingError: the facts of a ``run.json`` are not those of the baseline.

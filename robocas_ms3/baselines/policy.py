@@ -49,8 +49,10 @@ class RunPolicy:
         tensors, about = checkpoints.load(folder / WEIGHTS, expected)
         with checkpoints.facts_of(folder / RUN):
             model = baseline.model(config, record.facts)
-            checkpoints.put_in(model, tensors, folder / WEIGHTS)
-            self._policy: Policy = baseline.policy(config, record.facts, model.to(chosen).eval())
+        checkpoints.put_in(model, tensors, folder / WEIGHTS)
+        model = model.to(chosen).eval()
+        with checkpoints.facts_of(folder / RUN):
+            self._policy: Policy = baseline.policy(config, record.facts, model)
         step = checkpoints.step_of(about, folder / WEIGHTS)
         self._about = {**_about(record, step), "weights": hash_of_weights(folder)}
 
