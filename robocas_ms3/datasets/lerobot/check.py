@@ -341,7 +341,7 @@ def _check_checksums(root: Path) -> Iterator[Violation]:
             yield Violation(schema.CHECKSUMS_FILE, name, "a SHA-256", type(expected).__name__)
         elif PurePosixPath(name).parts[:1] not in {(folder,) for folder in schema.CONTENT} or ".." in Path(name).parts:
             yield Violation(schema.CHECKSUMS_FILE, name, f"a file in {', '.join(schema.CONTENT)}", "another path")
-        elif not (root / name).is_file():
+        elif not (root / name).exists():
             yield Violation(name, "", "a file", "none")
         elif (found := _checksum(root / name)) != expected:
             yield Violation(name, "", f"the bytes that were written, SHA-256 {expected}", found)
