@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -14,58 +15,80 @@ from typing import Any
 from robocas_ms3.errors import ExtensionError
 
 Handler = Callable[[int, FrameType | None], Any]
-_commands: list[Handler] = []  # the handler of Ctrl-C that a command installed; none in a library
+_SECOND = 0.5  # s from one SIGINT to the next that is a second one; sooner, it is the same key pressed, sent twice
+
+
+class _CommandInterrupt:
+    """Ctrl-C of a command: its handler is called once; the second one ends the process if it was not called by then.
+
+    Python only notes a signal, and calls the handler when native code returns or a deferral ends. A thread that learns
+    of the first SIGINT at once ignores those of the next half second, and then restores the system's default.
+    """
+
+    def __init__(self) -> None:
+        self.installed = False
+        self.holds = 0  # of `uninterrupted` and `responsive` that are under way
+        self._handler: Handler = signal.default_int_handler
+        self._handled = threading.Event()
+
+    def install(self, handler: Handler) -> None:
+        """Handle SIGINT by a command's handler."""
+        read, write = os.pipe()
+        os.set_blocking(write, False)
+        signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+        threading.Thread(target=self._watch, args=(read,), name="interrupts", daemon=True).start()
+        self._handler, self.installed = handler, True
+        signal.signal(signal.SIGINT, self.handle)
+        self.arm()
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        """Call the command's handler."""
+        self._handled.set()
+        self._handler(number, frame)
+
+    def waits(self) -> bool:
+        """Return whether the command waits for the first SIGINT, undeferred."""
+        return self.installed and signal.getsignal(signal.SIGINT) == self.handle
+
+    def arm(self) -> None:
+        """Let the system restore its default when the first SIGINT comes.
+
+        So the second one ends the process even while native code keeps the thread of `_watch` from running. Only where
+        the C library has ``sysv_signal``.
+        """
+        libc = ctypes.CDLL(None)
+        action = ctypes.create_string_buffer(1024)  # a `struct sigaction`, which begins with the handler
+        if hasattr(libc, "sysv_signal") and libc.sigaction(int(signal.SIGINT), None, action) == 0:
+            libc.sysv_signal(int(signal.SIGINT), ctypes.c_void_p.from_buffer(action))
+
+    def _watch(self, signals: int) -> None:
+        libc = ctypes.CDLL(None)  # `signal.signal` is for the main thread alone
+        while signal.SIGINT not in os.read(signals, 1):  # SIGTERM comes here too
+            pass
+        default = signal.SIG_IGN
+        while not self._handled.is_set():
+            if not self.holds:
+                libc.signal(int(signal.SIGINT), ctypes.c_void_p(int(default)))
+            default = signal.SIG_DFL
+            self._handled.wait(_SECOND)
+
+
+_command = _CommandInterrupt()
 
 
 def handle_interrupt(handler: Handler) -> None:
     """Install a command's handler of SIGINT; a second SIGINT ends the process while Python can't run the handler."""
-    signal.signal(signal.SIGINT, handler)
-    _commands[:] = [handler]
-    _let_second_end()
+    _command.install(handler)
 
 
 def was_interrupted() -> bool:
     """Return whether a ``KeyboardInterrupt`` may come from a signal: no, as long as a command waits for the first."""
-    return signal.getsignal(signal.SIGINT) not in _commands
+    return not _command.waits()
 
 
 @contextmanager
 def deferred_interrupts() -> Iterator[None]:
-    """Handle a SIGINT or SIGTERM that comes inside afterwards, once; a second SIGINT ends the process at once."""
-    with _deferred():
-        if _commands:
-            _let_second_end()
-        yield
-
-
-@contextmanager
-def responsive() -> Iterator[None]:
-    """Wait inside, in Python: a second SIGINT right after the first changes nothing."""
-    handler = signal.getsignal(signal.SIGINT)
-    armed = handler in _commands and threading.current_thread() is threading.main_thread()
-    if armed:
-        signal.signal(signal.SIGINT, handler)
-    try:
-        yield
-    finally:
-        if armed and not was_interrupted():
-            _let_second_end()
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back for a moment; processes that are started during that inherit it."""
-    with _deferred():
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            yield
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def _deferred() -> Iterator[None]:
-    """Call what deals with Ctrl-C and SIGTERM afterwards, once.
+    """Handle a SIGINT or SIGTERM that comes inside afterwards, once; of a command, a second SIGINT ends the process.
 
     A mask is not enough: the system gives the signal to another thread, of which Python tells the main one.
     """
@@ -84,6 +107,35 @@ def _deferred() -> Iterator[None]:
                 restored.callback(_restore, number, handler)
         if came:
             held[came[0][0]](*came[0])
+
+
+@contextmanager
+def responsive() -> Iterator[None]:
+    """Wait inside, in Python: a second SIGINT right after the first changes nothing."""
+    waits = _command.waits() and threading.current_thread() is threading.main_thread()
+    if waits:
+        _command.holds += 1
+        signal.signal(signal.SIGINT, _command.handle)
+    try:
+        yield
+    finally:
+        if waits:
+            _command.holds -= 1
+            if _command.waits():
+                _command.arm()
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C back for a moment, the second one too; processes that are started during that inherit it."""
+    with deferred_interrupts():
+        _command.holds += 1
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            _command.holds -= 1
 
 
 @contextmanager
@@ -114,19 +166,5 @@ def exit_error(error: BaseException, source: str) -> ExtensionError:
 
 def _restore(number: int, handler: Handler) -> None:
     signal.signal(number, handler)
-    if handler in _commands:
-        _let_second_end()
-
-
-def _let_second_end() -> None:
-    """Let the system reset SIGINT to its default when the first one comes.
-
-    Python only notes a signal, and calls its handler when native code returns. The second SIGINT then ends the process
-    at once. The handler ends the command if it is called before that. Only where the C library has ``sysv_signal``.
-    """
-    libc = ctypes.CDLL(None)
-    if not hasattr(libc, "sysv_signal"):
-        return
-    action = ctypes.create_string_buffer(1024)  # a `struct sigaction`, which begins with the handler
-    if libc.sigaction(int(signal.SIGINT), None, action) == 0:
-        libc.sysv_signal(int(signal.SIGINT), ctypes.c_void_p.from_buffer(action))
+    if handler == _command.handle:
+        _command.arm()

@@ -28,7 +28,25 @@ with uninterrupted():
 with {around}:
     print("ready", flush=True)
     while True:
-        hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
+        {call}
+"""
+LONG_CALLS = {
+    "with Python's lock": ("nullcontext()", "sum(range(2**62))"),
+    "without it": ("nullcontext()", HASHING := "hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)"),
+    "deferred": ("deferred_interrupts()", HASHING),
+}
+STEP = """
+import hashlib
+from robocas_ms3.cli.interrupts import heed_ctrl_c
+from robocas_ms3.exits import deferred_interrupts
+heed_ctrl_c()
+try:
+    with deferred_interrupts():
+        print("ready", flush=True)
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 500_000)
+        print("step done", flush=True)
+except KeyboardInterrupt:
+    print("handled", flush=True)
 """
 WAITING = """
 import os, signal, time
@@ -66,9 +84,9 @@ def python(program: str) -> subprocess.Popen:
     )
 
 
-@pytest.mark.parametrize("around", ["nullcontext()", "deferred_interrupts()"])
-def test_the_second_ctrl_c_ends_a_long_native_call(around):
-    with python(NATIVE.format(around=around)) as process:
+@pytest.mark.parametrize(("around", "call"), LONG_CALLS.values(), ids=LONG_CALLS)
+def test_the_second_ctrl_c_ends_a_long_native_call(around, call):
+    with python(NATIVE.format(around=around, call=call)) as process:
         try:
             assert process.stdout is not None and process.stdout.readline() == "ready\n"
             while process.poll() is None:  # how long the system takes to deliver the first one is not known
@@ -78,6 +96,14 @@ def test_the_second_ctrl_c_ends_a_long_native_call(around):
             assert process.returncode == -signal.SIGINT
         finally:
             process.kill()
+
+
+def test_a_step_is_finished_although_ctrl_c_came_twice_at_once():
+    with python(STEP) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        for _ in range(5):
+            process.send_signal(signal.SIGINT)
+        assert (process.communicate()[0], process.returncode) == ("step done\nhandled\n", 0)
 
 
 def test_the_first_of_two_at_once_is_handled_while_a_command_waits():
@@ -97,7 +123,7 @@ def test_an_exit_is_an_error_of_its_source():
     with pytest.raises(ExtensionError) as caught, no_exit("policy mine:Policy"):
         sys.exit(0)
     assert caught.value.where == "policy mine:Policy"
-    assert __file__ in caught.value.found
+    assert __file__ in str(caught.value.found)
     with pytest.raises(KeyboardInterrupt), no_exit("a library has no handler of its own"):
         raise KeyboardInterrupt
 
