@@ -17,16 +17,16 @@ def with_absolute_paths(cfg: _Config) -> _Config:
     """Return a command's configuration with absolute paths, and make those of environment variables absolute.
 
     Raises:
-        RobocasError: there is a relative path, and the working directory was removed.
+        RobocasError: the working directory was removed, which libraries don't survive.
     """
     try:
-        for variable in (CACHE, DATA):
-            if path := os.environ.get(variable):
-                os.environ[variable] = str(Path(path).absolute())
-        return _absolute(cfg)
+        os.getcwd()
     except FileNotFoundError as error:
-        fix = "Change to a folder that exists, or give absolute paths."
-        raise RobocasError("the working directory was removed", fix=fix) from error
+        raise RobocasError("the working directory was removed", fix="Change to a folder that exists.") from error
+    for variable in (CACHE, DATA):
+        if path := os.environ.get(variable):
+            os.environ[variable] = str(Path(path).absolute())
+    return _absolute(cfg)
 
 
 def _absolute(value: Any) -> Any:
