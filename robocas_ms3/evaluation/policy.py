@@ -155,10 +155,10 @@ def describe(policy: Policy) -> dict[str, Any]:
     """
     where = f"policy {_class_of(policy)}, describe()"
     with policy_code(policy):
-        added = getattr(policy, "describe", dict)()
+        wants, added = said_of(policy.wants), getattr(policy, "describe", dict)()
     if not isinstance(added, dict):
         raise EvaluationError("invalid policy description", where=where, expected="a dict", found=type(added).__name__)
-    said = {"class": _class_of(policy), "wants": said_of(policy.wants), **added}
+    said = {"class": _class_of(policy), "wants": wants, **added}
     return json.loads(json_text(said, where, error=EvaluationError))
 
 

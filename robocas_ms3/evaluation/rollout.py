@@ -169,13 +169,14 @@ class Rollouts:
         try:
             with policy_code(self._policy):
                 acted: Any = self._policy.act(seen)
+                actions = np.asarray(acted, np.float32)
         except PolicyFailed as failed:
             acted = failed.actions
             for env in envs if acted is None else failed.reasons:
                 self._playing[env].error = failed.reasons.get(env, str(failed))
             if acted is None:
                 return
-        actions = np.asarray(acted, np.float32)
+            actions = np.asarray(acted, np.float32)
         spent = (time.perf_counter() - begun) / len(envs)
         chunks = actions[:, None] if actions.ndim == 2 else actions
         if chunks.ndim != 3 or chunks.shape[0] != len(envs) or chunks.shape[1] < 1 or chunks.shape[2] != self._size:

@@ -42,6 +42,21 @@ class LeavesDescribed(Mine):
     def describe(self): raise SystemExit(0)
 class LeavesClosed(Mine):
     def close(self): raise SystemExit(0)
+class LeavesWantingLater(Mine):
+    asked = 0
+    @property
+    def wants(self):
+        self.asked += 1
+        if self.asked > 2: raise SystemExit(0)
+        return Mine.wants
+class LeavesConverted(Mine):
+    def act(self, observations): return self
+    def __array__(self, *_, **__): raise SystemExit(0)
+class LeavesLookedUp(Mine):
+    def __getattr__(self, name): raise SystemExit(0)
+class LeavesClosing(Mine):
+    @property
+    def close(self): raise SystemExit(0)
 """
 
 
@@ -103,6 +118,7 @@ def test_an_error_of_the_policys_own_is_its_own(here):
     [
         "own_leaving:Mine",
         *(f"own_policy:Leaves{when}" for when in ("Made", "Wanting", "Reset", "Acting", "Described", "Closed")),
+        *(f"own_policy:Leaves{when}" for when in ("WantingLater", "Converted", "LookedUp", "Closing")),
     ],
 )
 def test_a_policy_can_not_end_the_process(here, name):
@@ -110,6 +126,7 @@ def test_a_policy_can_not_end_the_process(here, name):
         describe(policy)
         list(Rollouts(Counting(1), policy, Rules(3), 0.05, refill=True).play([Start(-1, 0, "pick", "", "", "", 2, "")]))
     assert str(caught.value.where).startswith("policy own_")
+    assert str(here) in str(caught.value.found)
 
 
 def test_how_far_beside_follows_from_the_seed():

@@ -160,12 +160,16 @@ def _call(name: str, made: Any) -> Policy:
 
 @contextmanager
 def open_policy(name: str) -> Iterator[Policy]:
-    """Make a policy, and close it in the end if it can be closed."""
-    policy = make_policy(name)
-    try:
-        yield policy
-    finally:
-        close = getattr(policy, "close", None)
-        if close is not None:
-            with no_exit(f"policy {name}"):
+    """Make a policy, and close it in the end if it can be closed.
+
+    Raises:
+        ExtensionError: its code tried to end the process, wherever it is called inside.
+    """
+    with no_exit(f"policy {name}"):
+        policy = make_policy(name)
+        try:
+            yield policy
+        finally:
+            close = getattr(policy, "close", None)
+            if close is not None:
                 close()
