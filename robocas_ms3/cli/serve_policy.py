@@ -37,6 +37,7 @@ def main(cfg: ServePolicy) -> int:
     from robocas_ms3.errors import EvaluationError
     from robocas_ms3.evaluation.policies import open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
+    from robocas_ms3.evaluation.remote.address import strip_brackets
     from robocas_ms3.evaluation.remote.served import ServedFiles
     from robocas_ms3.evaluation.remote.server import PolicyServer
 
@@ -46,7 +47,7 @@ def main(cfg: ServePolicy) -> int:
         raise EvaluationError("no address to listen on", where="--host", expected="such as 127.0.0.1 or ::1")
     packs = [load_protocol(folder).rules.pack for folder in cfg.protocol]
     files = ServedFiles.of(cfg.protocol, packs)
-    if not _is_loopback(cfg.host):
+    if not _is_loopback(strip_brackets(cfg.host)):
         say(f"{cfg.host} is no loopback address: whoever can reach it can ask this policy")
     with open_policy(cfg.policy) as policy:
         PolicyServer(policy, cfg.host, cfg.port, files).run(lambda url: say(f"{cfg.policy} at {url}"))

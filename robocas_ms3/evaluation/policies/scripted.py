@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.benchmark import TASKS
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.errors import EvaluationError
@@ -75,6 +76,7 @@ class ScriptedPolicy:
 
         Raises:
             EvaluationError: the start does not name files of this machine, as of a client of a server.
+            ExtensionError: it names a task or a robot that this machine lacks.
         """
         for name in ("config_file", "layouts_file", "pack"):
             if not getattr(start, name):
@@ -84,6 +86,8 @@ class ScriptedPolicy:
                 )
                 expected = "a file of a shipped protocol, or of one that the server was started with"
                 raise EvaluationError(what, where=f"start.{name}", expected=expected, fix=fix)
+        TASKS.find(start.task, where="start.task")
+        find_robot(start.robot, where="start.robot")
         settings = EpisodeSettings(
             start.task,
             start.config_file,

@@ -77,6 +77,11 @@ def read_address(text: str) -> Address:
     return Address(urlunsplit((parts.scheme, parts.netloc, parts.path, "", "")), wants, **options)
 
 
+def strip_brackets(host: str) -> str:
+    """Return a host without the brackets that an IPv6 address has in a URL."""
+    return host[1:-1] if host.startswith("[") and host.endswith("]") else host
+
+
 def netloc(host: str, port: int) -> str:
     """Return host and port as a URL has them: an IPv6 address in brackets."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -16,9 +16,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from robocas_ms3 import __version__
-from robocas_ms3.errors import EvaluationError, WireError
+from robocas_ms3.errors import EvaluationError, RobocasError, WireError
 from robocas_ms3.evaluation.policy import Policy, describe, policy_code, said_of
-from robocas_ms3.evaluation.remote.address import netloc
+from robocas_ms3.evaluation.remote.address import netloc, strip_brackets
 from robocas_ms3.evaluation.remote.messages import (
     ACTIONS,
     ENV,
@@ -57,11 +57,13 @@ class PolicyServer:
     def __init__(
         self, policy: Policy, host: str = "127.0.0.1", port: int = 8000, files: ServedFiles | None = None
     ) -> None:
-        self._policy, self._host, self._port = policy, host, port
+        self._policy, self._host, self._port = policy, strip_brackets(host), port
         self._files = files or ServedFiles.of()
-        self._max_bytes = message_bytes(policy.wants)
+        with policy_code(policy):
+            self._wants = policy.wants
+        self._max_bytes = message_bytes(self._wants)
         about = json.loads(json.dumps({**describe(policy), "robocas_ms3": __version__}, default=str))
-        self._metadata = pack({WANTS: said_of(policy.wants), POLICY: about})
+        self._metadata = pack({WANTS: said_of(self._wants), POLICY: about})
         self._taken: set[int] = set()  # envs of the policy
         self._connections = 0
         self._stopping: Callable[[], Any] = lambda: None
@@ -131,6 +133,9 @@ class PolicyServer:
         except WireError as error:
             _LOG.warning("a client sent garbage: %s", error)
             return one_line(error), _GARBAGE
+        except RobocasError as error:
+            _LOG.warning("the policy failed: %s", error)
+            return one_line(error), _FAILED
         except Exception as error:  # whatever a policy raises, its client is to hear of it, and others are to be served
             _LOG.exception("the policy failed")
             return one_line(error), _FAILED
@@ -150,7 +155,7 @@ class PolicyServer:
             resets, envs[said] = True, next(env for env in itertools.count() if env not in self._taken)
             self._taken.add(envs[said])
         env = envs[said]
-        observations = observations_of(message, env, self._policy.wants)
+        observations = observations_of(message, env, self._wants)
         start = start_of(message, env, self._files) if resets else None
         with policy_code(self._policy):
             if start is not None:

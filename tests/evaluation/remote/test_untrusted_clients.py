@@ -1,5 +1,6 @@
 """Clients of a policy server choose no path of its machine, and learn no more than one line of what went wrong."""
 
+import logging
 import socket
 from dataclasses import replace
 from pathlib import Path
@@ -94,6 +95,14 @@ def test_shipped_files_and_those_of_the_servers_own_protocols_are_served(tmp_pat
     assert name_of(like_a_shipped_one) == like_a_shipped_one
 
 
+@pytest.mark.parametrize("name", ["task", "robot"])
+def test_a_task_or_robot_that_the_server_lacks_is_one_line_of_its_log(caplog, name):
+    with serving(Reading()) as url, caplog.at_level(logging.WARNING):
+        answer, code = asked(url, {name: "nothing"})
+    assert isinstance(answer, str) and answer.startswith(f"start.{name}:") and code
+    assert [record.exc_info for record in caplog.records if record.name.startswith("robocas_ms3")] == [None]
+
+
 @pytest.mark.parametrize("error", [ValueError("a\nb\x1b[31m" + "c" * 9999), SystemExit(0), RecursionError()])
 def test_a_failing_policy_is_one_line_to_its_client_and_others_are_served(error):
     policy = Failing(error)
@@ -129,13 +138,14 @@ def test_messages_are_no_larger_than_a_policys_pictures_need():
     assert (answer, code) == (None, 1009)
 
 
-def test_an_ipv6_address_is_in_brackets():
+@pytest.mark.parametrize("host", ["::1", "[::1]"])
+def test_an_ipv6_address_is_in_brackets(host):
     try:
         with socket.create_server(("::1", 0), family=socket.AF_INET6):
             pass
     except OSError:
         pytest.skip("no IPv6 here")
-    with serving(Told(), host="::1") as url:
+    with serving(Told(), host=host) as url:
         assert url.startswith("ws://[::1]:")
         remote = RemotePolicy(url)
         remote.reset([a_start()])
