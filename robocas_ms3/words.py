@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import logging
 import re
+import sys
+import threading
+import traceback
+from types import TracebackType
 from typing import Any
 
 # C0, DEL and C1 control characters, line and paragraph separators, marks and overrides of the text direction, lone
@@ -11,7 +15,13 @@ from typing import Any
 _UNPRINTABLE = r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 _CONTROL = re.compile(_UNPRINTABLE)
 _CONTROL_IN_LINES = re.compile(rf"(?![\n\t]){_UNPRINTABLE}")
-_MARKDOWN = re.compile(r"[\\`*\[\]<>|&~]")
+_MARKDOWN = re.compile(
+    r"[`*\[\]<>|&~$]"
+    r"|\\(?=[!-/:-@\[-`{-~]|$)"  # a backslash is markup only before punctuation
+    r"|(?<![^\W_])_|_(?![^\W_])"  # and `_` only at an end of a word
+    r"|:(?=//)|(?<=www)\.",  # links without brackets
+    re.IGNORECASE,
+)
 
 
 def printable(text: str, *, lines: bool = False) -> str:
@@ -26,7 +36,7 @@ def printable(text: str, *, lines: bool = False) -> str:
 
 
 def in_markdown(text: str) -> str:
-    """Return a text as one line of Markdown that shows it as it is: no HTML, links, emphasis or table cells."""
+    """Return a text as one line of Markdown that shows it as it is: no HTML, web links, emphasis or cells."""
     return _MARKDOWN.sub(r"\\\g<0>", printable(text))
 
 
@@ -44,6 +54,28 @@ def escape_log_lines() -> None:
     """Show control characters in log lines as escapes, in this process, where nobody set up a log handler."""
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_LogLines())
+
+
+def print_traceback(kind: type[BaseException], error: BaseException | None, at: TracebackType | None) -> None:
+    """Print a traceback on stderr, control characters as escapes; a `sys.excepthook`."""
+    sys.stderr.write(printable("".join(traceback.format_exception(kind, error, at)), lines=True))
+
+
+def escape_tracebacks() -> None:
+    """Show control characters in errors that nothing catches as escapes, in all threads of this process."""
+    sys.excepthook = print_traceback
+    threading.excepthook = _print_of_thread
+    sys.unraisablehook = _print_unraisable
+
+
+def _print_of_thread(args: threading.ExceptHookArgs) -> None:
+    if not issubclass(args.exc_type, SystemExit):  # which ends a thread, and is no error, as Python has it
+        print_traceback(args.exc_type, args.exc_value, args.exc_traceback)
+
+
+def _print_unraisable(args: sys.UnraisableHookArgs) -> None:
+    sys.stderr.write(printable(f"{args.err_msg or 'Exception ignored in'}: {args.object!r}") + "\n")
+    print_traceback(args.exc_type, args.exc_value, args.exc_traceback)
 
 
 def count_of(count: int, noun: str) -> str:

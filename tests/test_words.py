@@ -44,12 +44,17 @@ def test_control_characters_are_escapes_and_all_else_stays():
     assert json.loads(printable(json.dumps(HOSTILE, ensure_ascii=False))) == HOSTILE  # as `--json` prints it
 
 
+MARKUP = "__bold__ _x_ a_b (_c_) https://a.example WWW.a.example ftp://b \\* $x$ C:\\_ end\\"
+
+
 def test_a_text_in_markdown_has_no_markup():
-    shown = in_markdown(HOSTILE)
-    assert shown.isprintable()
-    assert not re.search(r"(?<!\\)(?:\\\\)*[<>|`*\[\]&]", shown)
-    assert re.sub(r"\\([\\`*\[\]<>|&~])", r"\1", shown) == printable(HOSTILE)
-    assert in_markdown("pick_table_scattered 0.5") == "pick_table_scattered 0.5"
+    for text in (HOSTILE, MARKUP):
+        shown = in_markdown(text)
+        assert shown.isprintable()
+        assert not re.search(r"(?<!\\)(?:\\\\)*[<>|`*\[\]&$]|(?<!\\)://|www\.", shown, re.IGNORECASE)
+        assert not re.search(r"(?<![\w\\])_|(?<!\\)_(?!\w)", shown)
+        assert re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", shown) == printable(text)
+    assert in_markdown("pick_table_scattered 0.5 \x1b") == "pick_table_scattered 0.5 \\u001b"
 
 
 def test_log_lines_of_this_package_are_one_line_without_control_characters(tmp_path):

@@ -22,12 +22,11 @@ import tyro
 from robocas_ms3 import __version__
 from robocas_ms3.cli.absolute import with_absolute_paths
 from robocas_ms3.cli.interrupts import INTERRUPTED, heed_ctrl_c, leave
-from robocas_ms3.cli.terminal import print_traceback
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.exits import no_exit
 from robocas_ms3.files import FULL
 from robocas_ms3.paths import ensure_home, is_writable, temporary_cache, variable_of
-from robocas_ms3.words import escape_log_lines, printable
+from robocas_ms3.words import escape_log_lines, escape_tracebacks, printable
 
 # Each names a module beside this one, with a dataclass called as the command and `main(cfg) -> int`; a dash in its name
 # is an underscore in the module's: import-robocas, import_robocas.py, ImportRobocas.
@@ -72,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     Args:
         argv: arguments after the program's name; default: the process's own.
     """
-    sys.excepthook = print_traceback
+    escape_tracebacks()
     heed_ctrl_c()
     leave(run(sys.argv[1:] if argv is None else argv))
 

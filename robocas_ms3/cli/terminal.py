@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import sys
-import traceback
 from collections.abc import Iterable
 from functools import lru_cache
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from robocas_ms3.words import printable
@@ -53,11 +51,6 @@ def say_lines(text: str) -> None:
 def tell(text: str) -> None:
     """Print one line on stderr."""
     print(printable(text), file=sys.stderr, flush=True)
-
-
-def print_traceback(kind: type[BaseException], error: BaseException, at: TracebackType | None) -> None:
-    """Print a traceback on stderr; a `sys.excepthook`."""
-    sys.stderr.write(printable("".join(traceback.format_exception(kind, error, at)), lines=True))
 
 
 @lru_cache(maxsize=1)

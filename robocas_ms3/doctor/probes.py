@@ -115,7 +115,9 @@ def _main() -> int:
         sys.stderr.write(f"{error}\n")
         return ABSENT
     except Exception as error:  # whatever the trial meets is its answer
-        sys.stderr.write(f"{type(error).__name__}: {' '.join(str(error).split())}\n")
+        from robocas_ms3.words import printable
+
+        sys.stderr.write(printable(f"{type(error).__name__}: {' '.join(str(error).split())}") + "\n")
         return 1
     answer.write(found + "\n")
     answer.flush()

@@ -25,7 +25,7 @@ from robocas_ms3.processes.lives import is_too_large, leave_with
 from robocas_ms3.processes.sent import SentError
 from robocas_ms3.processes.starting import end_with, start
 from robocas_ms3.processes.worker import Worker
-from robocas_ms3.words import escape_log_lines
+from robocas_ms3.words import escape_log_lines, escape_tracebacks
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -227,6 +227,7 @@ def _serve(open_worker: Callable[[], Worker[Any, Any]], pipe: Connection, parent
     end_with(parent)
     leave_with(parent)
     escape_log_lines()
+    escape_tracebacks()
     tqdm.set_lock(threading.RLock())  # its own is the system's, which a process that is killed leaves behind
     worker: Worker[Any, Any] | None = None
     while True:

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.routes import Response, Routes
-from robocas_ms3.words import printable
+from robocas_ms3.words import print_traceback, printable
 
 HOST = "127.0.0.1"
 MAX_CONNECTIONS = 256
@@ -80,8 +80,9 @@ class Viewer(ThreadingHTTPServer):
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of browsers that went away."""
-        if not isinstance(sys.exc_info()[1], ConnectionError | TimeoutError):
-            super().handle_error(request, client_address)
+        error = sys.exc_info()[1]
+        if error is not None and not isinstance(error, ConnectionError | TimeoutError):
+            print_traceback(type(error), error, error.__traceback__)
 
 
 class _Handler(BaseHTTPRequestHandler):

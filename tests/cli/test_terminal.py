@@ -68,11 +68,20 @@ def test_an_error_is_one_line(monkeypatch, capsys, error):
     assert SHOWN in line
 
 
-def test_a_traceback(tmp_path):
-    script = "import sys; sys.excepthook = __import__('robocas_ms3.cli.terminal', fromlist=['x']).print_traceback\n"
-    done = subprocess.run(
-        [sys.executable, "-c", script + f"raise ValueError({HOSTILE!r})"], capture_output=True, text=True, check=False
+WAYS_TO_FAIL = {
+    "in the main thread": "fail()",
+    "in another thread": "threading.Thread(target=fail).start()",
+    "while an object is freed": "type('Freed', (), {'__del__': fail})()",
+}
+
+
+@pytest.mark.parametrize("failing", WAYS_TO_FAIL.values(), ids=WAYS_TO_FAIL)
+def test_a_traceback(failing):
+    script = (
+        "import threading; from robocas_ms3.words import escape_tracebacks; escape_tracebacks()\n"
+        f"def fail(*_): raise ValueError({HOSTILE!r})\n"
+        f"{failing}"
     )
-    assert done.returncode == 1
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert SHOWN in done.stderr
     assert not controls(done.stderr)

@@ -167,6 +167,15 @@ def test_the_number_of_connections_is_bounded(folder, monkeypatch):
         server.shutdown()
 
 
+def test_an_error_of_a_request_moves_no_cursor(server, capsys):
+    try:
+        raise ValueError("a\x1b[2Jb")
+    except ValueError:
+        server.handle_error(None, None)
+    assert "a\\u001b[2Jb" in (shown := capsys.readouterr().err)
+    assert "\x1b" not in shown
+
+
 def test_a_port_that_is_taken(folder):
     with socket.socket() as taken:
         taken.bind((HOST, 0))

@@ -20,7 +20,7 @@ from robocas_ms3.datasets.lerobot.schema import checksum
 from robocas_ms3.documents import load_json
 from robocas_ms3.errors import EvaluationError, RobocasError
 from robocas_ms3.evaluation.remote.server import PolicyServer
-from robocas_ms3.words import printable
+from robocas_ms3.words import escape_log_lines, escape_tracebacks, printable
 
 CHECKPOINT = "train/checkpoints/last/pretrained_model"
 INFO = "dataset/meta/info.json"
@@ -97,6 +97,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--play", type=int, help="actions of a chunk that are played; default: as trained")
     parser.add_argument("--rate", type=float, help="actions a second; default: the dataset's in the run's folder")
     cfg = parser.parse_args(words)
+    escape_log_lines()
     try:
         alone = (cfg.run / "config.json").is_file()
         checkpoint = cfg.run if alone else cfg.run / CHECKPOINT
@@ -112,4 +113,5 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    escape_tracebacks()
     sys.exit(main())

@@ -8,13 +8,13 @@ from __future__ import annotations
 import signal
 import socket
 import sys
-import traceback
 from contextlib import suppress
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.evaluation.bridge.channel import Channel, leave_with_starter
 from robocas_ms3.exits import no_exit
 from robocas_ms3.processes import use_one_torch_thread
+from robocas_ms3.words import escape_log_lines, escape_tracebacks, print_traceback
 
 
 def main(fd: int, starter: int) -> int:
@@ -27,6 +27,8 @@ def main(fd: int, starter: int) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the starter's, which closes its end
     end = socket.socket(fileno=fd)
     leave_with_starter(end, starter)
+    escape_log_lines()
+    escape_tracebacks()
     channel, bridge = Channel(end), None
     try:
         from robocas_ms3.evaluation.bridge.server import open_bridge  # the simulator, which takes seconds
@@ -39,7 +41,7 @@ def main(fd: int, starter: int) -> int:
     except EOFError:
         return 0
     except Exception as error:  # whatever it is, the other end is to hear of it
-        traceback.print_exc()
+        print_traceback(type(error), error, error.__traceback__)
         said = str(error) if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}"
         with suppress(OSError):
             channel.send({"error": " ".join(said.split())})

@@ -22,7 +22,7 @@ from robocas_ms3.processes import SentError, leave_with, use_one_torch_thread
 from robocas_ms3.tasks.vector.block import Block, Field, Path, leaves, space_fields
 from robocas_ms3.tasks.vector.handle import LEAVE, NUMBER, STEP, name_envs
 from robocas_ms3.tasks.vector.messages import Call, EnvDescription, Order, Reset, Row, Share
-from robocas_ms3.words import escape_log_lines
+from robocas_ms3.words import escape_log_lines, escape_tracebacks
 
 FIRST_SEED = 2022  # of env 0's resets without a seed, as in ManiSkill; env 1 has the next
 _log = logging.getLogger(__name__)
@@ -38,6 +38,7 @@ def main(connection: int, memory: int, parent: int) -> None:
     """
     faulthandler.enable()
     escape_log_lines()
+    escape_tracebacks()
     leave_with(parent)
     for descriptor in (connection, memory):
         os.set_inheritable(descriptor, False)
