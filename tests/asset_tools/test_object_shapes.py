@@ -15,8 +15,9 @@ from asset_tools.build import build_object
 from asset_tools.decompose import decompose, few_vertices, for_engine
 from asset_tools.grasps import sample_grasps
 from asset_tools.repair import close
+from asset_tools.simplify import simplified
 from asset_tools.sources import ObjectSource
-from asset_tools.visual import simplified, to_display
+from asset_tools.visual import to_display
 from robocas_ms3.assets.cooking import OBLONG, SHRINKAGE, cook_hulls, cooking_faults
 from robocas_ms3.errors import AssetError
 

@@ -20,7 +20,8 @@ from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.glb import write_glb
 from asset_tools.reading.surface import Material, Part, to_mesh
-from asset_tools.visual import simplified, to_display
+from asset_tools.simplify import simplified
+from asset_tools.visual import to_display
 from robocas_ms3.errors import AssetError
 
 SHARED = Path(os.environ.get("ROBOCAS_SHARED", Path(__file__).resolve().parents[3] / "shared"))

@@ -1,0 +1,98 @@
+"""Fewer faces for rendering: edges are collapsed as far as no part is lost."""
+
+from __future__ import annotations
+
+import fast_simplification
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from robocas_ms3.errors import AssetError
+
+Array = NDArray[np.float64]
+
+DENSE = 3  # times as many faces as are wanted
+STUCK = 0.9  # of the faces left by a step of simplifying: a rougher one is needed
+ENOUGH = 6  # times as many faces as are wanted are accepted of a mesh with many holes or pieces
+GRIDS = (512, 362, 256, 181, 128, 91, 64, 45, 32, 16, 8)  # cells along the diagonal, to merge vertices in, fine first
+LEFT = 0.8  # share of area and volume that simplifying has to leave: with less, parts are lost or holes torn
+
+
+def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
+    """Merge vertices by position, collapse faces to the limit, and wind them outward.
+
+    A mesh with many holes or pieces can't be collapsed to the limit, or loses parts on the way. Up to six times as many
+    faces are accepted then; where that is not enough, vertices are merged on a grid.
+
+    Raises:
+        AssetError: no face is left.
+    """
+    body = welded(mesh)
+    center, size = body.bounds.mean(axis=0), float(np.linalg.norm(body.extents))
+    whole = (np.asarray(body.vertices) - center) / size, np.asarray(body.faces)
+    most, area = ENOUGH * triangles, float(body.area)
+    volume = abs(float(body.volume)) if body.is_watertight else 0.0
+
+    def keeps_parts(vertices: Array, faces: NDArray) -> bool:
+        light = trimesh.Trimesh(vertices * size, faces, process=False)
+        return bool(light.area >= LEFT * area and abs(light.volume) >= LEFT * volume)
+
+    found: list[tuple[Array, NDArray]] = []
+    for limit in (triangles, 2 * triangles, 4 * triangles, most):
+        found.append(_collapsed(*whole, limit))
+        if len(found[-1][1]) > most or keeps_parts(*found[-1]):
+            break
+    if len(found[-1][1]) > most or not keeps_parts(*found[-1]):
+        found += [_merged(*whole, cells) for cells in GRIDS]
+    found = [part for part in found if len(part[1]) <= most]
+    vertices, faces = next((part for part in found if keeps_parts(*part)), found[-1])
+    if len(faces) == 0:
+        raise AssetError("the mesh has no faces of any size", expected=f"1 to {triangles} faces", found=0)
+    body = trimesh.Trimesh(vertices * size + center, faces, process=False)
+    body.update_faces(body.nondegenerate_faces())
+    body.remove_unreferenced_vertices()
+    if not body.is_winding_consistent:
+        trimesh.repair.fix_winding(body)
+    if body.volume < 0:
+        body.invert()
+    return body
+
+
+def welded(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the faces of a mesh, in the same order, over vertices merged by position."""
+    body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    body.merge_vertices(digits_vertex=None)
+    return body
+
+
+def outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a welded mesh with its faces outwards, in the same order."""
+    body = welded(mesh)
+    if body.volume < 0:
+        body.faces = np.array(body.faces)[:, ::-1]
+    return body
+
+
+def _collapsed(vertices: Array, faces: NDArray, triangles: int) -> tuple[Array, NDArray]:
+    """Return vertices and faces after edges were collapsed to the limit, or as near to it as it goes."""
+    gentle = (2, 3) if len(faces) > DENSE * triangles else ()
+    for aggression in (*gentle, 5, 7, 9, 12, 16, 20):  # it may stop above the limit
+        before = np.inf
+        while triangles < len(faces) < STUCK * before:
+            before = len(faces)  # by halves: a dense mesh that loses most of its faces at once folds over
+            target = max(triangles, before // 2) if gentle else triangles
+            vertices, faces = fast_simplification.simplify(
+                np.ascontiguousarray(vertices), faces.astype(np.int32), target_count=target, agg=aggression
+            )[:2]
+    return vertices, faces
+
+
+def _merged(vertices: Array, faces: NDArray, cells: int) -> tuple[Array, NDArray]:
+    """Return vertices and faces with one vertex, the mean, per cell of a grid with so many cells per unit."""
+    _, cell, counts = np.unique(np.floor(vertices * cells), axis=0, return_inverse=True, return_counts=True)
+    cell = cell.reshape(-1)
+    means = np.stack([np.bincount(cell, column) / counts for column in vertices.T], axis=1)
+    faces = cell[faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    return means, faces[np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1]]
