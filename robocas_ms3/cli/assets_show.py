@@ -106,7 +106,8 @@ def info(command: Info) -> int:
             )
         console.print(table)
     if pack.furniture:
-        table = Table(Column("furniture", no_wrap=True), "size (mm)", "surfaces", "joints", "handles", "finishes")
+        names = ("size (mm)", "surfaces", "joints", "handles", "finishes", "repairs")
+        table = Table(Column("furniture", no_wrap=True), *names)
         for loaded in pack.furniture.values():
             asset = loaded.asset
             table.add_row(
@@ -115,7 +116,8 @@ def info(command: Info) -> int:
                 ", ".join(asset.surfaces),
                 ", ".join(f"{link.joint.name} ({link.joint.kind})" for link in asset.links),
                 ", ".join(asset.handles),
-                "; ".join(f"{part}: {', '.join(names)}" for part, names in asset.finishes.items()),
+                "; ".join(f"{part}: {', '.join(finishes)}" for part, finishes in asset.finishes.items()),
+                "; ".join(asset.repairs),
             )
         console.print(table)
     return 0
