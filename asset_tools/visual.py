@@ -50,7 +50,7 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
         raise AssetError(
             "can't show this mesh", expected="faces, and finite vertices", found=f"{len(mesh.faces)} faces"
         )
-    source = _Source(mesh)
+    source = Appearance(mesh)
     if len(mesh.faces) <= triangles and (source.plain or source.single is not None):
         vertices, faces, normals, origin = _shaded(mesh)
         if mesh.volume < 0:
@@ -82,8 +82,8 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
     return trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
 
 
-class _Source:
-    """How the original looks: images and UVs with linear tints, or else colours of the corners, sRGB, 0 to 255.
+class Appearance:
+    """What a mesh looks like: images and UVs with linear tints, or else colours of the corners, sRGB, 0 to 255.
 
     Attributes:
         images: RGB; empty: colours alone.
@@ -223,7 +223,7 @@ def _unwrapped(body: trimesh.Trimesh, size: int) -> tuple[NDArray[np.int64], NDA
 
 def _baked(
     mesh: trimesh.Trimesh,
-    source: _Source,
+    source: Appearance,
     body: trimesh.Trimesh,
     corner_uv: Array,
     corner_normals: Array,

@@ -117,7 +117,7 @@ class Gltf:
 
 def shown_colors(mesh: trimesh.Trimesh) -> np.ndarray:
     """(F, 3) sRGB colour that the import shows in the middle of each face, 0 to 255."""
-    from asset_tools.visual import _Source
+    from asset_tools.visual import Appearance
 
     faces = np.arange(len(mesh.faces))
-    return np.rint(_Source(mesh).at(np.asarray(mesh.faces), faces, np.full((len(faces), 3), 1 / 3)))
+    return np.rint(Appearance(mesh).at(np.asarray(mesh.faces), faces, np.full((len(faces), 3), 1 / 3)))
