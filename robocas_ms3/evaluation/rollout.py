@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.policy import Observations, Policy, Start, policy_code, privileged
+from robocas_ms3.evaluation.policy import Observations, Policy, Start, Wants, policy_code, privileged
 from robocas_ms3.evaluation.tracking import MEASURES, summed
 from robocas_ms3.language.embed import TextEmbedder
 
+NOT_FINITE = "the policy's action is not finite"
 _WELDS = "welds"  # of `weld`, where there is one
 
 
@@ -63,147 +64,68 @@ class Rules:
     max_v0_steps: int | None = None
 
 
-class Rollouts:
-    """Plays episodes in a vector environment (`make_vec`, NumPy arrays, no resets of its own).
+class EpisodeBatch:
+    """Runs one episode in each of several envs; the caller chooses the action of every step.
 
-    In processes an env that is done begins the next episode at once; in a GPU's batch, where objects are built for all
-    envs together, it waits, masked, until all are done. What comes of an episode follows from its seed and the policy's
-    actions alone.
+    The result of an episode depends on its seed and its actions only.
 
     Args:
-        env: whose envs take actions of the policy's convention (`stepping.PolicyStepping`).
-        policy: that acts.
+        env: vector environment (`make_vec`, NumPy arrays, no automatic resets) whose envs take actions of the policy's
+            convention (`stepping.PolicyStepping`).
+        wants: what the policy sees, and what its actions mean.
         rules: when an episode ends.
-        control_dt: s of the scene a control step takes.
-        refill: whether envs may begin anew while others go on.
+        control_dt: simulated time of a control step, s.
+        refill: whether an env can be reset while others run. In a GPU's batch all envs are reset together.
+
+    Attributes:
+        obs: last observation of the environment, arrays (N, ...).
+        running: by env, the episode that it runs. An entry with an ``error`` ends at the next step.
+        size: numbers of an action.
     """
 
-    def __init__(self, env: Any, policy: Policy, rules: Rules, control_dt: float, *, refill: bool) -> None:
-        self._env, self._policy, self._rules, self._dt, self._refill = env, policy, rules, control_dt, refill
-        self._size = CONVENTIONS[policy.wants.convention].size
-        self._count: int = env.num_envs
-        self._playing: dict[int, Rollout] = {}
-        self._chunks: dict[int, list[NDArray[np.floating]]] = {}
-        self._obs: Any = None
+    def __init__(self, env: Any, wants: Wants, rules: Rules, control_dt: float, *, refill: bool) -> None:
+        self._env, self._wants, self._rules, self._dt, self.refill = env, wants, rules, control_dt, refill
+        self.size = CONVENTIONS[wants.convention].size
+        self.num_envs: int = env.num_envs
+        self.running: dict[int, Rollout] = {}
+        self.obs: Any = None
         self._info: dict[str, Any] = {}
         self._flags: list[str] = []  # names of an info's flags
-        self._held = np.zeros((0, self._count), dtype=bool)  # by flag and env, whether it has held in its episode
-        self._embed = TextEmbedder() if policy.wants.language == "embedding" else None
+        self._held = np.zeros((0, self.num_envs), dtype=bool)  # by flag and env, whether it has held in its episode
+        self._embed = TextEmbedder() if wants.language == "embedding" else None
 
-    def play(self, episodes: Sequence[Start]) -> Iterator[Rollout]:
-        """Play episodes; each is given as it ends, in any order. Their ``env`` is set here."""
-        waiting = list(reversed(episodes))
-        while waiting or self._playing:
-            free = [env for env in range(self._count) if env not in self._playing]
-            if waiting and free and (self._refill or not self._playing):
-                self._begin([(env, waiting.pop()) for env in free[: len(waiting)]])
-            yield from self._step()
+    def start(self, pairs: list[tuple[int, Start]]) -> list[Start]:
+        """Reset envs to the first state of episodes.
 
-    def lost(self, envs: Sequence[int], why: str) -> Iterator[Rollout]:
-        """Episodes under way in some envs that are no more: nothing is known of what happened in them."""
-        for env in envs:
-            if env in self._playing:
-                played = Rollout(self._playing[env].start, error=why)
-                played.flags = played.flag_seconds = dict.fromkeys(self._flags)
-                played.measures = dict.fromkeys((*MEASURES, *([_WELDS] if _WELDS in self._info else [])), 0.0)
-                yield played
+        Args:
+            pairs: an env and its episode. Where envs can't be reset one by one, no other episode may run.
 
-    def _begin(self, pairs: list[tuple[int, Start]]) -> None:
+        Returns:
+            The episodes, with ``env`` set.
+        """
         envs = [env for env, _ in pairs]
         seeds = [start.seed for _, start in pairs]
-        starts = [Start(**{**vars(start), "env": env}) for env, start in pairs]
-        for start in starts:
-            self._playing[start.env], self._chunks[start.env] = Rollout(start), []
-        if self._refill:
-            self._obs, info = self._env.reset(seed=seeds, options={"env_idx": np.array(envs)})
+        starts = [replace(start, env=env) for env, start in pairs]
+        self.running.update({start.env: Rollout(start) for start in starts})
+        if self.refill:
+            self.obs, info = self._env.reset(seed=seeds, options={"env_idx": np.array(envs)})
         else:  # a batch is reset as a whole, with the objects of these seeds
-            rest = [seeds[0]] * (self._count - len(seeds))
-            self._obs, info = self._env.reset(seed=seeds + rest, options={"reconfigure": True})
+            rest = [seeds[0]] * (self.num_envs - len(seeds))
+            self.obs, info = self._env.reset(seed=seeds + rest, options={"reconfigure": True})
         self._info = info
         if not self._flags:
             self._flags = [name for name, value in info.items() if _is_flag(value)]
-            self._held = np.zeros((len(self._flags), self._count), dtype=bool)
+            self._held = np.zeros((len(self._flags), self.num_envs), dtype=bool)
         self._held[:, envs] = False
         self._note()
-        with policy_code(self._policy):
-            self._policy.reset(starts)
+        return starts
 
-    def _step(self) -> Iterator[Rollout]:
-        self._ask()
-        for env, played in list(self._playing.items()):
-            if played.error:
-                yield self._end(env)
-        if not self._playing:
-            return
-        actions = np.zeros((self._count, self._size), np.float32)  # of envs that are done; nobody looks
-        for env in self._playing:
-            actions[env] = self._chunks[env].pop(0)
-        self._obs, _, _, _, self._info = self._env.step(actions)
-        for played in self._playing.values():
-            played.steps += 1
-        self._note()
-        for env in [env for env, played in self._playing.items() if self._is_over(played)]:
-            yield self._end(env)
-
-    def _end(self, env: int) -> Rollout:
-        played, info = self._playing.pop(env), self._info
-        played.seconds = self._seconds(env)
-        for name in self._flags:
-            played.at_end[name] = bool(info[name][env])
-            played.flags.setdefault(name, None)
-            played.flag_seconds.setdefault(name, None)
-        played.measures = {name: round(float(summed(info, name)[env]), 4) for name in MEASURES}
-        if _WELDS in info:
-            played.measures[_WELDS] = float(info[_WELDS][env])
-        if "retrieval" in info:
-            played.retrieval = info["retrieval"][env].copy()
-        return played
-
-    def _ask(self) -> None:
-        """See that every env that plays has an action."""
-        envs = [env for env in self._playing if not self._chunks[env]]
-        if not envs:
-            return
-        seen = self._observed(envs)
-        begun = time.perf_counter()
-        try:
-            with policy_code(self._policy):
-                acted: Any = self._policy.act(seen)
-                actions = np.asarray(acted, np.float32)
-        except PolicyFailed as failed:
-            acted = failed.actions
-            for env in envs if acted is None else failed.reasons:
-                self._playing[env].error = failed.reasons.get(env, str(failed))
-            if acted is None:
-                return
-            actions = np.asarray(acted, np.float32)
-        spent = (time.perf_counter() - begun) / len(envs)
-        chunks = actions[:, None] if actions.ndim == 2 else actions
-        if chunks.ndim != 3 or chunks.shape[0] != len(envs) or chunks.shape[1] < 1 or chunks.shape[2] != self._size:
-            raise EvaluationError(
-                "actions don't fit",
-                where=type(self._policy).__name__,
-                expected=f"({len(envs)}, {self._size}) or ({len(envs)}, chunk, {self._size})",
-                found=actions.shape,
-            )
-        every = self._policy.wants.look_every
-        if chunks.shape[1] > 1 and chunks.shape[1] % every:
-            what = "it would be asked for chunks without a look at pictures"
-            raise EvaluationError(
-                what, where=type(self._policy).__name__, expected=f"a multiple of {every} steps", found=chunks.shape[1]
-            )
-        finite = np.isfinite(chunks).all((1, 2))
-        for env, chunk, good in zip(envs, chunks, finite, strict=True):
-            if not good:
-                self._playing[env].error = self._playing[env].error or "the policy's action is not finite"
-            self._chunks[env] = list(chunk)
-            self._playing[env].inference_seconds += spent
-
-    def _observed(self, envs: list[int]) -> Observations:
-        obs, wants, index = self._obs, self._policy.wants, np.array(envs)
+    def observe(self, envs: list[int]) -> Observations:
+        """Return what the policy sees of some running envs."""
+        obs, wants, index = self.obs, self._wants, np.array(envs)
         agent, cameras = obs["agent"], obs.get("sensor_data", {})
-        playing = [self._playing[env].start for env in envs]
-        texts = [start.instruction if wants.language != "none" else "" for start in playing]
+        starts = [self.running[env].start for env in envs]
+        texts = [start.instruction if wants.language != "none" else "" for start in starts]
         return Observations(
             envs=index,
             instructions=texts,
@@ -216,6 +138,46 @@ class Rollouts:
             state=privileged(obs["extra"])[index] if wants.state else None,
         )
 
+    def step(self, actions: NDArray[np.float32]) -> Iterator[Rollout]:
+        """Step all envs once, and yield the episodes that end.
+
+        Args:
+            actions: (N, A); rows of envs without an episode have no effect on results.
+        """
+        for env in [env for env, played in self.running.items() if played.error]:
+            yield self._end(env)
+        if not self.running:
+            return
+        self.obs, _, _, _, self._info = self._env.step(actions)
+        for played in self.running.values():
+            played.steps += 1
+        self._note()
+        for env in [env for env, played in self.running.items() if self._is_over(played)]:
+            yield self._end(env)
+
+    def lost(self, envs: Sequence[int], why: str) -> Iterator[Rollout]:
+        """Yield the running episodes of envs whose process died, as failures without measures."""
+        for env in envs:
+            if env in self.running:
+                played = Rollout(self.running[env].start, error=why)
+                played.flags = played.flag_seconds = dict.fromkeys(self._flags)
+                played.measures = dict.fromkeys((*MEASURES, *([_WELDS] if _WELDS in self._info else [])), 0.0)
+                yield played
+
+    def _end(self, env: int) -> Rollout:
+        played, info = self.running.pop(env), self._info
+        played.seconds = self._seconds(env)
+        for name in self._flags:
+            played.at_end[name] = bool(info[name][env])
+            played.flags.setdefault(name, None)
+            played.flag_seconds.setdefault(name, None)
+        played.measures = {name: round(float(summed(info, name)[env]), 4) for name in MEASURES}
+        if _WELDS in info:
+            played.measures[_WELDS] = float(info[_WELDS][env])
+        if "retrieval" in info:
+            played.retrieval = info["retrieval"][env].copy()
+        return played
+
     def _note(self) -> None:
         """Write down which flags hold for the first time."""
         new = np.array([self._info[name] for name in self._flags]) & ~self._held
@@ -223,8 +185,8 @@ class Rollouts:
             return
         for flag, env in np.argwhere(new):
             self._held[flag, env] = True
-            if env in self._playing:
-                played, name = self._playing[env], self._flags[flag]
+            if env in self.running:
+                played, name = self.running[env], self._flags[flag]
                 played.flags[name], played.flag_seconds[name] = played.steps, round(self._seconds(env), 4)
 
     def _seconds(self, env: int) -> float:
@@ -234,6 +196,96 @@ class Rollouts:
         rules, info, env = self._rules, self._info, played.start.env
         v0 = rules.max_v0_steps is not None and summed(info, "v0_steps")[env] >= rules.max_v0_steps
         return v0 or played.steps >= rules.max_steps or any(info[name][env] for name in rules.ends_on if name in info)
+
+
+class Rollouts:
+    """Plays episodes in a vector environment with a policy.
+
+    In processes an env that is done begins the next episode at once; in a GPU's batch, where objects are built for all
+    envs together, it waits, masked, until all are done.
+
+    Args:
+        env: see `EpisodeBatch`.
+        policy: that acts.
+        rules: when an episode ends.
+        control_dt: simulated time of a control step, s.
+        refill: see `EpisodeBatch`.
+    """
+
+    def __init__(self, env: Any, policy: Policy, rules: Rules, control_dt: float, *, refill: bool) -> None:
+        self._batch = EpisodeBatch(env, policy.wants, rules, control_dt, refill=refill)
+        self._policy = policy
+        self._chunks: dict[int, list[NDArray[np.floating]]] = {}
+        self.lost = self._batch.lost
+
+    def play(self, episodes: Sequence[Start]) -> Iterator[Rollout]:
+        """Play episodes; each is given as it ends, in any order. Their ``env`` is set here."""
+        waiting, batch = list(reversed(episodes)), self._batch
+        while waiting or batch.running:
+            free = [env for env in range(batch.num_envs) if env not in batch.running]
+            if waiting and free and (batch.refill or not batch.running):
+                starts = batch.start([(env, waiting.pop()) for env in free[: len(waiting)]])
+                self._chunks.update({start.env: [] for start in starts})
+                with policy_code(self._policy):
+                    self._policy.reset(starts)
+            self._ask()
+            actions = np.zeros((batch.num_envs, batch.size), np.float32)
+            for env, played in batch.running.items():
+                if not played.error:
+                    actions[env] = self._chunks[env].pop(0)
+            yield from batch.step(actions)
+
+    def _ask(self) -> None:
+        """See that every env that plays has an action."""
+        running = self._batch.running
+        envs = [env for env in running if not self._chunks[env]]
+        if not envs:
+            return
+        seen = self._batch.observe(envs)
+        begun = time.perf_counter()
+        try:
+            with policy_code(self._policy):
+                acted: Any = self._policy.act(seen)
+                actions = np.asarray(acted, np.float32)
+        except PolicyFailed as failed:
+            acted = failed.actions
+            for env in envs if acted is None else failed.reasons:
+                running[env].error = failed.reasons.get(env, str(failed))
+            if acted is None:
+                return
+            actions = np.asarray(acted, np.float32)
+        spent = (time.perf_counter() - begun) / len(envs)
+        chunks = as_chunks(actions, len(envs), self._batch.size, where=type(self._policy).__name__)
+        every = self._policy.wants.look_every
+        if chunks.shape[1] > 1 and chunks.shape[1] % every:
+            what = "it would be asked for chunks without a look at pictures"
+            raise EvaluationError(
+                what, where=type(self._policy).__name__, expected=f"a multiple of {every} steps", found=chunks.shape[1]
+            )
+        for env, chunk in zip(envs, chunks, strict=True):
+            if not np.isfinite(chunk).all():
+                running[env].error = running[env].error or NOT_FINITE
+            self._chunks[env] = list(chunk)
+            running[env].inference_seconds += spent
+
+
+def as_chunks(actions: NDArray[np.float32], count: int, size: int, *, where: str) -> NDArray[np.float32]:
+    """Return the actions of ``count`` envs as chunks (E, H, A).
+
+    Args:
+        actions: (E, A), or chunks (E, H, A).
+        count: E.
+        size: A.
+        where: who gave them.
+
+    Raises:
+        EvaluationError: they have another shape.
+    """
+    chunks = actions[:, None] if actions.ndim == 2 else actions
+    if chunks.ndim != 3 or chunks.shape[0] != count or chunks.shape[1] < 1 or chunks.shape[2] != size:
+        expected = f"({count}, {size}) or ({count}, chunk, {size})"
+        raise EvaluationError("actions don't fit", where=where, expected=expected, found=actions.shape)
+    return chunks
 
 
 def _is_flag(value: Any) -> bool:
