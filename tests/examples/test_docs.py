@@ -42,6 +42,11 @@ def test_batched(tmp_path):
     assert ends == ["4 ended, 0.0 succeeded"] * 2
 
 
+def test_motion_planning(needs_renderer, tmp_path):
+    *_, end = run_first_program("motion_planning.md", tmp_path)
+    assert end.startswith("success True after ")
+
+
 def test_reinforcement_learning(tmp_path):
     rewards = [float(line.split()[0]) for line in run_first_program("rl.md", tmp_path)]
     assert len(rewards) == 5

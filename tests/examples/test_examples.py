@@ -7,6 +7,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
+import cv2
 import pytest
 from forkserver import ForkServer
 
@@ -59,6 +60,20 @@ def test_read_dataset(recorded, needs_renderer, tmp_path):
     assert about.startswith("1 episodes, ")
     first, last = trained.split("loss ")[1].split(" -> ")
     assert float(last) < float(first)
+
+
+def test_motion_planning_solves_pick_cube(needs_renderer, tmp_path):
+    lines = run("05_motion_planning.py", "--episodes", 10, "--image", "end.png", cwd=tmp_path)
+    assert [line.split(",")[0] for line in lines[-11:-1]] == [f"seed {seed}: success True" for seed in range(10)]
+    assert lines[-1] == "10 of 10 episodes succeeded"
+    image = cv2.imread(str(tmp_path / "end.png"))
+    assert image.shape == (512, 512, 3)
+    assert image.std() > 20
+
+
+def test_motion_planning_solves_pick(tmp_path):
+    lines = run("05_motion_planning.py", "--env", "RoboCASPick-v1", "--seed", 6, "--episodes", 4, cwd=tmp_path)
+    assert lines[-1] == "4 of 4 episodes succeeded"
 
 
 def test_ppo_in_a_shortened_form(tmp_path):

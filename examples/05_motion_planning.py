@@ -1,0 +1,165 @@
+"""Solve ManiSkill's PickCube-v1 or RoboCASPick-v1 with motion planning, written as ManiSkill's own solutions are.
+
+python examples/05_motion_planning.py --env PickCube-v1 --seed 0 --episodes 10
+python examples/05_motion_planning.py --env RoboCASPick-v1 --image end.png
+"""
+
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401  (registers PickCube-v1)
+import numpy as np
+import sapien
+import tyro
+from mani_skill.examples.motionplanning.base_motionplanner.utils import compute_grasp_info_by_obb, get_actor_obb
+
+import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.drops import overhangs, sample_drops
+from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins
+from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
+from robocas_ms3.planning.protocol import AttachedBody
+from robocas_ms3.planning.scene import SPACING, PlanningScene
+from robocas_ms3.poses import inverse, transform
+
+
+def solve_pick_cube(env, seed=None, debug=False, vis=False):
+    """Solve PickCube-v1; ``debug`` shows the box that the grasp is computed from."""
+    env.reset(seed=seed)
+    planner = PandaArmMotionPlanningSolver(env, base_pose=env.unwrapped.agent.robot.pose, vis=vis)
+    env = env.unwrapped
+
+    obb = get_actor_obb(env.cube, vis=debug)
+    approaching = np.array([0, 0, -1])
+    target_closing = env.agent.tcp.pose.sp.to_transformation_matrix()[:3, 1]
+    grasp_info = compute_grasp_info_by_obb(obb, approaching, target_closing, depth=0.025)
+    grasp_pose = env.agent.build_grasp_pose(approaching, grasp_info["closing"], env.cube.pose.sp.p)
+
+    planner.move_to_pose_with_screw(grasp_pose * sapien.Pose([0, 0, -0.05]))
+    planner.move_to_pose_with_screw(grasp_pose)
+    planner.close_gripper()
+    res = planner.move_to_pose_with_screw(sapien.Pose(env.goal_site.pose.sp.p, grasp_pose.q))
+    planner.close()
+    return res
+
+
+def solve_pick(env, seed=None, debug=False, vis=False):
+    """Solve RoboCASPick-v1 with a table; ``debug`` prints why poses were given up."""
+    env.reset(seed=seed)
+    planner = PandaArmMotionPlanningSolver(env, base_pose=env.unwrapped.agent.robot.pose, vis=vis)
+    env = env.unwrapped
+    scene, slot, rise = PlanningScene(env), int(env.target_slot[0]), sapien.Pose([0, 0, 0.1])
+    everything, all_but_target = scene.obstacles_in_world(), scene.obstacles_in_world(without=slot)
+
+    def reach_and_grasp(grasp_pose):
+        planner.clear_collisions()
+        planner.add_obstacles(everything)
+        planner.move_to_pose_with_RRTConnect(grasp_pose * sapien.Pose([0, 0, -0.1]))
+        planner.clear_collisions()
+        planner.add_obstacles(all_but_target)
+        planner.move_to_pose_with_screw(grasp_pose)
+        planner.move_to_pose_with_screw(rise * grasp_pose, dry_run=True)  # a grasp without a way up is of no use
+
+    grasp_pose = first_that_works(reach_and_grasp, ranked_grasps(env, scene, slot), debug)
+    planner.close_gripper(t=10)
+    planner.move_to_pose_with_screw(rise * grasp_pose)
+
+    held = AttachedBody(
+        np.concatenate(env.object_assets[0][slot].hulls), inverse(scene.tcp_in_base) @ scene.object_in_base(slot)
+    )
+    planner.planner.attach(held)
+    drops = ranked_drops(env, scene, slot, held, np.random.default_rng(seed))
+    first_that_works(planner.move_to_pose_with_RRTConnect, drops, debug)
+    planner.open_gripper(t=10)
+    planner.planner.attach(None)
+    res = planner.move_to_pose_with_RRTConnect(rise * grasp_pose)  # the object comes to rest during this motion
+    planner.close()
+    return res
+
+
+def first_that_works(move, poses, debug):
+    """Return the first pose to which a motion could be planned."""
+    failure = PlanningFailed("example", "no_pose")
+    for pose in poses:
+        try:
+            move(pose)
+            return pose
+        except PlanningFailed as error:
+            failure = error
+            if debug:
+                print(error)
+    raise failure
+
+
+def ranked_grasps(env, scene, slot):
+    """Return the annotated grasps that touch no other object; firm, central and steep ones first."""
+    target, base = env.object_assets[0][slot], scene.arm_base_in_world
+    notes, object_in_world = target.annotations, base @ scene.object_in_base(slot)
+    kept = filter_grasps(
+        object_in_world @ notes.grasps_tcp_in_object,
+        notes.grasp_widths,
+        arm_base_in_world=base,
+        object_center_in_world=object_in_world[:3, 3],
+        scene_points_in_world=transform(base, scene.obstacles_in_base(without=slot)),
+    )
+    margins = grip_margins(notes.grasps_tcp_in_object[kept.index], kept.widths, target.surface_points(SPACING))
+    distance = np.linalg.norm(kept.tcp_in_world[:, :3, 3] - object_in_world[:3, 3], axis=1)
+    score = margins + np.exp(-distance / 0.03) - kept.tcp_in_world[:, 2, 2]
+    return [sapien.Pose(kept.tcp_in_world[i]) for i in np.argsort(-score, kind="stable")]
+
+
+def ranked_drops(env, scene, slot, held, rng):
+    """Return TCP poses that hold the object above the basket; those where it fits the opening, steep ones first."""
+    inner = env.model.basket.asset.inner
+    low, high = np.array(inner.min), np.array(inner.max)
+    center = np.array([env.object_assets[0][slot].asset.center_of_mass])
+    vertices, center = transform(held.object_in_tcp, held.vertices), transform(held.object_in_tcp, center)
+    drops = sample_drops(
+        rng,
+        count=200,
+        container_in_base=scene.basket_in_base,
+        inner_low=low,
+        inner_high=high,
+        vertices_in_tcp=vertices,
+        center_in_tcp=center[0],
+    )
+    margin = np.array([0.03, 0.03, 0])
+    overhang = overhangs(drops, scene.basket_in_base, low + margin, high - margin, vertices)
+    order = np.lexsort((drops[:, 2, 2], np.ceil(overhang / 0.015)))
+    return [sapien.Pose(scene.arm_base_in_world @ drops[i]) for i in order]
+
+
+SOLUTIONS = {"PickCube-v1": solve_pick_cube, "RoboCASPick-v1": solve_pick}
+
+
+def main(
+    env: Literal["PickCube-v1", "RoboCASPick-v1"] = "PickCube-v1",
+    seed: int = 0,
+    episodes: int = 10,
+    image: Path | None = None,
+    debug: bool = False,
+    vis: bool = False,
+) -> None:
+    """Solve episodes of consecutive seeds; write an image of the last step to ``image``."""
+    no_renderer = dict(render_backend="none") if env == "RoboCASPick-v1" and not (image or vis) else {}
+    made = gym.make(env, obs_mode="state", control_mode="pd_joint_pos", sim_backend="cpu", **no_renderer)
+    successes = 0
+    for number in range(seed, seed + episodes):
+        try:
+            *_, info = SOLUTIONS[env](made, seed=number, debug=debug, vis=vis)
+            success = bool(info["success"][0])
+            print(f"seed {number}: success {success}, {int(info['elapsed_steps'][0])} steps")
+        except PlanningFailed as error:
+            success = False
+            print(f"seed {number}: {error}")
+        successes += success
+    print(f"{successes} of {episodes} episodes succeeded")
+    if image:
+        cv2.imwrite(str(image), made.unwrapped.render_rgb_array()[0].cpu().numpy()[..., ::-1])
+    made.close()
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

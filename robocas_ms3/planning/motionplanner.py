@@ -1,0 +1,275 @@
+"""The methods of ManiSkill's motion-planning solvers on top of this package's planners.
+
+``mani_skill.examples.motionplanning`` has the original, which needs mplib. Scripts written for it run with this class
+after a change of the import and of the constructor's arguments; docs/motion_planning.md lists the differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+import sapien
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.structs import Pose
+from mani_skill.utils.structs.pose import to_sapien_pose
+
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.planning import backends
+from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
+from robocas_ms3.planning.scene import seen_from
+from robocas_ms3.poses import from_wxyz, inverse
+from robocas_ms3.robots.agent import MobileManipulator
+from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.table import RobotSpec
+from robocas_ms3.robots.urdf import RobotFiles
+
+CONTROL_MODES = ("pd_joint_pos", "pd_joint_pos_vel")
+
+Step = tuple[Any, Any, Any, Any, dict[str, Any]]
+"""What ``env.step`` returns: observation, reward, terminated, truncated, info."""
+
+
+class PandaArmMotionPlanningSolver:
+    """Plan motions of a Panda arm and execute them in one environment.
+
+    The class has the methods of ManiSkill's solver of the same name. All poses and points are in the world frame. A
+    method that can't plan raises ``PlanningFailed`` and does not step the environment, where ManiSkill's prints a
+    status and returns -1. Methods that step return the last step: observation, reward, terminated, truncated, info.
+
+    Args:
+        env: one environment (``num_envs`` = 1) with control mode ``pd_joint_pos`` or ``pd_joint_pos_vel`` and with
+            ManiSkill's ``panda`` or ``panda_wristcam`` or a robot of this package; wrappers are stepped too.
+        base_pose: pose of the robot's root link; default: the pose in the simulation at each call.
+        vis: whether to show every step in ManiSkill's viewer, which needs a display.
+        joint_vel_limits: velocity limit of every arm joint, rad/s.
+        joint_acc_limits: acceleration limit of every arm joint, rad/s^2.
+        backend: name of the motion planner.
+
+    Attributes:
+        planner: the motion planner; its poses are in the frame of the arm's base.
+        gripper_state: gripper command that motions hold, 1 open to -1 closed.
+
+    Raises:
+        RobocasError: the environment has several envs, another control mode or another robot.
+        ExtensionError: no motion planner has this name.
+    """
+
+    OPEN, CLOSED = 1.0, -1.0
+
+    def __init__(
+        self,
+        env: gym.Env,
+        *,
+        base_pose: sapien.Pose | Pose | None = None,
+        vis: bool = False,
+        joint_vel_limits: float = 0.9,
+        joint_acc_limits: float = 0.9,
+        backend: str = backends.DEFAULT,
+    ) -> None:
+        self.env, self.base_env, self.vis = env, cast("BaseEnv", env.unwrapped), vis
+        if self.base_env.num_envs != 1:
+            raise RobocasError(
+                "the solver plans for one environment",
+                where="num_envs",
+                expected=1,
+                found=self.base_env.num_envs,
+                fix="Make the environment with num_envs=1.",
+            )
+        self.control_mode = str(self.base_env.control_mode)
+        if self.control_mode not in CONTROL_MODES:
+            raise RobocasError(
+                "the solver sends joint positions",
+                where="control_mode",
+                expected=" or ".join(CONTROL_MODES),
+                found=self.control_mode,
+                fix="Make the environment with control_mode='pd_joint_pos'.",
+            )
+        spec = _robot_spec(cast("BaseAgent", self.base_env.agent))
+        self.robot = self.base_env.agent.robot
+        self.description = replace(
+            spec.description, arm_velocity_limit=joint_vel_limits, arm_acceleration_limit=joint_acc_limits
+        )
+        self._joints = [joint.name for joint in self.robot.active_joints]
+        self._base_pose = None if base_pose is None else _matrix(base_pose)
+        self._obstacles: list[Obstacle] = []
+        self.planner = backends.make_planner(
+            backend, replace(spec, description=self.description), dt=self.base_env.control_timestep
+        )
+        self.gripper_state = self.OPEN
+
+    @property
+    def arm_base_in_world(self) -> Array:
+        """Pose of the arm's base in the world frame, 4x4."""
+        arm_base = from_wxyz(self.robot.links_map[self.description.arm_base_link].pose.raw_pose[0])
+        if self._base_pose is None:
+            return arm_base
+        return self._base_pose @ inverse(from_wxyz(self.robot.root.pose.raw_pose[0])) @ arm_base
+
+    def move_to_pose_with_RRTConnect(
+        self, pose: sapien.Pose | Pose, dry_run: bool = False, refine_steps: int = 0
+    ) -> Any:
+        """Move the TCP to a pose on any collision-free path.
+
+        Args:
+            pose: goal of the TCP.
+            dry_run: return the planned trajectory and do not step the environment.
+            refine_steps: how many times to send the last joint target again.
+
+        Returns:
+            The last step, or the trajectory of a dry run.
+
+        Raises:
+            PlanningFailed: the pose is out of reach or in collision, or no path was found.
+        """
+        start, goal = self._prepare(pose)
+        result = self.planner.plan_to_pose(start, goal, stage="move_to_pose_with_RRTConnect")
+        return result if dry_run else self.follow_path(result, refine_steps)
+
+    def move_to_pose_with_screw(self, pose: sapien.Pose | Pose, dry_run: bool = False, refine_steps: int = 0) -> Any:
+        """Move the TCP to a pose on a straight line with the shortest rotation, without collisions.
+
+        Args:
+            pose: goal of the TCP.
+            dry_run: return the planned trajectory and do not step the environment.
+            refine_steps: how many times to send the last joint target again.
+
+        Returns:
+            The last step, or the trajectory of a dry run.
+
+        Raises:
+            PlanningFailed: the line leaves the arm's reach or touches an obstacle.
+        """
+        start, goal = self._prepare(pose)
+        result = self.planner.plan_straight(start, goal, stage="move_to_pose_with_screw")
+        return result if dry_run else self.follow_path(result, refine_steps)
+
+    def follow_path(self, result: Trajectory, refine_steps: int = 0) -> Step:
+        """Send the joint targets of a planned trajectory, one per control step, and hold the gripper command.
+
+        Args:
+            result: a trajectory with at least one row, as a dry run returns it.
+            refine_steps: how many times to send the last joint target again.
+        """
+        qpos = np.concatenate([result.qpos, np.repeat(result.qpos[-1:], refine_steps, axis=0)])
+        qvel = np.gradient(np.concatenate([self._arm_qpos[None], qpos]), result.dt, axis=0)[1:]
+        qvel[len(result.qpos) - 1 :] = 0
+        return self._run(qpos, qvel)
+
+    def open_gripper(self, t: int = 6, gripper_state: float = OPEN) -> Step:
+        """Open the gripper for some control steps while the arm holds its position.
+
+        Args:
+            t: number of control steps, at least 1.
+            gripper_state: gripper command, also for the motions that follow.
+        """
+        return self._move_gripper(t, gripper_state)
+
+    def close_gripper(self, t: int = 6, gripper_state: float = CLOSED) -> Step:
+        """Close the gripper for some control steps while the arm holds its position; see ``open_gripper``."""
+        return self._move_gripper(t, gripper_state)
+
+    def add_box_collision(self, extents: Array, pose: sapien.Pose | Pose) -> None:
+        """Add a box to the obstacles.
+
+        Args:
+            extents: (3,) edge lengths, m.
+            pose: of the box's centre.
+        """
+        corners = np.array(list(product((-0.5, 0.5), repeat=3))) * np.asarray(extents, dtype=np.float64)
+        self.add_obstacles([Obstacle("box", Shape(hulls=(corners,)), _matrix(pose))])
+
+    def add_collision_pts(self, pts: Array) -> None:
+        """Add surface points to the obstacles.
+
+        Args:
+            pts: (P, 3) m, about 5 mm apart.
+
+        Raises:
+            RobocasError: a coordinate is NaN or infinite.
+        """
+        points = np.asarray(pts, dtype=np.float64).reshape(-1, 3)
+        if not np.isfinite(points).all():
+            bad = int((~np.isfinite(points)).any(axis=1).sum())
+            raise RobocasError(
+                "NaN or infinite points",
+                where="add_collision_pts",
+                expected="finite coordinates",
+                found=f"{bad} of {len(points)} points",
+                fix="Remove them, e.g. pts[np.isfinite(pts).all(axis=1)].",
+            )
+        self.add_obstacles([Obstacle("points", Shape(points=points), np.eye(4))])
+
+    def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Add rigid bodies to the obstacles, such as those of ``PlanningScene.obstacles_in_world``.
+
+        Args:
+            obstacles: bodies whose ``pose_in_base`` is their pose in the world frame.
+        """
+        self._obstacles += obstacles
+
+    def clear_collisions(self) -> None:
+        """Remove all obstacles; the arm's own links still count."""
+        self._obstacles = []
+
+    def close(self) -> None:
+        """Do nothing; solutions written for ManiSkill call it at their end."""
+
+    @property
+    def _arm_qpos(self) -> Array:
+        """(7,) rad."""
+        return self._qpos(self.description.arm_joints)
+
+    def _qpos(self, joints: Sequence[str]) -> Array:
+        qpos = self.robot.get_qpos()[0].cpu().numpy().astype(np.float64)
+        return qpos[[self._joints.index(name) for name in joints]]
+
+    def _prepare(self, pose: sapien.Pose | Pose) -> tuple[Array, Array]:
+        """Give the planner the present scene; return the start (7,) and the goal in the arm's base frame (4x4)."""
+        base = self.arm_base_in_world
+        self.planner.set_scene(seen_from(self._obstacles, base))
+        self.planner.finger_width = float(self._qpos(self.description.finger_joints).sum())
+        return self._arm_qpos, inverse(base) @ _matrix(pose)
+
+    def _move_gripper(self, t: int, gripper_state: float) -> Step:
+        self.gripper_state = gripper_state
+        return self._run(np.tile(self._arm_qpos, (t, 1)), np.zeros((t, 7)))
+
+    def _run(self, qpos: Array, qvel: Array) -> Step:
+        """Send targets (T, 7) rad and (T, 7) rad/s."""
+        step = self._step(qpos[0], qvel[0])
+        for row in zip(qpos[1:], qvel[1:], strict=True):
+            step = self._step(*row)
+        return step
+
+    def _step(self, qpos: Array, qvel: Array) -> Step:
+        arm = (qpos, qvel) if self.control_mode == "pd_joint_pos_vel" else (qpos,)
+        step = self.env.step(np.hstack([*arm, self.gripper_state]).astype(np.float32))
+        if self.vis:
+            self.base_env.render_human()
+        return cast("Step", step)
+
+
+def _matrix(pose: sapien.Pose | Pose) -> Array:
+    return to_sapien_pose(pose).to_transformation_matrix().astype(np.float64)
+
+
+def _robot_spec(agent: BaseAgent) -> RobotSpec:
+    """Return what a planner needs of an agent; ManiSkill's fixed Pandas are planned for with ManiSkill's own URDF."""
+    if isinstance(agent, MobileManipulator):
+        return agent.spec
+    uid, description = str(agent.uid), replace(MOBILE_PANDA, uid=str(agent.uid), finger_extension=0.0, envelope=None)
+    joints = {joint.name for joint in agent.robot.active_joints}
+    if not joints.issuperset(description.arm_joints + description.finger_joints):
+        expected = "panda, panda_wristcam or a robot of robocas_ms3"
+        fix = "Make the environment with robot_uids='panda'."
+        raise RobocasError("not a Panda arm with two fingers", where="robot", expected=expected, found=uid, fix=fix)
+    urdf = Path(str(agent.urdf_path))
+    files = RobotFiles(urdf=urdf, arm_urdf=urdf, arm_srdf=urdf.with_suffix(".srdf"), folder=urdf.parent)
+    return RobotSpec(description, lambda: files, f"{type(agent).__module__}:{type(agent).__qualname__}")
