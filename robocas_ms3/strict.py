@@ -95,7 +95,7 @@ def parse(model: type[_Model], data: Any, error: type[RobocasError], *, where: o
         model: the form.
         data: a mapping.
         error: to be raised.
-        where: they stand, for messages.
+        where: file or option of the values, for messages; or a function that returns it for the key of a mistake.
         about: what they aren't then, such as "no rules of a protocol".
 
     Raises:
@@ -105,6 +105,7 @@ def parse(model: type[_Model], data: Any, error: type[RobocasError], *, where: o
         text = json.dumps(data, default=lambda value: {type(value).__name__: str(value)})  # as a date, which none takes
     except (TypeError, ValueError) as problem:  # such a key, or an alias of what holds it
         what = "a value here has no place in this file"
+        where = where("") if callable(where) else where
         raise error(f"{about}: {what}" if about else what, where=where, found=problem) from problem
     # JSON mode: strict about types, yet lists serve as tuples and whole numbers as floats, as in YAML
     return parse_json(model, text, error, where=where, about=about)
@@ -162,6 +163,7 @@ def refusal(
     more = sum(not f"{first.key}.".startswith(f"{other.key}." if other.key else "") for other in others)
     said = (first.fix, f"{more} more after this one." if more else "", fix)
     what = f"{about}: {first.what}" if about else first.what
+    where = where(first.key) if callable(where) else where
     return error(what, where=where, expected=first.expected, found=first.found, fix=" ".join(filter(None, said)))
 
 

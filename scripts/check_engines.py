@@ -214,6 +214,12 @@ def main() -> int:
             shutil.rmtree(out, ignore_errors=True)
 
 
+def on_ray(address: str, gather: str = "no") -> list[str]:
+    """Return the options of a run on a cluster of Ray."""
+    options = ["--executor-option", f"address={address}", "--executor-option", f"gather={gather}"]
+    return ["--on", "ray", *options]
+
+
 def compare(out: Path, episodes: int, seed: int, jobs: int, kill: bool) -> int:
     """Run the plan by each engine into a folder; 1: what they made is not the same."""
     out.mkdir(parents=True, exist_ok=True)
@@ -231,21 +237,20 @@ def compare(out: Path, episodes: int, seed: int, jobs: int, kill: bool) -> int:
         runs.append(run)
 
     do(Run("local", []))
-    slurm = ["--on", "slurm", "--set", "units_per_job=2"]
+    slurm = ["--on", "slurm", "--executor-option", "units_per_job=2"]
     if shutil.which("sinfo") and subprocess.run(["sinfo"], capture_output=True, check=False).returncode == 0:
         do(Run("slurm", slurm))
         if kill:
             do(Run("slurm, a job killed", slurm, kill=kill_job))
     else:
-        do(Run("slurm by submitit alone", [*slurm, "executor=local"]))
-    ray = ["--on", "ray", "--set"]
+        do(Run("slurm by submitit alone", [*slurm, "--executor-option", "executor=local"]))
     with cluster(-(-jobs // 2)) as (address, _):
-        do(Run("ray", [*ray, f"address={address}"]))
-        do(Run("ray, gather", [*ray, f"address={address}", "gather=yes"]))
+        do(Run("ray", on_ray(address)))
+        do(Run("ray, gather", on_ray(address, "yes")))
     for gather in ("no", "yes") if kill else ():
         with cluster(-(-jobs // 2)) as (address, second):
             name = f"ray{', gather' if gather == 'yes' else ''}, a node killed"
-            do(Run(name, [*ray, f"address={address}", f"gather={gather}"], kill=second.kill))
+            do(Run(name, on_ray(address, gather), kill=second.kill))
     count = len(files(out / "local" / MADE))
     print(f"\n{episodes} pick episodes from seed {seed}, {jobs} jobs, {count} files\n")
     print("| engine | wall, s | killed | same bytes |\n|---|---|---|---|")

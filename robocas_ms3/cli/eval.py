@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from robocas_ms3.cli.options import Maybe, Several, Word
+from robocas_ms3.cli.options import Maybe, Repeated, Several, Word
 
 
 @dataclass
@@ -23,7 +23,7 @@ class Eval:
     - eval verify DIR ...: whether a result is whole, and of its protocol
     - eval videos DIR: plays failed episodes again and films them
     - eval protocols: lists the protocols that are shipped
-    - eval freeze PLAN.yaml --out DIR: makes a protocol of your own
+    - eval freeze PLAN.yaml --out DIR [--set objects.count=12]: makes a protocol of your own
     """
 
     words: Annotated[Several[str], tyro.conf.Positional] = ()
@@ -63,6 +63,9 @@ class Eval:
     protocols with upstream's steps (paper-v1), in processes; never to be compared with results without."""
     count: int = 8
     """How many videos, of all kinds of failures in turn."""
+    set: Repeated[str] = ()
+    """With freeze: set a key in all configurations of the plan, such as `--set objects.count=12`; repeatable
+    (docs/configuration.md)."""
 
 
 WORDS = ("report", "merge", "compare", "verify", "videos", "protocols", "freeze")
@@ -74,13 +77,21 @@ def main(cfg: Eval) -> int:
     from robocas_ms3.errors import EvaluationError
 
     first = cfg.words[0] if cfg.words else ""
+    if cfg.set and first != "freeze":
+        raise EvaluationError(
+            "a protocol's configurations are frozen",
+            where="--set",
+            expected="eval freeze PLAN.yaml --set KEY=VALUE",
+            found=cfg.set[0],
+            fix="Freeze a protocol of your own.",
+        )
     if first not in WORDS:
         return run(cfg)
     about = [Path(word) for word in cfg.words[1:]]
     if first == "protocols":
         return eval_protocols.protocols()
     if first == "freeze":
-        return eval_protocols.freeze(_one(about, first), cfg.out)
+        return eval_protocols.freeze(_one(about, first), cfg.out, cfg.set)
     if not about:
         raise EvaluationError("of what?", where=first, expected="a folder of a result, or those of its parts")
     if first == "compare":

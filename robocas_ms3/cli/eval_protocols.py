@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from robocas_ms3.words import count_of
@@ -22,8 +23,8 @@ def protocols() -> int:
     return 0
 
 
-def freeze(plan: Path, out: Path | None) -> int:
-    """Make a protocol."""
+def freeze(plan: Path, out: Path | None, overrides: Sequence[str] = ()) -> int:
+    """Make a protocol; ``overrides`` are set in all configurations of the plan."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.errors import EvaluationError
@@ -37,7 +38,7 @@ def freeze(plan: Path, out: Path | None) -> int:
     read = read_plan(plan)
     check_absent(out, EvaluationError)
     with bar("episodes chosen") as shown:
-        for done, total in make(read, out):
+        for done, total in make(read, out, overrides=overrides):
             shown.at(done, total)
     say(f"{out}: {count_of(len(load_protocol(out).episodes), 'episode')}, {load_protocol(out).hash}")
     return 0

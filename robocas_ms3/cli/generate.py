@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from robocas_ms3.benchmark import TASKS
-from robocas_ms3.cli.options import Maybe
+from robocas_ms3.cli.options import Maybe, Repeated
 from robocas_ms3.robots.table import DEFAULT
 from robocas_ms3.words import count_of
 
@@ -25,6 +25,8 @@ class Generate:
     """Record demonstrations of a task with its scripted policy, as a ManiSkill trajectory file.
 
     Rendering is not needed: states and actions are recorded, pictures are made by `robocas convert`.
+
+    Example: robocas generate pick -n 20 --config pick_shelf_scattered --set objects.count=12
     """
 
     task: Annotated[TaskName, tyro.conf.Positional]
@@ -33,6 +35,8 @@ class Generate:
     """How many successful episodes to record, at least 1."""
     config: Maybe[str] = None
     """Name of a shipped task configuration, or a YAML file. Default: the task's own (see `robocas list`)."""
+    set: Repeated[str] = ()
+    """Set a key of the configuration, such as `--set objects.count=12`; repeatable (docs/configuration.md)."""
     pack: str = "builtin"
     """Object pack: its name, or its folder."""
     out: Maybe[Path] = None
@@ -91,7 +95,7 @@ def run(cfg: Generate) -> int:
     from robocas_ms3.config import load_task_config, shipped_configs
 
     name = cfg.config or TASKS[cfg.task].default_config
-    loaded = load_task_config(name)  # before seconds go by for what is imported next
+    loaded = load_task_config(name, overrides=cfg.set)  # before seconds go by for what is imported next
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
     from robocas_ms3.demos.checks import check_limits
@@ -100,7 +104,7 @@ def run(cfg: Generate) -> int:
     from robocas_ms3.processes import Limits
 
     check_limits(cfg.episode_seconds, cfg.memory_gb)
-    config = recordable_config(loaded, name if name in shipped_configs() else None)
+    config = recordable_config(loaded, name if name in shipped_configs() and not cfg.set else None)
     out = cfg.out or Path("demos") / f"{Path(name).stem}-{Path(cfg.pack).name}"
     rate = cfg.replay_rate
     if rate is None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from robocas_ms3.scenes.bank import LayoutBank
     from robocas_ms3.scenes.table import Engine, Pair
 
-from robocas_ms3.cli.options import Maybe
+from robocas_ms3.cli.options import Maybe, Repeated
 from robocas_ms3.words import count_of
 
 
@@ -28,10 +28,15 @@ class Build:
     them, while arrangements change: for num_envs=4, --objects 0:4 --seeds 0:100 is what resets without a seed use.
     These are also written as one file, which such envs read at once. Where that is for a GPU, its engine tries each of
     them: a layout of which an object moves more than 3 mm in the first second is marked, and no reset takes it.
+
+    Example: robocas layouts build pick_table_scattered --seeds 0:100 --set objects.count=12
     """
 
     config: Annotated[str, tyro.conf.Positional]
     """Name of a shipped task configuration, or a YAML file."""
+    set: Repeated[str] = ()
+    """Set a key of the configuration, such as `--set objects.count=12`; repeatable (docs/configuration.md). The layouts
+    are those of the resolved configuration."""
     pack: str = "builtin"
     """Object pack: its name, or its folder."""
     furniture_pack: str = "builtin"
@@ -81,7 +86,7 @@ def build(command: Build) -> int:
         check_number("jobs", command.jobs, 1)
     objects = None if command.objects is None else objects_seeds(command.objects)
     seeds = seed_range(command.seeds)
-    config = load_task_config(command.config)
+    config = load_task_config(command.config, overrides=command.set)
     packs = load_pack(command.pack), load_pack(command.furniture_pack)  # before what takes seconds to import
     from robocas_ms3.scenes.bank import LayoutBank
     from robocas_ms3.scenes.fill import fill, pairs_of

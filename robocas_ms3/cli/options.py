@@ -13,5 +13,7 @@ Maybe = Annotated[_T | None, _UNSAID]
 """A value, by default none."""
 Several = Annotated[tuple[_T, ...], _UNSAID]
 """Values, by default none."""
+Repeated = Annotated[tuple[_T, ...], _UNSAID, tyro.conf.UseAppendAction]
+"""Values, one for each time that the option is given; by default none."""
 Word = Annotated[str, _UNSAID]
 """A text, by default empty."""

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from robocas_ms3.cli.options import Maybe, Several
+from robocas_ms3.cli.options import Maybe, Repeated
 from robocas_ms3.words import count_of
 
 
@@ -27,8 +27,8 @@ class Run:
     """Where the work is done: on this machine, by jobs of Slurm, by a Ray cluster."""
     jobs: Maybe[int] = None
     """How many episodes are made at once. Default: one for each CPU core of this machine."""
-    set: Several[str] = ()
-    """Options of the engine, NAME=VALUE each; docs/scale.md has them."""
+    executor_option: Repeated[str] = ()
+    """Set an option of Slurm or Ray, such as `--executor-option partition=cpu`; repeatable (docs/scale.md)."""
     resume: bool = False
     """Go on with a plan that was begun."""
     overwrite: bool = False
@@ -94,7 +94,7 @@ def run(command: Run) -> int:
 
     jobs = command.jobs if command.jobs is not None else os.cpu_count() or 1
     check_number("jobs", jobs, 1)
-    options = dict(_option(word) for word in command.set)
+    options = dict(_option(word) for word in command.executor_option)
     plan = load_plan(command.plan)
     check_engine(command.on, options)
     if command.on == "local" and plan.makes_datasets:
@@ -122,7 +122,7 @@ def _option(word: str) -> tuple[str, str]:
 
     name, sign, value = word.partition("=")
     if not (name and sign):
-        raise PlanError("no option of an engine", where="--set", expected="NAME=VALUE", found=word)
+        raise PlanError("invalid option", where="--executor-option", expected="NAME=VALUE", found=word)
     return name, value
 
 

@@ -4,17 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+from robocas_ms3.cli.options import Repeated
+
+if TYPE_CHECKING:
+    from robocas_ms3.config import TaskConfig
 
 
 @dataclass
 class Show:
-    """Render the scene of a configuration to PNG files, from all cameras, after reset."""
+    """Render the scene of a configuration to PNG files, from all cameras, after reset.
+
+    Example: robocas show pick_table_scattered --set objects.count=12 --set target.approach=front
+    """
 
     config: Annotated[str, tyro.conf.Positional] = "pick_table_scattered"
     """Name of a shipped task configuration, or a YAML file."""
+    set: Repeated[str] = ()
+    """Set a key of the configuration, such as `--set objects.count=12`; repeatable (docs/configuration.md)."""
+    print_config: bool = False
+    """Print the resolved configuration as YAML instead of rendering: `extends` and --set applied, defaults added."""
     pack: str = "builtin"
     """Object pack: its name, or its folder."""
     seed: int = 0
@@ -34,7 +46,9 @@ def main(cfg: Show) -> int:
     from robocas_ms3.strict import check_number
 
     check_number("seed", cfg.seed, 0, GREATEST_SEED)
-    config = load_task_config(cfg.config)  # before seconds go by for what is imported next
+    config = load_task_config(cfg.config, overrides=cfg.set)  # before seconds go by for what is imported next
+    if cfg.print_config:
+        return print_config(config)
     load_pack(cfg.pack)
     if cfg.shader.startswith("rt"):
         _require_gpu(cfg.shader)
@@ -77,6 +91,17 @@ def main(cfg: Show) -> int:
         say(f"wrote {path}")
     say(f"instruction: {base_env.get_language_instruction()[0]}")
     env.close()
+    return 0
+
+
+def print_config(config: TaskConfig) -> int:
+    """Print a configuration as YAML that `load_task_config` loads."""
+    import yaml
+
+    from robocas_ms3.cli.terminal import say_lines
+
+    text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True, default_flow_style=None)
+    say_lines(text.rstrip("\n"))
     return 0
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from robocas_ms3.cli.options import Maybe, Several
+from robocas_ms3.cli.options import Maybe, Repeated
 
 
 @dataclass
@@ -34,7 +33,7 @@ class Train:
     """Folder of the run. Default: runs/BASELINE-DATA, or runs/BASELINE."""
     config: Maybe[Path] = None
     """YAML file of what differs from the baseline's defaults."""
-    set: Annotated[Several[str], tyro.conf.UseAppendAction] = ()
+    set: Repeated[str] = ()
     """A value of the configuration, such as `--set chunk=4` or `--set train.learning_rate=3e-4`; may be given again."""
     steps: Maybe[int] = None
     """Steps of the optimiser; train.steps of the configuration."""
@@ -101,6 +100,7 @@ def _default_out(cfg: Train) -> Path:
 def changes_of(cfg: Train) -> dict[str, Any]:
     """What differs from the defaults, as the file and the options have it; options win."""
     from robocas_ms3.baselines.begin import merged
+    from robocas_ms3.config.overrides import parse_override
     from robocas_ms3.documents import load_yaml
     from robocas_ms3.errors import TrainingError
 
@@ -116,30 +116,8 @@ def changes_of(cfg: Train) -> dict[str, Any]:
             raise TrainingError("no configuration", where=cfg.config, expected="a mapping", found=type(read).__name__)
         found = read
     for text in cfg.set:
-        found = merged(found, _nested(text))
+        found = merged(found, parse_override(text, TrainingError, "train.seed=1"))
     for key in ("steps", "batch_size", "seed"):
         if (value := getattr(cfg, key)) is not None:
             found = merged(found, {"train": {key: value}})
     return found
-
-
-def _nested(text: str) -> dict[str, Any]:
-    """``a.b=1`` as ``{"a": {"b": 1}}``."""
-    import yaml
-
-    from robocas_ms3.errors import TrainingError
-
-    key, sign, word = text.partition("=")
-    if not (sign and all(key.split("."))):
-        raise TrainingError("not a value", where="--set", expected="KEY=VALUE, such as train.seed=1", found=text)
-    try:
-        nested: Any = yaml.safe_load(word)
-    except yaml.YAMLError as error:
-        raise TrainingError("not a value", where="--set", expected="YAML", found=word) from error
-    if isinstance(nested, str):  # YAML 1.1 reads 3e-4 as a word
-        with suppress(ValueError):
-            nested = float(nested)
-    first, *inner = key.split(".")
-    for part in reversed(inner):
-        nested = {part: nested}
-    return {first: nested}

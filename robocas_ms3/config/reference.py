@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from robocas_ms3.config.compose import EXTENDS
 from robocas_ms3.config.task import TaskConfig
 
 _HEAD = "| key | type and range | default | meaning |\n|---|---|---|---|\n"
 _ONE = {"string": "string", "integer": "whole number", "number": "number", "boolean": "true or false"}
 _MANY = {"string": "strings", "integer": "whole numbers", "number": "numbers"}
+_EXTENDS = f"| `{EXTENDS}` | string | none | base configuration: a shipped name, or a YAML file relative to this one |"
 _NAME = "NAME"  # stands for a key that the file chooses
 
 Schema = dict[str, Any]
@@ -26,6 +28,7 @@ def markdown() -> str:
         rows = [
             _row(schema, key, field, key in block.get("required", ())) for key, field in block["properties"].items()
         ]
+        rows = rows if name else [_EXTENDS, *rows]
         sections.append(f"### {title}\n\n{_about(block)}\n\n{_HEAD}" + "\n".join(rows))
     return "\n\n".join(sections)
 

@@ -110,10 +110,19 @@ def check_same_run(path: Path, run: dict[str, Any]) -> None:
         check_same(before["versions"], now, what, where=path, fix=fix, error=RobocasError)
     for key, value in json.loads(json.dumps(run)).items():
         if key != "versions" and before.get(key, value if key == WEIGHTS else None) != value:
+            place, expected, found = _first_difference(before.get(key), value, key)
             raise RobocasError(
-                f"{key} differ from those this output was begun with",
+                f"{place} is not that of this output",
                 where=path,
-                expected=before.get(key),
-                found=value,
+                expected=expected,
+                found=found,
                 fix="Use the same, another --out, or --overwrite.",
             )
+
+
+def _first_difference(one: Any, other: Any, place: str) -> tuple[str, Any, Any]:
+    """Return the dotted key of the first values that differ, and both values, of JSON values that differ."""
+    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
+        key = next(key for key in one if one[key] != other[key])
+        return _first_difference(one[key], other[key], f"{place}.{key}")
+    return place, one, other

@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 
 from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import load_task_config, shipped_configs
+from robocas_ms3.config import load_task_config
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.takeover import Takeover
@@ -118,9 +118,7 @@ class Player:
         )
 
     def _file_of(self, config: str | dict[str, Any]) -> str:
-        """A configuration as a file, which policies are told of."""
-        if isinstance(config, str):
-            return str(shipped_configs()[config])
+        """Write a resolved configuration to a file and return its path, which policies get."""
         folder = self._open.enter_context(tempfile.TemporaryDirectory(prefix="robocas-config-"))
         path = Path(folder) / "config.yaml"
         path.write_text(json.dumps(load_task_config(config).model_dump(mode="json")), encoding="utf-8")

@@ -52,14 +52,13 @@ class Scene(StrictModel):
     )
     change: dict[str, Any] = Field(default={}, description="keys that have other values, in the configuration's form")
 
-    def changed(self) -> TaskConfig:
-        """The configuration as it is to be.
+    def changed(self, overrides: Sequence[str] = ()) -> TaskConfig:
+        """Return the resolved configuration: the file, with ``change`` and then ``overrides`` merged over it.
 
         Raises:
-            ConfigError: there is none, or it can't be changed so.
+            ConfigError: there is no such file, or a key or value is wrong.
         """
-        config = load_task_config(self.config)
-        return load_task_config(_merged(config.model_dump(mode="json"), self.change)) if self.change else config
+        return load_task_config(self.config, self.change, overrides)
 
     @property
     def file(self) -> str:
@@ -113,13 +112,16 @@ def _beside(path: Path, scene: Scene) -> Scene:
     return scene if shipped or not file.is_file() else scene.model_copy(update={"config": str(file)})
 
 
-def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Iterator[tuple[int, int]]:
+def freeze(
+    plan: Plan, folder: Path, layouts: str | Path | None = "auto", overrides: Sequence[str] = ()
+) -> Iterator[tuple[int, int]]:
     """Write a protocol into a folder, which appears whole.
 
     Args:
         plan: what it is made from.
         folder: that it becomes.
         layouts: bank to take scenes from.
+        overrides: keys to set in all its configurations, see `load_task_config`.
 
     Yields:
         How many episodes are drawn, of how many.
@@ -130,7 +132,7 @@ def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Ite
     pack = load_pack(str(plan.rules.get("pack", "builtin")))
     said = {**plan.rules, "pack_hash": sha256(pack.root / MANIFEST)}
     rules = parse(Protocol, said, EvaluationError, where="rules", about=NO_RULES)
-    configs, train = _configs(plan.parts), _configs(plan.train)
+    configs, train = _configs(plan.parts, overrides), _configs(plan.train, overrides)
     total, episodes = sum(part.count for part in plan.parts), []
     with replacing_folder(folder) as tmp:
         for inside in (CONFIGS, LAYOUTS, *([TRAIN] if plan.train else [])):
@@ -154,11 +156,11 @@ def freeze(plan: Plan, folder: Path, layouts: str | Path | None = "auto") -> Ite
         (tmp / RULES).write_text(said, encoding="utf-8")
 
 
-def _configs(parts: Sequence[Scene]) -> dict[str, TaskConfig]:
+def _configs(parts: Sequence[Scene], overrides: Sequence[str]) -> dict[str, TaskConfig]:
     """Configurations by name."""
     found: dict[str, TaskConfig] = {}
     for part in parts:
-        config = part.changed()
+        config = part.changed(overrides)
         if not re.fullmatch(CONFIG_NAME, part.file) or len(part.file) > LONGEST:
             expected, fix = f"letters, digits, _ and -, at most {LONGEST}", "Give it a `name`, and a plain `split`."
             what = "this name can't be that of a configuration"
@@ -166,16 +168,6 @@ def _configs(parts: Sequence[Scene]) -> dict[str, TaskConfig]:
         if found.setdefault(part.file, config) != config:
             raise EvaluationError("two configurations of one name", where=part.file, fix="Give one of them a `name`.")
     return found
-
-
-def _merged(values: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
-    """Values with some changed; a block that becomes another kind is replaced."""
-    result = dict(values)
-    for key, new in change.items():
-        old = values.get(key)
-        same = isinstance(old, dict) and isinstance(new, dict) and new.get("kind", old.get("kind")) == old.get("kind")
-        result[key] = _merged(old, new) if same else new  # pyright: ignore[reportArgumentType]
-    return result
 
 
 def _write_config(config: TaskConfig, path: Path) -> None:

@@ -23,6 +23,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from robocas_ms3.benchmark import TASKS
+from robocas_ms3.config.load import check_no_base
 from robocas_ms3.documents import ARRAYS_LIMIT, JSON_LIMIT, DocumentError, load_yaml, read_bytes, read_text
 from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
@@ -205,6 +206,7 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
 
     Raises:
         EvaluationError: there is none, or it is not what it should be.
+        ConfigError: one of its configurations is not a mapping, or extends another file.
     """
     shipped = shipped_protocols()
     folder = shipped.get(str(name), Path(name)).absolute()
@@ -225,6 +227,8 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
         for path in (loaded.config_file(config), loaded.layouts_file(config)):
             if not path.is_file():
                 raise EvaluationError("a protocol's file is not there", where=path)
+    for path in sorted((folder / CONFIGS).glob("*.yaml")) + loaded.train_files():
+        check_no_base(path)
     return loaded
 
 

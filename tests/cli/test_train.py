@@ -35,7 +35,7 @@ def test_a_value_is_yaml(text, value):
 
 @pytest.mark.parametrize("text", ["steps", "=3", "train.=3", ".a=3", "a=[1"])
 def test_what_is_no_value(text):
-    with pytest.raises(TrainingError, match="--set: not a value"):
+    with pytest.raises(TrainingError, match="--set: invalid override"):
         changes_of(Train(set=(text,)))
 
 

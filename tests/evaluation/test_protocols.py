@@ -10,7 +10,7 @@ import yaml
 
 from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config import load_task_config
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.errors import ConfigError, EvaluationError
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.protocol import EPISODES, RULES, files_of, load_protocol, shipped_protocols
 
@@ -71,6 +71,16 @@ def test_a_copy_has_the_same_hash_and_a_change_another(folder):
         assert replace(mine).hash != before, path
         path.write_bytes(content)
     assert replace(mine).hash == before
+
+
+@pytest.mark.parametrize("inside", ["configs", "train"])
+def test_a_configuration_that_extends_another_file_is_refused(folder, inside):
+    (folder / inside).mkdir(exist_ok=True)
+    path = next((folder / inside).glob("*.yaml"), folder / inside / "new.yaml")
+    path.write_text("extends: pick_table_scattered\n")
+    with pytest.raises(ConfigError, match="'extends' is not allowed in a protocol") as caught:
+        load_protocol(folder)
+    assert caught.value.where == path
 
 
 def test_an_unknown_name_gets_the_nearest():

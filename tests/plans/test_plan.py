@@ -281,6 +281,6 @@ def test_a_wrong_option_of_an_engine_costs_nothing_that_is_there(tmp_path, capsy
     out = tmp_path / "out"
     out.mkdir()
     (out / PLAN).write_text('{"versions": {}, "plan": {}}')
-    assert run(["plan", "run", "tiny", "--out", str(out), "--overwrite", "--set", "partition=cpu"]) == 1
+    assert run(["plan", "run", "tiny", "--out", str(out), "--overwrite", "--executor-option", "partition=cpu"]) == 1
     assert "no options of the engine local" in capsys.readouterr().err
     assert (out / PLAN).is_file()

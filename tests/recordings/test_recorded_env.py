@@ -10,7 +10,7 @@ from synthetic import write_trajectory
 
 from robocas_ms3.assets.pack import MANIFEST
 from robocas_ms3.cli.main import run
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.errors import ConfigError, DatasetError
 from robocas_ms3.paths import builtin_packs_dir, task_configs_dir
 from robocas_ms3.recordings.environment import RecordedEnv, read_env, recorded_id
 
@@ -81,6 +81,14 @@ def test_what_lies_in_the_folder_where_we_run_is_not_taken_for_what_is_installed
     trusted = env.with_pack("mine").kwargs["pack"]  # by the user
     assert trusted == str(tmp_path / "mine")
     assert env.with_pack("builtin").kwargs["pack"] == "builtin"
+
+
+def test_a_recorded_configuration_can_not_extend_a_file(tmp_path):
+    (tmp_path / "base.yaml").write_text("extends: pick_table_scattered\n")
+    config = {"extends": str(tmp_path / "base.yaml")}
+    env = read_env({"env_id": ID, "env_kwargs": {"config": config}}, "F.json")
+    with pytest.raises(ConfigError, match="'extends' is a key of YAML files only"):
+        env.make(obs_mode="none", render_backend="none")
 
 
 json_values = st.recursive(

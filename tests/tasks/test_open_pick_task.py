@@ -7,10 +7,9 @@ from contextlib import contextmanager
 import gymnasium as gym
 import numpy as np
 import pytest
-import yaml
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.config import shipped_configs
+from robocas_ms3.config import load_task_config, shipped_configs
 from robocas_ms3.datasets.sources.arrays import episode_arrays, planar_base
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
@@ -201,7 +200,7 @@ def test_a_pull_opens_by_contact_and_leaves_the_handle(tmp_path):
 
 def farther_back(name: str, distance: float) -> dict:
     """A shipped configuration with the robot farther from everything, and allowed to drive."""
-    config = yaml.safe_load(shipped_configs()[name].read_text(encoding="utf-8"))
+    config = load_task_config(name).model_dump(mode="json")
     robot = config["robot"]
     yaw = np.deg2rad(robot.get("yaw_deg", 0.0))
     ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])

@@ -79,4 +79,6 @@ def refuse_options(engine: str, options: Mapping[str, str], known: tuple[str, ..
     unknown = sorted(set(options) - set(known))
     if unknown:
         expected = ", ".join(known) or "none"
-        raise PlanError(f"no options of the engine {engine}", where="--set", expected=expected, found=unknown)
+        raise PlanError(
+            f"no options of the engine {engine}", where="--executor-option", expected=expected, found=unknown
+        )

@@ -74,7 +74,7 @@ class RaySlot:
             fix = "Install the same on all nodes."
             check_same(self._terms.versions, versions(), "other versions", where=Path(node), fix=fix, error=PlanError)
             if self._terms.out is not None and not _appears(self._terms.out / PLAN):
-                fix = "Choose an --out that all nodes share, or pass --set gather=yes."
+                fix = "Choose an --out that all nodes share, or pass --executor-option gather=yes."
                 raise PlanError("this node does not see the folder", where=node, expected=self._out, fix=fix)
         except RobocasError as error:
             return SentError.of(error, node)

@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 class RayOptions(StrictModel):
-    """What ``--set`` may say."""
+    """What ``--executor-option`` may say."""
 
     address: str | None = Field(
         default=None, description="of the cluster; default: RAY_ADDRESS, or else one is started on this machine"
@@ -32,14 +32,14 @@ class RayOptions(StrictModel):
 
 
 def read_options(options: Mapping[str, str]) -> RayOptions:
-    """Read the words of ``--set``.
+    """Read the words of ``--executor-option``.
 
     Raises:
         PlanError: there is no such option, or it has no such value.
     """
     refuse_options("ray", options, tuple(RayOptions.model_fields))
     values = {name: value if name == "address" else _value(value) for name, value in options.items()}
-    return parse(RayOptions, values, PlanError, where="--set", about="no option of Ray")
+    return parse(RayOptions, values, PlanError, where="--executor-option", about="no option of Ray")
 
 
 def _value(text: str) -> Any:
@@ -83,7 +83,7 @@ def connect(options: RayOptions, jobs: int) -> bool:
     if not before:
         if address.startswith("ray://"):
             fix = "Run this on a node of the cluster, as `ray job submit` does, with address=auto."
-            raise PlanError("Ray's client can't do this", where="--set address", found=address, fix=fix)
+            raise PlanError("Ray's client can't do this", where="--executor-option address", found=address, fix=fix)
         _check_answers(address)
         about: dict[str, Any] = {}
         if address == "local":
@@ -120,7 +120,9 @@ def _check_room(ray: Any, options: RayOptions, may_grow: bool) -> None:
     if any(all(node.get(kind, 0) >= count for kind, count in wanted.items()) for node in nodes):
         return
     expected = ", ".join(f"{count:g} {kind}" for kind, count in wanted.items())
-    error = PlanError("no node of the cluster of Ray has room for an actor", where="--set", expected=expected)
+    error = PlanError(
+        "no node of the cluster of Ray has room for an actor", where="--executor-option", expected=expected
+    )
     if not may_grow:
         raise error
     _log.warning("%s; waiting for one", error)

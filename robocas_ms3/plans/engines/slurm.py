@@ -201,7 +201,7 @@ class SlurmEngine:
         self._refused += 1
         self._not_before = time.monotonic() + _AGAIN
         if not self._taken or self._refused > _AGAIN_TIMES:
-            fix = "Look at --set partition, account, qos, time and mem_gb."
+            fix = "Look at --executor-option partition, account, qos, time and mem_gb."
             raise PlanError("Slurm takes no such jobs", where="sbatch", found=error, fix=fix) from error
 
     def _look(self) -> None:
@@ -250,7 +250,7 @@ class SlurmEngine:
         one.died = 1 if moved_on else one.died + 1
         if one.died >= self._options.tries:
             what, found = "the jobs of this unit die", f"{one.died} in a row, {self._queue.ending(job.handle)}"
-            fix = f"See {job.handle.paths.stdout}; --set mem_gb, time and tries may help."
+            fix = f"See {job.handle.paths.stdout}; --executor-option mem_gb, time and tries may help."
             one.future.set_exception(PlanError(what, where=self._folder(one), found=found, fix=fix))
 
     def _fail(self, asked: Sequence[_Asked], unit: Unit, sent: SentError) -> None:

@@ -20,7 +20,7 @@ PASSED = (
 
 
 class SlurmOptions(StrictModel):
-    """What ``--set`` may say, besides `PASSED`."""
+    """What ``--executor-option`` may say, besides `PASSED`."""
 
     executor: Literal["slurm", "local"] = Field(default="slurm", description="local: processes of this machine")
     units_per_job: Annotated[int, Field(ge=1)] = Field(default=1, description="one after the other")
@@ -37,7 +37,7 @@ class SlurmOptions(StrictModel):
 
 
 def read_options(options: Mapping[str, str]) -> SlurmOptions:
-    """Read the words of ``--set``.
+    """Read the words of ``--executor-option``.
 
     Raises:
         PlanError: there is no such option, or it has no such value.
@@ -46,7 +46,9 @@ def read_options(options: Mapping[str, str]) -> SlurmOptions:
     refuse_options("slurm", options, own + PASSED)
     values: dict[str, Any] = {name: _number(value) for name, value in options.items() if name in own}
     passed = {name: value for name, value in options.items() if name in PASSED}
-    return parse(SlurmOptions, values | {"sbatch": passed}, PlanError, where="--set", about="no option of Slurm")
+    return parse(
+        SlurmOptions, values | {"sbatch": passed}, PlanError, where="--executor-option", about="no option of Slurm"
+    )
 
 
 def _number(text: str) -> Any:

@@ -184,7 +184,7 @@ def require_slurm() -> None:
         PlanError: they aren't.
     """
     if SlurmExecutor.affinity() < 0:
-        fix = "Run this where sbatch and srun are, or try --set executor=local."
+        fix = "Run this where sbatch and srun are, or try --executor-option executor=local."
         raise PlanError("there is no Slurm here", where="--on slurm", expected="srun", fix=fix)
 
 
