@@ -32,6 +32,7 @@ def parse_override(text: str, error: type[RobocasError], example: str) -> dict[s
     if isinstance(value, str):  # YAML 1.1 reads 3e-4 as a string
         with suppress(ValueError):
             value = float(value)
-    for name in reversed(names):
+    first, *inner = names
+    for name in reversed(inner):
         value = {name: value}
-    return value
+    return {first: value}
