@@ -82,26 +82,28 @@ class Composition:
                     raise ConfigError(what, where=source, expected=expected, found=repr(str(key)), fix=fix)
                 values.pop(key, None)
                 replaced = replaced or declared == "name"
-                self._set_source(place, source)
+                self._set_source(place, source, old)
             elif isinstance(new, Mapping) and new:
-                if not isinstance(old, dict) or new.get(_KIND, old.get(_KIND)) != old.get(_KIND):
-                    old = values[key] = {}
-                    self._set_source(place, "")
-                self._merge(old, new, place, source, removes)
+                inner = old
+                if not isinstance(inner, dict) or new.get(_KIND, inner.get(_KIND)) != inner.get(_KIND):
+                    inner = values[key] = {}
+                    self._set_source(place, "", old)
+                self._merge(inner, new, place, source, removes)
             elif not (isinstance(new, Mapping) and isinstance(old, dict)):
                 values[key] = copy.deepcopy(new)
-                self._set_source(place, source)
+                self._set_source(place, source, old)
         if replaced:  # furniture is built in this order: a piece takes the place of the one that it replaces
             first = {key: values[key] for key in changes if key in values}
             ordered = first | {key: value for key, value in values.items() if key not in first}
             values.clear()
             values.update(ordered)
 
-    def _set_source(self, place: tuple[str, ...], source: str) -> None:
-        """Note the source of a key; the keys inside its old value have none any more."""
+    def _set_source(self, place: tuple[str, ...], source: str, old: Any) -> None:
+        """Set the source of a key, and forget those of the keys inside its old value."""
         key = ".".join(place)
-        for inside in [name for name in self.sources if name.startswith(f"{key}.")]:
-            del self.sources[inside]
+        if isinstance(old, dict):  # only then: a file may have very many keys
+            for inside in [name for name in self.sources if name.startswith(f"{key}.")]:
+                del self.sources[inside]
         self.sources[key] = source
 
 

@@ -64,10 +64,10 @@ def test_parts_of_the_same_scenes_have_seeds_apart(written):
 def test_a_configuration_beside_the_plan_is_taken_whole(written, tmp_path):
     from robocas_ms3.config import load_task_config
 
-    config = load_task_config("pick_shelf_scattered").model_dump_json()
-    (tmp_path / "mine.yaml").write_text(config)  # JSON is YAML
+    (tmp_path / "mine.yaml").write_text("extends: pick_shelf_scattered\nobjects: {count: 4}\n")
     plan = load_plan(written("parts:\n  - {task: pick, config: mine.yaml, episodes: 3}\n"))
-    assert isinstance(plan.parts[0].config, dict)
+    resolved = load_task_config("pick_shelf_scattered", overrides=["objects.count=4"])
+    assert plan.parts[0].config == resolved.model_dump(mode="json")
     assert plan.parts[0].name == "00-mine"
 
 
