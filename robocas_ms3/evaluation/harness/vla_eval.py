@@ -139,7 +139,7 @@ class RoboCAS:
             )
         episode = episodes[number]
         self._episode, self._recorder, self._begun = episode, recorder, time.monotonic()
-        self._seen = self._driven.reset(episode.episode)
+        self._seen = self._driven.reset([episode.episode])
         self._record()
 
     async def apply_action(self, action: Mapping[str, Any]) -> None:
@@ -176,7 +176,7 @@ class RoboCAS:
         Raises:
             EvaluationError: vla-eval ended it before the protocol does.
         """
-        outcome, episode = self._driven.outcome, self._episode
+        outcome, episode = self._driven.outcomes.get(0), self._episode
         if outcome is None or episode is None:
             raise EvaluationError(
                 "the run ended an episode before the protocol does",

@@ -11,9 +11,9 @@ def made(monkeypatch) -> list[CountingEnv]:
     """Environments without physics; those that were made, in order."""
     envs: list[CountingEnv] = []
 
-    def make_env(protocol, wants, episode, num_envs, *, backend):
-        assert (num_envs, backend) == (1, "processes")
-        envs.append(CountingEnv(episode.config))
+    def make_env(protocol, wants, episode, num_envs, *, backend, **others):
+        assert backend in ("processes", "auto")
+        envs.append(CountingEnv(episode.config, num_envs))
         return envs[-1]
 
     monkeypatch.setattr(driven, "make_env", make_env)

@@ -1,4 +1,4 @@
-"""A vector environment of one env without physics, which succeeds once its actions have come to a number."""
+"""A vector environment without physics; an env succeeds once the first numbers of its actions add up to `ENOUGH`."""
 
 from __future__ import annotations
 
@@ -7,26 +7,28 @@ from typing import Any
 import numpy as np
 
 ENOUGH = 5.0
+BREAKS = 13.0  # an action with this number raises
+_POSE = [1, 2, 3, 0.4, 0.1, 0.2, 0.3]  # m; quaternion wxyz
 
 
 class CountingEnv:
-    num_envs = 1
-
-    def __init__(self, config: str) -> None:
-        self.config, self.seeds, self.actions, self.closed = config, [], [], False
-        self.sum, self.elapsed = 0.0, 0
+    def __init__(self, config: str, num_envs: int = 1) -> None:
+        self.config, self.num_envs, self.seeds, self.actions, self.closed = config, num_envs, [], [], False
+        self.sums, self.elapsed = np.zeros(num_envs), np.zeros(num_envs, int)
 
     def reset(self, *, seed: list[int], options: dict[str, Any]) -> tuple[Any, dict]:
-        assert list(options["env_idx"]) == [0]
+        envs = list(options["env_idx"])
+        assert len(seed) == len(envs)
         self.seeds += seed
-        self.sum, self.elapsed = 0.0, 0
+        self.sums[envs], self.elapsed[envs] = 0.0, 0
         return self._seen(), self._info()
 
     def step(self, actions: np.ndarray) -> tuple:
-        if actions[0, 0] == 13:
+        assert np.isfinite(actions).all()
+        if (actions[:, 0] == BREAKS).any():
             raise RuntimeError("the env broke")
-        self.actions.append(actions[0].copy())
-        self.sum += float(actions[0, 0])
+        self.actions.append(actions.copy())
+        self.sums += actions[:, 0]
         self.elapsed += 1
         return self._seen(), None, None, None, self._info()
 
@@ -34,19 +36,24 @@ class CountingEnv:
         self.closed = True
 
     def _seen(self) -> dict[str, Any]:
-        qpos = np.arange(12, dtype=np.float32)[None] + 10
-        tcp = np.array([[1, 2, 3, 0.4, 0.1, 0.2, 0.3]], np.float32)
-        image = np.full((1, 4, 6, 3), self.elapsed, np.uint8)
+        count = self.num_envs
+        qpos = np.tile(np.arange(12, dtype=np.float32) + 10, (count, 1))
+        tcp = np.tile(np.array(_POSE, np.float32), (count, 1))
+        pixels = np.tile(self.elapsed[:, None, None, None], (1, 4, 6, 3)).astype(np.uint8)
+        width = np.full((count, 1), 0.05, np.float32)
         return {
-            "agent": {"qpos": qpos, "tcp_in_arm_base": tcp, "gripper_width": np.array([[0.05]], np.float32)},
-            "extra": {},
-            "sensor_data": {"base_camera": {"rgb": image}},
+            "agent": {"qpos": qpos, "qvel": qpos, "tcp_in_arm_base": tcp, "gripper_width": width},
+            "extra": {"tcp_pose": tcp},
+            "sensor_data": {"base_camera": {"rgb": pixels, "depth": pixels[..., :1].astype(np.int16) * 100}},
         }
 
     def _info(self) -> dict[str, Any]:
-        flags = {"reached_any": self.sum > 1, "success": self.sum >= ENOUGH, "fail": False, "success_v0": False}
+        no = np.zeros(self.num_envs, bool)
+        sums = np.zeros((self.num_envs, 5), np.float32)
+        sums[:, 0] = self.sums  # the first is the path's length
+        flags = {"reached_any": self.sums > 1, "success": self.sums >= ENOUGH, "fail": no, "success_v0": no}
         return {
-            "sums": np.array([[self.sum, 0, 0, 0, 0]], np.float32),  # the first is the path's length
-            **{name: np.array([value]) for name, value in flags.items()},
-            "elapsed_steps": np.array([self.elapsed]),
+            "sums": sums,
+            **{name: value.copy() for name, value in flags.items()},
+            "elapsed_steps": self.elapsed.copy(),
         }

@@ -1,14 +1,10 @@
-"""What an env's robot feels is, number for number, what a dataset holds of the same states."""
+"""The robot state in observations equals the columns of a dataset for the same states."""
 
 import numpy as np
-import pytest
-
-pytest.importorskip("websockets")
-pytest.importorskip("msgpack")
 
 from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
 from robocas_ms3.datasets.sources.arrays import episode_arrays
-from robocas_ms3.evaluation.bridge.proprioception import KEYS, WIDTHS, Proprioception
+from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, Proprioception
 from robocas_ms3.poses import from_wxyz
 from robocas_ms3.recordings.motion import Motion, gripper_open
 from robocas_ms3.robots.description import MOBILE_PANDA

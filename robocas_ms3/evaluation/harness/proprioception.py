@@ -1,4 +1,4 @@
-"""What an env's robot feels, in the numbers and by the names of our LeRobot datasets."""
+"""Robot state in observations of LeRobot environments: the values and names of our LeRobot datasets."""
 
 from __future__ import annotations
 
@@ -21,21 +21,26 @@ KEYS = {
     "arm_base": "observation.arm_base",
     "gripper_open": "observation.gripper_open",
 }
-"""Name in an observation of LeRobot's environments -> column of our datasets."""
+"""Key of an environment's observation -> column of our LeRobot datasets."""
 WIDTHS = {name: next(one.width for one in FEATURES if one.key == column) for name, column in KEYS.items()}
-_TURNS = {"agent_pos": slice(3, 7), "arm_base": slice(3, 7)}  # quaternions, whose sign must not jump
-_YAW = 17  # of agent_pos, which does not jump either
+_TURNS = {"agent_pos": slice(3, 7), "arm_base": slice(3, 7)}  # quaternions
+_YAW = 17  # index in agent_pos
+
+
+def depth_key(camera: str) -> str:
+    """Return the key of a camera's depth in observations; LeRobot puts ``observation.`` before it."""
+    return f"images.{camera}_depth"
 
 
 @dataclass
 class _Robot:
-    """Of one episode.
+    """Robot of one episode.
 
     Attributes:
-        spec: which it is.
-        root: (4, 4) in the world; it stands still.
-        width: of the gripper at first, m.
-        last: what was read last.
+        spec: its row in the registry.
+        root: (4, 4) pose of its root link in the world, which is constant.
+        width: width of the gripper at the start, m.
+        last: values that `Proprioception.read` returned last.
     """
 
     spec: RobotSpec
@@ -45,17 +50,17 @@ class _Robot:
 
 
 class Proprioception:
-    """Reads observations of several envs, one after another of each episode."""
+    """Reads the robot state of several envs, step by step."""
 
     def __init__(self) -> None:
         self._robots: dict[int, _Robot] = {}
 
     def begin(self, env: int, obs: dict[str, Any], spec: RobotSpec) -> None:
-        """An episode begins.
+        """Start an episode.
 
         Args:
             env: row of the observation.
-            obs: the first one.
+            obs: first observation of the episode.
             spec: its robot.
         """
         robot = spec.description
@@ -65,12 +70,12 @@ class Proprioception:
         self._robots[env] = _Robot(spec, root, float(qpos[0, robot.finger_slice].sum()))
 
     def read(self, env: int, obs: dict[str, Any], gripper: float | None) -> dict[str, NDArray[np.float32]]:
-        """The numbers (D,) of `KEYS`.
+        """Return the values (D,) of each of `KEYS`.
 
         Args:
             env: row of the observation.
-            obs: of the environment.
-            gripper: its command in force, -1 closed to 1 open; None: there was none yet.
+            obs: observation of the environment.
+            gripper: last gripper command, -1 closed to 1 open; None: there was none yet.
         """
         robot, qpos = self._robots[env], _row(obs, env)[0]
         qvel = obs["agent"]["qvel"][env][None].astype(np.float64)
@@ -84,7 +89,7 @@ class Proprioception:
 
 
 def _row(obs: dict[str, Any], env: int) -> tuple[NDArray[np.float64], ...]:
-    """(1, ...) joint positions, and poses of the TCP in the arm's base and in the world."""
+    """Return joint positions (1, J) and the TCP's poses (1, 7) in the arm's base frame and in the world frame."""
     agent = obs["agent"]
     parts = (agent["qpos"], agent["tcp_in_arm_base"], obs["extra"]["tcp_pose"])
     return tuple(np.asarray(part[env], np.float64)[None] for part in parts)
@@ -93,7 +98,7 @@ def _row(obs: dict[str, Any], env: int) -> tuple[NDArray[np.float64], ...]:
 def _continued(
     before: dict[str, NDArray[np.float32]], now: dict[str, NDArray[np.float32]]
 ) -> dict[str, NDArray[np.float32]]:
-    """The same, without jumps of signs and of whole turns, as an episode of a dataset has none."""
+    """Return the values without sign flips of quaternions and jumps by full turns, as in an episode of a dataset."""
     found = {name: values.copy() for name, values in now.items()}
     for name, turn in _TURNS.items():
         if before[name][turn] @ found[name][turn] < 0:

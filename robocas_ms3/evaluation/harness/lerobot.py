@@ -1,0 +1,123 @@
+"""``--env.type=robocas`` of LeRobot's commands: its settings, and the environments made from them.
+
+Needs lerobot 0.6. LeRobot imports this through the distribution ``lerobot_env_robocas``.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from lerobot.configs import FeatureType, PolicyFeature  # pyright: ignore[reportMissingImports]
+from lerobot.envs import EnvConfig  # pyright: ignore[reportMissingImports]
+
+from robocas_ms3.evaluation.actions import CONVENTIONS
+from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, depth_key
+from robocas_ms3.evaluation.policy import CAMERAS, Reference, Wants
+from robocas_ms3.evaluation.protocol import load_protocol
+
+if TYPE_CHECKING:
+    from robocas_ms3.tasks.vector.backend import Backend  # imports the simulator
+
+
+@EnvConfig.register_subclass("robocas")
+@dataclass
+class RoboCASEnvConfig(EnvConfig):
+    """Settings of RoboCAS in LeRobot. The defaults are those of the LeRobot datasets that robocas_ms3 writes.
+
+    Attributes:
+        task: short name of a task; several separated by commas; ``all`` tasks of the protocol.
+        fps: actions per second, as the policy was trained with.
+        protocol: name of a shipped protocol, such as ``ms3-v1`` or ``smoke``, or its folder.
+        split: use the episodes of this split only, such as ``seen`` of ``objects-v1``; empty: all.
+        cameras: names separated by commas. LeRobot films the first one.
+        observation_width, observation_height: size of the images of every camera, pixels.
+        depth: add the depth of each camera as ``observation.images.CAMERA_depth``, (1, H, W) float32 in mm.
+        convention, reference: meaning of the actions (docs/evaluation.md).
+        backend: ``processes``, ``gpu`` or ``auto``.
+        results: folder for results that ``robocas eval report`` reads, one subfolder per task.
+        policy_name: name of the policy in these results.
+    """
+
+    task: str | None = "pick"
+    fps: int = 5
+    protocol: str = "ms3-v1"
+    split: str = ""
+    cameras: str = ",".join(CAMERAS)
+    observation_width: int = 640
+    observation_height: int = 480
+    depth: bool = False
+    convention: str = "robocas"
+    reference: str = "tcp"
+    backend: str = "auto"
+    results: str | None = None
+    policy_name: str = "lerobot"
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        wants = self.wants  # checks convention, reference and cameras
+        height, width = self.observation_height, self.observation_width
+        visual, state = FeatureType.VISUAL, FeatureType.STATE
+        images = [f"observation.images.{camera}" for camera in wants.cameras]
+        depths = [depth_key(camera) for camera in wants.cameras] if self.depth else []
+        self.features = {
+            "action": PolicyFeature(FeatureType.ACTION, (CONVENTIONS[self.convention].size,)),
+            **{name: PolicyFeature(state, (size,)) for name, size in WIDTHS.items()},
+            **{name: PolicyFeature(visual, (height, width, 3)) for name in images},
+            **{name: PolicyFeature(visual, (height, width, 1)) for name in depths},
+        }
+        self.features_map = {
+            **{name: name for name in ("action", *images)},
+            **KEYS,
+            **{name: f"observation.{name}" for name in depths},
+        }
+
+    @property
+    def wants(self) -> Wants:
+        """What the policy sees, and what its actions mean.
+
+        Raises:
+            EvaluationError: a setting is none of those that exist.
+        """
+        size = (self.observation_width, self.observation_height)
+        cameras = dict.fromkeys(_names(self.cameras, "env.cameras"), size)
+        return Wants(self.convention, cast(Reference, self.reference), self.fps, cameras, depth=self.depth)
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Nothing: `create_envs` does not call ``gym.make``."""
+        return {}
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
+        """Make the vector environments, ``{task: {0: environment}}``.
+
+        Args:
+            n_envs: episodes at a time.
+            use_async_envs: ignored, because envs on a CPU run in processes anyway.
+
+        Raises:
+            EvaluationError: the settings don't fit the protocol.
+            DatasetError: there is no render device.
+        """
+        from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
+        from robocas_ms3.evaluation.run import Settings
+
+        protocol = load_protocol(self.protocol)
+        tasks = _names(self.task or "", "env.task")
+        if tasks == ["all"]:
+            episodes = [episode for episode in protocol.episodes if self.split in ("", episode.split)]
+            tasks = list(dict.fromkeys(episode.task for episode in episodes))
+        envs: dict[str, dict[int, Any]] = {}
+        for task in tasks:
+            settings = Settings(n_envs, cast("Backend", self.backend), tasks=(task,), split=self.split)
+            folder = None if self.results is None else Path(self.results).absolute() / task
+            made = ProtocolVectorEnv(protocol, self.wants, settings, folder=folder, name=self.policy_name)
+            envs[task] = {0: made}
+        return envs
+
+
+def _names(text: str, where: str) -> list[str]:
+    names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if not names:
+        raise ValueError(f"{where}: expected at least one name, found {text!r}")
+    return names

@@ -1,0 +1,241 @@
+"""The episodes of one task of a protocol as a gymnasium vector environment, in LeRobot's conventions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from robocas_ms3.errors import EvaluationError
+from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.actions import CONVENTIONS
+from robocas_ms3.evaluation.harness.driven import DrivenEpisodes
+from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception, depth_key
+from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.run import Settings, chosen
+from robocas_ms3.robots.table import find_robot
+
+
+class ProtocolVectorEnv(gym.vector.VectorEnv):
+    """Runs the frozen episodes of one task, N at a time.
+
+    A seed is the index of an episode in the task's list, modulo the length of the list. There is no automatic reset:
+    an env whose episode has ended returns its last observation until the next reset.
+
+    Observations: ``pixels`` by camera (N, H, W, 3) uint8; ``agent_pos`` (N, 18), ``joint_velocity`` (N, 7),
+    ``arm_base`` (N, 7) and ``gripper_open`` (N, 1) float32, the state columns of our LeRobot datasets; with depth
+    ``images.CAMERA_depth`` (N, 1, H, W) float32 in mm, 0 where nothing was measured. Reward: 1 at the step where an
+    episode ends with success, else 0. ``info["is_success"]`` (N,): whether it has; at steps where an episode ends the
+    same array is in ``info["final_info"]``.
+
+    Args:
+        protocol: whose episodes.
+        wants: cameras, action convention and rate.
+        settings: ``tasks`` names the task; number of envs, where they run, split.
+        folder: for a result that ``robocas eval report`` reads; None: none is written.
+        name: of the policy, in the result.
+
+    Raises:
+        EvaluationError: the protocol has no such task or split, the policy does not fit it, N > 1 and the task has
+            several configurations, or the folder holds a result.
+        DatasetError: there are cameras, and no render device.
+    """
+
+    def __init__(
+        self,
+        protocol: LoadedProtocol,
+        wants: Wants,
+        settings: Settings,
+        *,
+        folder: Path | None = None,
+        name: str = "external",
+    ) -> None:
+        self._episodes = chosen(protocol.episodes, settings)
+        configs = list(dict.fromkeys(episode.config for episode in self._episodes))
+        if settings.num_envs > 1 and len(configs) > 1:
+            splits = ", ".join(dict.fromkeys(episode.split for episode in self._episodes))
+            fix = f"Choose one of the splits {splits}, or use one env."
+            where = protocol.rules.name
+            raise EvaluationError(
+                "several configurations in one batch", where=where, expected="one", found=", ".join(configs), fix=fix
+            )
+        self._driven = DrivenEpisodes(protocol, wants, settings, name)
+        self._task = self._episodes[0].task
+        self._max_steps = self._driven.max_steps(self._task)
+        self._folder, self._recorded = folder, set[int]()  # episodes that the result has
+        if folder is not None:
+            if (folder / results.OUTCOMES).exists():
+                raise EvaluationError("there is a result already", where=folder, fix="Choose another folder.")
+            results.begin(folder, self._driven.about, resume=False)
+        self._convention = CONVENTIONS[wants.convention]
+        self._proprioception = Proprioception()
+        self._wants, self._next = wants, 0
+        count = self.num_envs = settings.num_envs
+        self.render_mode = "rgb_array"
+        rate = self._driven.rate
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": rate, "autoreset_mode": AutoresetMode.DISABLED}
+        self.single_observation_space = _space(wants)
+        self.single_action_space = gym.spaces.Box(-np.inf, np.inf, (self._convention.size,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, count)
+        self.action_space = batch_space(self.single_action_space, count)
+        self.episodes = np.zeros(count, np.int64)  # numbers in the protocol's list
+        self._instructions = [""] * count
+        self._grippers: list[float | None] = [None] * count  # last command, -1 closed to 1 open
+        self._success, self._truncated = np.zeros(count, bool), np.zeros(count, bool)
+        self._ended = np.ones(count, bool)
+        self._obs: dict[str, NDArray[Any]] = {}
+        self._pixels: dict[str, NDArray[np.uint8]] = {}
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode in each env.
+
+        Args:
+            seed: of the first env, whose successors the other envs get, or one per env; None: the episodes after
+                those of the last reset.
+            options: ignored.
+
+        Raises:
+            ValueError: there are more or fewer seeds than envs, or one is None.
+        """
+        first: Any = self._next if seed is None else seed
+        seeds = [first + env for env in range(self.num_envs)] if np.ndim(first) == 0 else list(first)
+        if len(seeds) != self.num_envs or any(one is None for one in seeds):
+            raise ValueError(f"seed: expected {self.num_envs} integers, found {seeds}")
+        indices = [int(one) % len(self._episodes) for one in seeds]
+        self._next = indices[-1] + 1
+        episodes = [self._episodes[index] for index in indices]
+        self._driven.reset([episode.episode for episode in episodes])
+        self.episodes = np.array([episode.episode for episode in episodes], np.int64)
+        self._instructions = [episode.instruction for episode in episodes]
+        self._grippers = [None] * self.num_envs
+        robot, obs = find_robot(self._driven.protocol.rules.robot), self._driven.obs
+        for env in range(self.num_envs):
+            self._proprioception.begin(env, obs, robot)
+        for flags in (self._ended, self._success, self._truncated):
+            flags[:] = False
+        self._obs = {name: np.zeros((self.num_envs, *shape), np.float32) for name, shape in _shapes(self._wants)}
+        self._pixels = {
+            name: np.zeros((self.num_envs, height, width, 3), np.uint8)
+            for name, (width, height) in self._wants.cameras.items()
+        }
+        self._read(list(range(self.num_envs)))
+        return self._shown(), self._info()
+
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[dict[str, Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Step the envs whose episodes run.
+
+        Args:
+            actions: (N, A).
+
+        Raises:
+            ValueError: the actions have another shape.
+            EvaluationError: there was no reset.
+            WorkerDied: a process of the environment died.
+        """
+        acts = np.asarray(actions, np.float32)
+        if acts.shape != self.action_space.shape:
+            raise ValueError(f"actions: expected {self.action_space.shape}, found {acts.shape}")
+        before, running = self._success.copy(), np.flatnonzero(~self._ended).tolist()
+        if not self._obs:
+            raise EvaluationError("no episode is running", fix="Call reset first.")
+        if running:
+            self._driven.step(acts)
+            for env, command in zip(running, self._commands(acts[running]), strict=True):
+                self._grippers[env] = command
+            self._record(running)
+            self._read(running)
+        reward = (self._success & ~before).astype(np.float64)
+        just_ended = np.isin(np.arange(self.num_envs), running) & self._ended
+        terminated, truncated = self._ended & ~self._truncated, self._truncated.copy()
+        return self._shown(), reward, terminated, truncated, self._info(just_ended)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...]:
+        """Return the first camera's image (H, W, 3) of each env."""
+        return tuple(next(iter(self._pixels.values())).copy())
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return ``task``, ``task_description`` or ``_max_episode_steps`` of each env."""
+        if name == "task_description":
+            return tuple(self._instructions)
+        shared = {"task": self._task, "_max_episode_steps": self._max_steps}
+        if name not in shared:
+            raise AttributeError(f"{name}: expected one of task_description, {', '.join(shared)}")
+        return (shared[name],) * self.num_envs
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Return what `render` gives, or what `get_attr` gives."""
+        return self.render() if name == "render" else self.get_attr(name)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the environment."""
+        self._driven.close()
+
+    def _commands(self, actions: NDArray[np.float32]) -> list[float]:
+        """Gripper commands of actions (E, A), -1 closed to 1 open."""
+        if self._convention.read is None:
+            return actions[:, -1].tolist()
+        opened = self._convention.read(np.nan_to_num(actions.astype(np.float64))).open
+        return np.where(opened, 1.0, -1.0).tolist()
+
+    def _record(self, envs: list[int]) -> None:
+        """Take over the outcomes of episodes that have just ended in some of these envs."""
+        for env in envs:
+            outcome = self._driven.outcomes.get(env)
+            if outcome is None:
+                continue
+            self._ended[env], self._success[env] = True, outcome.success
+            self._truncated[env] = not outcome.success and outcome.steps >= self._max_steps
+            if self._folder is not None and outcome.episode not in self._recorded:
+                results.append(self._folder, outcome)
+                self._recorded.add(outcome.episode)
+
+    def _read(self, envs: list[int]) -> None:
+        """Read the observations of envs."""
+        obs = self._driven.obs
+        for env in envs:
+            for name, values in self._proprioception.read(env, obs, self._grippers[env]).items():
+                self._obs[name][env] = values
+        for camera, pixels in self._pixels.items():
+            images = obs["sensor_data"][camera]
+            pixels[envs] = images["rgb"][envs]
+            if self._wants.depth:
+                self._obs[depth_key(camera)][envs] = images["depth"][envs].transpose(0, 3, 1, 2)
+
+    def _shown(self) -> dict[str, Any]:
+        """Copies, because the caller may keep them."""
+        pixels = {name: value.copy() for name, value in self._pixels.items()}
+        return {"pixels": pixels, **{name: value.copy() for name, value in self._obs.items()}}
+
+    def _info(self, just_ended: NDArray[np.bool_] | None = None) -> dict[str, Any]:
+        info = {"is_success": self._success.copy(), "_is_success": np.ones(self.num_envs, bool)}
+        if just_ended is not None and just_ended.any():
+            info["final_info"] = {"is_success": self._success.copy(), "_is_success": just_ended}
+            info["_final_info"] = just_ended
+        return info
+
+
+def _shapes(wants: Wants) -> list[tuple[str, tuple[int, ...]]]:
+    """Names and shapes of the float32 entries of one env's observation."""
+    depths = [(depth_key(name), (1, h, w)) for name, (w, h) in wants.cameras.items()] if wants.depth else []
+    return [*((name, (width,)) for name, width in WIDTHS.items()), *depths]
+
+
+def _space(wants: Wants) -> gym.spaces.Dict:
+    numbers: dict[str, gym.Space[Any]] = {
+        name: gym.spaces.Box(-np.inf, np.inf, shape, np.float32) for name, shape in _shapes(wants)
+    }
+    pixels: dict[str, gym.Space[Any]] = {
+        name: gym.spaces.Box(0, 255, (h, w, 3), np.uint8) for name, (w, h) in wants.cameras.items()
+    }
+    return gym.spaces.Dict({"pixels": gym.spaces.Dict(pixels), **numbers})

@@ -1,0 +1,199 @@
+"""A task of a protocol as a vector environment in LeRobot's conventions."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from robocas_ms3.errors import EvaluationError, VectorEnvError
+from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.harness import driven
+from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
+from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.run import Settings, evaluate
+
+SMOKE = load_protocol("smoke")
+WANTS = Wants(reference="tcp", rate_hz=5, cameras={"base_camera": (6, 4)}, depth=True)
+
+
+@pytest.fixture
+def make(made, monkeypatch):
+    """Makes environments without physics, and closes them."""
+    monkeypatch.setattr(driven, "require_renderer", lambda: None)
+    opened = []
+
+    def make(num_envs=2, task="pick", wants=WANTS, protocol=SMOKE, **kwargs):
+        settings = Settings(num_envs, "processes", tasks=(task,), split=kwargs.pop("split", ""))
+        opened.append(ProtocolVectorEnv(protocol, wants, settings, **kwargs))
+        return opened[-1]
+
+    yield make
+    for env in opened:
+        env.close()
+    assert all(env.closed for env in made)
+
+
+def act(*sums: float, gripper: float = 0.0) -> np.ndarray:
+    actions = np.zeros((len(sums), 7), np.float32)
+    actions[:, 0], actions[:, 6] = sums, gripper
+    return actions
+
+
+def test_observations_are_in_the_declared_space_and_have_the_datasets_names(make):
+    env = make()
+    obs, info = env.reset(seed=0)
+    assert env.observation_space.contains(obs)
+    assert set(obs) == {"pixels", "agent_pos", "joint_velocity", "arm_base", "gripper_open", "images.base_camera_depth"}
+    assert obs["images.base_camera_depth"].shape == (2, 1, 4, 6)
+    obs = env.step(act(1, 1))[0]
+    assert (obs["pixels"]["base_camera"] == 1).all() and (obs["images.base_camera_depth"] == 100).all()
+    assert env.render()[0].shape == (4, 6, 3)
+    assert info["is_success"].tolist() == [False, False] and "final_info" not in info
+
+
+def test_an_episode_ends_by_itself_and_its_last_observation_stays(make):
+    env = make()
+    env.reset(seed=0)
+    results = [env.step(act(2.5, 1)) for _ in range(5)]
+    rewards = [result[1].tolist() for result in results]
+    assert rewards == [[0, 0], [1, 0], [0, 0], [0, 0], [0, 1]]
+    assert [result[2].tolist() for result in results][1:4] == [[True, False]] * 3
+    assert not any(result[3].any() for result in results)
+    assert [result[0]["pixels"]["base_camera"][:, 0, 0, 0].tolist() for result in results] == [
+        [1, 1],
+        [2, 2],
+        [2, 3],
+        [2, 4],
+        [2, 5],
+    ]
+    infos = [result[4] for result in results]
+    assert [info["is_success"].tolist() for info in infos] == [[False] * 2, *[[True, False]] * 3, [True, True]]
+    assert [step for step, info in enumerate(infos) if "final_info" in info] == [1, 4]
+    assert infos[1]["_final_info"].tolist() == [True, False]
+    assert infos[4]["final_info"]["is_success"].tolist() == [True, True]
+    after = env.step(act(9, 9))
+    np.testing.assert_array_equal(after[0]["agent_pos"], results[-1][0]["agent_pos"])
+    assert not after[1].any() and after[2].all()
+
+
+def test_an_episode_without_success_is_truncated_and_one_with_an_error_terminated(make):
+    env = make()
+    env.reset(seed=0)
+    assert env.call("_max_episode_steps") == (200, 200)
+    broken = act(0, 0)
+    broken[1] = np.inf
+    _, _, terminated, truncated, _ = env.step(broken)
+    assert (terminated.tolist(), truncated.tolist()) == ([False, True], [False, False])
+    for _ in range(199):
+        _, reward, terminated, truncated, info = env.step(act(0, 0))
+    assert (terminated.tolist(), truncated.tolist()) == ([False, True], [True, False])
+    assert not info["is_success"].any() and not reward.any()
+
+
+def test_seeds_are_indices_of_the_tasks_episodes_modulo_their_number(make, made):
+    env = make(task="search")
+    env.reset(seed=1001)
+    assert env.episodes.tolist() == [5, 4]
+    said = [SMOKE.episodes[number].instruction for number in (5, 4)]
+    assert list(env.call("task_description")) == list(env.get_attr("task_description")) == said
+    assert env.get_attr("task") == ("search", "search")
+    env.reset()
+    assert env.episodes.tolist() == [5, 4]
+    env.reset(seed=[0, 0])
+    assert env.episodes.tolist() == [4, 4]
+    assert len(made) == 1 and made[0].num_envs == 2
+    with pytest.raises(ValueError, match="expected 2 integers"):
+        env.reset(seed=[1])
+    with pytest.raises(ValueError, match="actions: expected"):
+        env.step(np.zeros((2, 6)))
+    with pytest.raises(AttributeError, match="task_description"):
+        env.get_attr("nothing")
+
+
+def test_the_gripper_column_follows_the_commands(make):
+    env = make(1)
+    before = env.reset(seed=0)[0]["gripper_open"].item()
+    opened = env.step(act(0, gripper=1.0))[0]["gripper_open"].item()
+    closed = env.step(act(0, gripper=0.0))[0]["gripper_open"].item()
+    assert opened == 1.0 and closed == 0.0 and before in (0.0, 1.0)
+
+
+def test_a_step_before_a_reset_is_refused(make):
+    with pytest.raises(EvaluationError, match="Call reset first"):
+        make(1).step(act(0))
+
+
+def test_outcomes_are_written_once_per_episode(make, tmp_path):
+    env = make(1, folder=tmp_path / "result", name="mine")
+    for _ in range(2):  # two passes over the two episodes
+        for seed in (0, 1):
+            env.reset(seed=seed)
+            while not env.step(act(1))[2].all():
+                pass
+    result = results.read(tmp_path / "result")
+    assert sorted(result.outcomes) == [0, 1] and result.run["policy"]["name"] == "mine"
+    with pytest.raises(EvaluationError, match="there is a result already"):
+        make(1, folder=tmp_path / "result")
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "error", "words"),
+    [
+        (dict(task="juggle"), EvaluationError, "no such task"),
+        (dict(split="nowhere"), EvaluationError, "no such split"),
+        (
+            dict(protocol=load_protocol("paper-v1"), wants=Wants(reference="tcp", rate_hz=10)),
+            EvaluationError,
+            "another rate",
+        ),
+        (dict(wants=Wants(rate_hz=7)), EvaluationError, "divisor of 100"),
+        (dict(protocol=load_protocol("objects-v1")), EvaluationError, "one of the splits"),
+    ],
+)
+def test_settings_that_do_not_fit_the_protocol_are_refused(make, kwargs, error, words):
+    with pytest.raises(error, match=words):
+        make(**kwargs)
+
+
+def test_an_unknown_backend_is_refused(monkeypatch):
+    with pytest.raises(VectorEnvError, match="no such backend"):
+        ProtocolVectorEnv(SMOKE, Wants(rate_hz=5), Settings(1, "threads", tasks=("pick",)))  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.slow
+def test_real_episodes_have_the_outcomes_and_images_of_robocas_eval(needs_renderer, tmp_path):
+    size, down = (48, 36), np.array([0, 0, 0.02, 0, 0, 0.1, 0.0], np.float32)
+    wants = Wants(reference="tcp", rate_hz=5, cameras={"gripper_camera": size})
+
+    class Down:
+        def __init__(self) -> None:
+            self.wants, self.seen = wants, []
+
+        def reset(self, starts) -> None:
+            pass
+
+        def act(self, observations) -> np.ndarray:
+            self.seen.append(observations.images["gripper_camera"][:, 0, 0].tolist())
+            return np.tile(down, (len(observations.envs), 1))
+
+    shutil.copytree(SMOKE.folder, tmp_path / "short")
+    rules = tmp_path / "short" / "protocol.yaml"
+    rules.write_text(rules.read_text().replace("max_steps: null", "max_steps: 10"))
+    protocol, policy = load_protocol(tmp_path / "short"), Down()
+    settings = Settings(2, "processes", workers=1, tasks=("search",))
+    list(evaluate(protocol, policy, "down", tmp_path / "ours", settings))
+    env = ProtocolVectorEnv(protocol, wants, settings, folder=tmp_path / "theirs")
+    obs, _ = env.reset(seed=2000)
+    seen, done = [], np.zeros(2, bool)
+    while not done.all():
+        seen.append(obs["pixels"]["gripper_camera"][:, 0, 0].tolist())
+        obs, _, terminated, truncated, _ = env.step(np.tile(down, (2, 1)))
+        done = terminated | truncated
+    env.close()
+    assert seen == policy.seen and truncated.all()
+    ours, theirs = (results.read(tmp_path / name).outcomes for name in ("ours", "theirs"))
+    assert {n: one.without_clock() for n, one in ours.items()} == {n: one.without_clock() for n, one in theirs.items()}
+    assert all(one.measures["path_length"] > 0.1 for one in theirs.values())
