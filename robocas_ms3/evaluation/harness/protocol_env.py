@@ -218,7 +218,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         return {"pixels": pixels, **{name: value.copy() for name, value in self._obs.items()}}
 
     def _info(self, just_ended: NDArray[np.bool_] | None = None) -> dict[str, Any]:
-        info = {"is_success": self._success.copy(), "_is_success": np.ones(self.num_envs, bool)}
+        info: dict[str, Any] = {"is_success": self._success.copy(), "_is_success": np.ones(self.num_envs, bool)}
         if just_ended is not None and just_ended.any():
             info["final_info"] = {"is_success": self._success.copy(), "_is_success": just_ended}
             info["_final_info"] = just_ended
