@@ -29,6 +29,8 @@ class ServePolicy:
     protocol: Several[Path] = ()
     """Folders of your own protocols, for policies that read an episode's configuration, such as scripted. Clients may
     choose among these and the shipped ones."""
+    max_batch: int = 64
+    """Largest number of envs per call of the policy; fewer where their images exceed the size limit of a message."""
 
 
 def main(cfg: ServePolicy) -> int:
@@ -38,11 +40,15 @@ def main(cfg: ServePolicy) -> int:
     from robocas_ms3.evaluation.policies import open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.remote.address import strip_brackets
+    from robocas_ms3.evaluation.remote.metadata import LARGEST_BATCH
     from robocas_ms3.evaluation.remote.served import ServedFiles
     from robocas_ms3.evaluation.remote.server import PolicyServer
 
     if not 0 <= cfg.port < 2**16:
         raise EvaluationError("no such port", where="--port", expected="0 to 65535", found=cfg.port)
+    if not 1 <= cfg.max_batch <= LARGEST_BATCH:
+        expected = f"1 to {LARGEST_BATCH}"
+        raise EvaluationError("invalid batch size", where="--max-batch", expected=expected, found=cfg.max_batch)
     if not cfg.host:
         raise EvaluationError("no address to listen on", where="--host", expected="such as 127.0.0.1 or ::1")
     packs = [load_protocol(folder).rules.pack for folder in cfg.protocol]
@@ -50,7 +56,8 @@ def main(cfg: ServePolicy) -> int:
     if not _is_loopback(strip_brackets(cfg.host)):
         say(f"{cfg.host} is no loopback address: whoever can reach it can ask this policy")
     with open_policy(cfg.policy) as policy:
-        PolicyServer(policy, cfg.host, cfg.port, files).run(lambda url: say(f"{cfg.policy} at {url}"))
+        server = PolicyServer(policy, cfg.host, cfg.port, files, cfg.max_batch)
+        server.run(lambda url: say(f"{cfg.policy} at {url}"))
     return 0
 
 

@@ -24,9 +24,9 @@ class Up:
 
 
 @contextmanager
-def serving(policy, folder):
+def serving(policy, folder, *options):
     """The command at work, and the address that it says."""
-    words = [sys.executable, ROOT / "robocas_cli.py", "serve-policy", policy, "--port", "0"]
+    words = [sys.executable, ROOT / "robocas_cli.py", "serve-policy", policy, "--port", "0", *options]
     where = {"PYTHONPATH": f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', ROOT)}"}
     served = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | where)
     try:
@@ -53,10 +53,52 @@ def test_a_policy_of_ones_own_is_served_until_ctrl_c(tmp_path):
         assert (out, err.strip(), served.returncode) == ("closed\n", "interrupted", 130)
 
 
+SLOW = """
+import time
+from robocas_ms3.evaluation.policy import Wants
+
+class Slow:
+    wants = Wants()
+    def reset(self, starts): ...
+    def act(self, observations):
+        print("acts", flush=True)
+        time.sleep(300)
+    def close(self): print("closed")
+"""
+
+
+def test_ctrl_c_ends_a_policy_that_computes(tmp_path):
+    from websockets.sync.client import connect
+
+    from robocas_ms3.evaluation.remote.wire import pack
+
+    (tmp_path / "mine.py").write_text(SLOW)
+    with serving("mine:Slow", tmp_path) as (served, url), connect(url, proxy=None) as client:
+        client.send(pack(observation()))
+        assert served.stdout.readline() == "acts\n"
+        served.send_signal(signal.SIGINT)
+        out, err = served.communicate(timeout=60)
+        assert (out, err.strip(), served.returncode) == ("closed\n", "interrupted", 130)
+
+
+def observation():
+    sizes = {"qpos": 12, "tcp_in_base": 7, "gripper_width": 1}
+    return {f"observation/{name}": np.zeros(size, np.float32) for name, size in sizes.items()}
+
+
+@pytest.mark.parametrize(("options", "announced"), [((), 64), (("--max-batch", "3"), 3)])
+def test_the_size_of_batches_is_announced(tmp_path, options, announced):
+    from websockets.sync.client import connect
+
+    from robocas_ms3.evaluation.remote.wire import unpack
+
+    with serving("still", tmp_path, *options) as (_, url), connect(url, proxy=None) as client:
+        assert unpack(client.recv())["robocas_max_batch"] == announced
+
+
 def test_openpis_client_is_served(tmp_path):
     openpi = pytest.importorskip("openpi_client.websocket_client_policy")
-    sizes = {"qpos": 12, "tcp_in_base": 7, "gripper_width": 1}
-    seen = {f"observation/{name}": np.zeros(size, np.float32) for name, size in sizes.items()}
+    seen = observation()
     with serving("random", tmp_path) as (_, url):
         client = openpi.WebsocketClientPolicy(host="127.0.0.1", port=int(url.rpartition(":")[2]))
         assert client.get_server_metadata()["robocas_wants"]["reference"] == "tcp"
@@ -65,8 +107,16 @@ def test_openpis_client_is_served(tmp_path):
     assert not np.array_equal(first, second)
 
 
-def test_an_address_that_is_none():
-    words = [sys.executable, ROOT / "robocas_cli.py", "serve-policy", "still", "--port", "99999"]
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--port", "99999", "no such port"),
+        ("--max-batch", "0", "invalid batch size"),
+        ("--max-batch", "257", "invalid"),
+    ],
+)
+def test_an_option_out_of_range(option, value, message):
+    words = [sys.executable, ROOT / "robocas_cli.py", "serve-policy", "still", option, value]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("error: --port: no such port")
+    assert done.stderr.startswith(f"error: {option}: {message}")

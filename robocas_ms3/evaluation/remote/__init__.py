@@ -1,7 +1,8 @@
-"""Policies on the other end of a websocket, in messages that openpi's client and server understand too.
+"""Policies behind a websocket, in messages that openpi's client and server understand too.
 
-``wire`` turns values to bytes and back, ``messages`` says what is in them, ``client`` is a `Policy` that asks a server,
-``server`` lets any `Policy` answer. docs/remote_policies.md has the messages.
+``client`` is the `Policy` that asks a server (``requests``, ``connection``), ``server`` lets any `Policy` answer
+(``answers``, ``executor``). ``messages``, ``metadata`` and ``wire`` are the format, described in
+docs/remote_policies.md.
 """
 
 from robocas_ms3.errors import MissingExtraError

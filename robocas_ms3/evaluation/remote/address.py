@@ -25,14 +25,16 @@ class Address:
         wants: what the policy wants, as its metadata would say; empty: its metadata do.
         rename: other keys of an observation, by name: of a camera, ``qpos``, ``prompt``, ...
         play: of a chunk, how many actions are played before the server is asked again; None: all.
-        timeout_s: clock time an answer may take.
-        connect_s: clock time in which a server has to be there, from an episode's begin on.
+        max_in_flight: number of requests without an answer, for servers without batches; None: one per env.
+        timeout_s: clock time in which the server has to answer one of the requests.
+        connect_s: clock time in which a connection has to be open, when an episode starts.
     """
 
     url: str
     wants: dict[str, Any] = field(default_factory=dict)
     rename: dict[str, str] = field(default_factory=dict)
     play: int | None = None
+    max_in_flight: int | None = None
     timeout_s: float = 120.0
     connect_s: float = 30.0
 
@@ -42,8 +44,8 @@ def read_address(text: str) -> Address:
 
     ``convention``, ``reference``, ``rate_hz``, ``language``, ``depth=1``, ``state=1`` and
     ``cameras=base_camera:224x224,gripper_camera:224x224`` (width x height) are what a policy wants;
-    ``rename=base_camera:observation/image,qpos:observation/state``, ``play=5``, ``timeout_s`` and ``connect_s`` are the
-    client's.
+    ``rename=base_camera:observation/image,qpos:observation/state``, ``play=5``, ``max_in_flight=1``, ``timeout_s`` and
+    ``connect_s`` are the client's.
 
     Raises:
         EvaluationError: it is no address, or has an option that is none.
@@ -68,7 +70,7 @@ def read_address(text: str) -> Address:
             wants[name] = {camera: _size(name, size) for camera, size in _pairs(name, value).items()}
         elif name == "rename":
             options[name] = _pairs(name, value)
-        elif name == "play" and _COUNT.fullmatch(value):
+        elif name in ("play", "max_in_flight") and _COUNT.fullmatch(value):
             options[name] = int(value)
         elif name in ("timeout_s", "connect_s"):
             options[name] = _number(name, value)
@@ -89,7 +91,7 @@ def netloc(host: str, port: int) -> str:
 
 _HELP = (
     "There are convention, reference, language, rate_hz, depth=1, state=1, cameras=NAME:WxH,..., "
-    "rename=NAME:KEY,..., play=N, timeout_s and connect_s."
+    "rename=NAME:KEY,..., play=N, max_in_flight=N, timeout_s and connect_s."
 )
 
 

@@ -1,14 +1,16 @@
-"""What client and server say: wants, observations of one env, actions. Plain maps, as `wire` packs them.
+"""Convert observations and actions to messages and back. Messages are plain maps, which `wire` packs.
 
-A server begins with its metadata, then each observation is answered by ``{"actions": (H, A)}``, or by a line that says
-what went wrong, after which it hangs up. Arrays of an observation have no axis for envs.
+The first message of a server is its metadata (`metadata`). An observation is the map of one env, without an axis for
+envs; the answer is ``{"actions": (H, A)}``, or a text with the error, after which the server closes the connection.
+A batched request is ``{"batch": [observation, ...]}``; the answer is ``{"batch": [answer, ...]}`` in the same order,
+where an answer is ``{"actions": (H, A)}`` or ``{"error": text}``.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -19,14 +21,15 @@ from pydantic import TypeAdapter, ValidationError
 from robocas_ms3.errors import EvaluationError, RobocasError, WireError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.remote.metadata import LARGEST_BATCH
 from robocas_ms3.evaluation.remote.served import ServedFiles, name_of
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES
 from robocas_ms3.robots.table import DEFAULT
 from robocas_ms3.strict import refusal
 from robocas_ms3.words import printable
 
-WANTS, POLICY = "robocas_wants", "robocas_policy"  # keys of the metadata
 ENV, RESET, START, PROMPT, ACTIONS = "env_id", "reset", "start", "prompt", "actions"
+BATCH, ERROR = "batch", "error"
 PREFIX = "observation/"
 ROBOT = {"qpos": 12, "tcp_in_base": 7, "gripper_width": 1}
 _LARGEST = 1e3  # m or rad: physics of what is beyond would be broken, and nobody means it
@@ -34,6 +37,7 @@ _MAX_PIXELS = 4096  # a side
 _MAX_TEXT = 10_000  # characters
 _LARGEST_NUMBER = 2**32 - 1  # of episodes and seeds
 _LONGEST_LINE = 300  # characters
+_OTHER_BYTES = 8 * 2**20  # of a request, besides images
 _WANTS = TypeAdapter(Wants)
 
 
@@ -120,6 +124,38 @@ def observations_of(message: Mapping[str, Any], env: int, wants: Wants) -> Obser
     )
 
 
+def stack_observations(observations: Sequence[Observations]) -> Observations:
+    """Return one batch of several, in their order.
+
+    Raises:
+        WireError: arrays of the same name differ in shape.
+    """
+    if len(observations) == 1:
+        return observations[0]
+
+    def stack(name: str, arrays: list[Any]) -> Any:
+        if arrays[0] is None:
+            return None
+        if len({array.shape[1:] for array in arrays}) > 1:
+            shapes = sorted({str(array.shape[1:]) for array in arrays})
+            raise WireError("observations of a batch differ in shape", where=PREFIX + name, found=", ".join(shapes))
+        return np.concatenate(arrays)
+
+    def of_all(name: str) -> list[Any]:
+        return [getattr(one, name) for one in observations]
+
+    first = observations[0]
+    return Observations(
+        envs=np.concatenate(of_all("envs")),
+        instructions=[text for one in observations for text in one.instructions],
+        embeddings=stack("embedding", of_all("embeddings")),
+        images={name: stack(name, [one.images[name] for one in observations]) for name in first.images},
+        depths={name: stack(f"{name}_depth", [one.depths[name] for one in observations]) for name in first.depths},
+        **{name: stack(name, of_all(name)) for name in ROBOT},
+        state=stack("simulator_state", of_all("state")),
+    )
+
+
 def start_of(message: Mapping[str, Any], env: int, files: ServedFiles) -> Start:
     """Return the episode that starts; of a client that does not say more, the instruction alone.
 
@@ -170,16 +206,45 @@ def actions_of(reply: Any, convention: str) -> NDArray[np.float32]:
     return found.reshape(-1, size).astype(np.float32)
 
 
+def batch_of(message: Any, least: int, most: int) -> list[dict[str, Any]]:
+    """Return the maps of a batched request, or of the answer to it.
+
+    Args:
+        message: with the key ``batch``.
+        least: smallest number of maps.
+        most: largest number of maps.
+
+    Raises:
+        WireError: it is no list of maps, or has another length.
+    """
+    batch = message.get(BATCH) if isinstance(message, dict) else None
+    if not isinstance(batch, list) or not all(isinstance(one, dict) for one in batch):
+        raise WireError("invalid batch", where=BATCH, expected="a list of maps", found=type(batch).__name__)
+    if not least <= len(batch) <= most:
+        raise WireError("invalid batch", where=BATCH, expected=f"{least} to {most} maps", found=len(batch))
+    return batch
+
+
 def one_line(error: BaseException) -> str:
     """Return an error as a line without control characters, for the other end of a connection."""
     said = str(error) if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}"
     return printable(" ".join(said.split())[:_LONGEST_LINE])
 
 
-def message_bytes(wants: Wants) -> int:
-    """Return a size that no observation of a policy reaches: four times its pictures, and 8 MiB."""
+def message_bytes(wants: Wants, max_batch: int = 1) -> int:
+    """Return the size limit of a request: 8 MiB, and the images of all envs or four times those of one."""
+    return min(MAX_BYTES, _OTHER_BYTES + max(4, max_batch) * _image_bytes(wants))
+
+
+def batch_limit(wants: Wants, envs: int) -> int:
+    """Return how many of these envs fit in one request of `MAX_BYTES`, at least 1."""
+    return max(1, min(envs, LARGEST_BATCH, (MAX_BYTES - _OTHER_BYTES) // max(1, _image_bytes(wants))))
+
+
+def _image_bytes(wants: Wants) -> int:
+    """Size of the images of one env."""
     pixels = sum(width * height for width, height in wants.cameras.values())
-    return min(MAX_BYTES, 4 * pixels * (5 if wants.depth else 3) + 8 * 2**20)
+    return pixels * (5 if wants.depth else 3)
 
 
 def _check_length(where: str, text: str) -> None:

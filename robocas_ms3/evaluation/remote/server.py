@@ -1,16 +1,15 @@
-"""Lets a policy answer over a socket: clients of ours, and openpi's."""
+"""A server that lets a policy answer over websockets: clients of ours, and openpi's."""
 
 from __future__ import annotations
 
 import asyncio
 import http
-import itertools
 import json
 import logging
+import threading
 from collections.abc import Callable
-from typing import Any
+from concurrent.futures import Future
 
-import numpy as np
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
@@ -18,55 +17,54 @@ from websockets.http11 import Request, Response
 from robocas_ms3 import __version__
 from robocas_ms3.errors import EvaluationError, RobocasError, WireError
 from robocas_ms3.evaluation.policy import Policy, describe, policy_code, said_of
+from robocas_ms3.evaluation.remote import keepalive
 from robocas_ms3.evaluation.remote.address import netloc, strip_brackets
-from robocas_ms3.evaluation.remote.messages import (
-    ACTIONS,
-    ENV,
-    POLICY,
-    RESET,
-    WANTS,
-    message_bytes,
-    observations_of,
-    one_line,
-    start_of,
-)
+from robocas_ms3.evaluation.remote.answers import Answers
+from robocas_ms3.evaluation.remote.executor import CallerThreadExecutor
+from robocas_ms3.evaluation.remote.messages import batch_limit, message_bytes, one_line
+from robocas_ms3.evaluation.remote.metadata import DEFAULT_BATCH, ServerMetadata
 from robocas_ms3.evaluation.remote.served import ServedFiles
-from robocas_ms3.evaluation.remote.wire import pack, unpack
+from robocas_ms3.evaluation.remote.wire import pack
 
 _LOG = logging.getLogger(__name__)
 HEALTH = "/healthz"
 MAX_CONNECTIONS = 256
-_MAX_ENVS = 1024  # of all connections
-_IDLE = 3600.0  # s after which a client that says nothing is taken for gone
+_IDLE = 3600.0  # s without a message, after which a connection is closed
+_STOP_S = 5.0  # for the network's thread to end
 _FAILED, _GARBAGE, _FULL = 1011, 1008, 1013  # close codes
 
 
 class PolicyServer:
-    """Asks its policy what clients ask for, one after another, in the thread that it runs in.
+    """Serve a policy: one request after another, in the thread that calls `run`.
 
-    The policy meets each env of each client as an env of its own, alone in its batch. Clients that say neither
-    ``env_id`` nor ``reset``, such as openpi's, play one episode a connection.
+    A second thread does the network's work. It answers pings and ``/healthz`` during inference.
 
     Args:
         policy: that acts.
-        host: to listen on; there is no password, so others than loopback let in whoever can reach it.
+        host: to listen on; there is no password, so with any address but loopback everyone who can reach it may ask.
         port: 0: any that is free.
         files: that clients may choose; default: those of shipped protocols.
+        max_batch: number of envs that a batched request may have; fewer where their images exceed a message's size.
     """
 
     def __init__(
-        self, policy: Policy, host: str = "127.0.0.1", port: int = 8000, files: ServedFiles | None = None
+        self,
+        policy: Policy,
+        host: str = "127.0.0.1",
+        port: int = 8000,
+        files: ServedFiles | None = None,
+        max_batch: int = DEFAULT_BATCH,
     ) -> None:
-        self._policy, self._host, self._port = policy, strip_brackets(host), port
-        self._files = files or ServedFiles.of()
+        self._host, self._port = strip_brackets(host), port
         with policy_code(policy):
-            self._wants = policy.wants
-        self._max_bytes = message_bytes(self._wants)
+            wants = policy.wants
+        max_batch = batch_limit(wants, max_batch)
+        self._max_bytes = message_bytes(wants, max_batch)
         about = json.loads(json.dumps({**describe(policy), "robocas_ms3": __version__}, default=str))
-        self._metadata = pack({WANTS: said_of(self._wants), POLICY: about})
-        self._taken: set[int] = set()  # envs of the policy
+        self._metadata = pack(ServerMetadata(said_of(wants), about, max_batch, answers_pings=True).message())
+        self._answers = Answers(policy, files or ServedFiles.of(), self._max_bytes, max_batch)
+        self._executor = CallerThreadExecutor()
         self._connections = 0
-        self._stopping: Callable[[], Any] = lambda: None
 
     def run(self, listening: Callable[[str], object] = lambda url: None) -> None:
         """Serve until `stop`.
@@ -77,15 +75,35 @@ class PolicyServer:
         Raises:
             EvaluationError: it can't listen there.
         """
-        asyncio.run(self._run(listening))
+        started: Future[tuple[str, Callable[[], object]]] = Future()
+        network = threading.Thread(target=self._serve, args=(started,), name="robocas-server", daemon=True)
+        network.start()
+        url, end = started.result()
+        try:
+            listening(url)
+            self._executor.run()
+        finally:
+            end()
+            network.join(_STOP_S)
 
     def stop(self) -> None:
-        """End `run`, from another thread."""
-        self._stopping()
+        """End `run`, from another thread, after the request that it answers now."""
+        self._executor.shutdown()
 
-    async def _run(self, listening: Callable[[str], object]) -> None:
+    def _serve(self, started: Future[tuple[str, Callable[[], object]]]) -> None:
+        """Run the network's event loop."""
+        try:
+            asyncio.run(self._listen(started))
+        except Exception as error:
+            if started.done():
+                _LOG.exception("the server's network thread failed")
+            else:
+                started.set_exception(error)
+        finally:
+            self._executor.shutdown()
+
+    async def _listen(self, started: Future[tuple[str, Callable[[], object]]]) -> None:
         loop, ended = asyncio.get_running_loop(), asyncio.Event()
-        self._stopping = lambda: loop.call_soon_threadsafe(ended.set)
         server = serve(
             self._talk,
             self._host,
@@ -95,7 +113,8 @@ class PolicyServer:
             compression=None,
             max_size=self._max_bytes,
             max_queue=1,
-            ping_interval=None,  # who waits for a policy can't answer in time
+            ping_interval=keepalive.PING_INTERVAL,
+            ping_timeout=keepalive.PING_TIMEOUT,
             close_timeout=1,
         )
         try:
@@ -104,64 +123,50 @@ class PolicyServer:
             raise EvaluationError("can't listen", where=netloc(self._host, self._port), found=error) from error
         async with running:
             port = next(iter(running.sockets)).getsockname()[1]
-            listening(f"ws://{netloc(self._host, port)}")
+            url = f"ws://{netloc(self._host, port)}"
+            started.set_result((url, lambda: loop.call_soon_threadsafe(ended.set)))
             await ended.wait()
 
     async def _talk(self, client: ServerConnection) -> None:
         if self._connections >= MAX_CONNECTIONS:
             return await client.close(_FULL, "too many clients")
         self._connections += 1
+        keepalive.enable_tcp_keepalive(client)
         envs: dict[int, int] = {}  # the client's to the policy's
+        closed = asyncio.ensure_future(client.wait_closed())
         try:
             await client.send(self._metadata)
             while True:
                 message = await asyncio.wait_for(client.recv(), _IDLE)
-                reply, code = self._reply(message, envs)
-                await client.send(reply)
+                reply = asyncio.get_running_loop().run_in_executor(self._executor, self._reply, message, envs)
+                await asyncio.wait({reply, closed}, return_when=asyncio.FIRST_COMPLETED)
+                if not reply.done():  # nobody waits for the answer
+                    reply.cancel()
+                    return
+                answer, code = reply.result()
+                await client.send(answer)
                 if code:
                     return await client.close(code)
         except (ConnectionClosed, asyncio.TimeoutError):
             pass
         finally:
+            closed.cancel()
             self._connections -= 1
-            self._taken -= set(envs.values())
+            self._executor.submit(self._answers.release, envs)
 
     def _reply(self, message: str | bytes, envs: dict[int, int]) -> tuple[str | bytes, int]:
-        """An answer, and the code to hang up with; 0: go on."""
+        """Return an answer, and the code to close the connection with; 0: it stays open."""
         try:
-            return pack({ACTIONS: self._actions(message, envs)}), 0
+            return pack(self._answers.answer(message, envs)), 0
         except WireError as error:
-            _LOG.warning("a client sent garbage: %s", error)
+            _LOG.warning("a client sent an invalid message: %s", error)
             return one_line(error), _GARBAGE
         except RobocasError as error:
             _LOG.warning("the policy failed: %s", error)
             return one_line(error), _FAILED
-        except Exception as error:  # whatever a policy raises, its client is to hear of it, and others are to be served
+        except Exception as error:  # a policy may raise anything; other clients are still served
             _LOG.exception("the policy failed")
             return one_line(error), _FAILED
-
-    def _actions(self, data: str | bytes, envs: dict[int, int]) -> np.ndarray:
-        message = unpack(data, self._max_bytes) if isinstance(data, bytes) else None
-        if not isinstance(message, dict):
-            raise WireError("no observation", expected="a map")
-        said, resets = message.get(ENV, 0), message.get(RESET)
-        if type(said) is not int or not (resets is None or isinstance(resets, bool)):
-            raise WireError("no observation", expected=f"a number {ENV}, and whether to {RESET}")
-        if said not in envs:
-            if resets is False:
-                raise WireError("no episode has begun", where=f"{ENV} {said}", expected=RESET)
-            if len(self._taken) >= _MAX_ENVS:
-                raise WireError("too many envs", expected=f"{_MAX_ENVS} at most")
-            resets, envs[said] = True, next(env for env in itertools.count() if env not in self._taken)
-            self._taken.add(envs[said])
-        env = envs[said]
-        observations = observations_of(message, env, self._wants)
-        start = start_of(message, env, self._files) if resets else None
-        with policy_code(self._policy):
-            if start is not None:
-                self._policy.reset([start])
-            acted = np.asarray(self._policy.act(observations))
-        return acted[0][None] if acted.ndim == 2 else acted[0]
 
 
 def _health(client: ServerConnection, request: Request) -> Response | None:

@@ -14,12 +14,14 @@ def test_an_address_alone():
 
 
 def test_options():
-    text = "ws://host:1?cameras=base_camera:320x240,gripper_camera:64x64&depth=1&rate_hz=5&rename=qpos:state&play=5&timeout_s=9"
+    text = "ws://host:1?cameras=base_camera:320x240,gripper_camera:64x64&depth=1&rate_hz=5&rename=qpos:state&play=5"
+    text += "&max_in_flight=2&timeout_s=9"
     assert read_address(text) == Address(
         "ws://host:1",
         wants={"cameras": {"base_camera": [320, 240], "gripper_camera": [64, 64]}, "depth": True, "rate_hz": 5.0},
         rename={"qpos": "state"},
         play=5,
+        max_in_flight=2,
         timeout_s=9.0,
     )
 
@@ -39,6 +41,7 @@ def test_options():
         "ws://host:1?cameras=base_camera",
         "ws://host:1?depth=yes",
         "ws://host:1?play=0",
+        "ws://host:1?max_in_flight=0",
         "ws://host:1?timeout_s=-1",
         "ws://host:1?rate_hz=nan",
         "ws://host:1?rename=",

@@ -16,7 +16,7 @@ from robocas_ms3.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.evaluation.remote.client import RemotePolicy
-from robocas_ms3.evaluation.remote.link import MAX_REPLY
+from robocas_ms3.evaluation.remote.connection import MAX_REPLY
 from robocas_ms3.evaluation.remote.wire import pack
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 
@@ -41,8 +41,8 @@ def answering(reply):
     ("reply", "reason"),
     [
         ("Traceback (most recent call last):\n  ...\nValueError: no cuda\n", "server failed: ValueError: no cuda"),
-        (b"\xc1garbage", "garbage"),
-        (b"", "garbage"),
+        (b"\xc1garbage", "invalid message"),
+        (b"", "invalid message"),
         (pack(7), "no actions"),
         (pack({}), "no actions"),
         (pack({"actions": None}), "no actions"),

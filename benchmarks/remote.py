@@ -1,0 +1,143 @@
+"""Measure the observations per second of a remote policy against servers that take a fixed time. Prints JSON.
+
+The servers run in processes of their own; observations are synthetic, and nothing is simulated:
+
+serial     openpi's protocol, one request at a time, as openpi's server computes
+parallel   openpi's protocol, every request takes the time by itself, as with a process per connection
+batched    `robocas serve-policy`: a call of the policy takes the time, whatever the number of envs
+
+Run: python benchmarks/remote.py [--inference-ms 100] [--rounds 20] [--images 224]
+"""
+
+import asyncio
+import json
+import multiprocessing
+import sys
+import time
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+import tyro
+from websockets.asyncio.server import ServerConnection, serve
+
+from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.remote.client import RemotePolicy
+from robocas_ms3.evaluation.remote.server import PolicyServer
+from robocas_ms3.evaluation.remote.wire import pack
+
+SERVERS = ("serial", "parallel", "batched")
+CAMERAS = ("base_camera", "gripper_camera")
+WARM_UP = 2  # rounds that are not measured
+CHUNK = (10, 7)
+SIZES = {"qpos": 12, "tcp_in_base": 7, "gripper_width": 1}
+
+
+@dataclass
+class Args:
+    inference_ms: float = 100
+    """Time that a server takes per request, or per call of the policy."""
+    rounds: int = 20
+    """Observations per env."""
+    envs: tuple[int, ...] = (1, 2, 4, 8, 16)
+    """Numbers of envs."""
+    images: int = 224
+    """Side of the images of two cameras, in pixels; 0: no images."""
+    servers: tuple[str, ...] = SERVERS
+    """Which servers: serial, parallel, batched."""
+
+
+class SlowPolicy:
+    """Take a fixed time per call."""
+
+    def __init__(self, seconds: float, wants: Wants) -> None:
+        self.seconds, self.wants = seconds, wants
+
+    def reset(self, starts: list[Start]) -> None:
+        """Keep no state."""
+
+    def act(self, observations: Observations) -> np.ndarray:
+        """Return (E, H, 7) zeros."""
+        time.sleep(self.seconds)
+        return np.zeros((len(observations.envs), *CHUNK))
+
+
+def main(args: Args) -> None:
+    """Run all servers with all numbers of envs."""
+    wants = Wants(cameras=dict.fromkeys(CAMERAS, (args.images, args.images)) if args.images else {})
+    report: dict[str, Any] = {"inference_ms": args.inference_ms, "images": args.images, "rounds": args.rounds}
+    for server in args.servers:
+        report[server] = {}
+        for envs in args.envs:
+            report[server][envs] = measure(server, envs, wants, args)
+            print(server, envs, report[server][envs], file=sys.stderr)
+    print(json.dumps(report, indent=2))
+
+
+def measure(server: str, envs: int, wants: Wants, args: Args) -> dict[str, float]:
+    """Return the observations per second of one server, and the median time of a call of `act` in ms."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=serve_slowly, args=(server, args.inference_ms / 1000, wants, theirs), daemon=True)
+    process.start()
+    try:
+        policy = RemotePolicy(ours.recv() + ("" if server == "batched" else options(wants)))
+        policy.reset([Start(env, env, "pick", "", "", "", env, "take the apple") for env in range(envs)])
+        observations, times = synthetic(envs, wants), []
+        for _ in range(WARM_UP + args.rounds):
+            start = time.perf_counter()
+            policy.act(observations)
+            times.append(time.perf_counter() - start)
+        policy.close()
+    finally:
+        process.terminate()
+        process.join()
+    measured = times[WARM_UP:]
+    per_second = envs * len(measured) / sum(measured)
+    return {"obs_per_s": round(per_second, 1), "act_ms": round(1000 * float(np.median(measured)), 2)}
+
+
+def synthetic(envs: int, wants: Wants) -> Observations:
+    """Return observations of seeded noise."""
+    rng = np.random.default_rng(0)
+    shapes = {name: (envs, height, width, 3) for name, (width, height) in wants.cameras.items()}
+    images = {name: rng.integers(0, 256, shape, np.uint8) for name, shape in shapes.items()}
+    robot = {name: rng.normal(size=(envs, size)).astype(np.float32) for name, size in SIZES.items()}
+    return Observations(np.arange(envs), ["take the apple"] * envs, None, images, {}, **robot, state=None)
+
+
+def options(wants: Wants) -> str:
+    """Return what an address says for a plain openpi server."""
+    cameras = ",".join(f"{name}:{width}x{height}" for name, (width, height) in wants.cameras.items())
+    return f"?cameras={cameras}" if cameras else ""
+
+
+def serve_slowly(server: str, seconds: float, wants: Wants, pipe: Connection) -> None:
+    """Serve until the process is terminated."""
+    if server == "batched":
+        PolicyServer(SlowPolicy(seconds, wants), port=0).run(pipe.send)
+    else:
+        asyncio.run(serve_openpi(seconds, pipe, parallel=server == "parallel"))
+
+
+async def serve_openpi(seconds: float, pipe: Connection, *, parallel: bool) -> None:
+    """Serve zeros by openpi's protocol."""
+    answer = pack({"actions": np.zeros(CHUNK)})
+
+    async def talk(client: ServerConnection) -> None:
+        await client.send(pack({}))
+        async for _ in client:
+            if parallel:
+                await asyncio.sleep(seconds)
+            else:
+                time.sleep(seconds)
+            await client.send(answer)
+
+    async with serve(talk, "127.0.0.1", 0, compression=None, max_size=None) as running:
+        pipe.send(f"ws://127.0.0.1:{next(iter(running.sockets)).getsockname()[1]}")
+        await running.serve_forever()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

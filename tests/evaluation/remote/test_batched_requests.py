@@ -1,0 +1,269 @@
+"""Servers that take the observations of all envs in one request."""
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("websockets")
+pytest.importorskip("msgpack")
+
+from remote_ends import IN_A_HURRY, StandIn, Told, a_start, serving, some_observations, talking
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from robocas_ms3.errors import EvaluationError, PolicyFailed
+from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.remote.client import RemotePolicy
+from robocas_ms3.evaluation.remote.messages import batch_limit, message_bytes, observation_message
+from robocas_ms3.evaluation.remote.wire import MAX_BYTES, pack
+from robocas_ms3.evaluation.rollout import Rollouts, Rules
+
+GARBAGE = 1008
+
+
+class SharedNoise(Told):
+    """Draw the noise of all envs of a call from one generator, so that an outcome follows from the calls."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[tuple[list[int], list[int]]] = []
+        self._rng = np.random.default_rng(0)
+        self._started: list[int] = []
+
+    def reset(self, starts):
+        super().reset(starts)
+        self._started = [start.env for start in starts]
+        self._rng.bytes(len(starts))
+
+    def act(self, observations):
+        self.calls.append((self._started, observations.envs.tolist()))
+        self._started = []
+        noise = self._rng.normal(size=(len(observations.envs), 2, 7)).astype(np.float32)
+        return noise * observations.tcp_in_base[:, None] + noise.mean()
+
+
+class Recording(StandIn):
+    """Record the actions of all steps."""
+
+    def __init__(self, steps) -> None:
+        super().__init__(len(steps), np.array(steps))
+        self.actions: list[np.ndarray] = []
+
+    def step(self, actions):
+        self.actions.append(actions.copy())
+        return super().step(actions)
+
+
+def play(policy):
+    """Play eight episodes in three envs that end after different numbers of steps."""
+    env = Recording([3, 4, 7])
+    starts = [a_start(-1, episode=number, seed=number) for number in range(8)]
+    played = Rollouts(env, policy, Rules(9), 0.05, refill=True).play(starts)
+    return [replace(one, inference_seconds=0.0) for one in played], env.actions
+
+
+def test_a_remote_run_is_equal_to_a_local_run_bit_for_bit():
+    local, served = SharedNoise(), SharedNoise()
+    expected, expected_actions = play(local)
+    with serving(served) as url:
+        remote = RemotePolicy(url)
+        played, actions = play(remote)
+        remote.close()
+    assert served.calls == local.calls
+    assert any(envs != sorted(envs) for _, envs in local.calls), "the order of rows would not be tested"
+    assert served.starts == local.starts
+    assert played == expected
+    assert [step.tobytes() for step in actions] == [step.tobytes() for step in expected_actions]
+
+
+def test_more_envs_than_a_batch_may_have_are_asked_in_several():
+    policy = Told()
+    with serving(policy, max_batch=2) as url:
+        remote = RemotePolicy(url)
+        remote.reset([a_start(env) for env in range(5)])
+        seen = some_observations(0, 1, 2, 3, 4)
+        np.testing.assert_array_equal(remote.act(seen), Told().act(seen))
+        remote.close()
+    assert [one.envs.tolist() for one in policy.seen] == [[0, 1], [2, 3], [4]]
+
+
+def test_a_batch_of_the_announced_size_fits_in_a_message():
+    for camera in ((8, 8), (224, 224), (640, 480), (4096, 4096)):
+        wants = Wants(cameras=dict.fromkeys(("base_camera", "gripper_camera", "static_camera"), camera), depth=True)
+        envs = batch_limit(wants, 256)
+        images = 3 * camera[0] * camera[1] * 5
+        assert envs == 1 or envs * images + 4 * 2**20 <= message_bytes(wants, envs) <= MAX_BYTES
+        assert batch_limit(wants, 1) == 1
+
+
+class FailingIn(Told):
+    """Fail in some envs, by `PolicyFailed` or by another exception."""
+
+    def __init__(self, env: int, error: Exception) -> None:
+        super().__init__()
+        self.env, self.error = env, error
+
+    def act(self, observations):
+        actions = super().act(observations)
+        if self.env in observations.envs:
+            raise PolicyFailed({self.env: "no\nplan"}, actions) if isinstance(self.error, PolicyFailed) else self.error
+        return actions
+
+
+def test_an_env_that_fails_ends_its_episode_alone():
+    policy = FailingIn(1, PolicyFailed({}))
+    seen = some_observations(0, 1, 2)
+    with serving(policy) as url:
+        remote = RemotePolicy(url)
+        remote.reset([a_start(env) for env in range(3)])
+        with pytest.raises(PolicyFailed) as failed:
+            remote.act(seen)
+        assert failed.value.reasons == {1: "the server failed: no plan"}
+        np.testing.assert_array_equal(failed.value.actions[[0, 2]], Told().act(seen)[[0, 2]])
+        assert remote.act(some_observations(0, 2)).shape == (2, 3, 7)
+        with pytest.raises(PolicyFailed, match="connection is lost"):
+            remote.act(some_observations(1))
+        policy.env = -1
+        remote.reset([a_start(1, episode=9)])
+        assert remote.act(seen).shape == (3, 3, 7)
+        remote.close()
+    assert policy.starts[3:] == [a_start(1, episode=9)]
+
+
+def test_an_exception_ends_the_episodes_of_its_batch_alone():
+    with serving(FailingIn(1, RuntimeError("out of memory"))) as url:
+        remote = RemotePolicy(url)
+        remote.reset([a_start(env) for env in range(3)])
+        remote.act(some_observations(0))
+        with pytest.raises(PolicyFailed) as failed:
+            remote.act(some_observations(1, 2))
+        assert failed.value.reasons == dict.fromkeys((1, 2), "the server failed: RuntimeError: out of memory")
+        assert remote.act(some_observations(0)).shape == (1, 3, 7)
+        remote.close()
+
+
+def test_a_server_that_restarts_serves_the_episodes_that_start():
+    with serving(Told()) as url:
+        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
+        remote.reset([a_start(0), a_start(1)])
+        remote.act(some_observations(0, 1))
+    policy = Told()
+    with serving(policy, int(url.rpartition(":")[2])):
+        remote.reset([a_start(1, episode=9)])
+        with pytest.raises(PolicyFailed) as failed:
+            remote.act(some_observations(0, 1))
+        assert failed.value.reasons.keys() == {0}
+        assert "connection is lost" in failed.value.reasons[0]
+        assert policy.starts == [a_start(1, episode=9)]
+        remote.close()
+
+
+GOOD = {"actions": np.zeros((1, 7))}
+
+
+@pytest.mark.parametrize(
+    ("answer", "failed"),
+    [
+        (7, {0, 1}),
+        ({}, {0, 1}),
+        (GOOD, {0, 1}),
+        ({"batch": {}}, {0, 1}),
+        ({"batch": []}, {0, 1}),
+        ({"batch": [GOOD]}, {0, 1}),
+        ({"batch": [GOOD] * 3}, {0, 1}),
+        ({"batch": [GOOD, 7]}, {0, 1}),
+        ({"batch": np.zeros((2, 1, 7))}, {0, 1}),
+        ({"batch": [GOOD, {}]}, {1}),
+        ({"batch": [GOOD, {"error": 7}]}, {1}),
+        ({"batch": [GOOD, {"error": "a\nb\x1b[31m"}]}, {1}),
+        ({"batch": [{"actions": np.full((1, 7), np.nan)}, GOOD]}, {0}),
+        ({"batch": [GOOD, {"actions": np.zeros((2, 7))}]}, {1}),
+    ],
+    ids=range(14),
+)
+def test_a_bad_answer_to_a_batch(answer, failed):
+    def talk(socket):
+        socket.send(pack({"robocas_max_batch": 8}))
+        for _ in socket:
+            socket.send(pack(answer))
+
+    with talking(talk) as url:
+        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
+        remote.reset([a_start(0), a_start(1)])
+        with pytest.raises(PolicyFailed) as raised:
+            remote.act(some_observations(0, 1))
+        remote.close()
+    assert raised.value.reasons.keys() == failed
+    assert all(reason.isprintable() for reason in raised.value.reasons.values())
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [*({"robocas_max_batch": value} for value in (0, -1, True, 1.5, "8", [])), {"robocas_answers_pings": 1}],
+)
+def test_an_announcement_out_of_range_is_an_error(metadata):
+    with talking(lambda socket: socket.send(pack(metadata))) as url, pytest.raises(EvaluationError, match="invalid"):
+        RemotePolicy(f"{url}?{IN_A_HURRY}")
+
+
+def message(env=0, **more):
+    return observation_message(some_observations(env), 0, a_start(env), reset=True) | more
+
+
+@pytest.mark.parametrize(
+    "batch",
+    [
+        7,
+        [],
+        {},
+        [7],
+        [message(), message()],
+        [message(env) for env in range(5)],
+        [message(), message(1, env_id="1")],
+        [message(), message(1, **{"observation/qpos": np.zeros(3, np.float32)})],
+        [message(), message(1, reset=False)],
+        [{"batch": [message()]}],
+    ],
+    ids=range(10),
+)
+def test_a_bad_batch_is_one_line_to_its_client(batch):
+    policy = Told()
+    with serving(policy, max_batch=4) as url, connect(url, proxy=None, compression=None) as client:
+        client.recv()
+        client.send(pack({"batch": batch}))
+        answer = client.recv(20)
+        with pytest.raises(ConnectionClosed):
+            client.recv(20)
+    assert isinstance(answer, str) and answer.isprintable()
+    assert (client.close_code, policy.seen, policy.starts) == (GARBAGE, [], [])
+
+
+def test_embeddings_of_a_batch_have_one_length():
+    policy = Told(Wants(language="embedding"))
+    embedded = [message(env, **{"observation/embedding": np.zeros(384 - env, np.float32)}) for env in range(2)]
+    with serving(policy) as url, connect(url, proxy=None, compression=None) as client:
+        client.recv()
+        client.send(pack({"batch": embedded}))
+        assert "differ in shape" in client.recv(20)
+    assert policy.seen == []
+
+
+def test_a_batch_needs_one_connection():
+    sockets = []
+
+    def talk(socket):
+        sockets.append(socket)
+        socket.send(pack({"robocas_max_batch": 64}))
+        for _ in socket:
+            socket.send(pack({"batch": [GOOD] * 16}))
+
+    with talking(talk) as url:
+        remote = RemotePolicy(url)
+        remote.reset([a_start(env) for env in range(16)])
+        for _ in range(3):
+            assert remote.act(some_observations(*range(16))).shape == (16, 1, 7)
+        assert sum(thread.name == "robocas-remote" for thread in threading.enumerate()) == 1
+        remote.close()
+    assert len(sockets) == 1

@@ -1,0 +1,188 @@
+"""A dead network is noticed, and a slow server is not taken for one."""
+
+import os
+import socket as sockets
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("websockets")
+pytest.importorskip("msgpack")
+
+from remote_ends import Told, a_start, serving, some_observations
+from websockets.sync.client import connect
+
+from robocas_ms3.errors import PolicyFailed
+from robocas_ms3.evaluation.remote import keepalive
+from robocas_ms3.evaluation.remote.client import RemotePolicy
+from robocas_ms3.evaluation.remote.messages import observation_message
+from robocas_ms3.evaluation.remote.wire import pack, unpack
+
+
+class Slow(Told):
+    """Take a while per call."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__()
+        self.seconds, self.entered = seconds, threading.Event()
+
+    def act(self, observations):
+        self.entered.set()
+        time.sleep(self.seconds)
+        return super().act(observations)
+
+
+@pytest.fixture
+def fast_pings(monkeypatch):
+    """Shorten the times of pings."""
+    monkeypatch.setattr(keepalive, "PING_INTERVAL", 0.2)
+    monkeypatch.setattr(keepalive, "PING_TIMEOUT", 1.0)
+
+
+def test_a_slow_server_is_not_dropped_and_answers_health_checks(fast_pings):
+    policy = Slow(4.0)  # several times what an answer to a ping may take
+    with serving(policy) as url:
+        remote = RemotePolicy(url)
+        remote.reset([a_start(0)])
+        answers = []
+        asking = threading.Thread(target=lambda: answers.append(remote.act(some_observations(0))))
+        asking.start()
+        assert policy.entered.wait(20)
+        with urllib.request.urlopen(url.replace("ws", "http", 1) + "/healthz", timeout=3) as health:
+            assert health.status == 200
+        assert asking.is_alive()
+        asking.join(30)
+        assert answers[0].shape == (1, 3, 7)
+        remote.close()
+
+
+def test_openpis_client_waits_for_a_slow_server(fast_pings, monkeypatch):
+    openpi = pytest.importorskip("openpi_client.websocket_client_policy")
+    pinging = openpi.websockets.sync.client.connect
+
+    def impatient(*args, **options):
+        return pinging(*args, **options, ping_interval=0.2, ping_timeout=1)
+
+    monkeypatch.setattr(openpi.websockets.sync.client, "connect", impatient)
+    with serving(Slow(4.0)) as url:
+        client = openpi.WebsocketClientPolicy(host=url)
+        assert client.infer(observation_message(some_observations(0), 0, None, reset=True))["actions"].shape == (3, 7)
+
+
+@contextmanager
+def tunnel(port, cut):
+    """Forward connections to a port, until the event is set: then nothing passes, and nothing is closed."""
+
+    def forward(source, sink):
+        while data := source.recv(2**16):
+            if not cut.is_set():
+                sink.sendall(data)
+
+    with sockets.create_server(("127.0.0.1", 0)) as server:
+
+        def accept():
+            while True:
+                try:
+                    near, _ = server.accept()
+                except OSError:
+                    return
+                far = sockets.create_connection(("127.0.0.1", port))
+                for pair in ((near, far), (far, near)):
+                    threading.Thread(target=forward, args=pair, daemon=True).start()
+
+        threading.Thread(target=accept, daemon=True).start()
+        yield f"ws://127.0.0.1:{server.getsockname()[1]}"
+        server.shutdown(sockets.SHUT_RDWR)
+
+
+def test_a_dead_network_is_noticed_by_both_ends(fast_pings):
+    policy, cut = Told(), threading.Event()
+    with serving(policy) as url, tunnel(int(url.rpartition(":")[2]), cut) as address:
+        remote = RemotePolicy(f"{address}?timeout_s=60&connect_s=1")
+        remote.reset([a_start(0)])
+        remote.act(some_observations(0))
+        cut.set()
+        start = time.monotonic()
+        with pytest.raises(PolicyFailed, match="no answer to a ping within 1 s"):
+            remote.act(some_observations(0))
+        assert time.monotonic() - start < 20
+        while time.monotonic() - start < 20:  # until the server has released the env
+            other = RemotePolicy(url)
+            other.reset([a_start(0)])
+            other.act(some_observations(0))
+            other.close()
+            if policy.starts[-1].env == 0:
+                return
+            time.sleep(0.2)
+        pytest.fail("the server keeps the env of a client that is gone")
+
+
+def test_a_request_whose_client_is_gone_is_skipped():
+    policy = Slow(1.5)
+
+    def ask(url):
+        client = connect(url, proxy=None, compression=None)
+        client.recv()
+        client.send(pack(observation_message(some_observations(0), 0, a_start(), reset=True)))
+        return client
+
+    with serving(policy) as url:
+        first = ask(url)
+        assert policy.entered.wait(20)
+        ask(url).close()
+        last = ask(url)
+        assert unpack(first.recv(20)).keys() == unpack(last.recv(20)).keys() == {"actions"}
+        assert len(policy.seen) == 2
+        first.close()
+        last.close()
+
+
+CUT = """
+import os, subprocess, sys, threading, time
+subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+from remote_ends import a_start, some_observations, talking
+from robocas_ms3.errors import PolicyFailed
+from robocas_ms3.evaluation.remote import keepalive
+from robocas_ms3.evaluation.remote.client import RemotePolicy
+from robocas_ms3.evaluation.remote.wire import pack
+
+keepalive.TCP_OPTIONS = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 2}
+
+def talk(socket):  # a plain openpi server, which answers no pings
+    socket.send(pack({}))
+    for _ in socket:
+        time.sleep(1000)
+
+with talking(talk) as url:
+    policy = RemotePolicy(url + "?timeout_s=300&connect_s=0.5")
+    policy.reset([a_start(0)])
+    threading.Timer(1, lambda: subprocess.run(["ip", "link", "set", "lo", "down"], check=True)).start()
+    start = time.monotonic()
+    try:
+        policy.act(some_observations(0))
+    except PolicyFailed as failed:
+        print("no server at" in str(failed), time.monotonic() - start, flush=True)
+    os._exit(0)
+"""
+
+
+def test_tcp_keepalive_notices_a_dead_network_without_pings():
+    """In a network namespace of its own, whose only interface goes down."""
+    words = ["unshare", "--map-root-user", "--user", "--net"]
+    try:
+        subprocess.run([*words, "ip", "link"], check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("no network namespaces here")
+    here = Path(__file__).resolve().parent
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(here), str(here.parents[2])])}
+    words += [sys.executable, "-c", CUT]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=env, check=False)
+    lost, seconds = done.stdout.split() or pytest.fail(done.stderr)
+    assert lost == "True"
+    assert float(seconds) < 30
