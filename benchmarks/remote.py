@@ -6,7 +6,7 @@ serial     openpi's protocol, one request at a time, as openpi's server computes
 parallel   openpi's protocol, every request takes the time by itself, as with a process per connection
 batched    `robocas serve-policy`: a call of the policy takes the time, whatever the number of envs
 
-Run: python benchmarks/remote.py [--inference-ms 100] [--rounds 20] [--images 224]
+Run: python benchmarks/remote.py [--in-turn] [--inference-ms 100] [--rounds 20] [--images 224]
 """
 
 import asyncio
@@ -46,6 +46,8 @@ class Args:
     """Side of the images of two cameras, in pixels; 0: no images."""
     servers: tuple[str, ...] = SERVERS
     """Which servers: serial, parallel, batched."""
+    in_turn: bool = False
+    """Ask for one env after another: max_in_flight=1, and batches of one env."""
 
 
 class SlowPolicy:
@@ -79,10 +81,11 @@ def measure(server: str, envs: int, wants: Wants, args: Args) -> dict[str, float
     """Return the observations per second of one server, and the median time of a call of `act` in ms."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=serve_slowly, args=(server, args.inference_ms / 1000, wants, theirs), daemon=True)
+    process = context.Process(target=serve_slowly, args=(server, args, wants, theirs), daemon=True)
     process.start()
     try:
-        policy = RemotePolicy(ours.recv() + ("" if server == "batched" else options(wants)))
+        options = [] if server == "batched" else [*plain_options(wants), *["max_in_flight=1"] * args.in_turn]
+        policy = RemotePolicy(f"{ours.recv()}?{'&'.join(options)}")
         policy.reset([Start(env, env, "pick", "", "", "", env, "take the apple") for env in range(envs)])
         observations, times = synthetic(envs, wants), []
         for _ in range(WARM_UP + args.rounds):
@@ -107,16 +110,17 @@ def synthetic(envs: int, wants: Wants) -> Observations:
     return Observations(np.arange(envs), ["take the apple"] * envs, None, images, {}, **robot, state=None)
 
 
-def options(wants: Wants) -> str:
-    """Return what an address says for a plain openpi server."""
+def plain_options(wants: Wants) -> list[str]:
+    """Return the options of an address that a plain openpi server needs."""
     cameras = ",".join(f"{name}:{width}x{height}" for name, (width, height) in wants.cameras.items())
-    return f"?cameras={cameras}" if cameras else ""
+    return [f"cameras={cameras}"] if cameras else []
 
 
-def serve_slowly(server: str, seconds: float, wants: Wants, pipe: Connection) -> None:
+def serve_slowly(server: str, args: Args, wants: Wants, pipe: Connection) -> None:
     """Serve until the process is terminated."""
+    seconds = args.inference_ms / 1000
     if server == "batched":
-        PolicyServer(SlowPolicy(seconds, wants), port=0).run(pipe.send)
+        PolicyServer(SlowPolicy(seconds, wants), port=0, **({"max_batch": 1} if args.in_turn else {})).run(pipe.send)
     else:
         asyncio.run(serve_openpi(seconds, pipe, parallel=server == "parallel"))
 

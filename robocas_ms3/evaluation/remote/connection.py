@@ -22,6 +22,7 @@ MAX_REPLY = 16 * 2**20  # bytes
 _RETRY_S = 0.2  # between attempts to connect
 _CLOSE_S = 1.0  # for a server's answer to a close frame
 _LOST = (OSError, EOFError, asyncio.TimeoutError, WebSocketException)
+_LOOP_LOCK = threading.Lock()  # for the start of the loop
 _T = TypeVar("_T")
 
 
@@ -150,7 +151,9 @@ class AnswerTimer:
 
 def run_in_loop(work: Coroutine[Any, Any, _T]) -> _T:
     """Run a coroutine in the thread of the event loop and return its result."""
-    future = asyncio.run_coroutine_threadsafe(work, _loop())
+    with _LOOP_LOCK:
+        loop = _loop()
+    future = asyncio.run_coroutine_threadsafe(work, loop)
     try:
         return future.result()
     except BaseException:
