@@ -18,9 +18,9 @@ import numpy as np
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.chain import ArmChain
-from robocas_ms3.planning.mplib_backend import MplibPlanner
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import robot_files
 
@@ -101,7 +101,7 @@ def main() -> None:
     options = parser.parse_args()
 
     files, watch, points, seconds = robot_files(), Stopwatch(), [], []
-    planner = MplibPlanner(files.arm_urdf, files.arm_srdf, robot=MOBILE_PANDA, dt=0.05)
+    planner = RRTConnectPlanner(files.arm_urdf, files.arm_srdf, robot=MOBILE_PANDA, dt=0.05)
     reachability = Reachability(ArmChain(files.arm_urdf, MOBILE_PANDA))
     for scene in range(options.seed, options.seed + options.scenes):
         rng = np.random.default_rng(scene)

@@ -117,6 +117,10 @@ class TrainingError(RobocasError):
     """A baseline can't be trained: its configuration, its run, its checkpoint or what it learns from is wrong."""
 
 
+class RobotDescriptionError(RobocasError):
+    """A robot's URDF, SRDF or collision mesh is missing or unusable."""
+
+
 class PlanningFailed(RobocasError):
     """A scripted policy could not go on.
 

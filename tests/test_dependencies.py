@@ -14,7 +14,6 @@ ROOT = Path(__file__).resolve().parents[1]
 DISTRIBUTIONS = metadata.packages_distributions()
 # Import name -> who brings it, where that is not a declaration of ours.
 BROUGHT = {
-    "mplib": "mani_skill pins it",
     "transformers": "sentence-transformers is made of it",
     "lerobot": "its own environment imports what imports it",
     "vla_eval": "only it uses the benchmark that imports it",

@@ -63,8 +63,8 @@ class Generate:
     """That noise: standard deviations in mm and degrees, of each component of each action."""
     noisy_failures: int = 1
     """Attempts that may fail for noise alone; after so many an episode counts without, and its record says so."""
-    planner: str = "mplib"
-    """Motion planner: mplib, or another package's (see docs/extending.md)."""
+    planner: str = "rrt_connect"
+    """Motion planner: rrt_connect, or another package's (see docs/extending.md)."""
     robot: str = DEFAULT
     """Robot: ours, or another package's (see docs/extending.md)."""
     fork: bool = True

@@ -81,6 +81,6 @@ def _none_left(policy: str, seed: int, why: str) -> Takeover:
 
 
 def _died(task: int | Takeover, why: str) -> EpisodeResult:
-    """What a seed comes to that takes its process down, as mplib's C++ can."""
+    """Return the result of a seed whose worker process died."""
     seed = task if isinstance(task, int) else task.seed
     return EpisodeResult(seed, success=False, attempts=1, failures=[Failure(seed, 0, "worker", why, 0.0)])

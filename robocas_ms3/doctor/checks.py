@@ -26,16 +26,12 @@ from robocas_ms3 import paths
 from robocas_ms3.doctor.probes import ABSENT
 
 DISTRIBUTION = "robocas-ms3"
-PYTHONS = ((3, 10), (3, 13))  # from, below
+PYTHONS = ((3, 10), (3, 14))  # from, below
 PROBE_SECONDS = 120
 PROBES = Path(__file__).with_name("probes.py")
 GIGABYTE = 1e9
 LEAST_DISK, ENOUGH_DISK = 1.0, 10.0  # GB; a converted episode of pick takes about 0.1
 
-WHY = {
-    "numpy": "mplib 0.1.1 dies with a segmentation fault under numpy 2",
-    "mplib": "mani_skill 3.0.1 pins it",
-}
 # Extra -> what it is for.
 EXTRAS = {
     "language": "sentence embeddings in datasets, and policies that read words",
@@ -46,7 +42,7 @@ EXTRAS = {
     "plots": "pictures of robocas stats",
 }
 # Packages worth a row of their own; the others share one.
-NAMED = ("numpy", "torch", "mani-skill", "sapien", "mplib", "gymnasium")
+NAMED = ("numpy", "torch", "mani-skill", "sapien", "python-fcl", "gymnasium")
 
 RENDERER_FIX = (
     "Install a Vulkan driver: the GPU's own, or Mesa >= 24.3 (mesa-vulkan-drivers and libvulkan1; in a checkout, as "
@@ -80,7 +76,7 @@ def examine() -> list[Finding]:
         lambda: [probe("render device", "render", required=False, fix=RENDERER_FIX)],
         lambda: [probe("physics on CPU", "physx_cpu", fix=_reinstall("sapien"))],
         lambda: [probe("physics on GPU", "physx_cuda", required=False, fix="Check the GPU's driver.")],
-        lambda: [probe("planner", "planner", fix="Mend the failing rows above first, then " + _reinstall("mplib"))],
+        lambda: [probe("planner", "planner", fix="Fix the failing rows above first, then " + _reinstall("python-fcl"))],
         lambda: [probe("asset packs", "packs", fix="Restore the named pack, or remove its folder.")],
         check_folders,
         lambda: [check_disk(Path.cwd())],
@@ -94,7 +90,7 @@ def check_python() -> list[Finding]:
     found = ".".join(map(str, sys.version_info[:3]))
     if PYTHONS[0] <= sys.version_info[:2] < PYTHONS[1]:
         return [Finding("python", "ok", found)]
-    return [Finding("python", "fail", found, "Use Python 3.10, 3.11 or 3.12: numpy < 2 has no builds for others.")]
+    return [Finding("python", "fail", found, "Use Python 3.10, 3.11, 3.12 or 3.13.")]
 
 
 def check_packages() -> list[Finding]:
@@ -102,7 +98,6 @@ def check_packages() -> list[Finding]:
     wanted = {_key(item.name): item for item in requirements(DISTRIBUTION)}
     if not wanted:
         return [Finding(DISTRIBUTION, "fail", "not installed", "Run bash scripts/setup.sh, or pip install -e .")]
-    wanted.setdefault("mplib", Requirement("mplib==0.1.1"))
     named = [check_package(wanted.pop(name)) for name in NAMED if name in wanted]
     rest = [check_package(item) for item in wanted.values()]
     bad = [finding for finding in rest if finding.status != "ok"]
@@ -116,8 +111,7 @@ def check_package(wanted: Requirement) -> Finding:
         wanted: name and versions.
     """
     name = _key(wanted.name)
-    why = f" ({WHY[name]})" if name in WHY else ""
-    fix = f"pip install '{wanted.name}{wanted.specifier}'{why}"
+    fix = f"pip install '{wanted.name}{wanted.specifier}'"
     try:
         found = metadata.version(wanted.name)
     except metadata.PackageNotFoundError:

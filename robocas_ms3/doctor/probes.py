@@ -67,12 +67,12 @@ def planner() -> str:
     """Generate the robot's files, construct the planner, plan a short motion."""
     import numpy as np
 
-    from robocas_ms3.planning.mplib_backend import MplibPlanner
+    from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
     from robocas_ms3.robots.table import find_robot
 
     robot = find_robot(None)
     files = robot.files()
-    planner = MplibPlanner(files.arm_urdf, files.arm_srdf, robot=robot.description, dt=0.05)
+    planner = RRTConnectPlanner(files.arm_urdf, files.arm_srdf, robot=robot.description, dt=0.05)
     start = np.asarray(robot.description.arm_rest, dtype=np.float64)
     path = planner.plan_to_qpos(start, [start + 0.2], stage="doctor")
     return f"works, planned {len(path.qpos)} steps"

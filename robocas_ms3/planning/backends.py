@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from robocas_ms3.extensions import Table
-from robocas_ms3.planning.mplib_backend import MplibPlanner
 from robocas_ms3.planning.protocol import Planner
+from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.table import RobotSpec
 
-DEFAULT = "mplib"
-BACKENDS: Table[Callable[..., Planner]] = Table("planner", "robocas_ms3.planners", Callable, {DEFAULT: MplibPlanner})
+DEFAULT = "rrt_connect"
+BACKENDS: Table[Callable[..., Planner]] = Table(
+    "planner", "robocas_ms3.planners", Callable, {DEFAULT: RRTConnectPlanner}
+)
 
 
 def make_planner(name: str, robot: RobotSpec, *, dt: float) -> Planner:

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.errors import RobotDescriptionError
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.robots.description import RobotDescription
 
@@ -30,17 +30,18 @@ class ArmChain:
         robot: the same.
         links: eight fixed transforms 4x4: from each link to the next one at 0 rad, the last to the TCP.
         hand_in_tcp: 4x4.
-        lower: (7,) joint limits with a margin, rad.
-        upper: (7,).
+        limits: (7, 2) lower and upper joint limits, rad.
+        lower: (7,) lower joint limits with a margin, rad.
+        upper: (7,) upper joint limits with a margin, rad.
 
     Raises:
-        RobocasError: the file is missing or is not that arm's.
+        RobotDescriptionError: the file is missing or is not that arm's.
     """
 
     def __init__(self, arm_urdf: Path | str, robot: RobotDescription) -> None:
         self.robot = robot
         if not Path(arm_urdf).is_file():
-            raise RobocasError("no such robot description", where=arm_urdf)
+            raise RobotDescriptionError("no such robot description", where=arm_urdf)
         root = ElementTree.parse(arm_urdf).getroot()
         joints = {child.attrib["link"]: joint for joint in root.iterfind("joint") for child in joint.findall("child")}
         chain: list[ElementTree.Element] = []
@@ -55,23 +56,23 @@ class ArmChain:
         if link != robot.arm_base_link or names != robot.arm_joints or not about_z:
             what = f"not the arm of {robot.uid}"
             expected = f"{', '.join(robot.arm_joints)}, each about z"
-            raise RobocasError(what, where=arm_urdf, expected=expected, found=", ".join(names))
+            raise RobotDescriptionError(what, where=arm_urdf, expected=expected, found=", ".join(names))
         self.links, self.hand_in_tcp = [], np.eye(4)
         pending, after_hand = np.eye(4), False
         for joint in chain:
-            pending = pending @ _origin(joint)
+            pending = pending @ joint_origin(joint)
             if after_hand:
-                self.hand_in_tcp = self.hand_in_tcp @ _origin(joint)
+                self.hand_in_tcp = self.hand_in_tcp @ joint_origin(joint)
             if joint in turning:
                 self.links.append(pending)
                 pending = np.eye(4)
             after_hand |= any(child.attrib["link"] == robot.hand_link for child in joint.findall("child"))
         self.links.append(pending)
         self.hand_in_tcp = np.linalg.inv(self.hand_in_tcp)
-        limits = np.array(
+        self.limits = np.array(
             [[float(e.attrib[key]) for key in ("lower", "upper")] for joint in turning for e in joint.findall("limit")]
         )
-        self.lower, self.upper = limits[:, 0] + LIMIT_MARGIN, limits[:, 1] - LIMIT_MARGIN
+        self.lower, self.upper = self.limits[:, 0] + LIMIT_MARGIN, self.limits[:, 1] - LIMIT_MARGIN
 
     def ending_behind(self, distance: float) -> ArmChain:
         """The same arm, whose end is a point this far (m) behind the TCP, against the approach."""
@@ -127,13 +128,15 @@ def _poses(rotation: Array, position: Array) -> Array:
     return pose
 
 
-def _origin(joint: ElementTree.Element) -> Array:
-    pose, origin = np.eye(4), joint.find("origin")
+def joint_origin(element: ElementTree.Element) -> Array:
+    """Return the pose (4, 4) of a URDF element's ``origin``, the identity where it has none."""
+    pose, origin = np.eye(4), element.find("origin")
     if origin is not None:
-        pose[:3, :3] = Rotation.from_euler("xyz", _numbers(origin.attrib.get("rpy", "0 0 0"))).as_matrix()
-        pose[:3, 3] = _numbers(origin.attrib.get("xyz", "0 0 0"))
+        pose[:3, :3] = Rotation.from_euler("xyz", read_numbers(origin.attrib.get("rpy", "0 0 0"))).as_matrix()
+        pose[:3, 3] = read_numbers(origin.attrib.get("xyz", "0 0 0"))
     return pose
 
 
-def _numbers(text: str) -> list[float]:
+def read_numbers(text: str) -> list[float]:
+    """Return the numbers of a URDF attribute."""
     return [float(value) for value in text.split()]

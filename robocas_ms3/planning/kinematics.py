@@ -1,99 +1,127 @@
-"""Continuation along a straight line of the TCP."""
+"""Numerical inverse kinematics along a straight line of the TCP."""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.planning.collision import ArmWorld
+from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import Array
-from robocas_ms3.planning.shapes import matrix_to_pose
 
 LINE_STEP = 0.01  # m between two poses of a straight line
-LINE_TURN = np.deg2rad(3)
-MAX_JUMP = 0.15  # rad a joint may turn between two poses of a straight line
+LINE_TURN = np.deg2rad(3)  # rad between two poses of a straight line
+MAX_JUMP = 0.15  # rad that a joint may turn between two poses of a straight line
+ITERATIONS = 30  # Newton steps towards all poses of a line
+TOLERANCE = 1e-7  # accepted pose error, m and rad together
+HALF_TURN = -0.99  # cosine below which a rotation counts as nearly a half turn
+DAMPING = 1e-8  # added to the diagonal of J J^T, so that it can be inverted at singularities
 
 
-def rotation_vector(rotation: Array) -> Array:
-    """Give the axis times the angle (3,) rad of a rotation matrix (3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_rotvec()
+def rotation_vector(rotations: Array) -> Array:
+    """Return the rotation vectors (M, 3) in rad, of length up to pi, of rotation matrices (M, 3, 3)."""
+    twice_sine_axis = rotations[:, (2, 0, 1), (1, 2, 0)] - rotations[:, (1, 2, 0), (2, 0, 1)]
+    sine = np.sqrt(np.einsum("mi,mi->m", twice_sine_axis, twice_sine_axis)) / 2
+    cosine = (np.einsum("mii->m", rotations) - 1) / 2
+    angle = np.arctan2(sine, cosine)
+    vectors = twice_sine_axis * (angle / (2 * np.maximum(sine, 1e-300)))[:, None]
+    half_turns = cosine < HALF_TURN  # the sine vanishes there, and the axis with it
+    if half_turns.any():
+        vectors[half_turns] = Rotation.from_matrix(rotations[half_turns]).as_rotvec()
+    return vectors
 
 
 def pose_error(found: Array, wanted: Array) -> tuple[float, float]:
-    """Give the distance (m) and angle (rad) between two poses (4x4)."""
+    """Return the distance (m) and the angle (rad) between two poses (4, 4)."""
     cosine = (np.trace(found[:3, :3].T @ wanted[:3, :3]) - 1) / 2
     sine = np.linalg.norm(found[:3, :3] - wanted[:3, :3]) / (2 * np.sqrt(2))  # sin(angle / 2), exact for small angles
     angle = 2 * np.arcsin(min(1.0, float(sine))) if cosine > 0 else float(np.arccos(np.clip(cosine, -1, 1)))
     return float(np.linalg.norm(found[:3, 3] - wanted[:3, 3])), angle
 
 
-class ArmKinematics:
-    """Pinocchio's closed-loop inverse kinematics with joint limits, made repeatable.
+def newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Array]:
+    """Move each configuration by one damped Newton step towards its own TCP pose, within the joint limits.
+
+    The step has the smallest norm over the joints. No BLAS or LAPACK routine is used: their last bits depend on the
+    machine.
 
     Args:
-        world: the arm; collisions are checked in it.
+        chain: the arm.
+        qpos: (M, 7) configurations, rad.
+        goals: (M, 4, 4) TCP poses in the base frame.
+
+    Returns:
+        The next configurations (M, 7), and the pose errors (M,) of the given ones: the norm over m and rad.
     """
+    poses, jacobian = chain.jacobian(qpos)
+    error = np.empty((len(qpos), 6))
+    error[:, :3] = goals[:, :3, 3] - poses[:, :3, 3]
+    error[:, 3:] = rotation_vector(np.einsum("mij,mkj->mik", goals[:, :3, :3], poses[:, :3, :3]))
+    square = np.einsum("mij,mkj->mik", jacobian, jacobian)
+    square[:, range(6), range(6)] += DAMPING
+    step = np.einsum("mji,mj->mi", jacobian, solve_positive(square, error))
+    return np.clip(qpos + step, chain.lower, chain.upper), np.sqrt(np.einsum("mi,mi->m", error, error))
 
-    def __init__(self, world: ArmWorld) -> None:
-        self._world = world
-        self.lower, self.upper = world.chain.lower, world.chain.upper
-        # The solver clamps every joint of the description, the fingers too.
-        full_limits = np.concatenate(world.kinematics.get_joint_limits())
-        self._full_lower, self._full_upper = full_limits[:, 0].copy(), full_limits[:, 1].copy()
-        arm = world.arm_indices
-        self._full_lower[arm], self._full_upper[arm] = self.lower, self.upper
 
-    def _solve(self, pose: Array, start: Array, *, gain: float, iterations: int, tolerance: float) -> Array | None:
-        """Solve from one start (7,) for a pose (7,); none when it does not converge inside the limits."""
-        world = self._world
-        full, converged, _ = world.kinematics.compute_IK_CLIK_JL(
-            world.tcp_index,
-            pose,
-            world.full_qpos(start),
-            self._full_lower,
-            self._full_upper,
-            tolerance,
-            iterations,
-            gain,
-            1e-8,
-        )
-        qpos = world.arm_qpos(full)
-        return qpos if converged and np.all((qpos >= self.lower) & (qpos <= self.upper)) else None
+def solve_positive(matrices: Array, values: Array) -> Array:
+    """Solve linear systems of symmetric positive definite matrices by Gauss-Jordan elimination without pivoting.
 
-    def line(self, start: Array, tcp_in_base: Array, *, stage: str) -> Array:
-        """Follow a straight line of the TCP (position linear, shortest rotation) from a configuration to a pose.
+    Args:
+        matrices: (M, N, N).
+        values: (M, N) right-hand sides.
 
-        Args:
-            start: (7,).
-            tcp_in_base: 4x4 goal.
-            stage: name for errors.
+    Returns:
+        (M, N) solutions.
+    """
+    rows = np.concatenate([matrices, values[:, :, None]], axis=2)
+    for pivot in range(rows.shape[1]):
+        rows[:, pivot] /= rows[:, pivot, pivot, None]
+        factors = rows[:, :, pivot].copy()
+        factors[:, pivot] = 0.0
+        rows -= factors[:, :, None] * rows[:, pivot, None, :]
+    return rows[:, :, -1]
 
-        Returns:
-            (n, 7) configurations at most 1 cm and 3 deg apart, the first is ``start``.
 
-        Raises:
-            PlanningFailed: ``line_unreachable`` (no configuration, or a joint limit), ``line_joint_jump``.
-        """
-        from scipy.spatial.transform import Rotation
+def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str) -> Array:
+    """Follow a straight line of the TCP from a configuration to a pose: linear position, shortest rotation.
 
-        begin = self._world.tcp(start)
-        turn = rotation_vector(begin[:3, :3].T @ tcp_in_base[:3, :3])
-        shift = tcp_in_base[:3, 3] - begin[:3, 3]
-        count = max(1, int(np.ceil(max(np.linalg.norm(shift) / LINE_STEP, np.linalg.norm(turn) / LINE_TURN))))
-        rotations = Rotation.from_matrix(begin[:3, :3]) * Rotation.from_rotvec(
-            np.linspace(0, 1, count + 1)[:, None] * turn
-        )
-        pose = np.tile(np.eye(4), (count + 1, 1, 1))
-        pose[:, :3, :3] = rotations.as_matrix()
-        pose[:, :3, 3] = begin[:3, 3] + np.linspace(0, 1, count + 1)[:, None] * shift
-        path = [np.asarray(start, dtype=np.float64)]
-        for target in pose[1:]:
-            qpos = self._solve(matrix_to_pose(target), path[-1], gain=0.9, iterations=60, tolerance=1e-7)
-            if qpos is None:
-                raise PlanningFailed(stage, "line_unreachable")
-            if np.abs(qpos - path[-1]).max() > MAX_JUMP:
-                raise PlanningFailed(stage, "line_joint_jump")
-            path.append(qpos)
-        return np.array(path)
+    Args:
+        chain: the arm.
+        start: (7,) configuration, rad.
+        tcp_in_base: (4, 4) goal pose of the TCP.
+        stage: stage of the policy, for errors.
+
+    Returns:
+        (n, 7) configurations whose TCP poses are at most 1 cm and 3 deg apart; the first is ``start``.
+
+    Raises:
+        PlanningFailed: ``line_unreachable`` (a pose has no configuration near the previous one within the joint
+            limits) or ``line_joint_jump``.
+    """
+    start = np.asarray(start, dtype=np.float64)
+    goals = _line_poses(chain.tcp(start[None])[0], tcp_in_base)
+    path = np.empty((len(goals) + 1, 7))
+    path[0] = start
+    for i, goal in enumerate(goals):  # one step each from the previous pose's estimate, then all together
+        path[i + 1] = newton_step(chain, path[i : i + 1], goal[None])[0][0]
+    for _ in range(ITERATIONS):
+        following, error = newton_step(chain, path[1:], goals)
+        if error.max() <= TOLERANCE:
+            break
+        path[1:] = following
+    else:
+        raise PlanningFailed(stage, "line_unreachable")
+    if np.abs(np.diff(path, axis=0)).max() > MAX_JUMP:
+        raise PlanningFailed(stage, "line_joint_jump")
+    return path
+
+
+def _line_poses(first: Array, last: Array) -> Array:
+    """Return the poses (n, 4, 4) of a line after its first pose."""
+    turn, shift = rotation_vector((first[:3, :3].T @ last[:3, :3])[None])[0], last[:3, 3] - first[:3, 3]
+    count = max(1, int(np.ceil(max(np.linalg.norm(shift) / LINE_STEP, np.linalg.norm(turn) / LINE_TURN))))
+    fractions = np.linspace(0, 1, count + 1)[1:, None]
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = (Rotation.from_matrix(first[:3, :3]) * Rotation.from_rotvec(fractions * turn)).as_matrix()
+    poses[:, :3, 3] = first[:3, 3] + fractions * shift
+    return poses

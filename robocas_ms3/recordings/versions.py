@@ -9,4 +9,4 @@ from importlib.metadata import version
 @cache  # it reads the packages' descriptions
 def versions() -> dict[str, str]:
     """Versions an episode depends on."""
-    return {name: version(name) for name in ("robocas-ms3", "mani_skill", "sapien", "mplib", "torch", "numpy")}
+    return {name: version(name) for name in ("robocas-ms3", "mani_skill", "sapien", "python-fcl", "torch", "numpy")}

@@ -110,7 +110,7 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
     panda = _parse(source / "panda_v2.urdf")
     tips = _adapt_fingers(panda, finger_extension)
     for mesh in panda.iterfind(".//collision/geometry/mesh"):
-        # Beside the URDF, since mplib takes absolute paths for relative ones. It reads the convex hulls beside them.
+        # The planner reads the convex hull next to each mesh.
         path = source / mesh.attrib["filename"]
         for name in (path.name, f"{path.name}.convex.stl"):
             shutil.copyfile(path.with_name(name), collision / name)

@@ -34,10 +34,10 @@ def test_this_machine_is_fine():
 
 @pytest.fixture
 def broken_machine(tmp_path):
-    """A folder for PYTHONPATH: numpy 2 that crashes mplib, a mani_skill and a sapien that can't be imported."""
+    """Return a folder for PYTHONPATH: numpy is too old, FCL crashes, mani_skill and sapien fail to import."""
     for name, version, source in (
-        ("numpy", "2.1.0", "__version__ = '2.1.0'\n"),
-        ("mplib", "0.1.1", "import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n"),
+        ("numpy", "1.20.0", "__version__ = '1.20.0'\n"),
+        ("fcl", "0.7.0.11", "import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n"),
         ("mani_skill", "3.0.1", "raise ImportError('broken on purpose')\n"),
         ("sapien", "3.0.3", "raise ImportError('broken on purpose')\n"),
     ):
@@ -56,7 +56,7 @@ def test_a_broken_machine_is_described(broken_machine):
     findings = {finding["name"]: finding for finding in json.loads(done.stdout)["findings"]}
     assert done.returncode == 1
     assert findings["numpy"]["status"] == "fail"
-    assert "segmentation fault" in findings["numpy"]["fix"]
+    assert "pip install 'numpy" in findings["numpy"]["fix"]
     for name in ("physics on CPU", "planner", "asset packs", "cache folder"):
         assert findings[name]["status"] == "fail", name
     for name in ("render device", "data folder"):
@@ -70,5 +70,5 @@ def test_the_table_shows_the_fix(broken_machine):
     done = doctor(PYTHONPATH=str(broken_machine), COLUMNS="200")
     assert done.returncode == 1
     assert "FAIL" in done.stdout
-    assert "pip install 'numpy<2,>=1.26'" in done.stdout
+    assert "pip install 'numpy" in done.stdout
     assert "Traceback" not in done.stdout + done.stderr

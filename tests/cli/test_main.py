@@ -126,7 +126,7 @@ def test_mistakes_are_told_before_anything_heavy_is_imported(tmp_path):
     code = (
         "import sys; from robocas_ms3.cli.main import run\n"
         f"for words in {list(MISTAKES)!r}:\n"
-        "    heavy = {'torch', 'sapien', 'mani_skill', 'gymnasium', 'matplotlib', 'trimesh', 'mplib'}\n"
+        "    heavy = {'torch', 'sapien', 'mani_skill', 'gymnasium', 'matplotlib', 'trimesh', 'fcl'}\n"
         "    assert run(words.split()) == 1, words\n"
         "    assert not heavy & set(sys.modules), (words, heavy & set(sys.modules))"
     )

@@ -37,7 +37,7 @@ away = np.cross(points - goal[:3, 3], (goal - planner.tcp(start))[:3, 3] / 0.15)
 print(motion.dt, np.abs(points[-1] - goal[:3, 3]).max() < 1e-4, np.linalg.norm(away, axis=1).max() < 2e-3)
 """,
     )
-    assert said.splitlines() == ["['mplib', 'straight'] True", "0.05 True True"]
+    assert said.splitlines() == ["['rrt_connect', 'straight'] True", "0.05 True True"]
 
 
 @pytest.mark.slow
@@ -49,7 +49,7 @@ def test_demonstrations_are_recorded_with_it(site, tmp_path):
 
 
 def test_without_its_package_it_is_unknown(tmp_path):
-    with pytest.raises(AssertionError, match=r"error: planner: no such planner .*'mplib'.*'straight'"):
+    with pytest.raises(AssertionError, match=r"error: planner: no such planner .*'rrt_connect'.*'straight'"):
         robocas(tmp_path, "generate", "pick", "--planner", "straight", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert "--planner straight" in PAGE

@@ -65,7 +65,7 @@ print(sorted(env.unwrapped.get_state_dict()["articulations"]))
     assert states == "['twin']"
 
 
-@pytest.mark.parametrize("name", ["mplib", "straight"])
+@pytest.mark.parametrize("name", ["rrt_connect", "straight"])
 def test_planners_plan_for_its_arm(site, name):
     said = python(
         site,
@@ -83,7 +83,7 @@ print(np.abs(planner.tcp(motion.qpos[-1]) - tip).max() < 1e-9, planner.collision
 """,
     )
     fastest, rest = said.splitlines()
-    assert float(fastest) == pytest.approx({"mplib": 0.7, "straight": 0.5}[name], abs=0.03)  # the Panda's is 0.5
+    assert float(fastest) == pytest.approx({"rrt_connect": 0.7, "straight": 0.5}[name], abs=0.03)  # the Panda's is 0.5
     assert rest == "True []"
 
 

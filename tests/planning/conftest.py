@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from planning_scenes import Checker
 
-from robocas_ms3.planning.mplib_backend import MplibPlanner
+from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import RobotFiles, robot_files
 
@@ -22,12 +22,12 @@ def checker(panda_files: RobotFiles) -> Checker:
 
 @pytest.fixture
 def make_planner(panda_files: RobotFiles):
-    def make(dt: float = 0.05, **settings) -> MplibPlanner:
-        return MplibPlanner(panda_files.arm_urdf, panda_files.arm_srdf, robot=MOBILE_PANDA, dt=dt, **settings)
+    def make(dt: float = 0.05, **settings) -> RRTConnectPlanner:
+        return RRTConnectPlanner(panda_files.arm_urdf, panda_files.arm_srdf, robot=MOBILE_PANDA, dt=dt, **settings)
 
     return make
 
 
 @pytest.fixture
-def planner(make_planner) -> MplibPlanner:
+def planner(make_planner) -> RRTConnectPlanner:
     return make_planner()

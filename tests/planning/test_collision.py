@@ -1,26 +1,23 @@
-"""mplib's traps around collisions, each closed: numpy 2, voxels, flags, the base frame, points at the base."""
+"""Collision checks: point clouds, bodies, held objects, finger widths, forks and threads."""
 
 from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from planning_scenes import REST, Box, Checker, cloud, corners, table_scene, top_down
 
 from robocas_ms3.errors import RobocasError
-from robocas_ms3.planning.collision import ArmWorld
+from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 
 @pytest.fixture
-def world(panda_files) -> ArmWorld:
-    return ArmWorld(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA)
-
-
-def test_numpy_2_is_refused_before_mplib_crashes(panda_files, monkeypatch):
-    monkeypatch.setattr(np, "__version__", "2.1.0")
-    with pytest.raises(RobocasError, match=r"numpy: .*expected < 2, found 2\.1\.0.*pip install"):
-        ArmWorld(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA)
+def world(panda_files) -> FclWorld:
+    return FclWorld(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA)
 
 
 def test_kinematics_agree_with_the_description(world, checker):
@@ -66,10 +63,6 @@ def test_recent_clouds_come_back_unchanged(world):
             world.set_points(points)
             assert world.free(REST[None])[0]
     assert len(world._shapes._recent) == 16
-
-
-def test_the_base_stays_at_the_origin(world):
-    np.testing.assert_array_equal(world._robot.get_base_pose(), [0, 0, 0, 1, 0, 0, 0])
 
 
 def test_points_at_the_robots_own_base_are_cut_and_far_ones_too(world):
@@ -201,3 +194,68 @@ def test_an_attached_body_is_met_by_bodies(world):
     assert world.contacts(REST, 0.08) == ["attached", "crumb"]
     world.attach(None)
     assert world.contacts(REST, 0.08) == []
+
+
+def verdicts(panda_files) -> bytes:
+    """The verdicts of a world of its own on the same configurations, obstacles and held object."""
+    world, boxes = FclWorld(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA), table_scene(0)
+    qpos = REST + np.random.default_rng(0).uniform(-0.8, 0.8, (300, 7))
+    found = []
+    for obstacles in (cloud(boxes), [body(box) for box in boxes]):
+        world.set_points(obstacles) if isinstance(obstacles, np.ndarray) else world.set_obstacles(obstacles)
+        for held in (None, AttachedBody(corners(0.05, 0.05, 0.1), np.eye(4))):
+            world.attach(held)
+            found.append(world.free(qpos))
+    assert 0.1 < np.mean(found) < 0.9
+    return np.array(found).tobytes()
+
+
+def test_a_fork_gives_the_same_verdicts(panda_files):
+    here, (reading, writing) = verdicts(panda_files), os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.write(writing, verdicts(panda_files))
+        finally:
+            os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading, "rb") as pipe:
+        assert pipe.read() == here
+    os.waitpid(child, 0)
+
+
+def test_a_world_that_was_made_before_a_fork_gives_the_same_verdicts_after_it(world):
+    world.set_obstacles([body(box) for box in table_scene(0)])
+    qpos = REST + np.random.default_rng(0).uniform(-0.8, 0.8, (300, 7))
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.write(writing, world.free(qpos).tobytes())
+        finally:
+            os._exit(0)
+    os.close(writing)
+    here = world.free(qpos)
+    with os.fdopen(reading, "rb") as pipe:
+        assert pipe.read() == here.tobytes()
+    os.waitpid(child, 0)
+    assert 20 < here.sum() < 280
+
+
+def test_worlds_in_threads_give_the_same_verdicts(panda_files):
+    with ThreadPoolExecutor(4) as pool:
+        assert set(pool.map(verdicts, [panda_files] * 4)) == {verdicts(panda_files)}
+
+
+def test_a_shape_that_several_obstacles_share_counts_at_each_of_their_places(world):
+    """Also in the next scene, which uses the same FCL objects again at other places."""
+    cube, tcp = Shape((corners(0.02, 0.02, 0.02),)), world.tcp(REST)
+    near, far = np.eye(4), np.eye(4)
+    near[:3, 3], far[:3, 3] = tcp[:3, 3], (0.6, 0.5, 0.8)
+    for _ in range(2):
+        world.set_obstacles(
+            [Obstacle("far", cube, far), Obstacle("near", cube, near), Obstacle("also near", cube, near)]
+        )
+        assert {"near", "also near"} == {name for name in world.contacts(REST, 0.0) if "panda" not in name}
+        world.set_obstacles([Obstacle("near", cube, far), Obstacle("far", cube, near)])
+        assert {"far"} == {name for name in world.contacts(REST, 0.0) if "panda" not in name}

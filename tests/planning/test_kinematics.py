@@ -1,17 +1,106 @@
-"""Errors between poses."""
+"""Rotation vectors, errors between poses, and straight lines of the TCP."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from planning_scenes import REST, top_down
+from scipy.spatial.transform import Rotation
 
-from robocas_ms3.planning.kinematics import pose_error
+from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.planning.chain import ArmChain
+from robocas_ms3.planning.kinematics import follow_line, newton_step, pose_error, rotation_vector, solve_positive
+from robocas_ms3.planning.reachability import Reachability
+from robocas_ms3.robots.description import MOBILE_PANDA
+
+
+@pytest.fixture(scope="module")
+def chain(panda_files) -> ArmChain:
+    return ArmChain(panda_files.arm_urdf, MOBILE_PANDA)
 
 
 @pytest.mark.parametrize(("turn", "expected"), [(0.0, 0.0), (1e-5, 1e-5), (0.7, 0.7), (2.5, 2.5), (np.pi, np.pi)])
 def test_pose_error_by_hand(turn, expected):
-    from scipy.spatial.transform import Rotation
-
     a, b = np.eye(4), np.eye(4)
     b[:3, :3], b[:3, 3] = Rotation.from_rotvec([0, turn, 0]).as_matrix(), (0.3, 0, 0.4)
     assert pose_error(a, b) == pytest.approx((0.5, expected), abs=1e-7)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.5, np.pi / 2, 3.0, np.pi - 1e-4, np.pi - 1e-9, np.pi])
+def test_rotation_vectors_are_the_ones_that_the_matrices_came_from(angle):
+    axes = np.random.default_rng(0).normal(size=(20, 3))
+    axes = np.concatenate([axes / np.linalg.norm(axes, axis=1, keepdims=True), np.eye(3)])
+    matrices = Rotation.from_rotvec(angle * axes).as_matrix()
+    vectors = rotation_vector(matrices)
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), angle, atol=1e-7)
+    np.testing.assert_allclose(Rotation.from_rotvec(vectors).as_matrix(), matrices, atol=1e-7)
+
+
+def test_linear_systems_are_solved():
+    rng = np.random.default_rng(0)
+    roots, expected = rng.normal(size=(50, 6, 7)), rng.normal(size=(50, 6))
+    matrices = roots @ roots.transpose(0, 2, 1) + 1e-8 * np.eye(6)
+    values = np.einsum("mij,mj->mi", matrices, expected)
+    np.testing.assert_allclose(solve_positive(matrices, values), expected, rtol=1e-6)
+
+
+def test_a_goal_turned_by_half_a_turn_is_far_away(chain):
+    """The sine of the error is zero there."""
+    goals = chain.tcp(np.tile(REST, (3, 1)))
+    for goal, axis in zip(goals, np.eye(3), strict=True):
+        goal[:3, :3] = Rotation.from_rotvec(np.pi * axis).as_matrix() @ goal[:3, :3]
+    _, error = newton_step(chain, np.tile(REST, (3, 1)), goals)
+    np.testing.assert_allclose(error, np.pi, atol=1e-6)
+
+
+def test_newton_steps_come_to_poses_nearby(chain):
+    rng = np.random.default_rng(0)
+    qpos = REST + rng.uniform(-0.3, 0.3, (50, 7))
+    goals = chain.tcp(qpos + rng.uniform(-0.05, 0.05, (50, 7)))
+    for _ in range(8):
+        qpos, error = newton_step(chain, qpos, goals)
+    assert error.max() < 1e-9
+    for found, goal in zip(chain.tcp(qpos), goals, strict=True):
+        assert max(pose_error(found, goal)) < 1e-8
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_line_is_straight_and_ends_at_its_goal(chain, checker, seed):
+    rng = np.random.default_rng(seed)
+    above = top_down(rng.uniform(0.4, 0.6), rng.uniform(-0.2, 0.2), 0.3, yaw=rng.uniform(-1, 1))
+    goal = above @ np.block(
+        [[Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)).as_matrix(), np.zeros((3, 1))], [0, 0, 0, 1]]
+    )
+    goal[:3, 3] += rng.uniform((-0.05, -0.05, -0.15), (0.05, 0.05, 0.05))
+    start = Reachability(chain).solutions(above, REST)[0]
+    path = follow_line(chain, start, goal, stage="x")
+    np.testing.assert_array_equal(path[0], start)
+    assert (path >= chain.lower).all() and (path <= chain.upper).all()
+    poses = np.array([checker.link_pose("panda_hand_tcp", qpos) for qpos in path])
+    assert pose_error(poses[-1], goal) == pytest.approx((0, 0), abs=1e-6)
+    fractions, turn = np.linspace(0, 1, len(path)), pose_error(above, goal)[1]
+    for fraction, pose in zip(fractions, poses, strict=True):
+        expected = above[:3, 3] + fraction * (goal - above)[:3, 3]
+        np.testing.assert_allclose(pose[:3, 3], expected, atol=1e-6)
+        assert pose_error(above, pose)[1] == pytest.approx(fraction * turn, abs=1e-6)
+    steps = [pose_error(a, b) for a, b in zip(poses[:-1], poses[1:], strict=True)]
+    assert np.max(steps, axis=0)[0] <= 0.01 + 1e-6 and np.max(steps, axis=0)[1] <= np.deg2rad(3) + 1e-6
+
+
+def refusal(chain, start, goal) -> str:
+    with pytest.raises(PlanningFailed) as caught:
+        follow_line(chain, start, goal, stage="here")
+    assert caught.value.stage == "here"
+    return caught.value.reason
+
+
+def test_a_line_out_of_reach_is_refused(chain):
+    start = Reachability(chain).solutions(top_down(0.5, 0, 0.3), REST)[0]
+    assert refusal(chain, start, top_down(1.2, 0, 0.3)) == "line_unreachable"
+
+
+def test_a_line_through_a_joint_limit_is_refused(chain):
+    """The last joint starts near its limit and would have to turn further."""
+    start = max(Reachability(chain).solutions(top_down(0.5, 0, 0.3), REST), key=lambda qpos: qpos[6])
+    assert len(follow_line(chain, start, top_down(0.5, 0, 0.3, yaw=1.0), stage="x")) > 15
+    assert refusal(chain, start, top_down(0.5, 0, 0.3, yaw=-2.0)) == "line_unreachable"

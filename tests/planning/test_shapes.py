@@ -1,24 +1,12 @@
-"""Convex hulls with a margin, worked out by hand, and poses as FCL takes them."""
+"""Convex hulls with a margin, calculated by hand."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from planning_scenes import corners
-from scipy.spatial.transform import Rotation
 
-from robocas_ms3.planning.shapes import convex_hull, inflated, matrix_to_pose
-from robocas_ms3.poses import from_wxyz as as_matrix
-
-
-def test_a_pose_of_a_matrix_turns_as_it_does():
-    turns = [Rotation.random(random_state=i) for i in range(20)]
-    turns += [Rotation.from_rotvec(np.pi * axis) for axis in np.eye(3)] + [Rotation.identity()]
-    for turn in turns:
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), (1, 2, 3)
-        np.testing.assert_allclose(as_matrix(torch.as_tensor(matrix_to_pose(matrix))), matrix, atol=1e-12)
+from robocas_ms3.planning.shapes import convex_hull, inflated
 
 
 def test_an_inflated_box_has_its_faces_moved_out():

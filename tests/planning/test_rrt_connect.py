@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from planning_scenes import REST, Box, cloud, corners, table_scene, top_down
 
-from robocas_ms3.errors import PlanningFailed, RobocasError
+from robocas_ms3.errors import PlanningFailed, RobocasError, RobotDescriptionError
+from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.kinematics import pose_error
-from robocas_ms3.planning.mplib_backend import TCP_SPEED_LIMIT, MplibPlanner
 from robocas_ms3.planning.protocol import AttachedBody, Planner, Trajectory
+from robocas_ms3.planning.rrt_connect import TCP_SPEED_LIMIT, RRTConnectPlanner
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 WALL = Box((0.55, 0.0, 0.15), (0.4, 0.03, 0.4))
@@ -167,9 +168,11 @@ def test_motions_are_joined_only_where_all_of_the_first_is_free(planner):
     assert planner.join(REST, reach, down).qpos.tolist() == [*reach.qpos.tolist(), *down.qpos.tolist()]
 
 
-def test_joined_motions_keep_to_joint_limits(planner):
+def test_joined_motions_keep_to_joint_limits(planner, panda_files):
     planner.set_scene([])
-    limit = planner._world.limits[5, 0]  # of joint 6; both motions keep to it, their sum would not
+    limit = ArmChain(panda_files.arm_urdf, MOBILE_PANDA).limits[
+        5, 0
+    ]  # of joint 6; both motions keep to it, their sum would not
     start, rise, fall = REST.copy(), np.tile(REST, (20, 1)), np.tile(REST, (20, 1))
     start[5], rise[:, 5], fall[:, 5] = limit + 0.02, np.linspace(limit + 0.024, limit + 0.1, 20), limit + 0.02
     first, second = Trajectory(rise, 0.05), Trajectory(fall, 0.05)
@@ -305,14 +308,17 @@ def test_nothing_is_printed(make_planner, capfd):
 
 
 def test_wrong_files_and_steps_are_refused(panda_files, tmp_path):
-    with pytest.raises(RobocasError, match="no such robot description"):
-        MplibPlanner(tmp_path / "none.urdf", panda_files.arm_srdf, robot=MOBILE_PANDA, dt=0.05)
-    with pytest.raises(RobocasError, match="time step must be positive"):
-        MplibPlanner(panda_files.arm_urdf, panda_files.arm_srdf, robot=MOBILE_PANDA, dt=0.0)
-    lonely = tmp_path / "panda_arm.urdf"
-    lonely.write_bytes(panda_files.arm_urdf.read_bytes())  # its meshes are not beside it
-    with pytest.raises(RobocasError, match="can't load this description"):
-        MplibPlanner(lonely, panda_files.arm_srdf, robot=MOBILE_PANDA, dt=0.05)
+    urdf, srdf = panda_files.arm_urdf, panda_files.arm_srdf
+    for missing, files in (
+        ("none.urdf", (tmp_path / "none.urdf", srdf)),
+        ("none.srdf", (urdf, tmp_path / "none.srdf")),
+    ):
+        with pytest.raises(RobotDescriptionError) as caught:
+            RRTConnectPlanner(*files, robot=MOBILE_PANDA, dt=0.05)
+        assert caught.value.where == tmp_path / missing
+    with pytest.raises(RobocasError) as caught:
+        RRTConnectPlanner(urdf, srdf, robot=MOBILE_PANDA, dt=0.0)
+    assert caught.value.where == "dt"
 
 
 def test_the_tcp_of_a_stretched_arm_keeps_its_speed_limit(planner):

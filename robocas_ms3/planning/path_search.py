@@ -1,6 +1,6 @@
-"""RRT-Connect and shortcutting with a fixed budget of collision checks: the same seed gives the same path, always.
+"""RRT-Connect and shortcutting with a fixed budget of collision checks.
 
-OMPL inside mplib stops by the clock (2 s), so whether a hard problem is solved there depends on the machine's load.
+The same seed gives the same path. A time limit would make the result depend on the machine's load.
 """
 
 from __future__ import annotations

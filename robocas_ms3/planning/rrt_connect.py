@@ -1,4 +1,4 @@
-"""The mplib backend of the planner protocol: its collision checks and lines; search and timing of ours."""
+"""Plan motions by RRT-Connect, straight lines and time parameterisation, with collision checks by FCL."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from robocas_ms3.errors import PlanningFailed, RobocasError
 from robocas_ms3.planning.chain import turn_between
-from robocas_ms3.planning.collision import ArmWorld
-from robocas_ms3.planning.kinematics import ArmKinematics
+from robocas_ms3.planning.collision import FclWorld
+from robocas_ms3.planning.kinematics import follow_line
+from robocas_ms3.planning.path_search import PathSearch
 from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle, Trajectory
 from robocas_ms3.planning.reachability import Reachability
-from robocas_ms3.planning.rrt import PathSearch
 from robocas_ms3.planning.timing import JointPath, blended, rounded, stopping, thinned, through, timed
 from robocas_ms3.robots.description import RobotDescription
 
@@ -35,13 +35,13 @@ TCP_SPEED_LIMIT = 0.45  # m/s: at 5 Hz pd_ee_delta_pose moves 0.1 m a step at mo
 Timed = TypeVar("Timed", Trajectory, Trajectory | None)
 
 
-class MplibPlanner:
+class RRTConnectPlanner:
     """Plan for the arm in its base frame; implements ``planning.protocol.Planner``.
 
     Args:
         urdf: the arm alone, rooted at its base.
-        srdf: its pairs of links that may touch.
-        robot: whose arm it is.
+        srdf: pairs of its links that need no check.
+        robot: description of the robot that carries the arm.
         dt: seconds between rows of a trajectory.
         velocity_limit: of every joint, rad/s; default: the robot's.
         acceleration_limit: of every joint, rad/s^2; default: the robot's.
@@ -50,7 +50,9 @@ class MplibPlanner:
         voxel: edge of the cloud's voxels = spacing of its points, m.
 
     Raises:
-        RobocasError: numpy 2, missing files, a description without the robot's links.
+        RobotDescriptionError: the URDF, the SRDF or a collision mesh is missing or unusable, or a geometry is not
+            supported.
+        RobocasError: ``dt`` is not positive.
     """
 
     def __init__(
@@ -68,8 +70,7 @@ class MplibPlanner:
     ) -> None:
         if not dt > 0:
             raise RobocasError("the time step must be positive", where="dt", found=dt)
-        self._world = ArmWorld(urdf, srdf, robot, voxel=voxel)
-        self._kinematics = ArmKinematics(self._world)
+        self._world = FclWorld(urdf, srdf, robot, voxel=voxel)
         self._reachability = Reachability(self._world.chain)
         self._dt = dt
         self._limits = {
@@ -77,9 +78,8 @@ class MplibPlanner:
             "acceleration": robot.arm_acceleration_limit if acceleration_limit is None else acceleration_limit,
         }
         self._budget = int(planning_time * CHECKS_PER_SECOND)
-        self._search = PathSearch(
-            self._world.free_until, self._kinematics.lower, self._kinematics.upper, step=rrt_range, spacing=SPACING
-        )
+        chain = self._world.chain
+        self._search = PathSearch(self._world.free_until, chain.lower, chain.upper, step=rrt_range, spacing=SPACING)
         self._rng = np.random.default_rng(0)
 
     @property
@@ -158,7 +158,7 @@ class MplibPlanner:
         """
         start = self._checked_start(start, stage)
         wanted = np.array(goals, dtype=np.float64).reshape(-1, 7)
-        lower, upper = self._world.limits.T
+        lower, upper = self._world.chain.limits.T
         wanted = wanted[np.all((wanted >= lower) & (wanted <= upper), axis=1)]
         wanted = wanted[self._world.free(wanted)]
         if not len(wanted):
@@ -203,7 +203,7 @@ class MplibPlanner:
                 ``straight_line_blocked``, ``timing_failed``.
         """
         start = self._checked_start(start, stage, obstacles=check_collisions)
-        waypoints = self._kinematics.line(start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
+        waypoints = follow_line(self._world.chain, start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
         if np.linalg.norm(waypoints[-1] - start) < STILL:
             return Trajectory(waypoints[-1:].copy(), self._dt)
         path = through(waypoints)
@@ -225,7 +225,7 @@ class MplibPlanner:
             points = blended(a, b, rows)
             path = through(thinned(points, BLEND_SPACING))
             driven, end = path.dense(FINE_SPACING), points[min(len(a), len(points) - 1)]
-            lower, upper = self._world.limits.T  # the sum of two motions may leave what either keeps to
+            lower, upper = self._world.chain.limits.T  # the sum of two motions may leave what either keeps to
             # up to the end of the corner: what follows was planned among other obstacles
             corner = int(np.linalg.norm(driven - end, axis=1).argmin()) + 1
             if np.any((driven < lower) | (driven > upper)) or not self._world.all_free(driven[:corner]):
@@ -237,7 +237,7 @@ class MplibPlanner:
 
     def _checked_start(self, start: Array, stage: str, *, obstacles: bool = True) -> Array:
         start = np.asarray(start, dtype=np.float64)
-        lower, upper = self._world.limits.T
+        lower, upper = self._world.chain.limits.T
         if np.any(start < lower - 1e-3) or np.any(start > upper + 1e-3):
             raise PlanningFailed(stage, "start_outside_limits")
         if not self._world.all_free(start[None], obstacles=obstacles):

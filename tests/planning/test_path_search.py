@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robocas_ms3.planning.rrt import PathSearch
+from robocas_ms3.planning.path_search import PathSearch
 
 LOW, HIGH = np.array([-2.0, -2.0]), np.array([2.0, 2.0])
 START, GOAL = np.array([-1.0, 0.0]), np.array([1.0, 0.0])

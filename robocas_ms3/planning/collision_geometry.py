@@ -1,0 +1,194 @@
+"""Read the collision geometry of an arm from its URDF, and the pairs of links to check from its SRDF."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.errors import RobotDescriptionError
+from robocas_ms3.planning.chain import ArmChain, joint_origin, read_numbers
+from robocas_ms3.planning.protocol import Array
+from robocas_ms3.planning.shapes import convex_hull, fcl_convex
+
+BASE, TCP = -1, 7  # frames of parts, next to 0 to 6 of links 1 to 7
+HULL_SUFFIX = ".convex.stl"  # a file of this suffix next to a mesh holds the mesh's convex hull
+
+
+@dataclass(frozen=True)
+class CollisionPart:
+    """One convex collision geometry of a link.
+
+    Attributes:
+        link: name of the link.
+        frame: frame that the part moves with: ``BASE``, 0 to 6 (links 1 to 7), or ``TCP``.
+        pose: (4, 4) pose of the part in that frame, with closed fingers.
+        slide: (3,) displacement of the part in that frame per metre of its finger joint; zero where no finger moves it.
+        geometry: FCL geometry.
+        corners: (V, 3) points whose convex hull contains the part, in the part's frame, m.
+    """
+
+    link: str
+    frame: int
+    pose: Array
+    slide: Array
+    geometry: Any
+    corners: Array
+
+    def bounds(self, finger: float) -> Array:
+        """Return the lower and upper corner (2, 3) of a box around the part in its frame, at a finger position in m."""
+        points = self.corners @ self.pose[:3, :3].T + self.pose[:3, 3] + finger * self.slide
+        return np.array([points.min(axis=0), points.max(axis=0)])
+
+
+def read_collision_parts(urdf: Path | str, chain: ArmChain, fcl: Any) -> list[CollisionPart]:
+    """Read the collision parts of all links from the arm's base link downwards.
+
+    A joint that is neither an arm joint nor a finger joint is taken at its zero position.
+
+    Args:
+        urdf: URDF of the arm, rooted at its base.
+        chain: kinematic chain of the same arm.
+        fcl: the ``fcl`` module.
+
+    Raises:
+        RobotDescriptionError: a mesh is missing or unreadable, a geometry has another type than mesh, box, cylinder or
+            sphere, or a finger joint is not prismatic.
+    """
+    robot, root = chain.robot, ElementTree.parse(urdf).getroot()
+    links = {link.attrib["name"]: link for link in root.iterfind("link")}
+    joints_below: dict[str, list[tuple[str, Element]]] = {}
+    for parent, child, joint in _joints(root):
+        joints_below.setdefault(parent, []).append((child, joint))
+    link7_in_tcp = np.linalg.inv(chain.links[7])
+
+    def visit(name: str, frame: int, pose: Array, slide: Array) -> Iterator[CollisionPart]:
+        for geometry, corners, origin in _collision_geometries(links[name], Path(urdf), fcl):
+            yield CollisionPart(name, frame, pose @ origin, slide, geometry, corners)
+        if frame == 6:  # links that hang from link 7 are rigid with the TCP
+            frame, pose = TCP, link7_in_tcp @ pose
+        for child, joint in joints_below.get(name, []):
+            if child in robot.arm_links:
+                yield from visit(child, robot.arm_links.index(child), np.eye(4), np.zeros(3))
+                continue
+            child_pose = pose @ joint_origin(joint)
+            child_slide = slide
+            if joint.attrib["name"] in robot.finger_joints:
+                child_slide = slide + child_pose[:3, :3] @ _slide_axis(joint, urdf)
+            yield from visit(child, frame, child_pose, child_slide)
+
+    return list(visit(robot.arm_base_link, BASE, np.eye(4), np.zeros(3)))
+
+
+def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPart]) -> list[tuple[int, int]]:
+    """Return the pairs of part indices (i < j) to check: of links neither adjacent nor disabled in the SRDF.
+
+    Args:
+        urdf: URDF of the arm; links that a joint connects are adjacent.
+        srdf: SRDF with ``disable_collisions`` elements.
+        parts: parts of the arm.
+    """
+    ignored = {frozenset((parent, child)) for parent, child, _ in _joints(ElementTree.parse(urdf).getroot())}
+    for pair in ElementTree.parse(srdf).getroot().iterfind("disable_collisions"):
+        ignored.add(frozenset((pair.attrib["link1"], pair.attrib["link2"])))
+    return [
+        (i, j)
+        for i, j in itertools.combinations(range(len(parts)), 2)
+        if parts[i].link != parts[j].link and frozenset((parts[i].link, parts[j].link)) not in ignored
+    ]
+
+
+def _joints(root: Element) -> Iterator[tuple[str, str, Element]]:
+    for joint in root.iterfind("joint"):
+        parent, child = (next(joint.iterfind(tag)).attrib["link"] for tag in ("parent", "child"))
+        yield parent, child, joint
+
+
+def _slide_axis(joint: Element, urdf: Path | str) -> Array:
+    if joint.attrib["type"] != "prismatic":
+        raise RobotDescriptionError(
+            f"finger joint {joint.attrib['name']!r} does not slide",
+            where=urdf,
+            expected="type prismatic",
+            found=joint.attrib["type"],
+            fix="Name sliding joints as finger_joints of the robot's description.",
+        )
+    axis = joint.find("axis")
+    return np.array(read_numbers(axis.attrib["xyz"]) if axis is not None else [1.0, 0.0, 0.0])
+
+
+def _collision_geometries(link: Element, urdf: Path, fcl: Any) -> Iterator[tuple[Any, Array, Array]]:
+    """Return the FCL geometry, the corners (V, 3) and the pose (4, 4) of each collision element of a link."""
+    for collision in link.iterfind("collision"):
+        origin = joint_origin(collision)
+        for shape in collision.iterfind("geometry/*"):
+            geometry, corners = _geometry(shape, link.attrib["name"], urdf, fcl)
+            yield geometry, corners, origin
+
+
+def _geometry(shape: Element, link: str, urdf: Path, fcl: Any) -> tuple[Any, Array]:
+    if shape.tag == "mesh":
+        scale = np.array(read_numbers(shape.attrib.get("scale", "1 1 1")))
+        path = _mesh_path(urdf, shape.attrib["filename"], link)
+        corners, faces = _read_hull(path, scale, link)
+        return fcl_convex(fcl, corners, faces), corners
+    if shape.tag == "box":
+        size = read_numbers(shape.attrib["size"])
+        return fcl.Box(*size), _box_corners(*size)
+    if shape.tag == "cylinder":
+        radius, length = float(shape.attrib["radius"]), float(shape.attrib["length"])
+        return fcl.Cylinder(radius, length), _box_corners(2 * radius, 2 * radius, length)
+    if shape.tag == "sphere":
+        radius = float(shape.attrib["radius"])
+        return fcl.Sphere(radius), _box_corners(2 * radius, 2 * radius, 2 * radius)
+    raise RobotDescriptionError(
+        f"unsupported collision geometry of link {link!r}",
+        where=urdf,
+        expected="mesh, box, cylinder or sphere",
+        found=shape.tag,
+        fix="Replace it by one of these.",
+    )
+
+
+def _box_corners(x: float, y: float, z: float) -> Array:
+    return np.array(list(itertools.product((-x / 2, x / 2), (-y / 2, y / 2), (-z / 2, z / 2))))
+
+
+def _mesh_path(urdf: Path, filename: str, link: str) -> Path:
+    """Return the file of a mesh, or the file of its convex hull where there is one next to it."""
+    mesh = urdf.parent / filename
+    hull = mesh.with_name(mesh.name + HULL_SUFFIX)
+    if hull.is_file():
+        return hull
+    if not mesh.is_file():
+        raise RobotDescriptionError(
+            f"missing collision mesh of link {link!r}",
+            where=mesh,
+            fix=f"Copy the mesh there, or correct its file name in {urdf}: a path relative to the URDF's folder.",
+        )
+    return mesh
+
+
+def _read_hull(path: Path, scale: Array, link: str) -> tuple[Array, NDArray[np.int32]]:
+    """Return the corners (V, 3) and triangles (F, 3) of the convex hull of a mesh."""
+    import trimesh
+
+    try:
+        mesh: Any = trimesh.load(path, force="mesh", process=False)
+        corners, faces, _ = convex_hull(np.asarray(mesh.vertices, dtype=np.float64) * scale)
+    except Exception as error:  # each of trimesh's loaders raises errors of its own; qhull refuses flat meshes
+        raise RobotDescriptionError(
+            f"unusable collision mesh of link {link!r}",
+            where=path,
+            expected="a mesh with a volume in a format that trimesh loads, such as STL or OBJ",
+            found=f"{type(error).__name__}: {str(error).partition(chr(10))[0]}",
+            fix="Export the mesh again, as STL.",
+        ) from error
+    return corners, faces

@@ -1,0 +1,152 @@
+"""Collision geometry from a URDF: every supported type, hulls of meshes, and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+import pytest
+import trimesh
+from planning_scenes import REST, Checker, corners
+
+from robocas_ms3.errors import RobotDescriptionError
+from robocas_ms3.planning.collision import FclWorld
+from robocas_ms3.planning.protocol import Obstacle, Shape
+from robocas_ms3.planning.shapes import MARGIN
+from robocas_ms3.robots.description import MOBILE_PANDA
+
+HAND = "collision/hand.stl"
+AHEAD = np.array([0, 0, 0.6])  # in the hand's frame, far from all links
+
+
+@pytest.fixture
+def files(panda_files, tmp_path) -> Path:
+    """A copy of the arm's files that a test can change."""
+    for path in (panda_files.arm_urdf, panda_files.arm_srdf):
+        shutil.copyfile(path, tmp_path / path.name)
+    shutil.copytree(panda_files.folder / "collision", tmp_path / "collision")
+    return tmp_path
+
+
+def load(files: Path) -> FclWorld:
+    return FclWorld(files / "panda_arm.urdf", files / "panda_arm.srdf", MOBILE_PANDA)
+
+
+def replace_hand(files: Path, shape: Element, *, position: str = "0 0 0.6", angles: str = "0 0 0") -> None:
+    """Give the hand one collision geometry, far ahead of it."""
+    tree = ElementTree.parse(files / "panda_arm.urdf")
+    hand = tree.find("link[@name='panda_hand']")
+    for collision in hand.findall("collision"):
+        hand.remove(collision)
+    collision = SubElement(hand, "collision")
+    SubElement(collision, "origin", xyz=position, rpy=angles)
+    SubElement(collision, "geometry").append(shape)
+    tree.write(files / "panda_arm.urdf")
+
+
+def touches_cube(world: FclWorld, checker: Checker, position: np.ndarray) -> bool:
+    """Whether the hand touches a cube of 5.2 mm with its margin, at a position relative to ``AHEAD``."""
+    pose = checker.link_pose("panda_hand", REST).copy()
+    pose[:3, 3] += pose[:3, :3] @ (AHEAD + position)
+    world.set_obstacles([Obstacle("cube", Shape((corners(*[0.0026 - MARGIN] * 3),)), pose)])
+    return "cube" in world.contacts(REST, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("tag", "size", "reach"),
+    [
+        ("sphere", {"radius": "0.2"}, (0.2, 0.2, 0.2)),
+        ("cylinder", {"radius": "0.2", "length": "0.5"}, (0.2, 0.2, 0.25)),
+        ("box", {"size": "0.4 0.3 0.5"}, (0.2, 0.15, 0.25)),
+    ],
+)
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_primitives_reach_as_far_as_they_are_large(files, checker, tag, size, reach, axis, side):
+    replace_hand(files, Element(tag, size))
+    world, direction = load(files), side * np.eye(3)[axis]
+    assert touches_cube(world, checker, direction * (reach[axis] + 0.002))
+    assert not touches_cube(world, checker, direction * (reach[axis] + 0.004))
+
+
+@pytest.mark.parametrize("tag", ["sphere", "cylinder"])
+def test_round_geometries_are_round(files, checker, tag):
+    """Next to the edge of the box around it there is room."""
+    replace_hand(files, Element(tag, {"radius": "0.2", "length": "0.5"}))
+    world, edge = load(files), np.array([0.2, 0.2, 0.0])
+    assert not touches_cube(world, checker, edge * 0.9)
+    assert touches_cube(world, checker, edge * 0.69)
+
+
+def test_geometries_are_placed_by_their_origin(files, checker):
+    replace_hand(files, Element("box", size="0.02 0.02 0.4"), position="0.1 0 0.6", angles="0 1.5707963 0")
+    world = load(files)
+    assert touches_cube(world, checker, np.array([0.29, 0, 0]))
+    assert not touches_cube(world, checker, np.array([0.1, 0, 0.1]))
+
+
+def test_a_mesh_without_a_hull_file_counts_as_its_convex_hull(files, checker):
+    """Two balls 40 cm apart in one file: what is between them counts too."""
+    balls = [trimesh.creation.icosphere(radius=0.05).apply_translation((x, 0, 0)) for x in (-0.2, 0.2)]
+    trimesh.util.concatenate(balls).export(files / "collision" / "balls.stl")
+    replace_hand(files, Element("mesh", filename="collision/balls.stl"))
+    world = load(files)
+    assert touches_cube(world, checker, np.array([0.0, 0, 0.045]))
+    assert not touches_cube(world, checker, np.array([0.0, 0, 0.055]))
+    replace_hand(files, Element("mesh", filename="collision/balls.stl", scale="0.5 2 1"))
+    world = load(files)
+    assert touches_cube(world, checker, np.array([0.0, 0.095, 0]))
+    assert not touches_cube(world, checker, np.array([0.14, 0, 0]))
+
+
+def test_a_hull_file_is_preferred(files, checker):
+    trimesh.creation.box((0.02, 0.02, 1.4)).export(files / f"{HAND}.convex.stl")
+    assert touches_cube(load(files), checker, np.array([0, 0, 0.09]))
+    (files / f"{HAND}.convex.stl").unlink()
+    assert not touches_cube(load(files), checker, np.array([0, 0, 0.09]))
+
+
+def refused(files: Path) -> RobotDescriptionError:
+    with pytest.raises(RobotDescriptionError) as caught:
+        load(files)
+    assert caught.value.fix
+    return caught.value
+
+
+def test_a_missing_mesh_is_refused(files):
+    for path in (files / HAND, files / f"{HAND}.convex.stl"):
+        path.unlink()
+    error = refused(files)
+    assert error.where == files / HAND
+    assert "panda_hand" in error.what
+
+
+@pytest.mark.parametrize("content", [b"", b"no mesh", b"solid x\nendsolid x\n"])
+def test_an_unreadable_mesh_is_refused(files, content):
+    (files / f"{HAND}.convex.stl").write_bytes(content)
+    assert refused(files).where == files / f"{HAND}.convex.stl"
+
+
+def test_a_flat_mesh_is_refused(files):
+    flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]])
+    flat.export(files / f"{HAND}.convex.stl")
+    assert refused(files).where == files / f"{HAND}.convex.stl"
+
+
+def test_an_unsupported_geometry_is_refused(files):
+    replace_hand(files, Element("capsule", radius="0.1", length="0.1"))
+    error = refused(files)
+    assert (error.where, error.found) == (files / "panda_arm.urdf", "capsule")
+    assert "panda_hand" in error.what
+
+
+def test_a_finger_joint_that_turns_is_refused(files):
+    tree = ElementTree.parse(files / "panda_arm.urdf")
+    tree.find("joint[@name='panda_finger_joint1']").set("type", "revolute")
+    tree.write(files / "panda_arm.urdf")
+    error = refused(files)
+    assert (error.expected, error.found) == ("type prismatic", "revolute")
+    assert "panda_finger_joint1" in error.what
