@@ -32,6 +32,11 @@ def as_float(values: Array) -> Array:
     return values.float() if isinstance(values, Tensor) else np.asarray(values, np.float32)
 
 
+def as_double(values: Array) -> Array:
+    """Return numbers as float64."""
+    return values.double() if isinstance(values, Tensor) else np.asarray(values, np.float64)
+
+
 def clamp(values: Array, low: Any, high: Any) -> Array:
     """Values within limits, which are numbers or arrays of the same kind."""
     if isinstance(values, Tensor):
@@ -44,9 +49,14 @@ def greater(one: Array, other: Array) -> Array:
     return torch.maximum(one, other) if isinstance(one, Tensor) else np.maximum(one, other)
 
 
-def join(arrays: list[Array]) -> Array:
-    """Arrays as one, along their last axis."""
-    return torch.cat(arrays, dim=-1) if isinstance(arrays[0], Tensor) else np.concatenate(arrays, axis=-1)
+def join(arrays: list[Array], axis: int = -1) -> Array:
+    """Arrays as one, along an axis."""
+    return torch.cat(arrays, dim=axis) if isinstance(arrays[0], Tensor) else np.concatenate(arrays, axis=axis)
+
+
+def matmul(first: Array, second: Array) -> Array:
+    """Return the products (B, i, k) of matrices (B, i, j) and (B, j, k)."""
+    return torch.bmm(first, second) if isinstance(first, Tensor) else first @ second
 
 
 def length(vectors: Array) -> Array:

@@ -10,22 +10,18 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-import sapien
 import torch
-from mani_skill.agents.controllers import PDEEPoseController, PDEEPoseControllerConfig
-from mani_skill.agents.controllers.utils.kinematics import Kinematics
-from mani_skill.utils.geometry.rotation_conversions import matrix_to_quaternion, quaternion_invert, quaternion_multiply
+from mani_skill.agents.controllers import PDEEPosController, PDEEPoseController, PDEEPoseControllerConfig
 from mani_skill.utils.structs import Link, Pose
 
-from robocas_ms3.arrays import as_tensor, choose, clamp, every, join, length, native, none
+from robocas_ms3.arrays import as_double, as_float, as_tensor, choose, clamp, every, join, length, native, none
+from robocas_ms3.errors import RobocasError
 from robocas_ms3.robots import rotations
 from robocas_ms3.robots.drives import ARM_SET_FROM_OUTSIDE, EvenDrives
 from robocas_ms3.robots.ee_deltas import ee_delta_target
+from robocas_ms3.robots.kinematics import SerialChain
 
 BODY_FRAME = "body_translation:body_aligned_body_rotation"
-BATCHED_IK_ITERATIONS, IK_DAMPING = 8, 1e-4
-FARTHEST = 0.5  # m and rad together that one iteration goes: linear steps lead astray beyond
-IK_TOLERANCE = 1e-4  # m and rad together, as SAPIEN's solver has it, which is used on a CPU
 # m and rad between the TCP and the pose it was asked for: beyond, something holds the arm back, or set it elsewhere.
 EE_HELD_BACK = (0.1, 0.5)
 
@@ -46,46 +42,42 @@ def _relative_pose(frame: Link, link: Link) -> Any:
     return np.concatenate([position, quaternion])[None]
 
 
-def batched_ik(
-    kinematics: Kinematics, target: Pose, qpos: torch.Tensor, limits: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Solve inverse kinematics of many arms at once, within their joints' limits.
+class _ArmChainController(PDEEPoseController):
+    """ManiSkill's controller with a `SerialChain` in place of its kinematics.
 
-    Levenberg's damped steps; a joint that a step would push beyond its limit takes no part in it. ManiSkill's batched
-    solver takes one step, too coarse for 0.5 rad, and knows no limits.
-
-    Args:
-        kinematics: set up for batches, as it is on a GPU.
-        target: (N,) poses of the end link in the root frame of the kinematics.
-        qpos: (N, joints) present configuration.
-        limits: (joints, 2), rad.
-
-    Returns:
-        (N, joints) positions, and (N,) whether they reach the poses, to ``IK_TOLERANCE``.
+    ManiSkill's solver knows no joint limits on a CPU; on a GPU it waits for the device and takes a single step.
     """
-    low, high = limits.unbind(1)
-    damping = IK_DAMPING * torch.eye(len(limits), device=qpos.device)
-    missed = _missed(kinematics, target, qpos)
-    for _ in range(BATCHED_IK_ITERATIONS):
-        jacobian = cast("torch.Tensor", kinematics.pk_chain.jacobian(qpos))
-        missed = missed * (FARTHEST / torch.linalg.vector_norm(missed, dim=1, keepdim=True)).clamp(max=1.0)
-        downhill = (jacobian.mT @ missed[..., None])[..., 0]
-        stuck = ((qpos <= low) & (downhill < 0)) | ((qpos >= high) & (downhill > 0))
-        jacobian = jacobian.masked_fill(stuck[:, None], 0.0)
-        step = torch.linalg.solve(jacobian.mT @ jacobian + damping, jacobian.mT @ missed[..., None])
-        qpos = (qpos + step[..., 0]).clamp(low, high)
-        missed = _missed(kinematics, target, qpos)
-    return qpos, torch.linalg.vector_norm(missed, dim=1) < IK_TOLERANCE
+
+    def _initialize_joints(self) -> None:
+        super(PDEEPosController, self)._initialize_joints()  # not that class' own, which builds the kinematics
+        self.initial_qpos = None
+        links = self.articulation.links_map
+        self.ee_link, self.root_link = links[self.config.ee_link], links[cast("str", self.config.root_link_name)]
+        device = self.device if self.scene.gpu_sim_enabled else None
+        self._chain = SerialChain(self.config.urdf_path, self.root_link.name, self.ee_link.name, device)
+        names = tuple(joint.name for joint in self.joints)
+        if names != self._chain.joint_names:
+            what, expected = "the controlled joints are not those of the arm", ", ".join(self._chain.joint_names)
+            raise RobocasError(what, where=self.config.urdf_path, expected=expected, found=", ".join(names))
+        limits = as_double(native(self.articulation.get_qlimits()[0, self.active_joint_indices]))
+        self._lower, self._upper = limits[:, 0], limits[:, 1]
+
+    def _solve(self, target: Any, qpos: Any) -> tuple[Any, Any]:
+        """Solve inverse kinematics within the joint limits.
+
+        Args:
+            target: (N, 7) poses of the end effector in the arm's base frame, native.
+            qpos: (N, joints) where the arm is, rad, native.
+
+        Returns:
+            (N, joints) float32 positions, and (N,) whether they reach the poses, native.
+        """
+        target = as_double(target)
+        qpos, solved = self._chain.inverse(target[:, :3], target[:, 3:], as_double(qpos), self._lower, self._upper)
+        return as_float(qpos), solved
 
 
-def _missed(kinematics: Kinematics, target: Pose, qpos: torch.Tensor) -> torch.Tensor:
-    """(N, 6) translation, m, and rotation, about rad, from the end link to where it should be, in the root frame."""
-    reached = cast("Any", kinematics.pk_chain.forward_kinematics(qpos)).get_matrix()
-    turned = quaternion_multiply(target.q, quaternion_invert(matrix_to_quaternion(reached[:, :3, :3])))
-    return torch.cat([target.p - reached[:, :3, 3], 2 * turned[:, 1:] * turned[:, :1].sign()], dim=1)
-
-
-class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
+class RoboCASEEPoseController(EvenDrives, _ArmChainController):
     """End-effector pose control: deltas in the end effector's frame, or absolute poses in the arm's base frame.
 
     Differs from ManiSkill's: rotations have their natural sign; body-frame deltas work on a GPU too, since the target
@@ -95,14 +87,10 @@ class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
     were recorded, and is there when the step ends.
     """
 
-    def _check_gpu_sim_works(self) -> None:
-        """Every frame works: ``set_action`` hands poses in the root frame to inverse kinematics."""
-
     def _clip_and_scale_action(self, action: Any) -> Any:
-        position = self._middle[:3] + self._half[:3] * clamp(action[:, :3], -1, 1)
-        rotation, most = action[:, 3:], native(self.action_space_high)[3:]
-        size = native(torch.linalg.vector_norm(as_tensor(rotation), dim=1, keepdim=True).clamp(min=1.0))
-        return join([position, rotation / size * most])
+        position, rotation = clamp(action[:, :3], -1, 1), action[:, 3:]
+        rotation = rotation / clamp(length(rotation)[:, None], 1.0, np.inf)
+        return self._middle + self._half * join([position, rotation])
 
     def _wanted_pose(self, reference: Any, action: Any) -> Any:
         """(N, 7) the target in the arm's base frame, native.
@@ -115,17 +103,6 @@ class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
             return join([*ee_delta_target(reference[:, :3], reference[:, 3:], action)])
         return join([action[:, :3], rotations.from_euler(action[:, 3:6])])
 
-    def _initialize_joints(self) -> None:
-        super()._initialize_joints()
-        self._limits = self.articulation.get_qlimits()[0, self.active_joint_indices]
-        if not self.kinematics.use_gpu_ik:
-            of_model: list[torch.Tensor] = [
-                self.kinematics.pmodel_active_joint_indices,
-                self.kinematics.qmask,
-                self.kinematics.pmodel_controlled_joint_indices,
-            ]
-            self._chain, self._free, self._arm = (tensor.numpy() for tensor in of_model)
-
     sets_target_qvel = True
 
     def set_action(self, action: Any) -> None:
@@ -137,7 +114,7 @@ class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
             last = native(self._target_qpos)
         start = choose(abs(last - now) > ARM_SET_FROM_OUTSIDE, now, last)
         wanted = self._wanted_pose(reference, action)
-        target, solved = self._solve(wanted)
+        target, solved = self._solve(wanted, now)
         if not every(solved):
             stay = self._reference_pose() if reference is None else reference
             target, wanted = choose(solved[:, None], target, now), choose(solved[:, None], wanted, stay)
@@ -159,32 +136,18 @@ class RoboCASEEPoseController(EvenDrives, PDEEPoseController):
 
     def _reference_pose(self) -> Any:
         """`reference_pose`, (N, 7) native."""
+        position, quaternion = self._chain.forward(as_double(self._now()))
+        now = as_float(join([position, rotations.positive(quaternion)]))
         if not self.config.use_target or self._target_pose is None:
-            return native(self.ee_pose_at_base.raw_pose)
+            return now
         far, turned = EE_HELD_BACK
-        now = _relative_pose(cast("Link", self.root_link), self.ee_link)
         target = native(self._target_pose.raw_pose)
         distance = length(target[:, :3] - now[:, :3])
         cosine = abs((target[:, 3:] * now[:, 3:]).sum(1))  # of half the angle between them
         lost = (distance > far) | (cosine < np.cos(turned / 2))
         if none(lost):
             return target
-        return choose(lost[:, None], native(self.ee_pose_at_base.raw_pose), target)
-
-    def _solve(self, target: Any) -> tuple[Any, Any]:
-        """(N, joints) that reach poses (N, 7) in the arm's base frame, and (N,) whether they do, native."""
-        kinematics = self.kinematics
-        if self.scene.gpu_sim_enabled:
-            return batched_ik(kinematics, Pose(raw_pose=target), self.qpos, self._limits)
-        # what ManiSkill's `compute_ik` does, without its conversions
-        found, success, _ = kinematics.pmodel.compute_inverse_kinematics(
-            kinematics.end_link_idx,
-            sapien.Pose(target[0, :3], target[0, 3:]),
-            initial_qpos=self.articulation._objs[0].qpos[self._chain],
-            active_qmask=self._free,
-            max_iterations=100,
-        )
-        return found[self._arm].astype(np.float32)[None], np.array([success])
+        return choose(lost[:, None], now, target)
 
 
 @dataclass

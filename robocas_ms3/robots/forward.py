@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree
@@ -41,13 +42,13 @@ def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:
     """
     pose = np.tile(np.eye(4), (len(positions), 1, 1))
     columns = iter(np.asarray(positions, np.float64).T)
-    for kind, origin, axis in _joints(urdf, root, tip):
-        pose = pose @ origin
-        if kind == "fixed":
+    for joint in read_joints(urdf, root, tip):
+        pose = pose @ joint.origin
+        if joint.kind == "fixed":
             continue
-        along = next(columns)[:, None] * axis
+        along = next(columns)[:, None] * joint.axis
         motion = np.tile(np.eye(4), (len(positions), 1, 1))
-        if kind == "prismatic":
+        if joint.kind == "prismatic":
             motion[:, :3, 3] = along
         else:
             motion[:, :3, :3] = Rotation.from_rotvec(along).as_matrix()
@@ -55,11 +56,27 @@ def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:
     return pose
 
 
+@dataclass(frozen=True)
+class Joint:
+    """A joint of a URDF.
+
+    Attributes:
+        name, kind: its ``name`` and ``type``.
+        origin: (4, 4) m, its frame in the parent link's.
+        axis: (3,) in its own frame.
+    """
+
+    name: str
+    kind: str
+    origin: Array
+    axis: Array
+
+
 @lru_cache(maxsize=8)
-def _joints(urdf: Path, root: str, tip: str) -> list[tuple[str, Array, Array]]:
-    """(type, origin (4, 4), axis (3,)) of each joint from one link to another."""
+def read_joints(urdf: Path, root: str, tip: str) -> list[Joint]:
+    """Read the joints from one link of a URDF to another, fixed ones included, in this order."""
     by_child = {joint.find("child").attrib["link"]: joint for joint in ElementTree.parse(urdf).iterfind("joint")}  # type: ignore[union-attr]
-    found: list[tuple[str, Array, Array]] = []
+    found: list[Joint] = []
     while tip != root:
         joint = by_child[tip]
         origin, axis = np.eye(4), joint.find("axis")
@@ -67,7 +84,8 @@ def _joints(urdf: Path, root: str, tip: str) -> list[tuple[str, Array, Array]]:
         if at is not None:
             origin[:3, 3] = _numbers(at.get("xyz", "0 0 0"))
             origin[:3, :3] = Rotation.from_euler("xyz", _numbers(at.get("rpy", "0 0 0"))).as_matrix()
-        found.append((joint.attrib["type"], origin, _numbers("1 0 0" if axis is None else axis.attrib["xyz"])))
+        direction = _numbers("1 0 0" if axis is None else axis.attrib["xyz"])
+        found.append(Joint(joint.attrib["name"], joint.attrib["type"], origin, direction))
         tip = joint.find("parent").attrib["link"]  # type: ignore[union-attr]
     return found[::-1]
 

@@ -1,6 +1,7 @@
-"""Rotations as ManiSkill computes them, on tensors or NumPy's arrays (`arrays`): the same numbers, rounded alike.
+"""Rotations on tensors or NumPy's arrays (`arrays`), in ManiSkill's conventions. Quaternions are wxyz.
 
-On a CPU, where batches have one row, ManiSkill's take a third of a millisecond. Quaternions are wxyz.
+ManiSkill's own functions take a third of a millisecond on a CPU, and its conversions of matrices wait for a GPU.
+Results are float32, computed in float64: products of float32 matrices may be TF32 on a GPU.
 """
 
 from __future__ import annotations
@@ -9,75 +10,53 @@ from typing import Any
 
 import numpy as np
 import torch
-from mani_skill.utils.geometry.rotation_conversions import (
-    euler_angles_to_matrix,
-    matrix_to_quaternion,
-    quaternion_apply,
-    quaternion_multiply,
-)
-from numpy.typing import NDArray
 from torch import Tensor
 
-from robocas_ms3.arrays import Array
-
-# columns of b that w, x, y and z of a are multiplied with in a product, and their signs
-_COLUMNS = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
-_SIGNS = np.array([[1, 1, 1, 1], [-1, 1, -1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1]], np.float32)
-_INVERSE = np.array([1, -1, -1, -1], np.float32)
-_ZERO, _ONE, _TWO, _LEAST = np.float32(0), np.float32(1), np.float32(2), np.float32(0.1)
+from robocas_ms3.arrays import Array, as_double, as_float, choose, join, matmul
 
 
 def from_euler(angles: Array) -> Array:
-    """(N, 4) unit quaternions of intrinsic XYZ Euler angles (N, 3) float32, rad: R = Rx Ry Rz; w is not negative."""
-    if isinstance(angles, Tensor):
-        return matrix_to_quaternion(euler_angles_to_matrix(angles, "XYZ"))
-    # NumPy's own functions round otherwise
-    tensor = torch.from_numpy(angles)
-    cosines, sines = torch.cos(tensor).numpy(), torch.sin(tensor).numpy()
-    return np.stack([_from_cosines(*both) for both in zip(cosines, sines, strict=True)])
-
-
-def _from_cosines(cosines: NDArray[np.float32], sines: NDArray[np.float32]) -> NDArray[np.float32]:
-    (cx, cy, cz), (sx, sy, sz) = cosines, sines
-    m10, m20 = sx * sy, -cx * sy
-    m00, m01, m02 = cy * cz, -cy * sz, sy
-    m10, m11, m12 = m10 * cz + cx * sz, cx * cz - m10 * sz, -sx * cy
-    m20, m21, m22 = m20 * cz + sx * sz, sx * cz - m20 * sz, cx * cy
-    # of each number of the quaternion, twice its size
-    w = _ONE + m00 + m11 + m22
-    x = _ONE + m00 - m11 - m22
-    y = _ONE - m00 + m11 - m22
-    z = _ONE - m00 - m11 + m22
-    sizes = torch.sqrt(torch.from_numpy(np.maximum([w, x, y, z], _ZERO))).numpy()
-    largest = int(sizes.argmax())
-    size = sizes[largest]
-    rows = (
-        (size * size, m21 - m12, m02 - m20, m10 - m01),
-        (m21 - m12, size * size, m10 + m01, m02 + m20),
-        (m02 - m20, m10 + m01, size * size, m12 + m21),
-        (m10 - m01, m20 + m02, m21 + m12, size * size),
-    )
-    quaternion = np.array(rows[largest], np.float32) / (_TWO * max(size, _LEAST))
-    return -quaternion if quaternion[0] < 0 else quaternion
+    """Return unit quaternions (N, 4), w >= 0, of intrinsic XYZ Euler angles (N, 3), rad: R = Rx Ry Rz."""
+    half = 0.5 * as_double(angles)
+    library: Any = torch if isinstance(half, Tensor) else np
+    (cx, cy, cz), (sx, sy, sz) = library.cos(half).T, library.sin(half).T
+    yz = cy * cz, sy * sz, sy * cz, cy * sz
+    parts = [
+        cx * yz[0] - sx * yz[1],
+        sx * yz[0] + cx * yz[1],
+        cx * yz[2] - sx * yz[3],
+        cx * yz[3] + sx * yz[2],
+    ]
+    return positive(as_float(library.stack(parts, 1)))
 
 
 def multiply(first: Array, second: Array) -> Array:
-    """(N, 4) products of unit quaternions (N, 4), float32, as those whose w is not negative."""
-    if isinstance(first, Tensor):
-        return quaternion_multiply(first, second)
-    product = _product(first, second)
-    return np.where(product[:, :1] < 0, -product, product)
+    """Return products (N, 4), w >= 0, of unit quaternions (N, 4)."""
+    product = matmul(left_matrix(as_double(first)), as_double(second)[:, :, None])
+    return positive(as_float(product[:, :, 0]))
 
 
 def turn(quaternion: Array, vector: Array) -> Array:
-    """(N, 3) vectors (N, 3) turned by unit quaternions (N, 4), float32."""
+    """Return vectors (N, 3) turned by unit quaternions (N, 4)."""
+    left = left_matrix(as_double(quaternion))
+    half = matmul(left[:, :, 1:], as_double(vector)[:, :, None])
+    return as_float(matmul(left, join([-half[:, :1], half[:, 1:]], axis=1))[:, 1:, 0])
+
+
+def positive(quaternion: Array) -> Array:
+    """Return the same rotations as quaternions (N, 4) with w >= 0."""
+    return choose(quaternion[:, :1] < 0, -quaternion, quaternion)
+
+
+def left_matrix(quaternion: Array) -> Array:
+    """Return the matrices (N, 4, 4) that multiply quaternions by others (N, 4) from the left."""
     if isinstance(quaternion, Tensor):
-        return quaternion_apply(quaternion, vector)
-    pure = np.zeros_like(quaternion)
-    pure[:, 1:] = vector
-    return _product(_product(quaternion, pure), quaternion * _INVERSE)[:, 1:]
+        return torch.stack(_left_numbers(*quaternion.T), 1).reshape(-1, 4, 4)
+    return (quaternion @ _LEFT).reshape(-1, 4, 4)
 
 
-def _product(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
-    parts = first[:, :, None] * (_SIGNS * second[:, _COLUMNS])
-    return parts[:, 0] + parts[:, 1] + parts[:, 2] + parts[:, 3]
+def _left_numbers(w: Any, x: Any, y: Any, z: Any) -> list[Any]:
+    return [w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w]
+
+
+_LEFT = np.array([_left_numbers(*unit) for unit in np.eye(4)])

@@ -9,6 +9,9 @@ from motions import matrix, moved
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.ee_deltas import to_ee_delta_action
+from robocas_ms3.robots.forward import chain
+from robocas_ms3.robots.urdf import robot_files
 
 MODES = {"pd_joint_pos": 8, "pd_joint_delta_pos": 8, "pd_ee_delta_pose": 7, "pd_ee_pose": 7}
 ALL_MODES = {**MODES, **{f"{mode}_base": size + 3 for mode, size in MODES.items()}}
@@ -71,6 +74,49 @@ def test_unreachable_pose_leaves_the_arm_where_it_is(make_env):
     for _ in range(5):
         env.step(np.array([1.9, 0, 0, 0, 0, 0, 1], np.float32))
     assert agent.robot.qpos[0, 3:10].numpy() == pytest.approx(MOBILE_PANDA.arm_evaluation_start, abs=1e-3)
+
+
+def near_a_limit(agent, joint: int) -> tuple[np.ndarray, np.ndarray]:
+    """Put an arm joint 0.01 rad before its upper limit; poses of the TCP there and with the joint 0.1 rad beyond."""
+    arms = np.array([MOBILE_PANDA.arm_evaluation_start] * 2)
+    arms[:, joint - 1] = MOBILE_PANDA.arm_limits[joint - 1][1] + np.array([-0.01, 0.1])
+    agent.reset(np.array([0, 0, 0, *arms[0], 0.04, 0.04]))
+    agent.controller.reset()
+    return tuple(chain(robot_files().arm_urdf, MOBILE_PANDA.arm_base_link, MOBILE_PANDA.tcp_link, arms))
+
+
+def ee_action(mode: str, now: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    if mode == "pd_ee_pose":
+        return np.array([*goal[:3, 3], *Rotation.from_matrix(goal[:3, :3]).as_euler("XYZ"), 1], np.float32)
+    translation, rotation = moved(now, goal)
+    return np.append(to_ee_delta_action(translation, rotation), np.float32(1))
+
+
+@pytest.mark.parametrize("mode", ["pd_ee_pose", "pd_ee_delta_pose"])
+def test_a_pose_beyond_the_joint_limits_leaves_the_arm_where_it_is(make_env, mode):
+    """The elbow alone sets the distance between shoulder and wrist, so no other joint can make up for its limit."""
+    env, agent = make_env(mode)
+    now, goal = near_a_limit(agent, 4)
+    action, start = ee_action(mode, now, goal), agent.robot.qpos[0, 3:10].numpy().copy()
+    for _ in range(10):
+        env.step(action)
+        assert agent.robot.qpos[0, 3:10].numpy() == pytest.approx(start, abs=1e-3)
+
+
+@pytest.mark.parametrize("mode", ["pd_ee_pose", "pd_ee_delta_pose"])
+def test_other_joints_make_up_for_one_at_its_limit(make_env, mode):
+    env, agent = make_env(mode)
+    now, goal = near_a_limit(agent, 7)
+    action = ee_action(mode, now, goal)
+    for _ in range(20):
+        env.step(action)
+        action = np.array([*np.zeros(6), 1], np.float32) if mode == "pd_ee_delta_pose" else action
+    translation, rotation = moved(goal, matrix(agent.tcp_in_arm_base))
+    assert np.linalg.norm(translation) < 5e-4
+    assert np.linalg.norm(rotation) < 1e-3
+    targets = agent.controller_targets()["arm"]["target_qpos"][0].numpy()
+    lower, upper = np.array(MOBILE_PANDA.arm_limits, np.float32).T
+    assert ((targets >= lower) & (targets <= upper)).all()
 
 
 def test_gripper_plus_one_opens_minus_one_closes(make_env):

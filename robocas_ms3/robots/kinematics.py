@@ -1,0 +1,193 @@
+"""Forward kinematics, Jacobians and inverse kinematics of an arm, for batches of configurations.
+
+The same code runs on tensors, where it never waits for the device, and on NumPy's arrays, which are faster on a CPU.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from robocas_ms3.arrays import Array, choose, clamp, join, matmul, none
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.robots.forward import read_joints
+from robocas_ms3.robots.rotations import left_matrix, positive
+
+IK_ITERATIONS = 8
+IK_DAMPING, IK_LEAST_DAMPING = 0.1, 1e-6  # times the squared error, and added to it
+IK_MAX_ERROR = 0.5  # m and rad together that one iteration corrects: linear steps diverge beyond
+IK_TOLERANCE = 1e-4  # m and rad together between a target and a pose that reaches it
+IK_CONVERGED = 1e-5  # m and rad together below which a configuration is not improved
+
+
+class SerialChain:
+    """Revolute joints between two links of a robot, with constants read from its URDF.
+
+    All arrays are float64: float32 leaves errors near the tolerance, and TF32 of a GPU's products would exceed it.
+
+    Args:
+        urdf: the robot.
+        root, tip: names of the links. Poses are those of the tip in the root's frame.
+        device: where the tensors are that the chain is used with; None: it is used with NumPy's arrays.
+
+    Attributes:
+        joint_names: the n joints, from the root to the tip.
+
+    Raises:
+        RobocasError: a joint between the links is neither fixed nor revolute.
+    """
+
+    def __init__(self, urdf: Path | str, root: str, tip: str, device: Any = None) -> None:
+        names: list[str] = []
+        fixed: list[NDArray[np.float64]] = []  # n + 1 transforms between joint frames whose z is the joint's axis
+        pending = np.eye(4)
+        for joint in read_joints(Path(urdf), root, tip):
+            if joint.kind not in ("fixed", "revolute"):
+                where = f"{urdf}, {joint.name}"
+                raise RobocasError("unsupported joint", where=where, expected="fixed or revolute", found=joint.kind)
+            pending = pending @ joint.origin
+            if joint.kind == "revolute":
+                to_axis = _frame_about(joint.axis)
+                names.append(joint.name)
+                fixed.append(pending @ to_axis)
+                pending = to_axis.T
+        self.joint_names = tuple(names)
+        constants = (*_joint_constants([*fixed, pending]), _QUOTIENT, np.eye(6))
+        if device is not None:
+            constants = tuple(torch.tensor(value, dtype=torch.float64, device=device) for value in constants)
+        self._angles, self._shift, self._weights, self._constant, self._quotient, self._identity = constants
+
+    def forward(self, qpos: Array) -> tuple[Array, Array]:
+        """Return the pose of the tip in the root's frame.
+
+        Args:
+            qpos: (N, n) rad.
+
+        Returns:
+            Positions (N, 3), m, and unit quaternions wxyz (N, 4), of either sign.
+        """
+        frames = self._frames(qpos)
+        return frames[-1, 0, :, :3, 3], frames[-1, 1, :, :, 0]
+
+    def jacobian(self, qpos: Array) -> Array:
+        """Return the Jacobians (N, 6, n) of the tip at (N, n): m/rad, then rad/rad, in the root's frame."""
+        return _twists(self._frames(qpos)).swapaxes(1, 2)
+
+    def inverse(
+        self, position: Array, quaternion: Array, qpos: Array, lower: Array, upper: Array
+    ) -> tuple[Array, Array]:
+        """Find joint positions within limits that reach poses, near given ones.
+
+        Levenberg-Marquardt with a damping proportional to the squared error (Sugihara, IEEE T-RO 27(5), 2011). A joint
+        at a limit takes no part in a step that would push it beyond. Each row's result is independent of the others.
+
+        Args:
+            position: (N, 3) m, targets of the tip in the root's frame.
+            quaternion: (N, 4) wxyz.
+            qpos: (N, n) rad, where the search starts.
+            lower, upper: (n,) rad, limits.
+
+        Returns:
+            Joint positions (N, n) within the limits, and (N,) whether they reach the targets to ``IK_TOLERANCE``.
+        """
+        to_target = (quaternion @ self._quotient).reshape(-1, 4, 4)
+        position, qpos, lower, upper = position[..., None], qpos[..., None], lower[:, None], upper[:, None]
+        iteration = 0
+        while True:
+            frames = self._frames(qpos[..., 0])
+            tip = frames[-1]
+            rotation = matmul(to_target, tip[1, ..., :1])
+            rotation = positive(rotation)
+            error = join([position - tip[0, :, :3, 3:], 2 * rotation[:, 1:]], axis=1)  # (N, 6, 1)
+            square = matmul(error.swapaxes(1, 2), error)  # (N, 1, 1)
+            moving = square > IK_CONVERGED**2
+            if iteration == IK_ITERATIONS or none(moving):
+                return qpos[..., 0], square[:, 0, 0] < IK_TOLERANCE**2
+            error = error * moving / clamp(square**0.5 / IK_MAX_ERROR, 1.0, np.inf)
+            twists = _twists(frames)
+            room = choose(matmul(twists, error) < 0, qpos - lower, upper - qpos)
+            twists = twists * (room > 0)
+            damping = (IK_DAMPING * square + IK_LEAST_DAMPING) * self._identity
+            step = matmul(twists, _solve(matmul(twists.swapaxes(1, 2), twists) + damping, error))
+            qpos = clamp(qpos + step, lower, upper)
+            iteration += 1
+
+    def _frames(self, qpos: Array) -> Array:
+        """Return poses of the joints and the tip, and the `left_matrix` of each orientation: (n + 1, 2, N, 4, 4)."""
+        rows, count = len(qpos), qpos.shape[1] + 1
+        angles = qpos @ self._angles + self._shift
+        sines = torch.sin(angles) if isinstance(angles, Tensor) else np.sin(angles)
+        local = sines @ self._weights + self._constant
+        frames = local.reshape(rows, -1, 4, 4).swapaxes(0, 1).reshape(-1, 4, 4)
+        # A prefix product: each matrix becomes that over the last 2, 4, 8, ... joints.
+        joined = 1
+        while joined < count:
+            skipped = 2 * rows * joined
+            later = frames[skipped:]
+            later[:] = matmul(frames[:-skipped], later)
+            joined *= 2
+        return frames.reshape(count, 2, rows, 4, 4)
+
+
+def _joint_constants(fixed: list[NDArray[np.float64]]) -> tuple[NDArray[np.float64], ...]:
+    """Return constants A, b, W, c with which sin(q A + b) W + c is what `SerialChain._frames` multiplies.
+
+    Four columns of A for each joint: sines of its angle q and of q + 90 deg turn poses about z, those of q / 2 and
+    q / 2 + 90 deg turn quaternions.
+    """
+    count = len(fixed) - 1
+    angles = np.kron(np.eye(count), [1, 1, 0.5, 0.5])
+    shift = np.tile([0, np.pi / 2], 2 * count)
+    weights, constant = np.zeros((count, 4, count + 1, 2, 4, 4)), np.zeros((count + 1, 2, 4, 4))
+    quarter_turn = np.zeros((4, 4))
+    quarter_turn[:2, :2] = [[0, -1], [1, 0]]
+    half_turn = left_matrix(np.array([[0.0, 0, 0, 1]]))[0]
+    for i, pose in enumerate(fixed):
+        quaternion = left_matrix(Rotation.from_matrix(pose[:3, :3]).as_quat()[None, [3, 0, 1, 2]])[0]
+        if i == count:
+            constant[i] = pose, quaternion
+        else:
+            constant[i, 0] = pose @ np.diag([0, 0, 1, 1])
+            weights[i, :2, i, 0] = pose @ quarter_turn, pose @ np.diag([1, 1, 0, 0])
+            weights[i, 2:, i, 1] = quaternion @ half_turn, quaternion
+    return angles, shift, weights.reshape(4 * count, -1), constant.reshape(-1)
+
+
+def _frame_about(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a rotation (4, 4) that turns z into an axis."""
+    z = axis / np.linalg.norm(axis)
+    x = np.cross([1, 0, 0] if abs(z[1]) > 0.9 else [0, 1, 0], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    return pose
+
+
+_QUOTIENT = (left_matrix(np.eye(4)) @ np.diag([1, -1, -1, -1])).reshape(4, 16)
+"""Turns quaternions a (N, 4) into matrices (N, 16) that multiply quaternions b to a times the conjugate of b."""
+
+
+def _twists(frames: Array) -> Array:
+    """Return the motions (N, n, 6) of the tip, m and rad, per rad of each joint."""
+    poses = frames[:, 0, :, :3]
+    axes, points = poses[:-1, ..., 2], poses[..., 3]
+    return join([_cross(axes, points[-1:] - points[:-1]), axes]).swapaxes(0, 1)
+
+
+def _cross(first: Array, second: Array) -> Array:
+    if isinstance(first, Tensor):
+        return torch.linalg.cross(first, second)
+    products = first[..., None] * second[..., None, :]  # `np.cross` takes five times as long
+    return (products - products.swapaxes(-1, -2)).reshape(*first.shape[:-1], 9)[..., [5, 6, 1]]
+
+
+def _solve(matrices: Array, columns: Array) -> Array:
+    if isinstance(matrices, Tensor):
+        return torch.linalg.solve_ex(matrices, columns)[0]  # `solve` waits for the device, to report singular matrices
+    return np.linalg.solve(matrices, columns)
