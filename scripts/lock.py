@@ -1,9 +1,10 @@
-"""Write requirements.lock: what pip resolves today for every Python the project supports, merged with markers.
+"""Write requirements.lock: the versions that pip resolves today for every supported Python, merged with markers.
 
-    python scripts/lock.py python3.10 python3.11 python3.12
+    python scripts/lock.py python3.10 python3.11 python3.12 python3.13
 
-Needs Python 3.11 itself. Packages that come with one build of torch only (CUDA libraries) stay out, so that the lock
-suits every build.
+Runs with Python 3.11 or newer. CUDA packages that come with one build of torch are left out, so that the lock fits every
+build. Some packages pin a requirement that we do not use and that has no build for a supported Python (``IGNORED``): the
+lock has the package without that requirement, and is installed with ``pip install --no-deps``.
 """
 
 import json
@@ -13,48 +14,72 @@ import tempfile
 from pathlib import Path
 
 import tomllib
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 TORCH = "torch==2.13.0"
-NOT_INSTALLED = {"slurm", "ray"}  # extras that setup.sh leaves out
+NUMPY = "numpy==2.2.6"  # the newest for Python 3.10 and for LeRobot 0.6, so that all environments compute the same bits
+OPENPI = "openpi-client==0.1.2"  # tests send messages with it; not in the dev extra because it asks for numpy < 2
+NOT_INSTALLED = {"slurm", "ray", "lerobot-env"}  # extras that setup.sh does not install into .venv
 OF_ONE_TORCH_BUILD = ("nvidia-c", "nvidia-n", "cuda-", "triton")
+IGNORED = {
+    "mani-skill": {"mplib"},  # ==0.1.1: no wheel for Python 3.13, and nothing here imports it
+    "openpi-client": {"numpy"},  # < 2: its code works with numpy 2
+}
 HEADER = """\
-# Exact versions for `pip install -c`; written by scripts/lock.py, not by hand.
-# numpy stays below 2: mplib 0.1.1 dies with a segmentation fault under numpy 2.
+# Exact versions, written by scripts/lock.py, not by hand. Install with `pip install --no-deps -r requirements.lock`
+# after torch: mani_skill pins mplib 0.1.1, which this project does not use and which has no wheel for Python 3.13.
 """
 
 
-def requirements() -> list[str]:
-    """Everything pyproject.toml asks for, all extras that setup.sh installs included, torch at its pinned version."""
+def project_requirements() -> list[str]:
+    """Return what pyproject.toml asks for with the extras that setup.sh installs, torch at its pinned version."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    found = [*project["build-system"]["requires"], *project["project"]["dependencies"], TORCH]
+    found = [*project["build-system"]["requires"], *project["project"]["dependencies"], TORCH, NUMPY, OPENPI]
     for name, extra in project["project"]["optional-dependencies"].items():
-        if name in NOT_INSTALLED:
-            continue
-        found += [item for item in extra if not item.startswith("robocas-ms3")]
+        if name not in NOT_INSTALLED:
+            found += [item for item in extra if not item.startswith("robocas-ms3")]
     return found
 
 
-def resolve(interpreter: str) -> tuple[str, dict[str, str]]:
-    """Ask pip what it would install: the Python version ("3.11") and {package: version}."""
+def pip_report(interpreter: str, *arguments: str) -> dict:
+    """Return the JSON report of what pip would install for an interpreter."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
+        command = [sys.executable, "-m", "pip", "--python", interpreter, "install", "--quiet", "--dry-run"]
         subprocess.run(
-            [sys.executable, "-m", "pip", "--python", interpreter, "install", "--quiet", "--dry-run"]
-            + ["--ignore-installed", "--only-binary=:all:", "--report", str(report), *requirements()],
-            check=True,
+            [*command, "--ignore-installed", "--only-binary=:all:", "--report", str(report), *arguments], check=True
         )
-        data = json.loads(report.read_text(encoding="utf-8"))
-    packages = {
-        item["metadata"]["name"].lower().replace("_", "-"): item["metadata"]["version"].split("+")[0]
-        for item in data["install"]
-    }
-    kept = {name: version for name, version in packages.items() if not name.startswith(OF_ONE_TORCH_BUILD)}
-    return data["environment"]["python_version"], kept
+        return json.loads(report.read_text(encoding="utf-8"))
+
+
+def resolve(interpreter: str) -> tuple[str, dict[str, str]]:
+    """Return the Python version ("3.11") and {package: version} of everything to install."""
+    wanted, packages = [], {}
+    for requirement in project_requirements():
+        name = canonicalize_name(Requirement(requirement).name)
+        if name not in IGNORED:
+            wanted.append(requirement)
+            continue
+        (item,) = pip_report(interpreter, "--no-deps", requirement)["install"]
+        packages[name] = item["metadata"]["version"]
+        needs = [Requirement(line) for line in item["metadata"].get("requires_dist", [])]
+        wanted += [
+            str(need)
+            for need in needs
+            if canonicalize_name(need.name) not in IGNORED[name] and "extra" not in str(need.marker or "")
+        ]
+    report = pip_report(interpreter, *wanted)
+    for item in report["install"]:
+        name = canonicalize_name(item["metadata"]["name"])
+        if not name.startswith(OF_ONE_TORCH_BUILD):
+            packages[name] = item["metadata"]["version"].split("+")[0]
+    return report["environment"]["python_version"], packages
 
 
 def merge(by_python: dict[str, dict[str, str]]) -> str:
-    """One line a package where all Pythons agree, else one a version, with a marker naming its Pythons."""
+    """Return one line per package where all Pythons agree, else one line per version with a marker for its Pythons."""
     lines = []
     for name in sorted({name for packages in by_python.values() for name in packages}):
         pythons: dict[str, list[str]] = {}

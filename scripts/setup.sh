@@ -1,40 +1,51 @@
 #!/usr/bin/env bash
 # Sets up everything the project needs; safe to run again (a second or so when there is nothing to do).
 #
-#   bash scripts/setup.sh
+#   bash scripts/setup.sh               # .venv: everything at the versions of requirements.lock, Python 3.10 to 3.13
+#   bash scripts/setup.sh --lerobot     # .venv-lerobot: RoboCAS and LeRobot 0.6 in one environment, Python 3.12
 #
-# ROBOCAS_VENV            folder of the virtual environment (default: .venv in the checkout)
-# ROBOCAS_PYTHON          interpreter to make it with (default: the first of python3.11, 3.12, 3.10, python3 that fits)
-# ROBOCAS_SKIP_RENDERER=1 leave rendering as it is
-# ROBOCAS_SKIP_BROWSER=1  install no Chromium for the tests of robocas view
+# ROBOCAS_VENV            folder of the virtual environment instead of .venv or .venv-lerobot
+# ROBOCAS_PYTHON          interpreter to create it with (default: the first of python3.11, 3.12, 3.13, 3.10, python3 that
+#                         is supported)
+# ROBOCAS_NUMPY           another version of numpy than that of requirements.lock, such as 1.26.4
+# ROBOCAS_SKIP_RENDERER=1 do not install a software renderer
+# ROBOCAS_SKIP_BROWSER=1  do not install Chromium for the tests of robocas view
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 TORCH=torch==2.13.0
-venv=${ROBOCAS_VENV:-.venv}
+case "${1:-}" in
+    "") lerobot=0 default_venv=.venv pythons="python3.11 python3.12 python3.13 python3.10 python3 python" ;;
+    --lerobot) lerobot=1 default_venv=.venv-lerobot pythons="python3.12 python3 python" ;;
+    *) echo "usage: bash scripts/setup.sh [--lerobot]" >&2; exit 2 ;;
+esac
+venv=${ROBOCAS_VENV:-$default_venv}
 python=$venv/bin/python
 stamp_file=$venv/.robocas-setup
 
 say() { printf 'setup: %s\n' "$*"; }
 fail() { printf 'setup: error: %s\n' "$*" >&2; exit 1; }
 
-fits() { "$1" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))' 2>/dev/null; }
+# LeRobot 0.6 needs Python 3.12 or newer; pip finds no mplib, which mani_skill pins, for 3.13.
+if [ "$lerobot" = 1 ]; then supported="(3, 12) <= v < (3, 13)" versions="Python 3.12"
+else supported="(3, 10) <= v < (3, 14)" versions="Python 3.10, 3.11, 3.12 or 3.13"; fi
+is_supported() { "$1" -c "import sys; v = sys.version_info; sys.exit(not ($supported))" 2>/dev/null; }
 
 find_python() {
     local candidate
-    for candidate in ${ROBOCAS_PYTHON:-python3.11 python3.12 python3.10 python3 python}; do
-        if fits "$candidate"; then
+    for candidate in ${ROBOCAS_PYTHON:-$pythons}; do
+        if is_supported "$candidate"; then
             command -v "$candidate"
             return
         fi
     done
-    fail "no Python 3.10, 3.11 or 3.12 found (numpy < 2 has no builds for newer ones)." \
-        "Install one, or name it: ROBOCAS_PYTHON=/path/to/python3.11 bash scripts/setup.sh"
+    fail "${ROBOCAS_PYTHON:-no interpreter on the PATH} is not $versions." \
+        "Install one, or name it: ROBOCAS_PYTHON=/path/to/python3.12 bash scripts/setup.sh $*"
 }
 
 make_venv() {
     local base
-    base=$(find_python)
+    base=$(find_python "$@")
     say "virtual environment $venv, $("$base" --version)"
     if "$base" -m venv --clear "$venv" >/dev/null 2>&1; then return; fi
     # Debian and Ubuntu keep ensurepip in a package of its own.
@@ -49,24 +60,31 @@ make_venv() {
 
 install_packages() {
     local pip=("$python" -m pip --disable-pip-version-check install --quiet)
-    say "packages, at the versions of requirements.lock (minutes the first time)"
     "${pip[@]}" --upgrade 'pip>=24'
-    # torch first and by itself: a CPU build where one is at hand satisfies it, and nothing later replaces it.
-    "${pip[@]}" -c requirements.lock "$TORCH"
-    "${pip[@]}" -c requirements.lock hatchling editables
-    "${pip[@]}" -c requirements.lock --no-build-isolation -e '.[dev]'
-    # opencv-python wants libGL, which a machine without a desktop lacks; the headless build of the same version does not.
+    if [ "$lerobot" = 1 ]; then
+        say "robocas-ms3[lerobot-env] (minutes and gigabytes the first time)"
+        "${pip[@]}" -e '.[lerobot-env]'
+    else
+        say "packages, at the versions of requirements.lock (minutes the first time)"
+        # torch first, with its dependencies: a CPU build satisfies it where pip finds one, and nothing later replaces it.
+        "${pip[@]}" -c requirements.lock "$TORCH"
+        # The lock is complete. --no-deps: mani_skill pins mplib, which is not used and has no wheel for Python 3.13.
+        "${pip[@]}" --no-deps -r requirements.lock
+        "${pip[@]}" --no-deps --no-build-isolation -e .
+        if [ -n "${ROBOCAS_NUMPY:-}" ]; then "${pip[@]}" --no-deps "numpy==$ROBOCAS_NUMPY"; fi
+    fi
+    # opencv-python needs libGL, which machines without a desktop lack; the headless build does not.
     if ! "$python" -c 'import cv2' 2>/dev/null; then
         "${pip[@]}" --no-deps --force-reinstall \
             "opencv-python-headless==$("$python" -c 'from importlib.metadata import version; print(version("opencv-python"))')"
-        "$python" -c 'import cv2' || fail "OpenCV can't be imported; the line above says what it lacks."
+        "$python" -c 'import cv2' || fail "OpenCV cannot be imported; the line above names the missing library."
     fi
 }
 
-stamp=$({ pwd; cat pyproject.toml requirements.lock scripts/setup.sh; } | sha256sum | cut -d ' ' -f 1)
-if [ "$(cat "$stamp_file" 2>/dev/null)" != "$stamp" ] || ! fits "$python"; then
+stamp=$({ pwd; echo "$lerobot ${ROBOCAS_NUMPY:-}"; cat pyproject.toml requirements.lock scripts/setup.sh; } | sha256sum | cut -d ' ' -f 1)
+if [ "$(cat "$stamp_file" 2>/dev/null)" != "$stamp" ] || ! is_supported "$python"; then
     rm -f "$stamp_file"
-    fits "$python" || make_venv
+    is_supported "$python" || make_venv "$@"
     install_packages
     echo "$stamp" >"$stamp_file"
     say "done: $venv/bin/robocas"
