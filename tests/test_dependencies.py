@@ -76,7 +76,6 @@ def test_locked_versions_are_the_ones_installed():
             item = Requirement(line)
             if item.marker is None or item.marker.evaluate():
                 locked[item.name] = str(item.specifier).removeprefix("==")
-    assert locked["numpy"].startswith("1.26.")
     for name in declared():
         installed = metadata.version(name).partition("+")[0]
         assert locked[name] == installed, f"{name}: run scripts/setup.sh"
