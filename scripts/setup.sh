@@ -63,7 +63,7 @@ install_packages() {
     "${pip[@]}" --upgrade 'pip>=24'
     if [ "$lerobot" = 1 ]; then
         say "robocas-ms3[lerobot-env] (minutes and gigabytes the first time)"
-        "${pip[@]}" -e '.[lerobot-env]'
+        "${pip[@]}" -e '.[lerobot-env]' ./lerobot_env_robocas
     else
         say "packages, at the versions of requirements.lock (minutes the first time)"
         # torch first, with its dependencies: a CPU build satisfies it where pip finds one, and nothing later replaces it.
@@ -81,7 +81,7 @@ install_packages() {
     fi
 }
 
-stamp=$({ pwd; echo "$lerobot ${ROBOCAS_NUMPY:-}"; cat pyproject.toml requirements.lock scripts/setup.sh; } | sha256sum | cut -d ' ' -f 1)
+stamp=$({ pwd; echo "$lerobot ${ROBOCAS_NUMPY:-}"; cat pyproject.toml lerobot_env_robocas/pyproject.toml requirements.lock scripts/setup.sh; } | sha256sum | cut -d ' ' -f 1)
 if [ "$(cat "$stamp_file" 2>/dev/null)" != "$stamp" ] || ! is_supported "$python"; then
     rm -f "$stamp_file"
     is_supported "$python" || make_venv "$@"
