@@ -2,9 +2,9 @@
 
     python scripts/lock.py python3.10 python3.11 python3.12 python3.13
 
-Runs with Python 3.11 or newer. CUDA packages that come with one build of torch are left out, so that the lock fits every
-build. Some packages pin a requirement that we do not use and that has no build for a supported Python (``IGNORED``): the
-lock has the package without that requirement, and is installed with ``pip install --no-deps``.
+Runs with Python 3.11 or newer. CUDA packages that come with one build of torch are left out, so that the lock fits all
+builds. Some packages pin a requirement that we do not use and that has no build for a supported Python (``IGNORED``):
+the lock has the package without that requirement, and is installed with ``pip install --no-deps``.
 """
 
 import json

@@ -39,7 +39,7 @@ find_python() {
             return
         fi
     done
-    fail "${ROBOCAS_PYTHON:-no interpreter on the PATH} is not $versions." \
+    fail "found no $versions (tried: ${ROBOCAS_PYTHON:-$pythons})." \
         "Install one, or name it: ROBOCAS_PYTHON=/path/to/python3.12 bash scripts/setup.sh $*"
 }
 

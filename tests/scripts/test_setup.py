@@ -74,10 +74,19 @@ def test_no_script_names_a_host():
             assert not re.search(r"://(?!127\.0\.0\.1)", path.read_text()), path.name
 
 
-def test_a_python_that_does_not_fit_is_named():
-    done = bash(f"bash {SCRIPTS / 'setup.sh'}", ROBOCAS_VENV="/nonexistent/venv", ROBOCAS_PYTHON="no-such-python")
+@pytest.mark.parametrize(("option", "newest"), [("", "3.13"), ("--lerobot", "3.12")])
+def test_missing_interpreter(option, newest):
+    command = f"bash {SCRIPTS / 'setup.sh'} {option}"
+    done = bash(command, ROBOCAS_VENV="/nonexistent/venv", ROBOCAS_PYTHON="no-such-python")
     assert done.returncode == 1
-    assert done.stderr.startswith("setup: error: no Python 3.10, 3.11 or 3.12 found")
+    assert newest in done.stderr
+    assert "no-such-python" in done.stderr
+
+
+def test_unknown_option_of_setup():
+    done = bash(f"bash {SCRIPTS / 'setup.sh'} --gpu")
+    assert done.returncode == 2
+    assert "usage" in done.stderr
 
 
 def test_nothing_to_do_is_quick_and_silent(needs_renderer):
