@@ -7,7 +7,7 @@
 # scripts/check_lerobot_env.py: lerobot-eval with untrained weights of ACT on two tasks of the protocol `smoke`, recorded
 # actions of the demonstrator in LeRobot's loop against `robocas eval`, and an env.py from a cache of the Hub.
 # The first run downloads several gigabytes (torch with its CUDA libraries). Needs a renderer (scripts/setup.sh installs
-# one) but no GPU, and no model hub. Takes about 15 minutes on two cores.
+# one) but no GPU, and no model hub. The whole check takes about 15 minutes on two cores.
 #
 # ROBOCAS_LEROBOT_ENV_VENV    folder of the environment (default: .venv-lerobot-env in the checkout)
 # ROBOCAS_LEROBOT_ENV_PYTHON  interpreter to create it with (default: python3.12, the oldest that LeRobot 0.6 supports)

@@ -55,7 +55,7 @@ class Proprioception:
     def __init__(self) -> None:
         self._robots: dict[int, _Robot] = {}
 
-    def begin(self, env: int, obs: dict[str, Any], spec: RobotSpec) -> None:
+    def reset(self, env: int, obs: dict[str, Any], spec: RobotSpec) -> None:
         """Start an episode.
 
         Args:

@@ -119,7 +119,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._grippers = [None] * self.num_envs
         robot, obs = find_robot(self._driven.protocol.rules.robot), self._driven.obs
         for env in range(self.num_envs):
-            self._proprioception.begin(env, obs, robot)
+            self._proprioception.reset(env, obs, robot)
         for flags in (self._ended, self._success, self._truncated):
             flags[:] = False
         self._obs = {name: np.zeros((self.num_envs, *shape), np.float32) for name, shape in _shapes(self._wants)}

@@ -47,14 +47,14 @@ def observed(robots: list[Motion], step: int) -> dict:
 
 
 def test_every_step_of_two_envs_is_what_a_dataset_holds():
-    robots, feels = [moving(1), moving(2)], Proprioception()
+    robots, state = [moving(1), moving(2)], Proprioception()
     for env in range(2):
-        feels.begin(env, observed(robots, 0), PANDA)
+        state.reset(env, observed(robots, 0), PANDA)
     read: list[list[dict]] = [[], []]
     for step in range(STEPS):
         for env in range(2):
             command = None if step == 0 else float(COMMANDS[step - 1])
-            read[env].append(feels.read(env, observed(robots, step), command))
+            read[env].append(state.read(env, observed(robots, step), command))
     for env, robot in enumerate(robots):
         columns = frame_columns(episode_arrays(robot, "", []))
         for name, column in KEYS.items():
