@@ -34,6 +34,7 @@ LONGEST = {
     "tests/tasks/test_registry.py",
     "tests/tasks/vector/test_processes.py",
     "tests/tasks/vector/test_same_episodes.py",
+    "tests/test_emulated_gpu.py",
     "tests/test_registration_of_strangers.py",
     "tests/viewer/test_page.py",
 }
@@ -45,8 +46,16 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ["ROBOCAS_DATA"] = config.stash[_DATA]
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the longest files: whoever has one at the end is waited for by the other processes."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the long run on the emulated GPU interface unless asked for, and start with the longest files.
+
+    A process that has a long file at the end is waited for by the other processes.
+    """
+    if "emulated_gpu_full" not in (config.option.markexpr or ""):
+        marked = [item for item in items if item.get_closest_marker("emulated_gpu_full")]
+        long = [item for item in marked if not item.get_closest_marker("gpu")]
+        config.hook.pytest_deselected(items=long)
+        items[:] = [item for item in items if item not in long]
     items.sort(key=lambda item: item.nodeid.partition("::")[0] not in LONGEST)  # a stable sort
 
 

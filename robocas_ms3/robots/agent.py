@@ -87,7 +87,9 @@ class MobileManipulator(BaseAgent):
             stiffness=self.gripper_stiffness, damping=self.gripper_damping, force_limit=self.gripper_force_limit
         )
         base = dict(stiffness=self.base_stiffness, damping=self.base_damping, force_limit=self.base_force_limit)
-        return deepcopy_dict(control_modes(self.spec, arm, gripper, base, base_max_speed=self.base_max_speed))
+        on_gpu = self.scene.gpu_sim_enabled
+        speed = self.base_max_speed
+        return deepcopy_dict(control_modes(self.spec, arm, gripper, base, base_max_speed=speed, on_gpu=on_gpu))
 
     @property
     def _sensor_configs(self) -> list[CameraConfig]:

@@ -13,6 +13,7 @@ from robocas_ms3.robots.joint_controllers import (
     JOINT_SCALE,
     FingersControllerConfig,
     HeldJointsControllerConfig,
+    JointDeltaControllerConfig,
     SmoothJointPosControllerConfig,
 )
 from robocas_ms3.robots.table import RobotSpec
@@ -22,7 +23,7 @@ Drive = dict[str, Any]
 
 
 def control_modes(
-    spec: RobotSpec, arm: Drive, gripper: Drive, base: Drive, *, base_max_speed: float
+    spec: RobotSpec, arm: Drive, gripper: Drive, base: Drive, *, base_max_speed: float, on_gpu: bool
 ) -> dict[str, dict[str, Any]]:
     """Configurations of the controllers of each control mode, by name.
 
@@ -30,7 +31,10 @@ def control_modes(
         spec: the robot.
         arm, gripper, base: how their joints are driven.
         base_max_speed: m/s and rad/s.
+        on_gpu: whether the physics is on a GPU. On a CPU the arm of ``pd_joint_delta_pos`` has ManiSkill's own
+            controller, whose exact class ManiSkill's replay tool asks for.
     """
+    joint_deltas = JointDeltaControllerConfig if on_gpu else PDJointPosControllerConfig
     robot = spec.description
     arm_joints, base_joints, fingers = list(robot.arm_joints), list(robot.base_joints), list(robot.finger_joints)
     end_effector: dict[str, Any] = dict(
@@ -42,7 +46,7 @@ def control_modes(
     )
     arms = dict(
         pd_joint_pos=SmoothJointPosControllerConfig(arm_joints, None, None, **arm),
-        pd_joint_delta_pos=PDJointPosControllerConfig(arm_joints, -JOINT_SCALE, JOINT_SCALE, use_delta=True, **arm),
+        pd_joint_delta_pos=joint_deltas(arm_joints, -JOINT_SCALE, JOINT_SCALE, use_delta=True, **arm),
         pd_ee_delta_pose=RoboCASEEPoseControllerConfig(
             pos_lower=-POSITION_SCALE,
             pos_upper=POSITION_SCALE,

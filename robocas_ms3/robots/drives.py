@@ -14,7 +14,22 @@ from robocas_ms3.arrays import as_tensor, clamp, native
 ARM_SET_FROM_OUTSIDE, HELD_SET_FROM_OUTSIDE = 0.3, 0.02
 
 
-class DirectDrives(PDJointPosController):
+class BatchedDrives(PDJointPosController):
+    """ManiSkill's joint positions, whose drive targets are written on a GPU without waiting for it."""
+
+    def set_drive_targets(self, targets: torch.Tensor) -> None:
+        """Set the targets (N, joints), rad or m, of all joints in all envs."""
+        if self.scene.gpu_sim_enabled:
+            self._write(cast("Any", self.scene.px).cuda_articulation_target_qpos, targets)
+        else:
+            super().set_drive_targets(targets)
+
+    def _write(self, buffer: Any, values: torch.Tensor) -> None:
+        """Write values (N, joints) to a buffer of the GPU; ManiSkill indexes with a mask, for which the host waits."""
+        buffer.torch()[self.articulation.get_joint_target_indices(self.joints)] = values
+
+
+class DirectDrives(BatchedDrives):
     """Works on native arrays (`arrays`), and on a CPU without ManiSkill's wrapper of each joint.
 
     These would take longer than the physics.
@@ -47,7 +62,7 @@ class DirectDrives(PDJointPosController):
         return self.articulation._objs[0].qpos[None, self._columns]
 
     def set_drive_targets(self, targets: torch.Tensor) -> None:
-        """Set the targets (N, joints), rad or m, of all joints."""
+        """Set the targets (N, joints), rad or m, of all joints in all envs."""
         if self.scene.gpu_sim_enabled:
             super().set_drive_targets(targets)
         else:
@@ -59,9 +74,9 @@ class DirectDrives(PDJointPosController):
             drive.set_drive_target(target)
 
     def set_drive_velocities(self, velocities: torch.Tensor) -> None:
-        """Set the velocities (N, joints), rad/s or m/s, that the drives of all joints aim at."""
+        """Set the velocities (N, joints), rad/s or m/s, that the drives of all joints aim at in all envs."""
         if self.scene.gpu_sim_enabled:
-            self.articulation.set_joint_drive_velocity_targets(velocities, self.joints, self.active_joint_indices)
+            self._write(cast("Any", self.scene.px).cuda_articulation_target_qvel, velocities)
             return
         for drive, velocity in zip(self._drives, velocities[0].tolist(), strict=True):
             drive.set_drive_velocity_target(velocity)
@@ -75,6 +90,7 @@ class EvenDrives(DirectDrives):
         shares = torch.arange(1, self._sim_steps + 1, device=self.device) / self._sim_steps
         self._shares = shares[:, None, None]
         self._ahead: list[Any] = []
+        self._step = 0
 
     def _move_evenly(self, start: Any, end: Any) -> None:
         """Plan the control step's drive targets, from after ``start`` (N, joints) to ``end``, native."""

@@ -34,7 +34,9 @@ def relative_pose(frame: Link, link: Link) -> Pose:
 def _relative_pose(frame: Link, link: Link) -> Any:
     """(N, 7) native (`arrays`) poses of a link in the frame of another."""
     if frame.scene.gpu_sim_enabled:
-        return (frame.pose.inv() * link.pose).raw_pose
+        base, pose = frame.pose, link.pose  # ManiSkill's own product waits for the GPU
+        inverse = torch.cat([base.q[:, :1], -base.q[:, 1:]], dim=1)
+        return torch.cat([rotations.turn(inverse, pose.p - base.p), rotations.multiply(inverse, pose.q)], dim=1)
     pose = frame._bodies[0].entity_pose.inv() * link._bodies[0].entity_pose
     position, quaternion = pose.p, pose.q
     if quaternion[0] < 0:  # as ManiSkill's products

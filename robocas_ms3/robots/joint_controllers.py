@@ -14,10 +14,23 @@ from mani_skill.agents.controllers import (
 )
 
 from robocas_ms3.arrays import as_tensor, choose, clamp, join, native
-from robocas_ms3.robots.drives import ARM_SET_FROM_OUTSIDE, HELD_SET_FROM_OUTSIDE, DirectDrives, EvenDrives
+from robocas_ms3.robots.drives import (
+    ARM_SET_FROM_OUTSIDE,
+    HELD_SET_FROM_OUTSIDE,
+    BatchedDrives,
+    DirectDrives,
+    EvenDrives,
+)
 
 JOINT_SCALE = 0.1  # rad at |action| = 1, arm joints
 BASE_SCALE = (0.025, 0.025, 0.025)  # m, m, rad, base joints: 0.5 m/s at 20 Hz
+
+
+@dataclass
+class JointDeltaControllerConfig(PDJointPosControllerConfig):
+    """Configuration of ManiSkill's joint deltas on a GPU; see ``BatchedDrives``."""
+
+    controller_cls = BatchedDrives
 
 
 class FingersController(DirectDrives, PDJointPosMimicController):
@@ -85,7 +98,11 @@ class HeldJointsController(DirectDrives):
     def reset(self) -> None:
         """Take the present configuration as the one to hold, in the envs that are being reset."""
         super().reset()
-        self.set_drive_targets(self._target_qpos[self.scene._reset_mask])
+        held = self._target_qpos[self.scene._reset_mask]
+        if self.scene.gpu_sim_enabled:
+            self.articulation.set_joint_drive_targets(held, self.joints, self.active_joint_indices)
+        else:
+            self.set_drive_targets(held)
 
     def set_action(self, action: Any) -> None:
         """Keep the drive targets, unless the state was set from outside: then hold the joints where they are now."""

@@ -12,6 +12,7 @@ from robocas_ms3.benchmark.tasks import SEARCH
 from robocas_ms3.scenes.targets import selection_camera
 from robocas_ms3.tasks import occlusion, rewards, terms
 from robocas_ms3.tasks.learning import DENSE, LearningEnv
+from robocas_ms3.tasks.schedule import PeriodicSchedule
 from robocas_ms3.tasks.transfer import STAGES
 
 # of each object's surface; hidden shares are then off ray casting by 0.03 on average, 0.08 at the 95th percentile
@@ -45,6 +46,7 @@ class RoboCASSearchEnv(LearningEnv):
         eye = selection_camera(self.model).pose[:3, 3]
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
         self._looked: _Look | None = None
+        self._schedule = PeriodicSchedule(self.num_envs, self._look_period, self.device)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
@@ -56,6 +58,7 @@ class RoboCASSearchEnv(LearningEnv):
             self._look_again = torch.zeros_like(self._cleared_at_reset)  # whatever the time
             self._begins = torch.zeros_like(self._cleared_at_reset)
         self._looked = None
+        self._schedule.reset(env_idx.cpu().numpy())
         self._begins[env_idx] = True
         self._look_again[env_idx] = True
 
@@ -69,6 +72,7 @@ class RoboCASSearchEnv(LearningEnv):
         """Set the state; see `RoboCASEnv`. A heap that is not cleared is looked at anew, at once."""
         super().set_state_dict(state, env_idx)
         envs = slice(None) if env_idx is None else env_idx
+        self._schedule.every_step(slice(None) if env_idx is None else env_idx.cpu().numpy())
         self._looked = None  # else what follows would hang on what was before
         self._begins[envs], self._look_again[envs] = False, True
         self._cleared_at_reset = self._cleared_at_reset.clone()  # infos hold it
@@ -99,11 +103,19 @@ class RoboCASSearchEnv(LearningEnv):
         waits = self._looked is None or self._looked.others != self.bodies.others
         return None if waits and not none(self._due()) else known
 
+    def _before_control_step(self) -> None:
+        super()._before_control_step()
+        self._schedule.advance()
+
+    @property
+    def _look_period(self) -> int:
+        """Control steps from one look at the clutter to the next."""
+        return max(1, self.control_freq // LOOKS_PER_SECOND)
+
     def _due(self) -> Any:
         """(N,) bool, native: whose clutter is looked at in this step."""
-        every = max(1, self.control_freq // LOOKS_PER_SECOND)
         settled = native(self._stages["target_grasped"]) | native(self._stages["obstacles_cleared"])
-        return ((native(self.elapsed_steps) % every == 0) | native(self._look_again)) & ~settled
+        return ((native(self.elapsed_steps) % self._look_period == 0) | native(self._look_again)) & ~settled
 
     def _task_stages(self, objects: Any, held: Any) -> dict[str, Any]:
         """``obstacles_cleared``, (N,) bool, of this moment; nothing in steps in which no env is looked at."""
@@ -127,13 +139,17 @@ class RoboCASSearchEnv(LearningEnv):
                 self._looked = looked._replace(others=others)
                 return looked.cleared
         cleared = torch.zeros_like(due)
-        for envs in due.nonzero()[:, 0].split(ENVS_AT_ONCE):
-            found = self.clutter(envs)
-            cleared[envs], self.hidden_share[envs] = found.cleared, found.hidden_share
-            self._obstacles[envs] = found.obstacles
+        # on a GPU some envs more than are due, as finding these would wait for it; what is found of them is not taken
+        looked_at = self._schedule.due() if self.gpu_sim_enabled else due.nonzero()[:, 0]
+        for envs in looked_at.split(ENVS_AT_ONCE):
+            found, taken = self.clutter(envs), due[envs]
+            cleared[envs] = found.cleared & taken
+            self.hidden_share[envs] = torch.where(taken, found.hidden_share, self.hidden_share[envs])
+            self._obstacles[envs] = torch.where(taken[:, None], found.obstacles, self._obstacles[envs])
             if self._reward_mode in DENSE:
                 points = occlusion.surface_points(poses[envs], self._surface_points[envs])
-                self._push_point[envs] = occlusion.push_point(points, found.obstacles, self.target_slot[envs])
+                push_point = occlusion.push_point(points, found.obstacles, self.target_slot[envs])
+                self._push_point[envs] = torch.where(taken[:, None], push_point, self._push_point[envs])
         self._looked, self._look_again = _Look(others, poses, cleared), self._look_again & ~due
         return cleared
 

@@ -3,11 +3,13 @@
 import devices
 import pytest
 import torch
+from gpu_emulation import emulated_envs
 from made_up_dataset import made_up_dataset
 
 pytestmark = [
     pytest.mark.gpu,
     pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: unproven on a GPU"),
+    pytest.mark.skipif(emulated_envs() > 0, reason="the emulation has no autograd"),
 ]
 
 

@@ -1,4 +1,4 @@
-"""Contracts of many envs on a GPU. Without a CUDA device all of it is skipped; `scripts/gpu_checks.sh` runs it."""
+"""Contracts of a batch of envs, on a GPU (`scripts/gpu_checks.sh`) or on the emulated interface of one."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from batches import check_partial_reset, check_state_round_trip, make_batch, set_control_mode
+from gpu_emulation import emulated_envs
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.cli.layouts import Build, Layouts, main
@@ -20,43 +22,48 @@ pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device: unproven on a GPU"),
 ]
 
-ENVS = 16
+ENVS = emulated_envs() or 16
+SOME = [1, 3]  # envs of a partial reset
 STILL = 0.003  # m in a second, of what a layout calls at rest
+only_gpu = pytest.mark.skipif(emulated_envs() > 0, reason="the emulation has no limits of memory")
+only_emulated = pytest.mark.skipif(
+    emulated_envs() == 0, reason="a GPU rounds differently: bit for bit on the emulation"
+)
 
 
 @pytest.fixture(params=sorted(TASKS), scope="module")
 def many(request):
-    made = gym.make(TASKS[request.param].env_id, num_envs=ENVS, obs_mode="state", render_backend="none")
+    made = make_batch(request.param, ENVS, obs_mode="state")
     yield made
     made.close()
 
 
 def moved(env: gym.Env, seed: int, count: int) -> None:
-    """Some random motions of every arm."""
+    """Move every arm at random."""
     base: Any = env.unwrapped
-    generator = torch.Generator(base.device).manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
     rest = base.agent.robot.get_qpos()[:, 3:10]
     for _ in range(count):
-        arm = rest + 0.1 * torch.randn(rest.shape, generator=generator, device=base.device)
+        arm = rest + 0.1 * torch.randn(rest.shape, generator=generator).to(base.device)
         env.step(torch.cat([arm, torch.ones(len(arm), 1, device=base.device)], dim=1))
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
-@pytest.mark.parametrize("count", [16, 256])
+@pytest.mark.parametrize("count", [emulated_envs()] if emulated_envs() else [16, 256])
 def test_contract(name, count):
     env = gym.make(TASKS[name].env_id, num_envs=count, obs_mode="state", render_backend="none")
     base: Any = env.unwrapped
     states = []
-    for _ in range(2):
+    for _ in range(3):  # PhysX keeps contacts over a reset: the first one with a seed differs from later ones
         observation, info = env.reset(seed=0)
         assert observation.shape[0] == count
         moved(env, 0, 3)
         states.append(base.get_state().clone())
-    torch.testing.assert_close(*states, atol=1e-4, rtol=0)  # a GPU adds up in any order
+    torch.testing.assert_close(*states[1:], atol=1e-4, rtol=0)  # a GPU adds up in any order
     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
     for value in (observation, reward, terminated, truncated, *info.values()):
         if isinstance(value, torch.Tensor):
-            assert value.device == base.device
+            assert value.is_cuda
             assert len(value) == count
             assert torch.isfinite(value.float()).all()
     assert info["success"].dtype == torch.bool
@@ -66,12 +73,13 @@ def test_contract(name, count):
 
 @pytest.mark.parametrize("name", sorted(TASKS))
 def test_scenes_are_those_of_a_cpu(name):
-    env = gym.make(TASKS[name].env_id, num_envs=8, obs_mode="none", render_backend="none", seeds=(0, 7))
-    one = gym.make(TASKS[name].env_id, obs_mode="none", render_backend="none")
+    count = emulated_envs() or 8
+    env = make_batch(name, count, obs_mode="none")
+    one = gym.make(TASKS[name].env_id, obs_mode="none", render_backend="none", sim_backend="physx_cpu")
     base: Any = env.unwrapped
     alone: Any = one.unwrapped
-    env.reset(seed=list(range(8)))
-    for seed in range(8):
+    env.reset(seed=list(range(count)))
+    for seed in range(count):
         one.reset(seed=seed)
         assert [a.asset.id for a in base.object_assets[seed]] == [a.asset.id for a in alone.object_assets[0]]
         torch.testing.assert_close(base.object_poses[seed].cpu(), alone.object_poses[0], atol=1e-4, rtol=0)
@@ -93,14 +101,14 @@ def test_what_is_at_rest_stays(many):
     assert shift.max() < STILL
 
 
-def test_a_partial_reset_leaves_the_other_envs_alone(many):
+def test_a_partial_reset_leaves_the_other_envs_unchanged(many):
     base: Any = many.unwrapped
     many.reset(seed=0)
     moved(many, 1, 10)
     before, targets = base.bodies.read().clone(), base.agent.controller_targets()
-    some = torch.tensor([1, 4, 5], device=base.device)
+    some = torch.tensor(SOME, device=base.device)
     many.reset(options={"env_idx": some})
-    others = torch.tensor([i for i in range(ENVS) if i not in (1, 4, 5)], device=base.device)
+    others = torch.tensor([i for i in range(ENVS) if i not in SOME], device=base.device)
     # written back and read again, by way of centres of mass
     torch.testing.assert_close(base.bodies.read()[others], before[others], atol=1e-5, rtol=0)
     assert not torch.equal(base.bodies.read()[some], before[some])
@@ -111,18 +119,30 @@ def test_a_partial_reset_leaves_the_other_envs_alone(many):
     assert (base.elapsed_steps[others] == 10).all()
 
 
+@only_emulated
+@pytest.mark.parametrize("mode", ["pd_joint_pos", "pd_joint_delta_pos"])
+def test_a_partial_reset_changes_no_bit_of_the_other_envs(many, mode):
+    set_control_mode([many], mode)
+    check_partial_reset(many, SOME, mode)
+
+
+def test_a_state_that_is_set_is_the_one_that_was_read(many):
+    set_control_mode([many], "pd_joint_pos")
+    check_state_round_trip(many, SOME, "pd_joint_pos")
+
+
 @pytest.mark.parametrize("mode", ["pd_joint_pos", "pd_ee_delta_pose"])
-def test_a_state_is_come_back_to(mode):
-    env = gym.make("RoboCASPick-v1", num_envs=8, obs_mode="none", control_mode=mode, render_backend="none")
+def test_the_same_actions_from_a_state_that_is_set_again_lead_to_the_same_configuration(mode):
+    env = gym.make("RoboCASPick-v1", num_envs=ENVS, obs_mode="none", control_mode=mode, render_backend="none")
     base: Any = env.unwrapped
     env.reset(seed=0)
     size = env.action_space.shape[-1]
-    generator = torch.Generator(base.device).manual_seed(0)
+    generator = torch.Generator().manual_seed(0)
 
     def play() -> torch.Tensor:
         start = base.agent.robot.get_qpos()[:, 3:10] if size == 8 else None
         for _ in range(10):
-            noise = 0.1 * torch.randn(8, size, generator=generator, device=base.device)
+            noise = 0.1 * torch.randn(ENVS, size, generator=generator).to(base.device)
             if start is not None:
                 noise[:, :7] += start
             env.step(noise)
@@ -138,14 +158,16 @@ def test_a_state_is_come_back_to(mode):
 
 
 def test_heaps_are_tried_by_this_engine_and_resets_gather_what_stays(tmp_path):
-    command = Build("search_table_small_heap", objects="0:4", seeds="0:4", jobs=2, out=tmp_path, engine="gpu")
+    count = 2 if emulated_envs() else 4
+    pairs = dict(objects=f"0:{count}", seeds=f"0:{count}")
+    command = Build("search_table_small_heap", **pairs, jobs=2, out=tmp_path, engine="gpu")
     assert main(Layouts(command)) == 0
     made = gym.make(
         "RoboCASSearch-v1",
         config="search_table_small_heap",
-        num_envs=8,
+        num_envs=ENVS,
         layouts=tmp_path,
-        seeds=(0, 3),
+        seeds=(0, count - 1),
         obs_mode="none",
         render_backend="none",
     )
@@ -153,17 +175,18 @@ def test_heaps_are_tried_by_this_engine_and_resets_gather_what_stays(tmp_path):
     assert env._tabled is not None
     assert not env._table.pairs(State.UNTRIED)
     tried = {state: len(env._table.pairs(state)) for state in (State.STAYS, State.MOVES)}
-    assert sum(tried.values()) == 16
-    assert tried[State.MOVES] <= 4, tried
+    assert sum(tried.values()) == count * count
+    assert tried[State.MOVES] <= count, tried
     for _ in range(5):
         made.reset()
-        assert env.object_poses.device == env.device
-        for i in (0, 7):
+        assert env.object_poses.is_cuda
+        for i in (0, ENVS - 1):
             wanted = Starts.of([env.layout(i)], env.device).object_poses[0]
             torch.testing.assert_close(env.object_poses[i], wanted, atol=1e-4, rtol=0)
     made.close()
 
 
+@only_gpu
 def test_contact_buffers_hold_what_256_heaps_need():
     env = gym.make("RoboCASSearch-v1", num_envs=256, obs_mode="none", render_backend="none")
     env.reset(seed=0)
@@ -171,6 +194,7 @@ def test_contact_buffers_hold_what_256_heaps_need():
     env.close()
 
 
+@pytest.mark.emulated_gpu_full
 def test_cameras_see_something():
     size = dict(width=64, height=48)
     env = gym.make("RoboCASPick-v1", num_envs=4, obs_mode="rgb", sensor_configs=size)

@@ -28,9 +28,12 @@ class _Arm(RoboCASEEPoseController):
 
 class _Base(HeldJointsController):
     qpos = joints_at(20)  # type: ignore[assignment]
+    joints, active_joint_indices = (), None  # type: ignore[assignment]
 
-    def set_drive_targets(self, targets: torch.Tensor) -> None:
-        self.told = targets
+    @property
+    def articulation(self) -> SimpleNamespace:
+        """What takes the drive targets of the envs that are being reset."""
+        return SimpleNamespace(set_joint_drive_targets=lambda targets, *_: setattr(self, "told", targets))
 
 
 @pytest.fixture

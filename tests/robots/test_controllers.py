@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from mani_skill.agents.controllers import PDJointPosController
 from motions import matrix, moved
 from scipy.spatial.transform import Rotation
@@ -178,6 +179,13 @@ def test_base_drives_to_an_absolute_target_at_its_speed_limit(make_env):
         speeds.append(agent.robot.qvel[0, :3].abs().max().item())
     assert agent.robot.qpos[0, :3].numpy() == pytest.approx([0.3, -0.2, -0.4], abs=1e-3)
     assert 0.45 < max(speeds) < 0.55
+
+
+def test_a_step_without_an_action_after_a_reset_holds_the_robot(make_env):
+    env, agent = make_env("pd_joint_pos")
+    before = agent.robot.qpos.clone()
+    env.unwrapped.step(None)
+    assert torch.allclose(agent.robot.qpos, before, atol=1e-4)
 
 
 def test_reset_sets_the_drive_targets_too(make_env):

@@ -1,0 +1,29 @@
+"""A batch on the emulated GPU interface equals single envs on the CPU, in all tasks and control modes."""
+
+from __future__ import annotations
+
+import pytest
+from batches import check_equals_singles, set_control_mode
+from gpu_emulation import emulated_envs
+
+JOINT_MODES = ("pd_joint_pos", "pd_joint_delta_pos", "pd_joint_pos_base", "pd_joint_delta_pos_base")
+END_EFFECTOR_MODES = ("pd_ee_delta_pose", "pd_ee_pose", "pd_ee_delta_pose_base", "pd_ee_pose_base")
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(emulated_envs() == 0, reason="a GPU's physics differs from that of a CPU"),
+]
+
+
+@pytest.mark.parametrize("mode", JOINT_MODES)
+def test_joint_modes(task, batch_and_singles, mode):
+    batch, singles = batch_and_singles
+    set_control_mode([batch, *singles], mode)
+    check_equals_singles(batch, singles, mode, steps=10, heap=task == "search")
+
+
+@pytest.mark.parametrize("mode", END_EFFECTOR_MODES)
+def test_end_effector_modes(task, batch_and_singles, mode):
+    batch, singles = batch_and_singles
+    set_control_mode([batch, *singles], mode)
+    check_equals_singles(batch, singles, mode, steps=50, heap=task == "search")

@@ -1,0 +1,213 @@
+"""Motions of a batch of envs, what they lead to, and checks that compare a batch with single envs and with itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import gymnasium as gym
+import torch
+from scipy.spatial.transform import Rotation
+
+import robocas_ms3  # noqa: F401
+from robocas_ms3.tasks import TASKS
+
+JOINT_TOLERANCE = 1e-5  # rad, m and rewards
+HEAP_TOLERANCE = 2.5e-3  # m and rewards, of objects in a heap, whose contacts amplify the last bit
+HEAP_QUATERNION_TOLERANCE = 5e-3
+TCP_TOLERANCE = 1e-3  # m, where inverse kinematics of a batch and of a single env are different solvers
+_SETTINGS = dict(obs_mode="state_dict", reward_mode="normalized_dense", render_backend="none")
+
+
+def make_batch(task: str, count: int, **kwargs: Any) -> gym.Env:
+    """Make a batch whose env i has the objects of seed i."""
+    return gym.make(TASKS[task].env_id, num_envs=count, seeds=(0, count - 1), **{**_SETTINGS, **kwargs})
+
+
+def make_singles(task: str, count: int, **kwargs: Any) -> list[gym.Env]:
+    """Make single envs on the CPU, env i with the objects of seed i, which resets keep."""
+    envs = []
+    for seed in range(count):
+        env = gym.make(TASKS[task].env_id, sim_backend="physx_cpu", reconfiguration_freq=0, **{**_SETTINGS, **kwargs})
+        env.reset(seed=seed, options={"reconfigure": True})
+        envs.append(env)
+    return envs
+
+
+def set_control_mode(envs: Sequence[gym.Env], mode: str) -> None:
+    """Change the control mode of envs, which have to be reset then."""
+    for env in envs:
+        base: Any = env.unwrapped
+        base.agent.set_control_mode(mode)
+
+
+@dataclass(frozen=True)
+class Trace:
+    """States after each of T steps, the state before them first, on the CPU.
+
+    Attributes:
+        qpos: (T + 1, N, 12).
+        tcp: (T + 1, N, 7) in the world.
+        objects: (T + 1, N, K, 7).
+        rewards: (T, N).
+        flags: (T, N, F) bool, of the info.
+    """
+
+    qpos: torch.Tensor
+    tcp: torch.Tensor
+    objects: torch.Tensor
+    rewards: torch.Tensor
+    flags: torch.Tensor
+
+
+def play(env: gym.Env, actions: torch.Tensor) -> Trace:
+    """Step with actions (T, N, A)."""
+    base: Any = env.unwrapped
+    states, rewards, flags = [_state(base)], [], []
+    for action in actions.to(base.device):
+        _, reward, _, _, info = env.step(action)
+        states.append(_state(base))
+        rewards.append(reward)
+        flags.append(torch.stack([info[name] for name in (*base.STAGES, "success", "fail", "disturbed")], dim=-1))
+    qpos, tcp, objects = (torch.stack(values).cpu() for values in zip(*states, strict=True))
+    return Trace(qpos, tcp, objects, torch.stack(rewards).cpu(), torch.stack(flags).cpu())
+
+
+def play_singles(envs: Sequence[gym.Env], actions: torch.Tensor) -> Trace:
+    """Reset single envs, env i with seed i, and step them one after the other with actions (T, N, A)."""
+    traces = []
+    for seed, env in enumerate(envs):
+        env.reset(seed=seed)
+        traces.append(play(env, actions[:, seed : seed + 1]))
+    return Trace(*(torch.cat([getattr(trace, f.name) for trace in traces], dim=1) for f in fields(Trace)))
+
+
+def _state(base: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return base.agent.robot.get_qpos().clone(), base.agent.tcp.pose.raw_pose.clone(), base.object_poses
+
+
+def smooth_actions(env: gym.Env, mode: str, steps: int) -> torch.Tensor:
+    """(T, N, A) actions of a smooth motion from the present state, another one in each env, on the CPU.
+
+    The fingers close after half of the steps. The base moves in the modes that take it.
+    """
+    base: Any = env.unwrapped
+    qpos, tcp = base.agent.robot.get_qpos().cpu(), base.agent.tcp_in_arm_base.raw_pose.cpu()
+    generator = torch.Generator().manual_seed(len(mode))
+    direction = 2 * torch.rand(len(qpos), 10, generator=generator) - 1
+    share = torch.linspace(0, 1, steps)[:, None, None]
+    arm_mode = mode.removesuffix("_base")
+    if arm_mode == "pd_joint_pos":
+        arm = qpos[:, 3:10] + 0.2 * share * direction[:, :7]
+    elif arm_mode == "pd_joint_delta_pos":
+        arm = (0.1 * direction[:, :7]).expand(steps, -1, -1)
+    elif arm_mode == "pd_ee_delta_pose":
+        arm = (0.02 * direction[:, :6]).expand(steps, -1, -1)
+    else:
+        euler = Rotation.from_quat(tcp[:, [4, 5, 6, 3]].numpy()).as_euler("XYZ")
+        start = torch.cat([tcp[:, :3], torch.from_numpy(euler).float()], dim=1)
+        arm = start + 0.1 * share * direction[:, :6]
+    fingers = torch.where(share < 0.5, 1.0, -1.0).expand(-1, len(qpos), -1)
+    parts = [arm, fingers]
+    if mode.endswith("_base"):
+        moved = direction[:, 7:]
+        parts.append((0.1 * moved).expand(steps, -1, -1) if "delta" in mode else qpos[:, :3] + 0.05 * share * moved)
+    return torch.cat(parts, dim=2)
+
+
+def check_equals_singles(batch: gym.Env, singles: Sequence[gym.Env], mode: str, steps: int, heap: bool) -> None:
+    """Compare a batch with single envs over a smooth motion from a reset.
+
+    Args:
+        batch: N envs (`make_batch`).
+        singles: N single envs (`make_singles`), which have made the same steps as the batch before.
+        mode: control mode, which both have.
+        steps: T.
+        heap: whether the objects are in a heap, whose contacts amplify the last bit.
+
+    Raises:
+        AssertionError: they differ by more than the tolerances of this module.
+    """
+    for length in (2, steps):  # PhysX keeps contacts over a reset: the first one with a seed differs from later ones
+        batch.reset(seed=list(range(len(singles))))
+        actions = smooth_actions(batch, mode, length)
+        found, expected = play(batch, actions), play_singles(singles, actions)
+    objects = HEAP_TOLERANCE if heap else JOINT_TOLERANCE
+    quaternions = HEAP_QUATERNION_TOLERANCE if heap else JOINT_TOLERANCE
+    _close(found.qpos[0], expected.qpos[0], JOINT_TOLERANCE, "qpos after the reset")
+    _close(found.objects[0], expected.objects[0], JOINT_TOLERANCE, "objects after the reset")
+    _close(found.objects[..., :3], expected.objects[..., :3], objects, "positions of objects")
+    _close(found.objects[..., 3:], expected.objects[..., 3:], quaternions, "quaternions of objects")
+    assert torch.equal(found.flags, expected.flags), "flags differ"
+    if "ee" in mode:
+        _close(found.tcp[..., :3], expected.tcp[..., :3], TCP_TOLERANCE, "TCP")
+        return
+    _close(found.qpos, expected.qpos, JOINT_TOLERANCE, "qpos")
+    _close(found.rewards, expected.rewards, objects, "rewards")
+
+
+def check_partial_reset(batch: gym.Env, some: Sequence[int], mode: str) -> None:
+    """Check that a reset of some envs of a batch leaves the others bit for bit unchanged, then and in later steps.
+
+    Raises:
+        AssertionError: another env has changed.
+    """
+    base: Any = batch.unwrapped
+    count = base.num_envs
+    others = [env for env in range(count) if env not in some]
+    for _ in range(2):  # PhysX keeps contacts over a reset: the first one with a seed differs from later ones
+        batch.reset(seed=list(range(count)))
+        actions = smooth_actions(batch, mode, 10)
+        undisturbed = play(batch, actions)
+    batch.reset(seed=list(range(count)))
+    play(batch, actions[:5])
+    before, targets = base.bodies.read().clone(), base.agent.controller_targets()
+    batch.reset(options={"env_idx": torch.tensor(some, device=base.device)})
+    after = base.bodies.read()
+    assert torch.equal(after[others], before[others]), "the state of another env has changed"
+    assert not torch.equal(after[some], before[some]), "the envs are where they were"
+    for name, values in base.agent.controller_targets().items():
+        for key, value in values.items():
+            assert torch.equal(value[others], targets[name][key][others]), f"{key} of another env has changed"
+    assert base.elapsed_steps.tolist() == [0 if env in some else 5 for env in range(count)]
+    later = play(batch, actions[5:])
+    for f in fields(Trace):
+        found, expected = getattr(later, f.name), getattr(undisturbed, f.name)[5:]
+        assert torch.equal(found[:, others], expected[:, others]), f"{f.name} of another env differs in later steps"
+
+
+def check_state_round_trip(batch: gym.Env, some: Sequence[int], mode: str) -> None:
+    """Check that a state that is set again is the one that was read, in all envs or in some of them alone.
+
+    Raises:
+        AssertionError: a state differs.
+    """
+    base: Any = batch.unwrapped
+    batch.reset(seed=list(range(base.num_envs)))
+    actions = smooth_actions(batch, mode, 10)
+    play(batch, actions[:5])
+    stored, flat = base.get_state_dict(), base.get_state().clone()
+    play(batch, actions[5:])
+    moved = base.get_state().clone()
+    assert not torch.equal(moved, flat)
+    index = torch.tensor(some, device=base.device)
+    base.set_state_dict(_rows(stored, index), index)
+    others = [env for env in range(base.num_envs) if env not in some]
+    _close(base.get_state()[some], flat[some], 1e-6, "state of the envs that were set")
+    assert torch.equal(base.get_state()[others], moved[others]), "the state of another env has changed"
+    base.set_state_dict(stored)
+    _close(base.get_state(), flat, 1e-6, "state")
+    for name, values in base.agent.controller_targets().items():
+        for key, value in values.items():
+            _close(value, stored["controller"][name][key], 1e-6, f"{name}.{key}")
+
+
+def _rows(nested: Any, envs: torch.Tensor) -> Any:
+    if isinstance(nested, dict):
+        return {name: _rows(value, envs) for name, value in nested.items()}
+    return nested[envs]
+
+
+def _close(found: torch.Tensor, expected: torch.Tensor, tolerance: float, name: str) -> None:
+    torch.testing.assert_close(found, expected, atol=tolerance, rtol=0, msg=lambda text: f"{name}: {text}")
