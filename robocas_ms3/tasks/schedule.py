@@ -21,17 +21,17 @@ class PeriodicSchedule:
         self._step = 0
         self._reset_at = np.zeros(num_envs, dtype=np.int64)  # of `_step`
         self._always = np.zeros(num_envs, dtype=bool)
-        self._indices: dict[int, torch.Tensor] = {}  # by `_step` modulo the period
+        self._indices: list[torch.Tensor] = []  # by `_step` modulo the period; empty: to be made
 
     def reset(self, envs: NDArray[np.int64]) -> None:
         """Note that some envs (E,) are reset: they are due before their first step, and every period from then on."""
         self._reset_at[envs], self._always[envs] = self._step, False
-        self._indices = {}
+        self._indices = []
 
     def every_step(self, envs: NDArray[np.int64] | slice) -> None:
         """Let some envs be due in every step, until they are reset."""
         self._always[envs] = True
-        self._indices = {}
+        self._indices = []
 
     def advance(self) -> None:
         """Note that all envs make a control step."""
@@ -39,8 +39,8 @@ class PeriodicSchedule:
 
     def due(self) -> torch.Tensor:
         """(D,) int64 indices of the envs that are due in the present step."""
-        phase = self._step % self._period
-        if phase not in self._indices:
-            due = ((self._step - self._reset_at) % self._period == 0) | self._always
-            self._indices[phase] = torch.from_numpy(np.flatnonzero(due)).to(self._device)
-        return self._indices[phase]
+        if not self._indices:  # of all phases at once: a copy to the GPU waits for it, so none is made within a step
+            phases = np.arange(self._period)[:, None]
+            due = ((phases - self._reset_at) % self._period == 0) | self._always
+            self._indices = [torch.from_numpy(np.flatnonzero(row)).to(self._device) for row in due]
+        return self._indices[self._step % self._period]

@@ -32,7 +32,7 @@ def test_a_step_does_not_wait(batch, arm, base):
     set_control_mode([batch], mode)
     env: Any = batch.unwrapped  # gymnasium's time limit reads flags of all envs
     env.reset(seed=0)
-    actions = smooth_actions(batch, mode, 6).to(env.device)
+    actions = smooth_actions(batch, mode, 4).to(env.device)
     env.step(actions[0])  # fills caches
     with no_host_synchronisation():
         for action in actions[1:]:

@@ -82,10 +82,13 @@ class EmulatedTensor(torch.Tensor):
 
 
 class _FactoryMode(TorchDispatchMode):
-    """Handles operations without tensor arguments, such as ``torch.zeros(2, device="cuda")``."""
+    """Handles operations without emulated tensors, such as ``torch.zeros(2, device="cuda")``."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return _dispatch(func, args, kwargs or {})
+        kwargs = kwargs or {}
+        if not types and kwargs.get("device") is None:  # all on the CPU
+            return func(*args, **kwargs)
+        return _dispatch(func, args, kwargs)
 
 
 def install() -> None:
