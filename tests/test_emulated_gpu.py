@@ -1,4 +1,4 @@
-"""Run tests/gpu on the emulated GPU interface, in a process of its own: the emulation cannot be removed from a process."""
+"""Run tests/gpu on the emulated GPU interface, in a separate process, as the emulation cannot be undone."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ pytestmark = pytest.mark.skipif(unsupported_torch() is not None, reason=str(unsu
 def run(*arguments: str) -> int:
     """Run tests/gpu on the emulation; return how many tests passed."""
     path = os.pathsep.join(filter(None, [str(ROOT), str(ROOT / "tests/support"), os.environ.get("PYTHONPATH")]))
-    command = [sys.executable, "-m", "pytest", "-p", "gpu_emulation.plugin", "-p", "no:cacheprovider", "-q", "tests/gpu"]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "gpu_emulation.plugin", "-p", "no:cacheprovider"]
     done = subprocess.run(
-        [*command, *arguments],
+        [*command, "tests/gpu", *arguments],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
         capture_output=True,
