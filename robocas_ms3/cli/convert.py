@@ -28,7 +28,10 @@ class Convert:
     out: Path
     """Folder of the dataset."""
     to: str = "robocas"
-    """Format of the dataset: robocas, lerobot (LeRobot's v3.0, needs the extra 'lerobot'), or another package's."""
+    """Format of the dataset: robocas, lerobot (needs the extra 'lerobot'), or another package's."""
+    lerobot_version: Literal["0.6", "0.5", "2.1"] = "0.6"
+    """What reads the LeRobot dataset: 0.6: LeRobot 0.6 and later (format v3.0, language columns, depth as video);
+    0.5: LeRobot 0.4 and 0.5 (v3.0, subtask_index); 2.1: readers of format v2.1, as openpi and GR00T."""
     codec: Literal["h264", "av1"] = "h264"
     """Of lerobot's videos; AV1 takes half the space."""
     rate: Maybe[float] = None
@@ -121,6 +124,7 @@ def _format(cfg: Convert) -> Format:
         "leave_out": cfg.leave_out,
         "image_format": cfg.image_format != "png",
         "codec": cfg.codec != "h264",
+        "lerobot_version": cfg.lerobot_version != "0.6",
     }
     for option, given in flags.items():
         if given and option not in chosen.options:
@@ -143,6 +147,7 @@ def _convert(cfg: Convert) -> int:
             "embeddings": cfg.embeddings,
             "previews": (True if cfg.all_videos else None) if cfg.video else False,
             "codec": cfg.codec,
+            "lerobot_version": cfg.lerobot_version,
             "leave_out": cfg.leave_out,
             "episode_limits": Limits(cfg.episode_seconds, cfg.memory_gb),
         }

@@ -86,7 +86,7 @@ _BUILTIN = (
         f"{_PACKAGE}.lerobot.reader:open_lerobot",
         f"{_PACKAGE}.lerobot.convert:convert_lerobot",
         f"{_PACKAGE}.lerobot.check:report_lerobot",
-        ("codec", "leave_out", "episode_limits"),
+        ("codec", "lerobot_version", "leave_out", "episode_limits"),
     ),
     Format(
         "robocas",

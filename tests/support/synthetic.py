@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from robocas_ms3.datasets.pictures.boxes import box_of
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -83,7 +84,9 @@ class RayCaster:
             wanted = {n: CAMERA_IN_PARENT[n] for n in self.pictures.cameras}
             shots = {n: self.shoot(parents[n] @ camera, boxes) for n, camera in wanted.items()}
             depth = {n: p[1] for n, p in shots.items() if self.pictures.depth}
-            yield Frame({n: p[0] for n, p in shots.items()}, depth)
+            masks = {n: p[2] == 2 for n, p in shots.items() if self.pictures.boxes}  # behind the table: the target
+            found = {n: box for n, mask in masks.items() if (box := box_of(mask))}
+            yield Frame({n: p[0] for n, p in shots.items()}, depth, found)
 
     def shoot(self, camera_in_world, boxes):
         width, height = self.size
@@ -97,7 +100,7 @@ class RayCaster:
             in_front = (near < far) & (near > 0.001) & (near < depth)
             depth = np.where(in_front, near, depth)
             hit[in_front] = index + 1
-        return COLOURS[hit % len(COLOURS)], np.round(depth * 1000).astype(np.uint16)
+        return COLOURS[hit % len(COLOURS)], np.round(depth * 1000).astype(np.uint16), hit
 
 
 def slab(eye, rays, box):

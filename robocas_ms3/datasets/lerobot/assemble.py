@@ -1,31 +1,33 @@
-"""Joins the parts of episodes into the files of a LeRobot dataset: tables one after the other, videos as they are."""
+"""Join the parts of episodes into the files of a LeRobot dataset: tables one after the other, videos as they are."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.lerobot.depth import DEPTH_INFO
+from robocas_ms3.datasets.lerobot.episodes import GROUP, open_episodes, stage_rows, write_tasks
+from robocas_ms3.datasets.lerobot.language import EVENTS
+from robocas_ms3.datasets.lerobot.parts import Part, read_parts, survey
 from robocas_ms3.datasets.lerobot.schema import Limits
-from robocas_ms3.datasets.lerobot.stage import EPISODE_FILE, FRAMES_FILE, SUBGOAL, video_name
-from robocas_ms3.datasets.lerobot.stats import Histogram, Levels, Range, vector_stats
-from robocas_ms3.datasets.lerobot.tables import RollingTable, column, numbers, write_texts
+from robocas_ms3.datasets.lerobot.stage import FRAMES_FILE, coding_of, video_name
+from robocas_ms3.datasets.lerobot.stats import Histogram, Levels, vector_stats
+from robocas_ms3.datasets.lerobot.table_writing import RollingTable, write_texts
+from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Layout, Variant, find_variant
 from robocas_ms3.datasets.lerobot.video import Joiner, packet_times
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.datasets.sources.protocol import Kind
 from robocas_ms3.files import write_json
 
-_NUMERIC = (*(feature.key for feature in schema.FEATURES), schema.SUBTASK_INDEX.key, *schema.INDICES)
-_ROWS = 64  # episodes a row group, of the tables about episodes
+_FLOATS = {feature.key for feature in schema.FEATURES} | {"timestamp", schema.REWARD.key}
 
 
 def assemble(parts: Sequence[Path], plan: dict[str, Any], fps: int, root: Path, limits: Limits) -> None:
@@ -34,185 +36,167 @@ def assemble(parts: Sequence[Path], plan: dict[str, Any], fps: int, root: Path, 
     Args:
         parts: folder of each.
         plan: content of ``conversion.json``.
-        fps: frames a second.
+        fps: frames per second.
         root: where to write; an empty folder.
         limits: sizes of files.
 
     Raises:
         DatasetError: a part is damaged.
     """
-    reader = _Parts(parts)
-    tasks, subgoals, ranges = _survey(reader)
+    variant = find_variant(plan["settings"]["lerobot_version"])
+    layout, entries = variant.layout, plan["episodes"]
+    texts, ranges = survey(read_parts(parts, entries), variant)
     histograms = {key: Histogram(found.low, found.high) for key, found in ranges.items()}
     levels: dict[str, Levels] = {}
-    first = reader.about(0)
-    cameras, codec = list(first["cameras"]), plan["settings"]["codec"]
-    kinds = ("rgb", "depth") if first["depth"] else ("rgb",)
+    first = next(read_parts(parts[:1], entries[:1])).about
+    streams = _streams(variant, first, plan["settings"]["codec"])
+    data_mb, video_mb = (0, 0) if layout.one_file_per_episode else (limits.data_mb, limits.video_mb)
+    frames = 0
     with ExitStack() as stack:
-
-        def open_table(pattern: str, **options: Any) -> RollingTable:
-            table = RollingTable(partial(schema.data_file, root, pattern), limits.data_mb, **options)
-            return stack.enter_context(closing(table))
-
-        data, rows = open_table(schema.DATA_PATH), open_table(schema.EPISODES_PATH, group=_ROWS)
-        scenes = RollingTable(lambda *_: root / schema.SCENES_FILE, np.inf, group=_ROWS, compression="zstd")
-        stack.enter_context(closing(scenes))
-        joiners: dict[tuple[str, str], Joiner] = {}
-        for camera in cameras:
-            for kind in kinds:
-                path: Callable[[int, int], Path] = partial(_video_file, root, kind, camera)
-                joiner = Joiner(path, fps, limits.video_mb, limits.video_seconds)
-                joiners[kind, camera] = stack.enter_context(closing(joiner))
-        start = 0
-        for index, entry in enumerate(plan["episodes"]):
-            about = reader.about(index)
-            columns, types = reader.columns(index, start, tasks, subgoals)
-            steps = about["steps"]
-            stats = {key: vector_stats(columns[key]) for key in _NUMERIC}
+        data = RollingTable(partial(layout.path, root, layout.data), data_mb)
+        scenes = RollingTable(lambda *_: root / schema.SCENES_FILE, np.inf, group=GROUP, compression="zstd")
+        episodes = open_episodes(layout, root, limits)
+        for writer in (data, scenes, episodes):
+            stack.enter_context(closing(writer))
+        joiners = {
+            stream.prefix: stack.enter_context(
+                closing(Joiner(partial(stream.path, root), fps, video_mb, limits.video_seconds))
+            )
+            for stream in streams
+        }
+        for part, entry in zip(read_parts(parts, entries), entries, strict=True):
+            about, steps = part.about, part.steps
+            columns, persistent = part.columns(variant, texts), part.persistent(fps) if variant.language else []
+            stats = {key: vector_stats(values) for key, values in columns.items()}
             for key, histogram in histograms.items():
                 histogram.add(columns[key])
-            for camera, counts in about["levels"].items():
-                found = Levels(np.array(counts), steps)
-                stats[schema.image_key(camera)] = found.stats()
-                levels.setdefault(camera, Levels()).merge(found)
-            chunk, file = data.place((parts[index] / FRAMES_FILE).stat().st_size)
-            data.add(_data_table(columns, types))
+            for key, counts in about["levels"].items():
+                found = _levels(key, counts, steps)
+                stats[key] = found.stats()
+                levels.setdefault(key, _levels(key, np.zeros_like(found.counts), 0)).merge(found)
+            chunk, file = data.place((part.folder / FRAMES_FILE).stat().st_size)
+            data.add(part.data(variant, columns, persistent))
             row = {
-                "episode_index": index,
+                "episode_index": part.index,
                 "tasks": [about["instruction"]],
                 "length": steps,
-                "dataset_from_index": start,
-                "dataset_to_index": start + steps,
+                "dataset_from_index": part.start,
+                "dataset_to_index": part.start + steps,
                 "data/chunk_index": chunk,
                 "data/file_index": file,
             }
-            for (kind, camera), joiner in joiners.items():
-                place = joiner.add(parts[index] / video_name(camera, kind, codec), steps)
-                name = f"videos/{schema.image_key(camera)}" if kind == "rgb" else f"depth/{camera}"
-                row[f"{name}/chunk_index"], row[f"{name}/file_index"] = place.chunk, place.file
-                row[f"{name}/from_timestamp"] = place.first / fps
-                row[f"{name}/to_timestamp"] = (place.first + steps) / fps
-            row["meta/episodes/chunk_index"], row["meta/episodes/file_index"] = rows.place()
-            row |= {f"stats/{key}/{name}": value for key, found in stats.items() for name, value in found.items()}
-            rows.add(pa.Table.from_pylist([row]))
-            scenes.add(_scene_table(index, entry, about))
-            start += steps
-    texts = {schema.TASKS_FILE: ("task_index", tasks), schema.SUBTASKS_FILE: ("subtask_index", subgoals)}
-    for name, (key, found) in texts.items():
-        write_texts(root / name, key, list(found))
+            for stream in streams:
+                place = joiners[stream.prefix].add(part.folder / stream.part_name, steps)
+                row[f"{stream.prefix}/chunk_index"], row[f"{stream.prefix}/file_index"] = place.chunk, place.file
+                row[f"{stream.prefix}/from_timestamp"] = place.first / fps
+                row[f"{stream.prefix}/to_timestamp"] = (place.first + steps) / fps
+            episodes.add(row, stats)
+            scenes.add(_scene_table(part, entry))
+            if variant.language:
+                events, times = part.table.column(EVENTS).to_pylist(), columns["timestamp"][:, 0].tolist()
+                stage_rows(root, part.index, persistent, events, times)
+            frames += steps
+    write_tasks(layout, root, list(texts.tasks))
+    if not variant.language:
+        write_texts(root / schema.SUBTASKS_FILE, schema.SUBTASK_INDEX.key, list(texts.subgoals))
+    if layout.one_file_per_episode:
+        write_json(root / schema.MODALITY_FILE, schema.modality_json(list(first["cameras"])))
     whole = {key: found.stats(histograms[key], key not in _FLOATS) for key, found in ranges.items()}
-    whole |= {schema.image_key(camera): found.stats() for camera, found in levels.items()}
-    write_json(root / schema.STATS_FILE, whole)
-    videos = {camera: packet_times(_video_file(root, "rgb", camera, 0, 0))[1] for camera in cameras}
-    robot_type = schema.robot_type(first["scene"])
-    write_json(root / schema.INFO_FILE, _info(plan, fps, start, len(tasks), videos, limits, robot_type))
+    write_json(root / schema.STATS_FILE, whole | {key: found.stats() for key, found in levels.items()})
+    totals = {"total_episodes": len(entries), "total_frames": frames, "total_tasks": len(texts.tasks)}
+    videos = {stream.key: stream.describe(root, variant) for stream in streams if stream.key}
+    write_json(root / schema.INFO_FILE, _info(variant, fps, totals, videos, limits, schema.robot_type(first["scene"])))
     write_json(root / schema.CONVERSION_FILE, plan)
     sums = {str(path.relative_to(root)): schema.checksum(path) for path in schema.content_files(root)}
     write_json(root / schema.CHECKSUMS_FILE, sums)
 
 
-_FLOATS = {feature.key for feature in schema.FEATURES} | {"timestamp"}
+@dataclass(frozen=True)
+class _Stream:
+    """The videos of a camera.
+
+    Attributes:
+        kind: of images.
+        key: of the feature; empty: LeRobot does not read these videos.
+        prefix: of the columns of ``meta/episodes``.
+        part_name: of the video of a part.
+        path: of a numbered file: (root, chunk, file) -> path.
+    """
+
+    kind: Kind
+    key: str
+    prefix: str
+    part_name: str
+    path: Callable[[Path, int, int], Path]
+
+    def describe(self, root: Path, variant: Variant) -> dict[str, Any]:
+        """Return ``info`` of the feature."""
+        marked = (
+            DEPTH_INFO if self.kind == "depth" else {f"{'' if variant.native_depth else 'video.'}is_depth_map": False}
+        )
+        return {**packet_times(self.path(root, 0, 0))[1], **marked}
 
 
-class _Parts:
-    """Reads parts."""
-
-    def __init__(self, folders: Sequence[Path]) -> None:
-        self._folders, self.count = folders, len(folders)
-
-    def about(self, index: int) -> dict[str, Any]:
-        path = self._folders[index] / EPISODE_FILE
-        try:
-            return load_json(path)
-        except (OSError, ValueError) as error:
-            raise DatasetError("this part of a conversion is damaged", where=path, fix="Pass --overwrite.") from error
-
-    def table(self, index: int) -> pa.Table:
-        path = self._folders[index] / FRAMES_FILE
-        try:
-            return pq.read_table(path)
-        except (OSError, pa.ArrowException) as error:
-            raise DatasetError("this part of a conversion is damaged", where=path, fix="Pass --overwrite.") from error
-
-    def columns(
-        self, index: int, start: int, tasks: dict[str, int], subgoals: dict[str, int]
-    ) -> tuple[dict[str, NDArray], pa.ChunkedArray]:
-        """Numeric features (T, D) with the numbers that follow from the episodes before, and sub-goal types."""
-        table = self.table(index)
-        columns = {key: numbers(table.column(key)) for key in _NUMERIC if key in table.column_names}
-        steps = len(table)
-        texts = table.column(SUBGOAL).to_pylist()
-        columns[schema.SUBTASK_INDEX.key] = np.array([subgoals[text] for text in texts], np.int64)[:, None]
-        columns["episode_index"] = np.full((steps, 1), index, np.int64)
-        columns["index"] = np.arange(start, start + steps)[:, None]
-        columns["task_index"] = np.full((steps, 1), tasks[self.about(index)["instruction"]], np.int64)
-        return columns, table.column(schema.SUBGOAL_TYPE.key)
+def _streams(variant: Variant, about: dict[str, Any], codec: str) -> list[_Stream]:
+    """Return the streams of a dataset, by the description of a part."""
+    layout, streams = variant.layout, []
+    kinds: tuple[Kind, ...] = ("rgb", "depth") if about["depth"] else ("rgb",)
+    for camera in about["cameras"]:
+        for kind in kinds:
+            name = video_name(camera, kind, coding_of(kind, codec, variant))
+            if kind == "rgb" or variant.native_depth:
+                key = schema.image_key(camera) if kind == "rgb" else schema.depth_key(camera)
+                streams.append(_Stream(kind, key, f"videos/{key}", name, _path_of(layout, layout.video, video_key=key)))
+            else:
+                streams.append(
+                    _Stream(kind, "", f"depth/{camera}", name, _path_of(layout, layout.depth, camera=camera))
+                )
+    return streams
 
 
-def _survey(parts: _Parts) -> tuple[dict[str, int], dict[str, int], dict[str, Range]]:
-    """Number texts as they come, and find the range of every feature, which histograms need beforehand."""
-    tasks: dict[str, int] = {}
-    subgoals: dict[str, int] = {}
-    ranges = {key: Range() for key in _NUMERIC}
-    start = 0
-    for index in range(parts.count):
-        tasks.setdefault(parts.about(index)["instruction"], len(tasks))
-        for text in parts.table(index).column(SUBGOAL).to_pylist():
-            subgoals.setdefault(text, len(subgoals))
-        columns, _ = parts.columns(index, start, tasks, subgoals)
-        for key, found in ranges.items():
-            found.add(columns[key])
-        start += len(columns["index"])
-    return tasks, subgoals, ranges
+def _path_of(layout: Layout, pattern: str, **names: str) -> Callable[[Path, int, int], Path]:
+    return lambda root, chunk, file: layout.path(root, pattern, chunk, file, **names)
 
 
-def _data_table(columns: dict[str, NDArray], types: pa.ChunkedArray) -> pa.Table:
-    made: dict[str, Any] = {feature.key: column(columns[feature.key]) for feature in schema.FEATURES}
-    made[schema.SUBGOAL_TYPE.key] = types
-    for key in (schema.SUBTASK_INDEX.key, *schema.INDICES):
-        made[key] = column(columns[key])
-    return pa.table(made)
+def _levels(key: str, counts: Any, pictures: int) -> Levels:
+    """Return counts of a video's levels; those of depth stand for mm."""
+    counts = np.array(counts, np.int64)
+    return Levels(counts, pictures, 1.0 if len(counts) == 1 else 1 / 255)
 
 
-def _scene_table(index: int, entry: dict[str, Any], about: dict[str, Any]) -> pa.Table:
+def _scene_table(part: Part, entry: dict[str, Any]) -> pa.Table:
     return pa.table(
         {
-            "episode_index": pa.array([index], pa.int64()),
-            "scene": pa.array([json.dumps(about["scene"], ensure_ascii=False)], pa.string()),
-            "cameras": pa.array([json.dumps(about["cameras"])], pa.string()),
+            "episode_index": pa.array([part.index], pa.int64()),
+            "scene": pa.array([json.dumps(part.about["scene"], ensure_ascii=False)], pa.string()),
+            "cameras": pa.array([json.dumps(part.about["cameras"])], pa.string()),
             "source": pa.array([json.dumps(entry, ensure_ascii=False)], pa.string()),
         }
     )
 
 
-def _video_file(root: Path, kind: str, camera: str, chunk: int, file: int) -> Path:
-    if kind == "depth":
-        return schema.data_file(root, schema.DEPTH_PATH, chunk, file, camera=camera)
-    return schema.data_file(root, schema.VIDEO_PATH, chunk, file, video_key=schema.image_key(camera))
-
-
 def _info(
-    plan: dict[str, Any],
+    variant: Variant,
     fps: int,
-    frames: int,
-    tasks: int,
+    totals: dict[str, int],
     videos: dict[str, dict[str, Any]],
     limits: Limits,
     robot_type: str,
 ) -> dict[str, Any]:
-    count = len(plan["episodes"])
+    layout, count = variant.layout, totals["total_episodes"]
+    if layout.one_file_per_episode:
+        files = {"total_videos": count * len(videos), "total_chunks": -(-count // CHUNK_FILES)}
+    else:
+        files = {"data_files_size_in_mb": limits.data_mb, "video_files_size_in_mb": limits.video_mb}
     return {
-        "codebase_version": schema.CODEBASE_VERSION,
+        "codebase_version": layout.codebase_version,
         "robot_type": robot_type,
-        "total_episodes": count,
-        "total_frames": frames,
-        "total_tasks": tasks,
-        "chunks_size": schema.CHUNK_FILES,
-        "data_files_size_in_mb": limits.data_mb,
-        "video_files_size_in_mb": limits.video_mb,
+        **totals,
+        "chunks_size": CHUNK_FILES,
+        **files,
         "fps": fps,
         "splits": {"train": f"0:{count}"},
-        "data_path": schema.DATA_PATH,
-        "video_path": schema.VIDEO_PATH,
-        "features": schema.features_json(videos),
+        "data_path": layout.data,
+        "video_path": layout.video,
+        "features": schema.features_json(variant, videos),
     }

@@ -10,6 +10,7 @@ from typing import Any
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
+from robocas_ms3.datasets.lerobot.variants import Layout
 from robocas_ms3.datasets.lerobot.video import packet_times, read_frames
 from robocas_ms3.errors import DatasetError
 
@@ -19,30 +20,37 @@ _MILLISECONDS = 0.6e-3  # Matroska rounds to them
 
 
 def check_videos(dataset: LeRobotDataset, key: str, decode: bool) -> Iterator[Violation]:
-    """Check a camera's videos, and its depth where there is any.
+    """Check the videos of a feature, and the camera's depth videos that LeRobot does not read, where there are any.
 
     Args:
         dataset: it is in.
-        key: of the camera's feature.
+        key: of the feature.
         decode: whether to decode the frames, or to count them only.
     """
-    root, info, rows = dataset.root, dataset.info, dataset.rows
+    root, layout, info, rows = dataset.root, dataset.layout, dataset.info, dataset.rows
     camera, feature = schema.camera_of(key), info["features"][key]
-    kinds = [(f"videos/{key}", schema.VIDEO_PATH, {"video_key": key})]
+    kinds = [(f"videos/{key}", layout.video)]
     if rows and f"depth/{camera}/file_index" in rows[0]:
-        kinds.append((f"depth/{camera}", schema.DEPTH_PATH, {"camera": camera}))
-    for prefix, pattern, names in kinds:
+        kinds.append((f"depth/{camera}", layout.depth))
+    for prefix, pattern in kinds:
         by_file: dict[Path, list[dict[str, Any]]] = defaultdict(list)
         for row in rows:
             place = row[f"{prefix}/chunk_index"], row[f"{prefix}/file_index"]
-            by_file[schema.data_file(root, pattern, *place, **names)].append(row)
+            by_file[layout.path(root, pattern, *place, video_key=key, camera=camera)].append(row)
         for path, inside in by_file.items():
             yield from _times(inside, prefix, info["fps"])
             frames = sum(row["length"] for row in inside)
             yield from _video(path, str(path.relative_to(root)), frames, info["fps"], feature["shape"], decode)
-        for path in sorted((root / prefix).rglob("*")):
-            if path.is_file() and path not in by_file:
+        for path in _files_of(root, layout, pattern, key, camera):
+            if path not in by_file:
                 yield Violation(str(path.relative_to(root)), "", "files of episodes only", "of none")
+
+
+def _files_of(root: Path, layout: Layout, pattern: str, key: str, camera: str) -> list[Path]:
+    """Return the files in the folders of a feature's videos."""
+    folder = layout.path(root, pattern, 0, 0, video_key=key, camera=camera).parent  # chunk-000, or below it
+    chunks = folder.parent.parent.glob(f"*/{folder.name}") if layout.one_file_per_episode else [folder.parent]
+    return sorted(path for chunk in chunks for path in chunk.rglob("*") if path.is_file())
 
 
 def _times(rows: list[dict[str, Any]], prefix: str, fps: int) -> Iterator[Violation]:

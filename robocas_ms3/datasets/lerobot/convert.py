@@ -8,11 +8,13 @@ import shutil
 import time
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 from robocas_ms3.datasets.lerobot.plan import PARTS, PLAN, check_resume, only, plan_of
-from robocas_ms3.datasets.lerobot.schema import CONTENT, INFO_FILE, Limits, require_extra, whole_rate
+from robocas_ms3.datasets.lerobot.schema import CONTENT, INFO_FILE, STAGING, Limits, require_extra, whole_rate
+from robocas_ms3.datasets.lerobot.variants import NEWEST, find_variant
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import Conversion
 from robocas_ms3.datasets.writing.dataset_player import open_player
@@ -35,7 +37,7 @@ from robocas_ms3.processes import Limits as EpisodeLimits
 Codec = Literal["h264", "av1"]
 
 _JOINED = ".joined"
-_FOLDERS = (*CONTENT, "meta")  # meta comes last: where it is, the dataset is whole
+_FOLDERS = (*CONTENT, STAGING, "meta")  # meta comes last: where it is, the dataset is whole
 _log = logging.getLogger(__name__)
 
 
@@ -46,6 +48,7 @@ def convert_lerobot(
     rate_hz: float | None = None,
     pictures: Pictures | None = None,
     codec: Codec = "h264",
+    lerobot_version: str = NEWEST,
     include_failed: bool = False,
     overwrite: bool = False,
     resume: bool = False,
@@ -58,7 +61,7 @@ def convert_lerobot(
     on_episode: Callable[[WrittenEpisode], None] | None = None,
     open_source: OpenSource = open_env,
 ) -> Conversion:
-    """Write a LeRobot dataset v3.0.
+    """Write a LeRobot dataset.
 
     Episodes are written one by one into ``out/.parts`` and joined at the end, without encoding again. Killed at any
     moment, it goes on with ``resume`` and ends as if it had not been; until it is done there is no ``meta`` folder.
@@ -69,6 +72,7 @@ def convert_lerobot(
         rate_hz: steps a second, a whole number; default: 5, or the folder's.
         pictures: cameras, size, depth; default: all, as they are.
         codec: of RGB.
+        lerobot_version: of the LeRobot that will read the dataset, see `variants.VARIANTS`.
         include_failed: also convert episodes without success.
         overwrite: replace what is in ``out``.
         resume: keep the episodes that are there.
@@ -83,18 +87,20 @@ def convert_lerobot(
         open_source: what shows a trajectory's states; must be importable by workers.
 
     Raises:
-        DatasetError: the input is unusable, nothing to convert, no render device, a rate that LeRobot can't have.
+        DatasetError: no such version, the input is unusable, nothing to convert, no render device, or a rate
+            that LeRobot does not have.
         IncompleteError: episodes can't be written; all others are, and ``resume`` goes on.
         OutputExistsError: ``out`` is not empty and no flag is set.
         MissingExtraError: the ``lerobot`` extra is not installed.
     """
     require_extra()
-    begun = time.perf_counter()
+    begun, variant = time.perf_counter(), find_variant(lerobot_version)
     out, limits = Path(out), limits or Limits()
-    request = Request(Path(source), rate_hz, pictures or Pictures(), include_failed, open_source, pack)
+    pictures = replace(pictures or Pictures(), boxes=variant.language)
+    request = Request(Path(source), rate_hz, pictures, include_failed, open_source, pack)
     with closing(open_player(request)) as player:
         fps = whole_rate(player.rate_hz)
-        plan = plan_of(player, fps, codec)
+        plan = plan_of(player, fps, codec, variant.version)
         with locked_folder(out):
             # Everything that may fail comes before the output is touched.
             claim_output(out, resume=resume or overwrite)
@@ -147,7 +153,9 @@ def _stage(
     missing = [(i, e["source"]) for i, e in enumerate(entries) if not part_folder(parts, i).is_dir()]
     if on_start:
         on_start(len(missing))
-    job = StageJob(request, parts, plan["settings"]["codec"], missing, limits, begun=len(missing) < len(entries))
+    settings = plan["settings"]
+    variant = find_variant(settings["lerobot_version"])
+    job = StageJob(request, parts, settings["codec"], variant, missing, limits, begun=len(missing) < len(entries))
     written: list[WrittenEpisode] = []
     failed: IncompleteError | None = None
     try:

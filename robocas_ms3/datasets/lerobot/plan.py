@@ -24,7 +24,7 @@ PARTS = ".parts"
 PLAN = "plan.json"
 
 
-def plan_of(player: Player, fps: int, codec: str) -> dict[str, Any]:
+def plan_of(player: Player, fps: int, codec: str, version: str) -> dict[str, Any]:
     """What a conversion will do: settings, episodes, split."""
     entries, pictures = player.entries(), player.pictures
     place = {entry["source"]: i for i, entry in enumerate(entries)}
@@ -35,6 +35,7 @@ def plan_of(player: Player, fps: int, codec: str) -> dict[str, Any]:
         "format": "lerobot",
         "made_with": versions(),
         "settings": {
+            "lerobot_version": version,
             "rate_hz": fps,
             "cameras": list(pictures.cameras),
             "depth": pictures.depth,

@@ -1,9 +1,10 @@
-"""Opens a LeRobot dataset; needs no ``lerobot``. What only those made here have is read where it is there."""
+"""Open a LeRobot dataset; needs no ``lerobot``. What only those made here have is read where it is there."""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
-from dataclasses import dataclass
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
@@ -14,16 +15,16 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.lerobot.arrays import robocas_arrays
+from robocas_ms3.datasets.lerobot.depth import to_depth
+from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, boxes_of, goals_of, read_rows_of
+from robocas_ms3.datasets.lerobot.metadata import Metadata
 from robocas_ms3.datasets.lerobot.records import (
-    SCENES,
+    SUBGOAL_TYPES,
     SUBGOALS,
     CameraRecord,
     CamerasRecord,
-    ConversionRecord,
-    InfoRecord,
-    episode_columns,
     frame_columns,
-    of_our_shapes,
     unknown_numbers,
 )
 from robocas_ms3.datasets.lerobot.tables import (
@@ -35,20 +36,20 @@ from robocas_ms3.datasets.lerobot.tables import (
     read_columns,
     read_objects,
     read_rows,
-    read_texts,
 )
 from robocas_ms3.datasets.lerobot.video import read_frames
+from robocas_ms3.datasets.pictures.boxes import Box
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, Side, SourceEpisode
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.datasets.sources.tolerant import first_line
-from robocas_ms3.documents import DocumentError, json_values, load_json
+from robocas_ms3.documents import DocumentError, json_values
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.subgoals import SubGoal
+from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
 from robocas_ms3.strict import parse
 
 
-class LeRobotDataset(EpisodeSource):
+class LeRobotDataset(Metadata, EpisodeSource):
     """A dataset's folder.
 
     Raises:
@@ -57,98 +58,14 @@ class LeRobotDataset(EpisodeSource):
     """
 
     def __init__(self, root: Path) -> None:
-        self.root = root
         schema.require_extra()
+        super().__init__(root)
         _ = self.info
-
-    @cached_property
-    def info(self) -> dict[str, Any]:
-        """``meta/info.json``.
-
-        Raises:
-            DatasetError: it is missing or damaged, or of another version.
-        """
-        path = self.root / schema.INFO_FILE
-        try:
-            found = load_json(path)
-        except (OSError, ValueError) as error:
-            raise DatasetError("no LeRobot dataset here", where=path, found=type(error).__name__) from error
-        version = found.get("codebase_version") if isinstance(found, dict) else None
-        if version != schema.CODEBASE_VERSION:
-            what = "a LeRobot dataset of another version"
-            raise DatasetError(what, where=self.root, expected=schema.CODEBASE_VERSION, found=version)
-        parse(InfoRecord, found, DatasetError, where=path)
-        return found
-
-    @cached_property
-    def settings(self) -> dict[str, Any]:
-        """``meta/robocas/conversion.json``; empty where there is none.
-
-        Raises:
-            DatasetError: it is damaged.
-        """
-        path = self.root / schema.CONVERSION_FILE
-        try:
-            found = load_json(path) if path.exists() else {}
-        except (OSError, ValueError) as error:
-            raise DatasetError("this JSON is damaged", where=path, found=first_line(error)) from error
-        parse(ConversionRecord, found, DatasetError, where=path)
-        return found
 
     @property
     def rate_hz(self) -> float:
         """Steps a second."""
         return float(self.info["fps"])
-
-    @cached_property
-    def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras."""
-        return tuple(schema.camera_of(key) for key, ft in self.info["features"].items() if ft["dtype"] == "video")
-
-    @property
-    def has_depth(self) -> bool:
-        """Whether depth is there."""
-        return bool(self.rows) and any(f"depth/{camera}/file_index" in self.rows[0] for camera in self.cameras[:1])
-
-    @property
-    def is_ours(self) -> bool:
-        """Whether it has the columns of those written here."""
-        return of_our_shapes(self.info["features"])
-
-    @cached_property
-    def rows(self) -> list[dict[str, Any]]:
-        """What ``meta/episodes`` says of each episode, but statistics.
-
-        Raises:
-            DatasetError: a table is damaged, too long, or lacks a column; or two rows are of one episode.
-        """
-        found = [row for path, table in self.tables_of_episodes() for row in self._checked(path, table).to_pylist()]
-        numbers = [row["episode_index"] for row in found]
-        if len(set(numbers)) < len(numbers):
-            raise DatasetError("two rows of one episode", where=self.root / "meta/episodes")
-        frames = sum(row["length"] for row in found)
-        if frames > self.info["total_frames"]:
-            what, expected = "episodes are longer than the dataset", f"{self.info['total_frames']} frames at most"
-            raise DatasetError(what, where=self.root / "meta/episodes", expected=expected, found=frames)
-        return found
-
-    def tables_of_episodes(self) -> Iterator[tuple[Path, pa.Table]]:
-        """Yield path and table of the files of ``meta/episodes``, without statistics.
-
-        Raises:
-            DatasetError: one is damaged, or they have more rows than there are episodes.
-        """
-        left = self.info["total_episodes"]
-        for path in sorted((self.root / "meta/episodes").glob("*/*.parquet")):
-            with open_table(path, most_rows=left) as file:
-                names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
-                table = read_columns(file, path, names, limit=OBJECTS_LIMIT)
-            left -= len(table)
-            yield path, table
-
-    def _checked(self, path: Path, table: pa.Table) -> pa.Table:
-        check_columns(table, episode_columns(table.column_names, self.info["features"]), path)
-        return table
 
     @cached_property
     def row_of(self) -> dict[int, dict[str, Any]]:
@@ -185,29 +102,6 @@ class LeRobotDataset(EpisodeSource):
         return entries[number] if number < len(entries) else {}
 
     @cached_property
-    def tasks(self) -> list[str]:
-        """Instructions, by ``task_index``."""
-        return read_texts(self.root / schema.TASKS_FILE, "task_index", self.info["total_tasks"])
-
-    @cached_property
-    def subtasks(self) -> list[str]:
-        """Texts of sub-goals, by ``subtask_index``."""
-        return read_texts(self.root / schema.SUBTASKS_FILE, "subtask_index", self.info["total_frames"])
-
-    def subtask_texts(self, places: NDArray, where: object) -> list[str]:
-        """Return the texts of sub-goals by their numbers.
-
-        Raises:
-            DatasetError: there is no text of such a number.
-        """
-        known = len(self.subtasks)
-        wrong = places[~((places >= 0) & (places < known) & (places == np.floor(places)))]
-        if len(wrong):
-            what, expected = "no such sub-goal", f"0 to {known - 1}"
-            raise DatasetError(what, where=f"{where}, subtask_index", expected=expected, found=wrong[0])
-        return [self.subtasks[place] for place in places.astype(np.int64).tolist()]
-
-    @cached_property
     def goals(self) -> dict[int, list[SubGoal]]:
         """Number -> sub-goals over the steps, in one pass over the tables; empty where they are not ours.
 
@@ -215,28 +109,37 @@ class LeRobotDataset(EpisodeSource):
             DatasetError: one is damaged.
         """
         goals: dict[int, list[SubGoal]] = {}
-        left = self.info["total_frames"]
         for path in sorted((self.root / "data").glob("*/*.parquet")) if self.is_ours else ():
-            columns = read_objects(path, SUBGOALS, most_rows=left)
-            left -= len(columns)
-            numbers, kinds, places = (columns.column(key) for key in SUBGOALS)
-            texts = self.subtask_texts(places.to_numpy(), path)
-            for (number, kind, text), steps in groupby(zip(numbers.to_pylist(), kinds.to_pylist(), texts, strict=True)):
+            for number, types, texts in self._subgoals(path):
                 before = goals.setdefault(number, [])
                 first = before[-1].last + 1 if before else 0
-                before.append(SubGoal(kind, text, first, first + len(list(steps)) - 1))
+                for run in subgoal_runs(types, texts):
+                    before.append(replace(run, first=first + run.first, last=first + run.last))
         return goals
 
-    @cached_property
-    def described(self) -> dict[int, dict[str, str]]:
-        """Number -> ``scene`` and ``cameras``, JSON, by ``meta/robocas/episodes.parquet``; empty without.
-
-        Raises:
-            DatasetError: the table is damaged.
-        """
-        path = self.root / schema.SCENES_FILE
-        rows = read_objects(path, SCENES, most_rows=self.info["total_episodes"]).to_pylist() if path.exists() else []
-        return {row.pop("episode_index"): row for row in rows}
+    def _subgoals(self, path: Path) -> Iterator[tuple[int, list[str], list[str]]]:
+        """Yield, of each episode of a file, its number and the types and texts of the sub-goals of its steps."""
+        if not self.has_language:
+            columns = read_objects(path, SUBGOALS, most_rows=self.info["total_frames"])
+            numbers, types, places = (columns.column(key) for key in SUBGOALS)
+            texts = self.subtask_texts(places.to_numpy(), path)
+            for number, steps in groupby(
+                zip(numbers.to_pylist(), types.to_pylist(), texts, strict=True), lambda s: s[0]
+            ):
+                _, kinds, said = zip(*steps, strict=True)
+                yield number, list(kinds), list(said)
+            return
+        with open_table(path, most_rows=self.info["total_frames"]) as file:
+            for group in range(file.num_row_groups):  # the rows of an episode are in each of its frames
+                keys = (*SUBGOAL_TYPES, PERSISTENT)
+                table = read_columns(file, path, keys, groups=[group], limit=OBJECTS_LIMIT)
+                check_columns(table, SUBGOAL_TYPES, path)
+                numbers = table.column("episode_index").to_numpy()
+                starts = np.flatnonzero(np.diff(numbers, prepend=-1))
+                for first, end in zip(starts, [*starts[1:], len(numbers)], strict=True):
+                    rows = read_rows_of(table.slice(first, 1), PERSISTENT, path)[0]
+                    types = table.column(schema.SUBGOAL_TYPE.key).slice(first, end - first).to_pylist()
+                    yield int(numbers[first]), types, goals_of(rows, len(types), self.info["fps"])
 
     def episode(self, number: int) -> LeRobotEpisode:
         """Open an episode.
@@ -293,10 +196,8 @@ class LeRobotEpisode(SourceEpisode):
         Raises:
             DatasetError: the file is damaged, or has another number of rows of this episode.
         """
-        row = self.row
-        path = schema.data_file(
-            self.dataset.root, schema.DATA_PATH, row["data/chunk_index"], row["data/file_index"]
-        )  # fmt: skip
+        row, layout = self.row, self.dataset.layout
+        path = layout.path(self.dataset.root, layout.data, row["data/chunk_index"], row["data/file_index"])
         table = read_rows(path, self.number, self.dataset.info["total_frames"])
         if len(table) != self.steps:
             what = "another number of rows than the table of episodes says"
@@ -324,12 +225,29 @@ class LeRobotEpisode(SourceEpisode):
             if values.shape[1] != feature.width or not (np.abs(values) <= np.finfo(np.float32).max).all():
                 where, expected = f"{self.where}, {feature.key}", f"{feature.width} finite numbers per step"
                 raise DatasetError("wrong numbers", where=where, expected=expected, fix=SEE_VALIDATE)
-        texts = self.dataset.subtask_texts(self.columns[schema.SUBTASK_INDEX.key][:, 0], self.where)
+        texts = self._subgoal_texts()
         types = self.table.column(schema.SUBGOAL_TYPE.key).to_pylist()
         try:
-            return schema.robocas_arrays(self.columns, self.instruction, texts, types)
+            return robocas_arrays(self.columns, self.instruction, texts, types)
         except ValueError as error:  # a quaternion of length 0, a text that is not ASCII
             raise DatasetError("wrong values", where=self.where, found=first_line(error), fix=SEE_VALIDATE) from error
+
+    def _subgoal_texts(self) -> list[str]:
+        if self.dataset.has_language:
+            first = read_rows_of(self.table.slice(0, 1), PERSISTENT, self.where)
+            return goals_of(first[0], self.steps, self.dataset.info["fps"])
+        return self.dataset.subtask_texts(self.columns[schema.SUBTASK_INDEX.key][:, 0], self.where)
+
+    @cached_property
+    def target_boxes(self) -> Sequence[dict[str, Box]]:
+        """Box of the target in each step, by its ``vqa`` rows; empty without language columns.
+
+        Raises:
+            DatasetError: the rows are damaged.
+        """
+        if not self.dataset.has_language:
+            return []
+        return [boxes_of(rows) for rows in read_rows_of(self.table, EVENTS, self.where)]
 
     @property
     def goals(self) -> list[SubGoal]:
@@ -370,15 +288,15 @@ class LeRobotEpisode(SourceEpisode):
         return np.array(self._camera(camera).camera_in_parent)
 
     def video(self, camera: str, kind: Kind) -> tuple[Path, int]:
-        """File of a camera's video and the number of its first frame there."""
-        names = {"video_key": schema.image_key(camera), "camera": camera}
-        start = f"videos/{names['video_key']}" if kind == "rgb" else f"depth/{camera}"
-        pattern = schema.VIDEO_PATH if kind == "rgb" else schema.DEPTH_PATH
-        row = self.row
-        path = schema.data_file(
-            self.dataset.root, pattern, row[f"{start}/chunk_index"], row[f"{start}/file_index"], **names
-        )  # fmt: skip
-        return path, round(row[f"{start}/from_timestamp"] * self.dataset.info["fps"])
+        """Return the file of a camera's video and the number of its first frame there."""
+        row, layout = self.row, self.dataset.layout
+        native = kind == "depth" and self.dataset.depth_feature(camera) is not None
+        key = schema.depth_key(camera) if native else schema.image_key(camera)
+        in_videos = kind == "rgb" or native
+        prefix, pattern = (f"videos/{key}", layout.video) if in_videos else (f"depth/{camera}", layout.depth)
+        place = row[f"{prefix}/chunk_index"], row[f"{prefix}/file_index"]
+        path = layout.path(self.dataset.root, pattern, *place, video_key=key, camera=camera)
+        return path, round(row[f"{prefix}/from_timestamp"] * self.dataset.info["fps"])
 
     def frames(
         self, camera: str, kind: Kind = "rgb", first: int = 0, count: int | None = None
@@ -386,7 +304,9 @@ class LeRobotEpisode(SourceEpisode):
         """Pictures one after the other, for which their video is opened once."""
         path, start = self.video(camera, kind)
         count = self.steps - first if count is None else count
-        return read_frames(path, start + first, count, self.dataset.info["fps"])
+        pictures = read_frames(path, start + first, count, self.dataset.info["fps"])
+        feature = self.dataset.depth_feature(camera) if kind == "depth" else None
+        return pictures if feature is None else _depths(pictures, feature["info"])
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
         """(H, W, 3) RGB."""
@@ -397,6 +317,13 @@ class LeRobotEpisode(SourceEpisode):
         """(H, W) mm, 0 = nothing."""
         (picture,) = self.frames(camera, "depth", step, 1)
         return picture
+
+
+def _depths(levels: Generator[NDArray, None, None], info: dict[str, Any]) -> Generator[NDArray, None, None]:
+    """Yield the depth in mm of images of levels, and close their video."""
+    with closing(levels):
+        for picture in levels:
+            yield to_depth(picture, info)
 
 
 def open_lerobot(root: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> LeRobotDataset:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, StringConstraints, model_validator
 
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBERS, TEXT, TEXTS, Column, Kind
+from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS
 from robocas_ms3.datasets.sources.provenance import EntryRecord
+from robocas_ms3.datasets.sources.tolerant import first_line
+from robocas_ms3.documents import JSON_LIMIT, json_values, read_text
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.strict import parse
 
 MAX_EPISODES = 10**6
 MAX_FRAMES = 10**9
@@ -19,7 +25,7 @@ _MAX_SECONDS = 1e6  # of a video's timestamps
 Name = Annotated[str, StringConstraints(pattern=r"^[^\x00-\x1f\x7f/\\.][^\x00-\x1f\x7f/\\]*$", max_length=200)]
 """A feature's key: it is part of paths, so LeRobot too refuses one with a slash."""
 Dtype = Annotated[
-    str, StringConstraints(pattern=r"^(video|image|string|bool|float(16|32|64)|u?int(8|16|32|64))$")
+    str, StringConstraints(pattern=r"^(video|image|string|language|bool|float(16|32|64)|u?int(8|16|32|64))$")
 ]  # fmt: skip
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -42,19 +48,19 @@ class FeatureRecord(_Record):
 class InfoRecord(_Record):
     """``meta/info.json``. Paths have LeRobot's own patterns: a pattern of a file could lead anywhere."""
 
-    codebase_version: Literal[schema.CODEBASE_VERSION]  # pyright: ignore[reportInvalidTypeForm]
+    codebase_version: Literal["v3.0", "v2.1"]
     robot_type: str | None = None
     total_episodes: Annotated[int, Field(ge=0, le=MAX_EPISODES)]
     total_frames: Annotated[int, Field(ge=0, le=MAX_FRAMES)]
     total_tasks: Annotated[int, Field(ge=0, le=MAX_EPISODES)]
-    chunks_size: Annotated[int, Field(ge=1, le=MAX_EPISODES)] = schema.CHUNK_FILES
+    chunks_size: Annotated[int, Field(ge=1, le=MAX_EPISODES)] = CHUNK_FILES
     data_files_size_in_mb: Annotated[float, Field(gt=0, le=1e6)] = 100
     video_files_size_in_mb: Annotated[float, Field(gt=0, le=1e6)] = 200
     fps: Annotated[int, Field(ge=1, le=1000)]
     splits: dict[str, str]
     features: dict[Name, FeatureRecord]
-    data_path: Literal[schema.DATA_PATH]  # pyright: ignore[reportInvalidTypeForm]
-    video_path: Literal[schema.VIDEO_PATH] | None = None  # pyright: ignore[reportInvalidTypeForm]
+    data_path: str
+    video_path: str | None = None
 
     @model_validator(mode="after")
     def _is_whole(self) -> InfoRecord:
@@ -63,7 +69,62 @@ class InfoRecord(_Record):
             raise ValueError(f"features: expected {', '.join(schema.INDICES)}, found no {', '.join(missing)}")
         if self.video_path is None and any(feature.dtype == "video" for feature in self.features.values()):
             raise ValueError("video_path: expected a pattern, as there are videos")
+        layout = LAYOUTS[self.codebase_version]
+        for key, pattern, own in (
+            ("data_path", self.data_path, layout.data),
+            ("video_path", self.video_path, layout.video),
+        ):
+            if pattern not in (own, None):
+                raise ValueError(f"{key}: expected {own}, found {pattern}")
+        if layout.one_file_per_episode and self.chunks_size != CHUNK_FILES:
+            raise ValueError(f"chunks_size: expected {CHUNK_FILES}, found {self.chunks_size}")
         return self
+
+
+class EpisodeLine(_Record):
+    """A line of ``meta/episodes.jsonl``."""
+
+    episode_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
+    tasks: list[str]
+    length: Annotated[int, Field(ge=1, le=MAX_FRAMES)]
+
+
+class TaskLine(_Record):
+    """A line of ``meta/tasks.jsonl``."""
+
+    task_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
+    task: str
+
+
+class StatsLine(_Record):
+    """A line of ``meta/episodes_stats.jsonl``."""
+
+    episode_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
+    stats: dict[str, dict[str, Any]]
+
+
+_Line = TypeVar("_Line", bound=_Record)
+
+
+def read_lines(path: Path, form: type[_Line], most: int) -> list[_Line]:
+    """Read a file of JSON lines.
+
+    Args:
+        path: of the file.
+        form: of each line.
+        most: number of lines; more are refused.
+
+    Raises:
+        DatasetError: the file is missing, damaged, or has more lines.
+    """
+    try:
+        lines = [line for line in read_text(path, JSON_LIMIT).split("\n") if line.strip()]
+        if len(lines) > most:
+            raise DatasetError("too many lines", where=path, expected=f"{most} at most", found=len(lines))
+        values = [json_values(line) for line in lines]
+    except (OSError, ValueError) as error:
+        raise DatasetError("these JSON lines can't be read", where=path, found=first_line(error)) from error
+    return [parse(form, found, DatasetError, where=f"{path}, line {n}") for n, found in enumerate(values, 1)]
 
 
 class ConversionRecord(_Record):
@@ -93,6 +154,7 @@ class CamerasRecord(_Record):
 
 
 SCENES: Mapping[str, Column] = {"episode_index": Column(INTEGER), "scene": Column(TEXT), "cameras": Column(TEXT)}
+SUBGOAL_TYPES: Mapping[str, Column] = {"episode_index": Column(INTEGER), schema.SUBGOAL_TYPE.key: Column(TEXT)}
 SUBGOALS: Mapping[str, Column] = {
     "episode_index": Column(INTEGER),
     schema.SUBGOAL_TYPE.key: Column(TEXT),
@@ -129,7 +191,8 @@ def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[s
 
 def frame_columns(features: Mapping[str, Any]) -> dict[str, Column]:
     """Return the columns that the data have to have; numbers themselves are checked per episode."""
-    stored = {key: feature["dtype"] for key, feature in features.items() if feature["dtype"] not in ("image", "video")}
+    apart = ("image", "video", "language")
+    stored = {key: feature["dtype"] for key, feature in features.items() if feature["dtype"] not in apart}
     columns = {key: Column(_kind_of(dtype)) for key, dtype in stored.items()}
     return {**columns, **{key: Column(INTEGER, greatest=MAX_FRAMES) for key in schema.INDICES if key != "timestamp"}}
 

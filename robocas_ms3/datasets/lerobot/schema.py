@@ -1,18 +1,33 @@
-"""The LeRobot dataset v3.0 as written here, declared once: writer, reader, check, documentation and tests read it.
+"""The LeRobot datasets that are written here, declared once: writer, reader, check, documentation and tests read it.
 
-::
+Format v3.0 (`variants.V3`)::
 
     meta/info.json                              version, rate, sizes, features
     meta/stats.json                             statistics of every numeric feature over the whole dataset
     meta/tasks.parquet                          instruction -> task_index
-    meta/subtasks.parquet                       text of a sub-goal -> subtask_index
-    meta/episodes/chunk-000/file-000.parquet    one row an episode: where it is, its tasks, its statistics
+    meta/subtasks.parquet                       text of a sub-goal -> subtask_index; without language columns only
+    meta/episodes/chunk-000/file-000.parquet    one row per episode: its files, tasks and statistics
+    data/chunk-000/file-000.parquet             one row per frame
+    videos/<key>/chunk-000/file-000.mp4         RGB and native depth, episodes one after the other
+    depth/<camera>/chunk-000/file-000.mkv       16-bit depth, FFV1; ours, LeRobot does not read it
+
+Format v2.1 (`variants.V21`)::
+
+    meta/info.json, stats.json, subtasks.parquet   as in v3.0
+    meta/tasks.jsonl                               instruction and task_index
+    meta/episodes.jsonl                            tasks and length of each episode
+    meta/episodes_stats.jsonl                      statistics of each episode
+    meta/modality.json                             slices of state and action, for GR00T
+    data/chunk-000/episode_000000.parquet
+    videos/chunk-000/<key>/episode_000000.mp4
+    depth/chunk-000/<camera>/episode_000000.mkv
+
+Both::
+
     meta/robocas/conversion.json                how the dataset was made, and which episode is which recording; ours
     meta/robocas/episodes.parquet               scene.json and cameras of each episode; ours
-    meta/robocas/checksums.json                 SHA-256 of the files below; ours
-    data/chunk-000/file-000.parquet             one row a frame
-    videos/<key>/chunk-000/file-000.mp4         RGB, episodes one after the other
-    depth/<camera>/chunk-000/file-000.mkv       16-bit depth, FFV1, in the same way; ours, LeRobot does not look there
+    meta/robocas/checksums.json                 SHA-256 of the files of data, videos and depth; ours
+    .annotate_staging/episode_000000/*.jsonl    the language rows, where lerobot-annotate looks for rows to keep
 
 Metres and radians; quaternions are xyzw.
 """
@@ -20,38 +35,34 @@ Metres and radians; quaternions are xyzw.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.schema import EPISODE_INFO
+from robocas_ms3.datasets.lerobot.variants import Variant
 from robocas_ms3.documents import check_regular
 from robocas_ms3.errors import DatasetError
-from robocas_ms3.poses import from_xyzw
-from robocas_ms3.recordings.motion import relative_motion
 from robocas_ms3.robots.table import DEFAULT
 
-CODEBASE_VERSION = "v3.0"
 ROBOT_TYPE = "mobile_panda"  # of the default robot; another one's is its name
 INFO_FILE = "meta/info.json"
 STATS_FILE = "meta/stats.json"
 TASKS_FILE = "meta/tasks.parquet"
 SUBTASKS_FILE = "meta/subtasks.parquet"
+TASKS_LINES = "meta/tasks.jsonl"
+EPISODES_LINES = "meta/episodes.jsonl"
+STATS_LINES = "meta/episodes_stats.jsonl"
+MODALITY_FILE = "meta/modality.json"
+EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+STAGING = ".annotate_staging"
 CONVERSION_FILE = "meta/robocas/conversion.json"
 SCENES_FILE = "meta/robocas/episodes.parquet"
 CHECKSUMS_FILE = "meta/robocas/checksums.json"
 CONTENT = ("data", "videos", "depth")
 """Folders of the files that grow with the dataset."""
-_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-DATA_PATH = f"data/{_FILE}.parquet"
-EPISODES_PATH = f"meta/episodes/{_FILE}.parquet"
-VIDEO_PATH = f"videos/{{video_key}}/{_FILE}.mp4"
-DEPTH_PATH = f"depth/{{camera}}/{_FILE}.mkv"
-CHUNK_FILES = 1000  # files a chunk
 _FILE_LIMIT = 2**34  # bytes
 
 
@@ -129,18 +140,39 @@ OUR_KEYS = tuple(feature.key for feature in FEATURES)
 
 SUBGOAL_TYPE = Feature("subgoal_type", ("type",), "type of the sub-goal pursued at this step", "string")
 SUBTASK_INDEX = Feature("subtask_index", ("index",), "row of meta/subtasks.parquet: text of that sub-goal", "int64")
+REWARD = Feature("next.reward", ("reward",), "1 in the last frame of a successful episode, else 0")
+SUCCESS = Feature("next.success", ("success",), "whether it is the last frame of a successful episode", "bool")
+DONE = Feature("next.done", ("done",), "whether it is the last frame of the episode", "bool")
+OUTCOME = (REWARD, SUCCESS, DONE)
+LANGUAGE_COLUMNS = ("language_persistent", "language_events")
 INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """LeRobot's own features: s, and numbers within the episode, of the episode, within the dataset, of the task."""
 
+NOT_NUMERIC = ("string", "language", "video", "image")
+"""``dtype`` of features that are no columns of numbers."""
+MAX_DEPTH_MM = 4095
+"""Largest depth of a native depth video, mm: 12 bits, one level per millimetre. Farther pixels are stored as this."""
+
 
 def image_key(camera: str) -> str:
-    """Name of a camera's feature."""
+    """Return the name of a camera's feature."""
     return f"observation.images.{camera}"
 
 
+def depth_key(camera: str) -> str:
+    """Return the name of a camera's native depth feature."""
+    return f"{image_key(camera)}_depth"
+
+
 def camera_of(key: str) -> str:
-    """Camera of a feature."""
+    """Return the camera of a feature."""
     return key.removeprefix("observation.images.")
+
+
+def is_depth(feature: dict[str, Any]) -> bool:
+    """Return whether a feature of ``info.json`` is a depth video."""
+    info = feature.get("info") or {}
+    return info.get("is_depth_map") is True or info.get("video.is_depth_map") is True
 
 
 def robot_type(scene: dict[str, Any]) -> str:
@@ -151,19 +183,52 @@ def robot_type(scene: dict[str, Any]) -> str:
     return ROBOT_TYPE if named in (None, DEFAULT) else str(named)
 
 
-def features_json(cameras: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """``features`` of ``info.json``; ``cameras`` by name: the video's description."""
+def video_feature(video: dict[str, Any]) -> dict[str, Any]:
+    """Return the entry of a video in ``features``, from its description by `video.describe`."""
+    shape = [video["video.height"], video["video.width"], video["video.channels"]]
+    return {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": video}
+
+
+def features_json(variant: Variant, videos: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return ``features`` of ``info.json``.
+
+    Args:
+        variant: what is written.
+        videos: description of each video by its feature's key.
+    """
     features = {feature.key: feature.as_json() for feature in FEATURES}
-    for camera, video in cameras.items():
-        shape = [video["video.height"], video["video.width"], 3]
-        names = ["height", "width", "channels"]
-        features[image_key(camera)] = {"dtype": "video", "shape": shape, "names": names, "info": video}
-    for feature in (SUBGOAL_TYPE, SUBTASK_INDEX):
+    features |= {key: video_feature(video) for key, video in videos.items()}
+    for feature in single_features(variant):
         features[feature.key] = {**feature.as_json(), "names": None}
+    if variant.language:
+        features |= {key: {"dtype": "language", "shape": [1], "names": None} for key in LANGUAGE_COLUMNS}
     for key in INDICES:
         dtype = "float32" if key == "timestamp" else "int64"
         features[key] = {"dtype": dtype, "shape": [1], "names": None}
     return features
+
+
+def single_features(variant: Variant) -> tuple[Feature, ...]:
+    """Return the features of a variant that have one value per frame, without LeRobot's own."""
+    subtask = () if variant.language else (SUBTASK_INDEX,)
+    return (SUBGOAL_TYPE, *subtask, *(OUTCOME if variant.outcome else ()))
+
+
+def modality_json(cameras: Sequence[str]) -> dict[str, Any]:
+    """Return ``meta/modality.json``, by which GR00T reads a dataset of format v2.1."""
+    state = {"ee_pos": 3, "ee_orn": 4, "robot_joints": 7, "gripper_width": 1, "agv_pose": 3}
+    action = {"rel_pos": 3, "rel_orn": 3, "gripper_open": 1}
+    return {
+        "state": _slices(state),
+        "action": _slices(action),
+        "video": {camera: {"original_key": image_key(camera)} for camera in cameras},
+        "annotation": {"human.task_description": {"original_key": "task_index"}},
+    }
+
+
+def _slices(widths: dict[str, int]) -> dict[str, dict[str, int]]:
+    ends = np.cumsum(list(widths.values())).tolist()
+    return {key: {"start": end - width, "end": end} for (key, width), end in zip(widths.items(), ends, strict=True)}
 
 
 def whole_rate(rate_hz: float) -> int:
@@ -177,60 +242,6 @@ def whole_rate(rate_hz: float) -> int:
             "LeRobot takes a whole number of frames a second", where="rate", expected="1, 2, 4, 5, ...", found=rate_hz
         )
     return round(rate_hz)
-
-
-def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
-    """The numeric features (T, D) of an episode, from the arrays of ``episode_info.npz``."""
-    turn = Rotation.from_quat(arrays["rel_orn"].astype(np.float64)).as_euler("xyz")
-    status = arrays["gripper_status"].astype(np.float32)[:, None]
-    command, joints = _next(status), _next(arrays["robot_joints"])
-    parts = {
-        "observation.state": (
-            arrays["ee_pos"], arrays["ee_orn"], arrays["robot_joints"], arrays["gripper_width"][:, None],
-            arrays["agv_pose"],
-        ),
-        "observation.joint_velocity": (arrays["arm_joint_vel"],),
-        "observation.arm_base": (arrays["base_pos"], arrays["base_orn"]),
-        "observation.gripper_open": (status,),
-        "action": (arrays["rel_pos"], turn, command),
-        "action.joint": (joints, command),
-        "action.base": (arrays["rel_agv_pose"],),
-    }  # fmt: skip
-    return {key: np.concatenate(part, axis=1).astype(np.float32) for key, part in parts.items()}
-
-
-def robocas_arrays(
-    columns: dict[str, NDArray], instruction: str, subgoals: list[str], types: list[str]
-) -> dict[str, NDArray]:
-    """The way back: arrays of ``episode_info.npz`` but the embeddings; relative turns come from the absolute ones."""
-    state, base = columns["observation.state"], columns["observation.arm_base"]
-    values: dict[str, Any] = {
-        "ee_pos": state[:, :3],
-        "ee_orn": state[:, 3:7],
-        "robot_joints": state[:, 7:14],
-        "gripper_width": state[:, 14],
-        "agv_pose": state[:, 15:18],
-        "arm_joint_vel": columns["observation.joint_velocity"],
-        "base_pos": base[:, :3],
-        "base_orn": base[:, 3:],
-        "gripper_status": columns["observation.gripper_open"].reshape(-1) > 0.5,
-        "rel_pos": columns["action"][:, :3],
-        "rel_agv_pose": columns["action.base"],
-        "episode_length": len(state),
-        "language_goal": instruction,
-        "step_lang_goals": subgoals,
-        "step_goal_type": types,
-    }
-    for pos, orn, rel in (("ee_pos", "ee_orn", "rel"), ("base_pos", "base_orn", "base_rel")):
-        poses = from_xyzw(values[pos].astype(np.float64), values[orn].astype(np.float64))
-        motion = relative_motion(poses)
-        values.setdefault(f"{rel}_pos", motion[:, :3, 3])
-        values[f"{rel}_orn"] = Rotation.from_matrix(motion[:, :3, :3]).as_quat(canonical=True)
-    return {spec.name: spec.cast(values[spec.name]) for spec in EPISODE_INFO if spec.name in values}
-
-
-def _next(values: NDArray) -> NDArray:
-    return np.concatenate([values[1:], values[-1:]])
 
 
 def require_extra() -> None:
@@ -268,8 +279,3 @@ def checksum(path: Path) -> str:
 def content_files(root: Path) -> list[Path]:
     """Files of data, videos and depth, sorted."""
     return sorted(path for name in CONTENT for path in (root / name).rglob("*") if path.is_file())
-
-
-def data_file(root: Path, pattern: str, chunk: int, file: int, **names: str) -> Path:
-    """Path of one of the numbered files."""
-    return root / pattern.format(chunk_index=chunk, file_index=file, **names)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Generator
 from contextlib import ExitStack, closing
@@ -15,11 +16,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.lerobot.schema import SUBGOAL_TYPE, frame_columns, whole_rate
+from robocas_ms3.datasets.lerobot.arrays import frame_columns
+from robocas_ms3.datasets.lerobot.depth import to_levels
+from robocas_ms3.datasets.lerobot.language import EVENTS, EVENTS_TYPE, event_rows
+from robocas_ms3.datasets.lerobot.schema import MAX_DEPTH_MM, SUBGOAL_TYPE, depth_key, image_key, whole_rate
 from robocas_ms3.datasets.lerobot.stats import Levels
-from robocas_ms3.datasets.lerobot.tables import column
-from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder
+from robocas_ms3.datasets.lerobot.table_writing import column
+from robocas_ms3.datasets.lerobot.variants import Variant
+from robocas_ms3.datasets.lerobot.video import CODINGS, Coding, Encoder
+from robocas_ms3.datasets.pictures.boxes import Box
 from robocas_ms3.datasets.schema import episode_folder
+from robocas_ms3.datasets.sources.protocol import Kind
 from robocas_ms3.datasets.writing.dataset_player import open_player
 from robocas_ms3.datasets.writing.frames import Frame
 from robocas_ms3.datasets.writing.players import Player, Request
@@ -31,6 +38,7 @@ from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import json_text, replacing_folder
 from robocas_ms3.processes import Limits
 
+_log = logging.getLogger(__name__)
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
 SUBGOAL = "subgoal"  # column of texts, which become numbers when parts are joined
 
@@ -43,6 +51,7 @@ class StageJob:
         request: what is converted.
         parts: folder of the parts.
         codec: of RGB.
+        variant: what is written.
         tasks: (episode index, number in the source) of those to write.
         limits: of an episode; None: there are none, and one process is this one.
         begun: whether there are parts already.
@@ -51,6 +60,7 @@ class StageJob:
     request: Request
     parts: Path
     codec: str
+    variant: Variant
     tasks: list[tuple[int, int]]
     limits: Limits | None = None
     begun: bool = False
@@ -75,9 +85,16 @@ def _sizes(part: Path) -> dict[str, int]:
     return {file.name: file.stat().st_size for file in sorted(part.iterdir()) if file.name != EPISODE_FILE}
 
 
-def video_name(camera: str, kind: str, codec: str) -> str:
-    """Name of a video in a part; ``kind`` is ``rgb`` or ``depth``."""
-    return f"{kind}_{camera}{CODINGS[codec if kind == 'rgb' else 'depth'].suffix}"
+def coding_of(kind: Kind, codec: str, variant: Variant) -> Coding:
+    """Return how images of a kind become a video."""
+    if kind == "rgb":
+        return CODINGS[codec]
+    return CODINGS["depth12" if variant.native_depth else "depth"]
+
+
+def video_name(camera: str, kind: Kind, coding: Coding) -> str:
+    """Return the name of a video in a part."""
+    return f"{kind}_{camera}{coding.suffix}"
 
 
 def stage_all(job: StageJob, processes: int) -> Generator[WrittenEpisode, None, None]:
@@ -123,23 +140,29 @@ def stage_episode(job: StageJob, player: Player, index: int, number: int) -> Wri
     started, timing, fps = time.perf_counter(), Timing(), whole_rate(player.rate_hz)
     with replacing_folder(part_folder(job.parts, index), sync=True) as folder:
         played = player.open(number, timing)
-        with _Videos(folder, job.codec, fps, timing) as videos, closing(played.frames()) as frames:
+        with _Videos(folder, job, fps, timing) as videos, closing(played.frames()) as frames:
             for frame in frames:
                 videos.add(frame)
         begun, arrays, cameras = time.perf_counter(), played.arrays, played.cameras()
-        steps = int(arrays["episode_length"])
+        steps, scene = int(arrays["episode_length"]), played.scene()
         if videos.steps != steps:
             raise DatasetError("pictures and arrays differ in length", where=number, expected=steps, found=videos.steps)
+        if videos.clipped:
+            _log.warning("episode %d: depth above %d mm is stored as %d mm", number, MAX_DEPTH_MM, MAX_DEPTH_MM)
         columns: dict[str, Any] = {key: column(values) for key, values in frame_columns(arrays).items()}
         columns[SUBGOAL_TYPE.key] = pa.array(arrays["step_goal_type"].tolist(), pa.string())
         columns["timestamp"] = pa.array((np.arange(steps) / fps).astype(np.float32))
         columns["frame_index"] = pa.array(np.arange(steps))
         columns[SUBGOAL] = pa.array(arrays["step_lang_goals"].tolist(), pa.string())
+        if job.variant.language:
+            target = str((scene.get("target") or {}).get("name") or "")
+            events = [event_rows(boxes, target) if target.strip() else [] for boxes in videos.boxes]
+            columns[EVENTS] = pa.array(events, EVENTS_TYPE)
         pq.write_table(pa.table(columns), folder / FRAMES_FILE)
         about = {
             "steps": steps,
             "instruction": str(arrays["language_goal"]),
-            "scene": played.scene(),
+            "scene": scene,
             "cameras": {
                 name: {
                     "intrinsic": np.asarray(cameras[name].intrinsic).tolist(),
@@ -148,7 +171,7 @@ def stage_episode(job: StageJob, player: Player, index: int, number: int) -> Wri
                 for name in player.pictures.cameras
             },
             "depth": player.pictures.depth,
-            "levels": {name: levels.counts.tolist() for name, levels in videos.levels.items()},
+            "levels": {key: levels.counts.tolist() for key, levels in videos.levels.items()},
             "sizes": _sizes(folder),
         }
         text = json_text(about, f"episode {number}", error=DatasetError)
@@ -160,14 +183,22 @@ def stage_episode(job: StageJob, player: Player, index: int, number: int) -> Wri
 
 
 class _Videos:
-    """Encoders of an episode: one a camera and kind, opened with the first frame."""
+    """Encode the images of an episode: one encoder per camera and kind, opened with the first frame.
 
-    def __init__(self, folder: Path, codec: str, fps: int, timing: Timing) -> None:
-        self._folder, self._codec, self._fps, self._timing = folder, codec, fps, timing
+    Attributes:
+        levels: counts of the levels of each video of LeRobot, by its feature's key.
+        boxes: of each frame.
+        steps: number of frames.
+        clipped: whether depth was out of the range of a native depth video.
+    """
+
+    def __init__(self, folder: Path, job: StageJob, fps: int, timing: Timing) -> None:
+        self._folder, self._job, self._fps, self._timing = folder, job, fps, timing
         self._encoders: dict[tuple[str, str], Encoder] = {}
         self._stack = ExitStack()
         self.levels: dict[str, Levels] = {}
-        self.steps = 0
+        self.boxes: list[dict[str, Box]] = []
+        self.steps, self.clipped = 0, False
 
     def __enter__(self) -> _Videos:
         return self
@@ -180,16 +211,22 @@ class _Videos:
         with self._timing.measure("encode"):
             for camera, picture in frame.rgb.items():
                 self._encoder("rgb", camera, picture).add(picture)
-                self.levels.setdefault(camera, Levels()).add(picture)
+                self.levels.setdefault(image_key(camera), Levels.rgb()).add(picture)
             for camera, picture in frame.depth.items():
-                self._encoder("depth", camera, picture).add(picture)
+                levels = picture
+                if self._job.variant.native_depth:
+                    levels = to_levels(picture)
+                    self.clipped = self.clipped or bool(picture.max() > MAX_DEPTH_MM)
+                    self.levels.setdefault(depth_key(camera), Levels.depth()).add(levels)
+                self._encoder("depth", camera, levels).add(levels)
+        self.boxes.append(frame.boxes)
         self.steps += 1
 
-    def _encoder(self, kind: str, camera: str, picture: NDArray) -> Encoder:
+    def _encoder(self, kind: Kind, camera: str, picture: NDArray) -> Encoder:
         if (kind, camera) not in self._encoders:
             height, width = picture.shape[:2]
-            path = self._folder / video_name(camera, kind, self._codec)
-            coding = CODINGS[self._codec if kind == "rgb" else "depth"]
+            coding = coding_of(kind, self._job.codec, self._job.variant)
+            path = self._folder / video_name(camera, kind, coding)
             encoder = self._stack.enter_context(Encoder(path, coding, self._fps, (width, height)))
             self._encoders[kind, camera] = encoder
         return self._encoders[kind, camera]

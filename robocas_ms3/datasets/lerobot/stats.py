@@ -18,6 +18,7 @@ Stats = dict[str, Any]
 
 def vector_stats(values: NDArray) -> Stats:
     """Of an episode's feature (T, D): lists of D numbers."""
+    values = values.astype(np.int64) if values.dtype == bool else values
     numbers = values.astype(np.float64)
     quantiles = np.quantile(numbers, list(QUANTILES.values()), axis=0)
     return {
@@ -89,18 +90,41 @@ class Histogram:
 
 
 class Levels:
-    """How often each of the 256 levels of each channel occurs: exact statistics of any number of pictures."""
+    """Count how often each level of each channel occurs: exact statistics of any number of images.
 
-    def __init__(self, counts: NDArray | None = None, pictures: int = 0) -> None:
-        self.counts = np.zeros((3, 256), np.int64) if counts is None else np.array(counts, np.int64)
-        self.pictures = pictures
+    Attributes:
+        counts: (channels, levels).
+        pictures: number of images.
+    """
 
-    def add(self, picture: NDArray[np.uint8]) -> None:
-        """Take (H, W, 3); of large pictures every few pixels."""
+    def __init__(self, counts: NDArray, pictures: int = 0, unit: float = 1 / 255) -> None:
+        """Start from counts.
+
+        Args:
+            counts: (channels, levels) of the images so far.
+            pictures: number of these images.
+            unit: what one level stands for in the statistics.
+        """
+        self.counts, self.pictures, self._unit = np.array(counts, np.int64), pictures, unit
+
+    @classmethod
+    def rgb(cls) -> Levels:
+        """Return empty counts of RGB images, with statistics between 0 and 1."""
+        return cls(np.zeros((3, 256), np.int64))
+
+    @classmethod
+    def depth(cls) -> Levels:
+        """Return empty counts of 12-bit depth images, with statistics in mm."""
+        return cls(np.zeros((1, 4096), np.int64), unit=1.0)
+
+    def add(self, picture: NDArray) -> None:
+        """Take (H, W, C) or (H, W); of large images every few pixels."""
         longest = max(picture.shape[:2])
         step = longest // _THINNED if longest >= _FINE else 1
-        for channel in range(3):
-            self.counts[channel] += np.bincount(picture[::step, ::step, channel].ravel(), minlength=256)
+        channels, levels = self.counts.shape
+        thinned = picture[::step, ::step].reshape(-1, channels)
+        for channel in range(channels):
+            self.counts[channel] += np.bincount(thinned[:, channel], minlength=levels)
         self.pictures += 1
 
     def merge(self, other: Levels) -> None:
@@ -109,21 +133,21 @@ class Levels:
         self.pictures += other.pictures
 
     def stats(self) -> Stats:
-        """Levels between 0 and 1, each statistic (3, 1, 1); ``count`` is that of pictures."""
-        levels = np.arange(256) / 255
+        """Return the statistics, each of shape (channels, 1, 1); ``count`` is that of images."""
+        values = np.arange(self.counts.shape[1]) * self._unit
         total = self.counts.sum(axis=1)
-        mean = self.counts @ levels / total
-        variance = self.counts @ levels**2 / total - mean**2
+        mean = self.counts @ values / total
+        variance = self.counts @ values**2 / total - mean**2
         below = np.cumsum(self.counts, axis=1)
         found = {
-            "min": levels[(self.counts > 0).argmax(axis=1)],
-            "max": levels[255 - (self.counts[:, ::-1] > 0).argmax(axis=1)],
+            "min": values[(self.counts > 0).argmax(axis=1)],
+            "max": values[len(values) - 1 - (self.counts[:, ::-1] > 0).argmax(axis=1)],
             "mean": mean,
             "std": np.sqrt(np.maximum(variance, 0)),
         }
         for name, share in QUANTILES.items():
-            found[name] = levels[(below < share * total[:, None]).sum(axis=1)]
-        shaped = {name: row.reshape(3, 1, 1).tolist() for name, row in found.items()}
+            found[name] = values[(below < share * total[:, None]).sum(axis=1)]
+        shaped = {name: row.reshape(-1, 1, 1).tolist() for name, row in found.items()}
         return {**shaped, "count": [self.pictures]}
 
 

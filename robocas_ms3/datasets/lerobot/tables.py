@@ -1,14 +1,13 @@
-"""Parquet files: columns of numbers, tables that grow over numbered files, and the two tables of texts."""
+"""Read Parquet files of unknown origin within bounds: columns of numbers, rows of an episode, tables of texts."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +15,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.lerobot.schema import CHUNK_FILES
 from robocas_ms3.documents import check_regular
 from robocas_ms3.errors import DatasetError
 
@@ -187,22 +185,18 @@ def _is_kind(found: pa.DataType, kind: Kind) -> bool:
 
 def _text_bytes(values: pa.ChunkedArray) -> int:
     """Return the bytes of texts that are stored as dictionaries, each counted as often as it occurs."""
-    size = 0
-    for chunk in values.chunks:
-        flat = chunk
-        while pa.types.is_list(flat.type) or pa.types.is_large_list(flat.type):
-            flat = flat.flatten()
-        if pa.types.is_dictionary(flat.type) and len(flat):
-            lengths = pc.binary_length(flat.dictionary).to_numpy(zero_copy_only=False)  # pyright: ignore[reportAttributeAccessIssue]
-            size += int(lengths[flat.indices.drop_null().to_numpy()].sum())
-    return size
+    return sum(map(_array_text_bytes, values.chunks))
 
 
-def column(values: NDArray) -> pa.Array:
-    """(T, D) as lists of D numbers, (T, 1) and (T,) as numbers."""
-    flat = pa.array(np.ascontiguousarray(values).reshape(-1))
-    width = values.shape[1] if values.ndim == 2 else 1
-    return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
+def _array_text_bytes(values: pa.Array) -> int:
+    if pa.types.is_list(values.type) or pa.types.is_large_list(values.type):
+        return _array_text_bytes(values.flatten())
+    if pa.types.is_struct(values.type):
+        return sum(map(_array_text_bytes, values.flatten()))
+    if not pa.types.is_dictionary(values.type) or not len(values):
+        return 0
+    lengths = pc.binary_length(values.dictionary).to_numpy(zero_copy_only=False)  # pyright: ignore[reportAttributeAccessIssue]
+    return int(lengths[values.indices.drop_null().to_numpy()].sum())
 
 
 def numbers(values: pa.ChunkedArray | pa.Array) -> NDArray:
@@ -222,62 +216,6 @@ def numbers(values: pa.ChunkedArray | pa.Array) -> NDArray:
     if len(flat) % len(whole):
         raise DatasetError("no column of numbers", expected="lists of one length", found=f"{len(flat)} numbers in all")
     return flat.to_numpy(zero_copy_only=False).reshape(len(whole), -1)
-
-
-class RollingTable:
-    """A table over numbered files; rows wait until there is a row group of them."""
-
-    def __init__(
-        self, path: Callable[[int, int], Path], limit_mb: float, group: int = 1, compression: str = "snappy"
-    ) -> None:
-        """Nothing is written yet.
-
-        Args:
-            path: of a file, from chunk and file number.
-            limit_mb: size a file may have, 2^20 bytes.
-            group: how many tables are written together.
-            compression: of columns.
-        """
-        self._path, self._limit, self._group, self._compression = path, limit_mb * 2**20, group, compression
-        self._count = 0
-        self._waiting: list[pa.Table] = []
-        self._file: Any = None
-        self._writer: pq.ParquetWriter | None = None
-        self._schema: pa.Schema | None = None
-
-    def place(self, size: int = 0) -> tuple[int, int]:
-        """Chunk and file of what is added next, which takes about ``size`` bytes."""
-        if self._file is not None and self._file.tell() + size > self._limit and self._file.tell() > 4:  # its head
-            self.close()
-        number = self._count if self._file is None else self._count - 1
-        return divmod(number, CHUNK_FILES)
-
-    def add(self, table: pa.Table) -> None:
-        """Append rows, into the file that `place` told."""
-        if self._file is None:
-            path = self._path(*divmod(self._count, CHUNK_FILES))
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._schema = self._schema or table.schema
-            self._file = path.open("wb")
-            self._writer = pq.ParquetWriter(self._file, self._schema, compression=self._compression)
-            self._count += 1
-        self._waiting.append(table.cast(self._schema))
-        if len(self._waiting) >= self._group:
-            self._flush()
-
-    def close(self) -> None:
-        """Finish the file that is being written."""
-        if self._writer is not None:
-            self._flush()
-            self._writer.close()
-            self._file.close()
-            self._writer = self._file = None
-
-    def _flush(self) -> None:
-        if self._waiting:
-            assert self._writer is not None
-            self._writer.write_table(pa.concat_tables(self._waiting).combine_chunks())
-            self._waiting.clear()
 
 
 def read_rows(path: Path, number: int, most_rows: float = np.inf) -> pa.Table:
@@ -309,32 +247,6 @@ def _footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[str], l
     found = [None if place is None else footer.row_group(group).column(place).statistics for group in groups]
     spans = [(s.min, s.max) if s and s.has_min_max and type(s.min) is int else (-np.inf, np.inf) for s in found]
     return footer, texts, spans
-
-
-def write_texts(path: Path, name: str, texts: Sequence[str]) -> None:
-    """Write a table of texts and their numbers; pandas makes the texts its index, by which LeRobot finds them."""
-    index = TEXT_INDEX
-    about = {
-        "index_columns": [index],
-        "column_indexes": [
-            {
-                "name": None,
-                "field_name": None,
-                "pandas_type": "unicode",
-                "numpy_type": "object",
-                "metadata": {"encoding": "UTF-8"},
-            }
-        ],
-        "columns": [
-            {"name": name, "field_name": name, "pandas_type": "int64", "numpy_type": "int64", "metadata": None},
-            {"name": None, "field_name": index, "pandas_type": "unicode", "numpy_type": "object", "metadata": None},
-        ],
-        "creator": {"library": "pyarrow", "version": pa.__version__},
-        "pandas_version": "2.0.0",
-    }
-    table = pa.table({name: pa.array(range(len(texts)), pa.int64()), index: pa.array(list(texts), pa.string())})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(about)}), path)
 
 
 def read_texts(path: Path, name: str, most_rows: float = np.inf) -> list[str]:

@@ -30,12 +30,14 @@ class Pictures:
         size: width and height in pixels; None: the cameras' own, 640 x 480.
         depth: whether depth is stored beside RGB.
         image_format: of RGB.
+        boxes: whether the box of the target is determined in each image.
     """
 
     cameras: tuple[str, ...] = tuple(camera.name for camera in schema.CAMERAS)
     size: tuple[int, int] | None = None
     depth: bool = True
     image_format: schema.ImageFormat = "png"
+    boxes: bool = False
 
     def __post_init__(self) -> None:
         """Put cameras in order, and check them.

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.datasets.actions import action_space
+from robocas_ms3.datasets.pictures.boxes import Box
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.recordings.seeds import one_seed
@@ -83,6 +84,11 @@ class SourceEpisode(Protocol):
     def layout(self) -> dict[str, Any]:
         """What stood where at its beginning, as ``layout`` of ``schema.SCENE``; empty where it is not known."""
         return self.scene.get("layout") or {}
+
+    @property
+    def target_boxes(self) -> Sequence[dict[str, Box]]:
+        """Box of the target in each step, by the cameras that see it; empty where they are not known."""
+        return []
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
         """(H, W, 3) RGB."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import open_source
+from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, SourceEpisode, shots
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame
@@ -101,7 +102,7 @@ class DatasetPlayer:
         """
         with timing.measure("load"):
             episode = self._source.episode(number)
-            return _PlayedEpisode(episode, _arrays(episode), self._sizes, self.pictures.depth, timing)
+            return _PlayedEpisode(episode, _arrays(episode), self._sizes, self.pictures, timing)
 
     def close(self) -> None:
         """Nothing is open."""
@@ -112,7 +113,7 @@ class _PlayedEpisode:
     episode: SourceEpisode
     arrays: dict[str, NDArray]
     sizes: dict[str, tuple[int, int]]
-    with_depth: bool
+    pictures: Pictures
     timing: Timing
 
     def frames(self) -> Generator[Frame, None, None]:
@@ -121,7 +122,8 @@ class _PlayedEpisode:
         Raises:
             DatasetError: one is damaged, or of another size than the dataset's.
         """
-        kinds: tuple[Kind, ...] = ("rgb", "depth") if self.with_depth else ("rgb",)
+        kinds: tuple[Kind, ...] = ("rgb", "depth") if self.pictures.depth else ("rgb",)
+        boxes = self.episode.target_boxes if self.pictures.boxes else []
         with ExitStack() as stack:
             cameras = tuple(self.sizes)
             runs = {kind: stack.enter_context(closing(shots(self.episode, cameras, kind))) for kind in kinds}
@@ -130,7 +132,7 @@ class _PlayedEpisode:
                     found = {kind: next(run) for kind, run in runs.items()}
                 for kind, pictures in found.items():
                     self._check_sizes(kind, step, pictures)
-                yield Frame(found["rgb"], found.get("depth", {}))
+                yield Frame(found["rgb"], found.get("depth", {}), boxes[step] if boxes else {})
 
     def _check_sizes(self, kind: str, step: int, pictures: Mapping[str, NDArray]) -> None:
         for camera, picture in pictures.items():

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.datasets.pictures.boxes import Box
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.recordings.environment import RecordedEnv
 from robocas_ms3.recordings.reading import Recording
@@ -34,10 +35,13 @@ class Frame:
     Attributes:
         rgb: camera -> (H, W, 3) uint8.
         depth: camera -> (H, W) uint16, mm; empty where depth is not wanted.
+        boxes: camera -> box of the target's visible pixels, of the cameras that see it; empty where boxes are not
+            wanted or not known.
     """
 
     rgb: dict[str, NDArray[np.uint8]]
     depth: dict[str, NDArray[np.uint16]]
+    boxes: dict[str, Box] = field(default_factory=dict)
 
 
 class FrameSource(Protocol):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
+from robocas_ms3.datasets.pictures.boxes import Box, box_of
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame
 from robocas_ms3.errors import DatasetError
@@ -47,7 +48,7 @@ class EnvFrames:
             sensors["width"], sensors["height"] = self._pictures.size
         require_renderer()
         self.env = env.make(
-            obs_mode="+".join(self._pictures.kinds),
+            obs_mode="+".join([*self._pictures.kinds, *(["segmentation"] if self._pictures.boxes else [])]),
             control_mode=control_mode,
             num_envs=1,
             sim_backend="physx_cpu",
@@ -116,7 +117,15 @@ class EnvFrames:
         return Frame(
             rgb={name: rgb_of(textures[name], shader) for name, shader in shaders.items()},
             depth={name: depth_of(textures[name], shader) for name, shader in shaders.items() if self._pictures.depth},
+            boxes=self._boxes(textures, shaders) if self._pictures.boxes else {},
         )
+
+    def _boxes(self, textures: dict[str, Any], shaders: dict[str, ShaderConfig]) -> dict[str, Box]:
+        """Return the box of the target's visible pixels in the cameras that see it."""
+        slot = int(self._base.target_slot[0])
+        number = int(self._base.scene.actors[f"object_{slot}"].per_scene_id[0])
+        masks = {name: segmentation_of(textures[name], shader) == number for name, shader in shaders.items()}
+        return {name: box for name, mask in masks.items() if (box := box_of(mask)) is not None}
 
     def cameras(self) -> dict[str, CameraModel]:
         """Intrinsics, and poses in the parents, at the state shown last."""
@@ -196,6 +205,12 @@ def depth_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray
     name = next(name for name, kinds in shader.texture_names.items() if "depth" in kinds)
     depth = shader.texture_transforms[name](textures[name])["depth"][0, ..., 0]  # int16
     return depth.clamp(min=0).cpu().numpy().astype(np.uint16)
+
+
+def segmentation_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.int16]:
+    """Return a camera's segmentation, (H, W): the number of the actor or link in each pixel, 0 = none."""
+    name = next(name for name, kinds in shader.texture_names.items() if "segmentation" in kinds)
+    return shader.texture_transforms[name](textures[name])["segmentation"][0, ..., 0].cpu().numpy()
 
 
 def _matrix(pose: Any) -> NDArray[np.float64]:

@@ -1,0 +1,184 @@
+"""Rows of LeRobot's language columns (LeRobot 0.6 and later): sub-goals, paraphrases and boxes in images.
+
+==========  ====================  =========  ===================================================  =========
+style       column                role       content                                              timestamp
+==========  ====================  =========  ===================================================  =========
+task_aug    language_persistent   user       an instruction that means the same                   0
+subtask     language_persistent   assistant  text of the sub-goal that begins at this time        its start
+vqa         language_events       user       question: where the target is; per camera            the frame
+vqa         language_events       assistant  JSON: box of the target's visible pixels             the frame
+==========  ====================  =========  ===================================================  =========
+
+The persistent rows of an episode are the same in each of its frames. A sub-goal holds until the next one begins.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from robocas_ms3.datasets.checks.scene_values import sound
+from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.pictures.boxes import Box
+from robocas_ms3.documents import json_values
+from robocas_ms3.errors import DatasetError, RobocasError
+from robocas_ms3.language.instructions import instruction, is_plural, part_name, template_ids
+from robocas_ms3.recordings.subgoals import SubGoal
+
+PERSISTENT, EVENTS = "language_persistent", "language_events"
+Row = dict[str, Any]
+
+_TOOL_CALLS = pa.field("tool_calls", pa.list_(pa.string()))
+_TEXTS = [
+    pa.field("role", pa.string(), nullable=False),
+    pa.field("content", pa.string()),
+    pa.field("style", pa.string()),
+]
+_CAMERA = pa.field("camera", pa.string())
+PERSISTENT_TYPE = pa.list_(
+    pa.struct([*_TEXTS, pa.field("timestamp", pa.float32(), nullable=False), _CAMERA, _TOOL_CALLS])
+)
+EVENTS_TYPE = pa.list_(pa.struct([*_TEXTS, _CAMERA, _TOOL_CALLS]))
+"""Arrow types of the columns, LeRobot's."""
+
+
+def persistent_rows(goals: Sequence[SubGoal], instructions: Iterable[str], fps: int) -> list[Row]:
+    """Return the persistent rows of an episode, in LeRobot's order.
+
+    Args:
+        goals: sub-goals over the frames.
+        instructions: texts that mean the same; repeated ones are left out.
+        fps: frames per second.
+    """
+    rows = [_row("user", text, "task_aug", timestamp=0.0) for text in dict.fromkeys(instructions)]
+    starts = [(goal, float(np.float32(goal.first / fps))) for goal in goals]
+    rows += [_row("assistant", goal.goal_description, "subtask", timestamp=start) for goal, start in starts]
+    return sorted(rows, key=lambda row: (row["timestamp"], row["style"]))
+
+
+def event_rows(boxes: Mapping[str, Box], target: str) -> list[Row]:
+    """Return the event rows of a frame: one question and its answer per camera that sees the target.
+
+    Args:
+        boxes: of the target, by camera.
+        target: name of the object, "sugar box".
+    """
+    question = f"Where {'are' if is_plural(target) else 'is'} the {target}?"
+    rows = []
+    for camera, box in boxes.items():
+        detection = {"label": target, "bbox_format": "xyxy", "bbox": list(box)}
+        answer = json.dumps({"detections": [detection]}, sort_keys=True, ensure_ascii=False)
+        key = schema.image_key(camera)
+        rows += [_row("user", question, "vqa", camera=key), _row("assistant", answer, "vqa", camera=key)]
+    return rows
+
+
+def _row(role: str, content: str, style: str, *, timestamp: float | None = None, camera: str | None = None) -> Row:
+    row: Row = {"role": role, "content": content, "style": style}
+    if timestamp is not None:
+        row["timestamp"] = timestamp
+    return {**row, "camera": camera, "tool_calls": None}
+
+
+def paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
+    """Return the instruction and its paraphrases in plain names: one per template of the split ``train``.
+
+    Templates of the split ``held_out`` are for evaluation and are never used.
+
+    Args:
+        scene: content of ``scene.json``; where it does not say what the instruction was made of, there are no
+            paraphrases.
+        text: the instruction.
+
+    Returns:
+        Texts, the instruction first; empty where there is no paraphrase.
+    """
+    known, _ = sound(scene)
+    task, target, recorded = known.get("task"), known.get("target") or {}, known.get("recorded") or {}
+    if not (task and target.get("name") and recorded.get("support")):
+        return []
+    opening = (known.get("config") or {}).get("opening") or {}
+    try:
+        part = opening.get("part") or (part_name(opening["handle"]) if opening.get("handle") else "")
+        texts = [
+            instruction(
+                task,
+                object=target["name"],
+                support=recorded["support"],
+                relation=recorded.get("relation") or None,
+                part=part,
+                template_id=template,
+            ).text
+            for template in template_ids(task, "train")
+        ]
+    except (RobocasError, LookupError, AttributeError, TypeError):  # another version's task, relation or configuration
+        return []
+    return list(dict.fromkeys([text, *texts])) if texts else []
+
+
+def goals_of(rows: Sequence[Row], count: int, fps: int) -> list[str]:
+    """Return the text of the sub-goal of each frame; empty before the first.
+
+    Args:
+        rows: persistent rows of the episode.
+        count: number of frames.
+        fps: frames per second.
+    """
+    starts = sorted((row["timestamp"], row["content"] or "") for row in rows if row["style"] == "subtask")
+    times = (np.arange(count) + 0.5) / fps
+    places = np.searchsorted([time for time, _ in starts], times, side="right") - 1
+    return [starts[place][1] if place >= 0 else "" for place in places.tolist()]
+
+
+def boxes_of(rows: Sequence[Row]) -> dict[str, Box]:
+    """Return the box of the target in a frame's event rows, by camera; answers of other forms are passed over."""
+    boxes = {}
+    for row in rows:
+        if row["style"] == "vqa" and row["role"] == "assistant" and row["camera"] and (box := box_in(row["content"])):
+            boxes[schema.camera_of(row["camera"])] = box
+    return boxes
+
+
+def box_in(answer: str | None) -> Box | None:
+    """Return the box in an answer; None where it is not JSON of one box."""
+    try:
+        (detection,) = json_values(answer or "")["detections"]
+        left, top, right, bottom = detection["bbox"]
+        return (int(left), int(top), int(right), int(bottom))
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None
+
+
+def read_rows_of(table: pa.Table, key: str, where: object) -> list[list[Row]]:
+    """Return the rows of a language column, those of each frame.
+
+    Raises:
+        DatasetError: the column is missing, or its values are no such rows.
+    """
+    fields = {*("role", "content", "style", "camera"), *(("timestamp",) if key == PERSISTENT else ())}
+    kind = table.schema.field(key).type if key in table.column_names else pa.null()
+    is_list = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+    value = kind.value_type if is_list else pa.null()
+    names = {value.field(i).name for i in range(value.num_fields)} if pa.types.is_struct(value) else set()
+    if pa.types.is_null(value) and is_list:  # what Arrow makes of lists that are all empty
+        return [[] for _ in range(len(table))]
+    if not fields <= names:
+        expected = f"lists of {', '.join(sorted(fields))}"
+        raise DatasetError("no language column", where=f"{where}, {key}", expected=expected, found=kind)
+    found = [frame or [] for frame in table.column(key).to_pylist()]
+    for row in (row for frame in found for row in frame):
+        if not _is_row(row, timed=key == PERSISTENT):
+            raise DatasetError("damaged language row", where=f"{where}, {key}", found=str(row)[:120])
+    return found
+
+
+def _is_row(row: Any, *, timed: bool) -> bool:
+    """Return whether texts are texts and the timestamp, of persistent rows, is a finite number."""
+    if not isinstance(row, dict) or not isinstance(row["role"], str):
+        return False
+    texts = all(isinstance(row[key], str | None) for key in ("content", "style", "camera"))
+    return texts and (not timed or (isinstance(row["timestamp"], float | int) and bool(np.isfinite(row["timestamp"]))))

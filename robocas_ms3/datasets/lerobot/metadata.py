@@ -1,0 +1,220 @@
+"""What ``meta`` says of a LeRobot dataset, whichever format it is in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.lerobot.records import (
+    SCENES,
+    ConversionRecord,
+    EpisodeLine,
+    InfoRecord,
+    TaskLine,
+    episode_columns,
+    of_our_shapes,
+    read_lines,
+)
+from robocas_ms3.datasets.lerobot.tables import (
+    OBJECTS_LIMIT,
+    check_columns,
+    open_table,
+    read_columns,
+    read_objects,
+    read_texts,
+)
+from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS, Layout
+from robocas_ms3.datasets.sources.tolerant import first_line
+from robocas_ms3.documents import load_json
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.strict import parse
+
+
+class Metadata:
+    """The ``meta`` folder of a dataset; each file is read when it is asked for.
+
+    Attributes:
+        root: folder of the dataset.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    @cached_property
+    def info(self) -> dict[str, Any]:
+        """``meta/info.json``.
+
+        Raises:
+            DatasetError: it is missing or damaged, or of another version.
+        """
+        path = self.root / schema.INFO_FILE
+        try:
+            found = load_json(path)
+        except (OSError, ValueError) as error:
+            raise DatasetError("no LeRobot dataset here", where=path, found=type(error).__name__) from error
+        version = found.get("codebase_version") if isinstance(found, dict) else None
+        if not isinstance(version, str) or version not in LAYOUTS:
+            what = "a LeRobot dataset of another version"
+            raise DatasetError(what, where=self.root, expected=" or ".join(LAYOUTS), found=version)
+        parse(InfoRecord, found, DatasetError, where=path)
+        return found
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """``meta/robocas/conversion.json``; empty where there is none.
+
+        Raises:
+            DatasetError: it is damaged.
+        """
+        path = self.root / schema.CONVERSION_FILE
+        try:
+            found = load_json(path) if path.exists() else {}
+        except (OSError, ValueError) as error:
+            raise DatasetError("this JSON is damaged", where=path, found=first_line(error)) from error
+        parse(ConversionRecord, found, DatasetError, where=path)
+        return found
+
+    @property
+    def layout(self) -> Layout:
+        """Where the files are."""
+        return LAYOUTS[self.info["codebase_version"]]
+
+    @cached_property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras, without those of native depth."""
+        features = self.info["features"].items()
+        return tuple(
+            schema.camera_of(key) for key, ft in features if ft["dtype"] == "video" and not schema.is_depth(ft)
+        )
+
+    def depth_feature(self, camera: str) -> dict[str, Any] | None:
+        """Return the feature of a camera's native depth video, or None."""
+        feature = self.info["features"].get(schema.depth_key(camera))
+        return feature if feature and feature["dtype"] == "video" and schema.is_depth(feature) else None
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether there is depth of the first camera."""
+        first = self.cameras[:1]
+        beside = bool(self.rows) and any(f"depth/{camera}/file_index" in self.rows[0] for camera in first)
+        return beside or any(self.depth_feature(camera) is not None for camera in first)
+
+    @property
+    def has_language(self) -> bool:
+        """Whether the data have language columns."""
+        return schema.LANGUAGE_COLUMNS[0] in self.info["features"]
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether it has the columns of those written here."""
+        return of_our_shapes(self.info["features"])
+
+    @cached_property
+    def rows(self) -> list[dict[str, Any]]:
+        """What ``meta/episodes`` says of each episode, but statistics.
+
+        Raises:
+            DatasetError: a table is damaged, too long, or lacks a column; or two rows are of one episode.
+        """
+        found = [row for path, table in self.tables_of_episodes() for row in self._checked(path, table).to_pylist()]
+        numbers = [row["episode_index"] for row in found]
+        if len(set(numbers)) < len(numbers):
+            raise DatasetError("two rows of one episode", where=self.root / "meta/episodes")
+        frames = sum(row["length"] for row in found)
+        if frames > self.info["total_frames"]:
+            what, expected = "episodes are longer than the dataset", f"{self.info['total_frames']} frames at most"
+            raise DatasetError(what, where=self.root / "meta/episodes", expected=expected, found=frames)
+        return found
+
+    def tables_of_episodes(self) -> Iterator[tuple[Path, pa.Table]]:
+        """Yield path and table of the files of ``meta/episodes``, without statistics.
+
+        Raises:
+            DatasetError: one is damaged, or they have more rows than there are episodes.
+        """
+        left = self.info["total_episodes"]
+        if self.layout.one_file_per_episode:
+            yield self.root / schema.EPISODES_LINES, self._table_of_lines(left)
+            return
+        for path in sorted((self.root / "meta/episodes").glob("*/*.parquet")):
+            with open_table(path, most_rows=left) as file:
+                names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
+                table = read_columns(file, path, names, limit=OBJECTS_LIMIT)
+            left -= len(table)
+            yield path, table
+
+    def _table_of_lines(self, most: int) -> pa.Table:
+        """Return ``meta/episodes.jsonl`` as the table that format v3.0 has in its place."""
+        features, fps = self.info["features"], self.info["fps"]
+        prefixes = [f"videos/{key}" for key, feature in features.items() if feature["dtype"] == "video"]
+        if (self.root / "depth").is_dir():
+            prefixes += [f"depth/{camera}" for camera in self.cameras]
+        rows, start = [], 0
+        for line in read_lines(self.root / schema.EPISODES_LINES, EpisodeLine, most):
+            chunk, file = divmod(line.episode_index, CHUNK_FILES)
+            row = {"episode_index": line.episode_index, "tasks": line.tasks, "length": line.length}
+            row |= {"dataset_from_index": start, "dataset_to_index": start + line.length}
+            row |= {"data/chunk_index": chunk, "data/file_index": file}
+            for prefix in prefixes:
+                row |= {f"{prefix}/chunk_index": chunk, f"{prefix}/file_index": file}
+                row |= {f"{prefix}/from_timestamp": 0.0, f"{prefix}/to_timestamp": line.length / fps}
+            rows.append(row)
+            start += line.length
+        empty = {key: [] for key in episode_columns((), features)}
+        return pa.Table.from_pylist(rows) if rows else pa.table(empty)
+
+    def _checked(self, path: Path, table: pa.Table) -> pa.Table:
+        check_columns(table, episode_columns(table.column_names, self.info["features"]), path)
+        return table
+
+    @cached_property
+    def tasks(self) -> list[str]:
+        """Instructions, by ``task_index``.
+
+        Raises:
+            DatasetError: they are damaged, or their numbers are not 0, 1, 2, ...
+        """
+        if self.layout.one_file_per_episode:
+            path = self.root / schema.TASKS_LINES
+            lines = sorted(read_lines(path, TaskLine, self.info["total_tasks"]), key=lambda line: line.task_index)
+            if [line.task_index for line in lines] != list(range(len(lines))):
+                expected = f"0 to {len(lines) - 1}, each once"
+                raise DatasetError("wrong numbers of texts", where=f"{path}, task_index", expected=expected)
+            return [line.task for line in lines]
+        return read_texts(self.root / schema.TASKS_FILE, "task_index", self.info["total_tasks"])
+
+    @cached_property
+    def subtasks(self) -> list[str]:
+        """Texts of sub-goals, by ``subtask_index``."""
+        return read_texts(self.root / schema.SUBTASKS_FILE, "subtask_index", self.info["total_frames"])
+
+    def subtask_texts(self, places: NDArray, where: object) -> list[str]:
+        """Return the texts of sub-goals by their numbers.
+
+        Raises:
+            DatasetError: there is no text of such a number.
+        """
+        known = len(self.subtasks)
+        wrong = places[~((places >= 0) & (places < known) & (places == np.floor(places)))]
+        if len(wrong):
+            what, expected = "no such sub-goal", f"0 to {known - 1}"
+            raise DatasetError(what, where=f"{where}, subtask_index", expected=expected, found=wrong[0])
+        return [self.subtasks[place] for place in places.astype(np.int64).tolist()]
+
+    @cached_property
+    def described(self) -> dict[int, dict[str, str]]:
+        """Number -> ``scene`` and ``cameras``, JSON, by ``meta/robocas/episodes.parquet``; empty without.
+
+        Raises:
+            DatasetError: the table is damaged.
+        """
+        path = self.root / schema.SCENES_FILE
+        rows = read_objects(path, SCENES, most_rows=self.info["total_episodes"]).to_pylist() if path.exists() else []
+        return {row.pop("episode_index"): row for row in rows}

@@ -1,0 +1,103 @@
+"""The forms of a LeRobot dataset that are written here, in one table: by the version of LeRobot that reads them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from robocas_ms3.errors import DatasetError
+
+CHUNK_FILES = 1000
+"""Files per chunk folder."""
+_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+_EPISODE = "episode_{episode_index:06d}"
+_EPISODE_CHUNK = "chunk-{episode_chunk:03d}"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the files of a format version are. The patterns are those of ``info.json``.
+
+    Attributes:
+        codebase_version: LeRobot's name of the format.
+        data: pattern of the tables of frames.
+        video: pattern of the videos.
+        depth: pattern of the depth videos that LeRobot does not read.
+        one_file_per_episode: whether each episode has its own files, and ``meta`` is JSON lines.
+    """
+
+    codebase_version: str
+    data: str
+    video: str
+    depth: str
+    one_file_per_episode: bool = False
+
+    def path(self, root: Path, pattern: str, chunk: int, file: int, **names: str) -> Path:
+        """Return the path of a numbered file.
+
+        Args:
+            root: folder of the dataset.
+            pattern: ``data``, ``video`` or ``depth`` of the layout.
+            chunk, file: numbers of the chunk and of the file in it.
+            names: ``video_key`` of a video, ``camera`` of a depth video.
+        """
+        episode = {"episode_chunk": chunk, "episode_index": chunk * CHUNK_FILES + file}
+        return root / pattern.format(chunk_index=chunk, file_index=file, **episode, **names)
+
+
+V3 = Layout("v3.0", f"data/{_FILE}.parquet", f"videos/{{video_key}}/{_FILE}.mp4", f"depth/{{camera}}/{_FILE}.mkv")
+V21 = Layout(
+    "v2.1",
+    f"data/{_EPISODE_CHUNK}/{_EPISODE}.parquet",
+    f"videos/{_EPISODE_CHUNK}/{{video_key}}/{_EPISODE}.mp4",
+    f"depth/{_EPISODE_CHUNK}/{{camera}}/{_EPISODE}.mkv",
+    one_file_per_episode=True,
+)
+LAYOUTS = {layout.codebase_version: layout for layout in (V3, V21)}
+"""Layouts by ``codebase_version``."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What is written for a version of LeRobot.
+
+    Attributes:
+        version: of LeRobot.
+        layout: where files are.
+        language: whether sub-goals, paraphrases and boxes are language columns; otherwise sub-goals are
+            ``subtask_index``.
+        native_depth: whether depth is a video feature of LeRobot; otherwise it is an FFV1 video that LeRobot ignores.
+        outcome: whether ``next.reward``, ``next.success`` and ``next.done`` are written.
+    """
+
+    version: str
+    layout: Layout
+    language: bool = False
+    native_depth: bool = False
+    outcome: bool = False
+
+
+Version = Literal["0.6", "0.5", "2.1"]
+NEWEST: Version = "0.6"
+VARIANTS: dict[str, Variant] = {
+    variant.version: variant
+    for variant in (
+        Variant("0.6", V3, language=True, native_depth=True, outcome=True),
+        Variant("0.5", V3),
+        Variant("2.1", V21, outcome=True),
+    )
+}
+
+
+def find_variant(version: str) -> Variant:
+    """Return the variant of a version.
+
+    Raises:
+        DatasetError: there is none.
+    """
+    if version not in VARIANTS:
+        raise DatasetError(
+            "unknown LeRobot version", where="--lerobot-version", expected=", ".join(VARIANTS), found=version
+        )
+    return VARIANTS[version]
