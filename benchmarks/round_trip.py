@@ -24,6 +24,7 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
+from robocas_ms3.datasets.lerobot.variants import NEWEST, VARIANTS
 from robocas_ms3.datasets.manage.importing import import_robocas
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.parts import open_part
@@ -78,12 +79,14 @@ def _one(trajectory: Path, ours: Path, size: tuple[int, int] | None) -> dict[str
     with _timed(report, "robocas"):
         convert(trajectory, ours, pictures=Pictures(size=size), embeddings=False)
     report["robocas"] |= {"episodes": len(Dataset(ours).numbers), "violations": len(validate(ours).violations)}
-    for kind, source in (("from_hdf5", trajectory), ("from_robocas", ours)):
-        root = Path(f"{base}_lerobot_{kind}")
-        with _timed(report, f"lerobot_{kind}"):
-            convert_lerobot(source, root, pictures=Pictures(size=size if kind == "from_hdf5" else None))
-        report[f"lerobot_{kind}"] |= _compare(Dataset(ours), LeRobotDataset(root))
-        report[f"lerobot_{kind}"]["violations"] = len(check_lerobot(root, decode=True))
+    sources = [("from_hdf5", trajectory, NEWEST), *((f"{version}_from_robocas", ours, version) for version in VARIANTS)]
+    for kind, source, version in sources:
+        root, name = Path(f"{base}_lerobot_{kind}"), f"lerobot_{kind}"
+        with _timed(report, name):
+            pictures = Pictures(size=size if source is trajectory else None)
+            convert_lerobot(source, root, pictures=pictures, lerobot_version=version)
+        report[name] |= _compare(Dataset(ours), LeRobotDataset(root))
+        report[name]["violations"] = len(check_lerobot(root, decode=True))
     theirs, back = Path(f"{base}_upstream"), Path(f"{base}_imported")
     _as_upstream(ours, theirs)
     with _timed(report, "import"):

@@ -1,20 +1,34 @@
-# Sourced by train_lerobot.sh and serve_lerobot.sh, in the checkout's folder: makes LeRobot's environment, sets $venv.
-# It is check_lerobot.sh's own, with what talks over the policy socket besides; both may be used in turn.
+# Sourced by check_lerobot.sh, train_lerobot.sh and serve_lerobot.sh, in the checkout's folder: makes an environment with
+# LeRobot and sets $venv. The first call downloads gigabytes (torch with its CUDA libraries); no GPU is needed.
 #
-# ROBOCAS_LEROBOT_VENV    folder of that environment (default: .venv-lerobot in the checkout)
-# ROBOCAS_LEROBOT_PYTHON  interpreter to make it with (default: python3.11)
+# lerobot_version         of the dataset: 0.6 (default), 0.5 or 2.1; see docs/lerobot.md
+# ROBOCAS_LEROBOT_VENV    folder of the environment (default: .venv-lerobot in the checkout; of older versions
+#                         .venv-lerobot-0.5 and .venv-lerobot-2.1)
+# ROBOCAS_LEROBOT_PYTHON  interpreter to make it with (default: python3.12)
 
-packages=(lerobot==0.4.4 torch==2.10.0 torchvision==0.25.0) # as check_lerobot.sh has them, and why
+lerobot_version=${lerobot_version:-0.6}
+case $lerobot_version in
+# openai: lerobot-annotate talks to its server with it.
+0.6) packages=("lerobot[training,diffusion]==0.6.1" torch==2.11.0 torchvision==0.26.0 "openai>=1.40,<2") ;;
+0.5) packages=(lerobot==0.5.1 torch==2.10.0 torchvision==0.25.0) ;;
+# The last release that reads format v2.1. It sets no upper bound on PyAV, and torchvision 0.22 needs one of 15 or less.
+2.1) packages=(lerobot==0.3.3 torch==2.7.1 torchvision==0.22.1 av==15.1.0) ;;
+*)
+    echo "unknown LeRobot version '$lerobot_version': expected 0.6, 0.5 or 2.1" >&2
+    exit 2
+    ;;
+esac
 socket=("msgpack>=1.0.5" "websockets>=15" "pydantic>=2" scipy PyYAML platformdirs)
-venv=${ROBOCAS_LEROBOT_VENV:-.venv-lerobot}
+suffix=-$lerobot_version
+venv=${ROBOCAS_LEROBOT_VENV:-.venv-lerobot${suffix#-0.6}}
 
 if [ "$(cat "$venv/.packages" 2>/dev/null)" != "${packages[*]}" ]; then
     echo "environment $venv: ${packages[*]} (minutes and gigabytes the first time)"
-    "${ROBOCAS_LEROBOT_PYTHON:-python3.11}" -m venv --clear "$venv"
+    "${ROBOCAS_LEROBOT_PYTHON:-python3.12}" -m venv --clear "$venv"
     "$venv/bin/python" -m pip --disable-pip-version-check install -qq "${packages[@]}"
     echo "${packages[*]}" >"$venv/.packages"
 fi
-if [ "$(cat "$venv/.socket" 2>/dev/null)" != "${socket[*]}" ]; then
+if [ "${with_socket:-}" ] && [ "$(cat "$venv/.socket" 2>/dev/null)" != "${socket[*]}" ]; then
     "$venv/bin/python" -m pip --disable-pip-version-check install -qq "${socket[@]}"
     echo "${socket[*]}" >"$venv/.socket"
 fi

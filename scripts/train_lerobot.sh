@@ -32,7 +32,8 @@ act=(--policy.chunk_size=10 --policy.n_action_steps=5 --policy.dim_model=256 --p
     --policy.dim_feedforward=1024 --policy.optimizer_lr=1e-4 --policy.optimizer_lr_backbone=1e-4
     --policy.pretrained_backbone_weights=null)
 diffusion=(--policy.horizon=16 --policy.n_obs_steps=2 --policy.n_action_steps=5 '--policy.down_dims=[128,256,512]'
-    --policy.noise_scheduler_type=DDIM --policy.num_inference_steps=10 --policy.drop_n_last_frames=10)
+    --policy.noise_scheduler_type=DDIM --policy.num_inference_steps=10 --policy.drop_n_last_frames=10
+    --policy.pretrained_backbone_weights=null --policy.use_group_norm=true)
 case $kind in
 act) sizes=("${act[@]}") ;;
 diffusion) sizes=("${diffusion[@]}") ;;
@@ -50,6 +51,7 @@ if [ -d "$out/dataset" ] && [ ! -f "$out/asked" ]; then
 fi
 echo "$asked" >"$out/asked"
 
+with_socket=1
 . scripts/lerobot_environment.sh
 export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH}
 if [ ! -d "$out/dataset" ]; then

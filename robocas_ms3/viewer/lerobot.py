@@ -1,4 +1,4 @@
-"""A LeRobot dataset (v3.0) on the page: those of `robocas convert` in full, others by their columns."""
+"""A LeRobot dataset (v3.0 or v2.1) on the page: those of `robocas convert` in full, others by their columns."""
 
 from __future__ import annotations
 

@@ -7,14 +7,14 @@ from dying import die_at
 from synthetic import RayCaster
 
 from robocas_ms3 import files
-from robocas_ms3.datasets.lerobot import assemble, convert, stage, tables, video
+from robocas_ms3.datasets.lerobot import assemble, convert, stage, table_writing, video
 
 PLACES = {  # moment -> (module, name of the function or method's owner and it, which call is the last)
     "frame": (video.Encoder, "add", 50),  # in the second episode
     "part": (files, "_move_in", 2),
     "plan": (convert, "write_json", 1),
     "join": (video.Joiner, "add", 7),
-    "table": (tables.RollingTable, "add", 4),
+    "table": (table_writing.RollingTable, "add", 4),
     "overview": (assemble, "write_json", 2),
     "rename": (convert.os, "replace", 3),  # plan, data, videos: the third
     "joined": (Path, "rmdir", 1),

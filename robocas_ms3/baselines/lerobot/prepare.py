@@ -34,8 +34,9 @@ from robocas_ms3.baselines.lerobot.observations import (
 )
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import episode_columns, frame_columns
-from robocas_ms3.datasets.lerobot.schema import FEATURES, INDICES, INFO_FILE, STATS_FILE
+from robocas_ms3.datasets.lerobot.schema import FEATURES, INDICES, INFO_FILE, STAGING, STATS_FILE, is_depth
 from robocas_ms3.datasets.lerobot.tables import Column, check_columns, numbers, open_table, read_columns
+from robocas_ms3.datasets.lerobot.variants import V3
 from robocas_ms3.datasets.sources.files import read_json
 from robocas_ms3.errors import DatasetError, RobocasError
 from robocas_ms3.files import replacing_folder, write_json
@@ -44,6 +45,8 @@ from robocas_ms3.words import printable
 
 Embed = Callable[[Sequence[str]], NDArray[np.float32]]
 _WIDTHS = {feature.key: feature.width for feature in FEATURES}
+_NOT_COPIED = ("data", "episodes", "robocas", "depth", ".parts", STAGING)
+"""Folders that are written here, or that the policies do not need."""
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 
@@ -62,7 +65,8 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
     check_absent(out)
     info = _info(source)
     with replacing_folder(out) as part:
-        shutil.copytree(source, part, ignore=_ignored, copy_function=_link, dirs_exist_ok=True)
+        ignored = shutil.ignore_patterns(*_NOT_COPIED, *_depth_keys(info["features"]))
+        shutil.copytree(source, part, ignore=ignored, copy_function=_link, dirs_exist_ok=True)
         vectors = None if embed is None else scaled(embed(LeRobotDataset(source).tasks))
         kept: dict[str, list[NDArray]] = {}
         for path in sorted((source / "data").rglob("*.parquet")):
@@ -74,14 +78,19 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
         for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
             _table(path, episode_columns((), info["features"]))  # bounded and checked, with texts as dictionaries
             table = pq.read_table(path)  # LeRobot reads no statistics of episodes, and these are of other columns
-            names = [name for name in table.column_names if not name.startswith("stats/")]
+            left_out = ("stats/", *(f"videos/{key}/" for key in _depth_keys(info["features"])))
+            names = [name for name in table.column_names if not name.startswith(left_out)]
             _write(table.select(names), part / path.relative_to(source))
         _write_meta(source, part, info, {key: np.concatenate(values) for key, values in kept.items()})
 
 
 def _info(source: Path) -> dict[str, Any]:
     try:
-        info = LeRobotDataset(source).info
+        dataset = LeRobotDataset(source)
+        info = dataset.info
+        if dataset.layout is not V3:
+            version = info["codebase_version"]
+            raise DatasetError("another format", where=source, expected=V3.codebase_version, found=version)
         widths = {key: info["features"][key]["shape"] for key in _WIDTHS}
     except (DatasetError, KeyError) as error:
         fix = "Make one: robocas convert F.h5 --to lerobot --out DIR"
@@ -121,7 +130,7 @@ def _columns(
 
 def _table(path: Path, columns: Mapping[str, Column]) -> pa.Table:
     with open_table(path) as file:
-        table = read_columns(file, path)
+        table = read_columns(file, path, columns)
         check_columns(table, columns, path)
     return table
 
@@ -144,7 +153,9 @@ def _write_meta(source: Path, part: Path, info: dict[str, Any], columns: dict[st
         key: {"dtype": "float32", "shape": [values.shape[1]], "names": names[key]} for key, values in columns.items()
     }
     features |= {
-        key: said for key, said in info["features"].items() if key.startswith("observation.images.") or key in INDICES
+        key: said
+        for key, said in info["features"].items()
+        if (key.startswith("observation.images.") and not is_depth(said)) or key in INDICES
     }
     stats = read_json(source / STATS_FILE)
     stats = {key: said for key, said in stats.items() if key in features} | {
@@ -165,9 +176,9 @@ def _write(table: pa.Table, path: Path) -> None:
     pq.write_table(table, path)
 
 
-def _ignored(_folder: str, names: list[str]) -> set[str]:
-    """What is written anew, or is of no use to LeRobot."""
-    return set(names) & {"data", "episodes", "robocas", "depth", ".parts"}
+def _depth_keys(features: Mapping[str, Any]) -> list[str]:
+    """Return the features of depth, which ACT and diffusion policy would take for RGB."""
+    return [key for key, feature in features.items() if is_depth(feature)]
 
 
 def _link(source: str, target: str) -> None:

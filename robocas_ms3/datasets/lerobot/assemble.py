@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -26,7 +27,9 @@ from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Layout, Variant, 
 from robocas_ms3.datasets.lerobot.video import Joiner, packet_times
 from robocas_ms3.datasets.sources.protocol import Kind
 from robocas_ms3.files import write_json
+from robocas_ms3.words import count_of
 
+_log = logging.getLogger(__name__)
 _FLOATS = {feature.key for feature in schema.FEATURES} | {"timestamp", schema.REWARD.key}
 
 
@@ -51,7 +54,7 @@ def assemble(parts: Sequence[Path], plan: dict[str, Any], fps: int, root: Path, 
     first = next(read_parts(parts[:1], entries[:1])).about
     streams = _streams(variant, first, plan["settings"]["codec"])
     data_mb, video_mb = (0, 0) if layout.one_file_per_episode else (limits.data_mb, limits.video_mb)
-    frames = 0
+    frames = clipped = 0
     with ExitStack() as stack:
         data = RollingTable(partial(layout.path, root, layout.data), data_mb)
         scenes = RollingTable(lambda *_: root / schema.SCENES_FILE, np.inf, group=GROUP, compression="zstd")
@@ -96,6 +99,10 @@ def assemble(parts: Sequence[Path], plan: dict[str, Any], fps: int, root: Path, 
                 events, times = part.table.column(EVENTS).to_pylist(), columns["timestamp"][:, 0].tolist()
                 stage_rows(root, part.index, persistent, events, times)
             frames += steps
+            clipped += bool(about.get("depth_clipped"))
+    if clipped:
+        limit = schema.MAX_DEPTH_MM
+        _log.warning("%s: depth above %d mm is stored as %d mm", count_of(clipped, "episode"), limit, limit)
     write_tasks(layout, root, list(texts.tasks))
     if not variant.language:
         write_texts(root / schema.SUBTASKS_FILE, schema.SUBTASK_INDEX.key, list(texts.subgoals))

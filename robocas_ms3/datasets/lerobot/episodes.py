@@ -21,7 +21,7 @@ from robocas_ms3.datasets.lerobot.schema import (
     Limits,
 )
 from robocas_ms3.datasets.lerobot.table_writing import RollingTable, write_texts
-from robocas_ms3.datasets.lerobot.variants import Layout
+from robocas_ms3.datasets.lerobot.variants import V3, Layout
 
 GROUP = 64
 """Episodes per row group of the tables about episodes."""
@@ -48,7 +48,7 @@ class EpisodesTable:
     """Write ``meta/episodes`` of format v3.0."""
 
     def __init__(self, root: Path, limits: Limits) -> None:
-        self._rows = RollingTable(partial(_numbered, root), limits.data_mb, group=GROUP)
+        self._rows = RollingTable(partial(V3.path, root, EPISODES_PATH), limits.data_mb, group=GROUP)
 
     def add(self, row: dict[str, Any], stats: Mapping[str, Mapping[str, Any]]) -> None:
         """Append an episode, its statistics as columns."""
@@ -122,7 +122,3 @@ def write_lines(path: Path, records: Iterable[Mapping[str, Any]]) -> None:
 
 def _line(record: Mapping[str, Any]) -> str:
     return json.dumps(record, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def _numbered(root: Path, chunk: int, file: int) -> Path:
-    return root / EPISODES_PATH.format(chunk_index=chunk, file_index=file)

@@ -61,7 +61,7 @@ def persistent_rows(goals: Sequence[SubGoal], instructions: Iterable[str], fps: 
 
 
 def event_rows(boxes: Mapping[str, Box], target: str) -> list[Row]:
-    """Return the event rows of a frame: one question and its answer per camera that sees the target.
+    """Return the event rows of a frame, in LeRobot's order: a question and its answer per camera that sees the target.
 
     Args:
         boxes: of the target, by camera.
@@ -74,7 +74,7 @@ def event_rows(boxes: Mapping[str, Box], target: str) -> list[Row]:
         answer = json.dumps({"detections": [detection]}, sort_keys=True, ensure_ascii=False)
         key = schema.image_key(camera)
         rows += [_row("user", question, "vqa", camera=key), _row("assistant", answer, "vqa", camera=key)]
-    return rows
+    return sorted(rows, key=lambda row: (row["role"], row["camera"]))
 
 
 def _row(role: str, content: str, style: str, *, timestamp: float | None = None, camera: str | None = None) -> Row:

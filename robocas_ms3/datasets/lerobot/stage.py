@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Generator
 from contextlib import ExitStack, closing
@@ -38,7 +37,6 @@ from robocas_ms3.errors import DatasetError
 from robocas_ms3.files import json_text, replacing_folder
 from robocas_ms3.processes import Limits
 
-_log = logging.getLogger(__name__)
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
 SUBGOAL = "subgoal"  # column of texts, which become numbers when parts are joined
 
@@ -147,8 +145,6 @@ def stage_episode(job: StageJob, player: Player, index: int, number: int) -> Wri
         steps, scene = int(arrays["episode_length"]), played.scene()
         if videos.steps != steps:
             raise DatasetError("pictures and arrays differ in length", where=number, expected=steps, found=videos.steps)
-        if videos.clipped:
-            _log.warning("episode %d: depth above %d mm is stored as %d mm", number, MAX_DEPTH_MM, MAX_DEPTH_MM)
         columns: dict[str, Any] = {key: column(values) for key, values in frame_columns(arrays).items()}
         columns[SUBGOAL_TYPE.key] = pa.array(arrays["step_goal_type"].tolist(), pa.string())
         columns["timestamp"] = pa.array((np.arange(steps) / fps).astype(np.float32))
@@ -171,6 +167,7 @@ def stage_episode(job: StageJob, player: Player, index: int, number: int) -> Wri
                 for name in player.pictures.cameras
             },
             "depth": player.pictures.depth,
+            "depth_clipped": videos.clipped,
             "levels": {key: levels.counts.tolist() for key, levels in videos.levels.items()},
             "sizes": _sizes(folder),
         }

@@ -56,7 +56,7 @@ CODINGS = {
         {
             "g": "2",
             "preset": "ultrafast",
-            "x265-params": "lossless=1:keyint=2:min-keyint=2:scenecut=0:bframes=0:open-gop=0:pools=none"
+            "x265-params": "lossless=1:ctu=16:keyint=2:min-keyint=2:scenecut=0:bframes=0:open-gop=0:pools=none"
             ":frame-threads=1:log-level=none",
         },
     ),

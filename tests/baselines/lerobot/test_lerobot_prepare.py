@@ -86,10 +86,21 @@ def test_meta_says_the_same(source, out):
 
 
 def test_videos_are_the_same_files(source, out):
-    videos = sorted(path.relative_to(source) for path in source.rglob("*.mp4"))
-    assert videos
+    videos, there = ({path.relative_to(root) for path in root.rglob("*.mp4")} for root in (out, source))
+    assert videos == {path for path in there if "_depth" not in str(path)}
+    assert videos < there
     assert all((out / path).samefile(source / path) for path in videos)
-    assert not list(out.rglob("*.mkv"))
+    info = json.loads((out / "meta/info.json").read_text())
+    assert not [key for key in info["features"] if "depth" in key or "language" in key]
+    assert not [name for name in pq.read_table(out / EPISODES).column_names if "depth" in name]
+    assert not (out / ".annotate_staging").exists()
+
+
+def test_another_format_is_refused(source, tmp_path):
+    convert_lerobot(source, tmp_path / "old", lerobot_version="2.1")
+    with pytest.raises(DatasetError, match="no LeRobot dataset of ours .*expected v3.0, found v2.1"):
+        prepare(tmp_path / "old", tmp_path / "out", None)
+    assert not (tmp_path / "out").exists()
 
 
 def test_without_language(source, tmp_path):
@@ -143,7 +154,7 @@ def test_a_disk_without_links_gets_copies(source, tmp_path, monkeypatch):
 
     monkeypatch.setattr(module.os, "link", refuse)
     prepare(source, tmp_path / "out", None)
-    for path in source.rglob("*.mp4"):
+    for path in (path for path in source.rglob("*.mp4") if "_depth" not in str(path)):
         copy = tmp_path / "out" / path.relative_to(source)
         assert copy.read_bytes() == path.read_bytes()
         assert not copy.samefile(path)

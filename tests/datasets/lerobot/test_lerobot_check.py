@@ -15,15 +15,8 @@ from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot, is_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.tables import (
-    TEXT,
-    Column,
-    column,
-    numbers,
-    read_objects,
-    read_rows,
-    write_texts,
-)
+from robocas_ms3.datasets.lerobot.table_writing import column, write_texts
+from robocas_ms3.datasets.lerobot.tables import TEXT, Column, numbers, read_objects, read_rows
 from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.errors import DatasetError
@@ -37,7 +30,7 @@ DEPTH = "depth/base_camera/chunk-000/file-000.mkv"
 @pytest.fixture(scope="module")
 def valid(trajectory, tmp_path_factory):
     out = tmp_path_factory.mktemp("checked") / "dataset"
-    convert_lerobot(trajectory, out, pictures=Pictures(("base_camera",)), open_source=RayCaster)
+    convert_lerobot(trajectory, out, pictures=Pictures(("base_camera",)), open_source=RayCaster, lerobot_version="0.5")
     return out
 
 
@@ -148,7 +141,7 @@ def test_overview_that_contradicts(spoiled):
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("codebase_version", "v2.1"),
+        ("codebase_version", "v2.0"),
         *(("fps", value) for value in (5.5, 0, -1, 10**6, True, "5", None)),
         *(("total_frames", value) for value in (-1, 2**62, "14", 1e308)),
         ("data_path", "../{chunk_index}/{file_index:9999999999d}"),

@@ -48,12 +48,11 @@ def lerobot(trajectory, tmp_path_factory):
     return out
 
 
-def test_the_folder_is_that_of_version_3(lerobot):
+def test_the_folder_of_version_0_6(lerobot):
     expected = {
         "meta/info.json",
         "meta/stats.json",
         "meta/tasks.parquet",
-        "meta/subtasks.parquet",
         "meta/episodes/chunk-000/file-000.parquet",
         "meta/robocas/conversion.json",
         "meta/robocas/episodes.parquet",
@@ -62,9 +61,10 @@ def test_the_folder_is_that_of_version_3(lerobot):
     }
     for camera in ("base", "gripper", "static"):
         expected.add(f"videos/observation.images.{camera}_camera/chunk-000/file-000.mp4")
-        expected.add(f"depth/{camera}_camera/chunk-000/file-000.mkv")
+        expected.add(f"videos/observation.images.{camera}_camera_depth/chunk-000/file-000.mp4")
+    for number in (0, 1):
+        expected |= {f".annotate_staging/episode_{number:06d}/{name}.jsonl" for name in ("plan", "vqa")}
     assert set(files_of(lerobot)) == expected
-    assert {path.name for path in lerobot.iterdir()} == {"meta", "data", "videos", "depth"}
     info = json.loads((lerobot / "meta/info.json").read_text())
     assert info["codebase_version"] == "v3.0"
     assert (info["fps"], info["total_episodes"], info["total_frames"], info["total_tasks"]) == (5, 2, 14, 2)
@@ -80,8 +80,9 @@ def test_the_folder_is_that_of_version_3(lerobot):
     np.testing.assert_allclose(table.column("timestamp").to_pylist()[:7], np.arange(7) / 5, atol=1e-6)
 
 
-def test_texts(lerobot):
-    dataset = LeRobotDataset(lerobot)
+def test_texts_of_version_0_5(trajectory, tmp_path):
+    run(trajectory, tmp_path / "out", lerobot_version="0.5")
+    dataset = LeRobotDataset(tmp_path / "out")
     instructions = [f"grasp the cube {seed} on the table and move it to the basket" for seed in (3, 5)]
     assert dataset.tasks == instructions
     assert [row["tasks"] for row in dataset.rows] == [[text] for text in instructions]
@@ -93,10 +94,11 @@ def test_texts(lerobot):
     assert types == ["move and grasp"] * 3 + ["transfer object"] * 4
 
 
-def test_from_a_folder_as_from_the_trajectory(lerobot, made, tmp_path):
+def test_from_a_folder_as_from_the_trajectory(trajectory, made, tmp_path):
     """Nothing is rendered the second time, and it is the same but for where it comes from."""
-    out = tmp_path / "out"
-    convert_lerobot(made, out, open_source=None)  # type: ignore[arg-type]
+    lerobot, out = tmp_path / "lerobot", tmp_path / "out"
+    run(trajectory, lerobot, lerobot_version="0.5")
+    convert_lerobot(made, out, open_source=None, lerobot_version="0.5")  # type: ignore[arg-type]
     before, after = files_of(lerobot), files_of(out)
     different = {name for name in before if before[name] != after.get(name)}
     assert different == {"meta/robocas/conversion.json", "meta/robocas/episodes.parquet"}
@@ -122,7 +124,8 @@ def test_and_back(made, tmp_path, codec):
             np.testing.assert_array_equal(ours.intrinsic(camera), theirs.intrinsic(camera))
             np.testing.assert_array_equal(ours.camera_in_parent(camera), theirs.camera_in_parent(camera))
             for step in (0, 3, 6):  # bit for bit, whatever the order
-                np.testing.assert_array_equal(ours.depth(camera, step), theirs.depth(camera, step))
+                within = np.minimum(theirs.depth(camera, step), schema.MAX_DEPTH_MM)
+                np.testing.assert_array_equal(ours.depth(camera, step), within)
                 difference = np.abs(ours.rgb(camera, step).astype(int) - theirs.rgb(camera, step))
                 assert difference.mean() < 6  # the made-up pictures are all edges; subsampled colours bleed there
         shown = np.stack(list(ours.frames("base_camera", "depth")))
@@ -139,7 +142,7 @@ def test_depth_of_all_16_bits(trajectory, tmp_path):
                 frame.depth["gripper_camera"][:] = noise[step]
                 yield frame
 
-    convert_lerobot(trajectory, tmp_path / "out", open_source=Noisy)
+    convert_lerobot(trajectory, tmp_path / "out", open_source=Noisy, lerobot_version="0.5")
     found = LeRobotDataset(tmp_path / "out").episode(1)
     np.testing.assert_array_equal(np.stack(list(found.frames("gripper_camera", "depth"))), noise)
 
@@ -186,12 +189,13 @@ def test_files_roll_over_at_their_limits(trajectory, tmp_path):
     dataset = LeRobotDataset(out)
     assert [row["data/file_index"] for row in dataset.rows] == [0, 1, 2]
     assert [row["videos/observation.images.base_camera/file_index"] for row in dataset.rows] == [0, 0, 1]
-    assert [row["depth/base_camera/from_timestamp"] for row in dataset.rows] == [0, 1.4, 0]
+    depth = "videos/observation.images.base_camera_depth"
+    assert [row[f"{depth}/from_timestamp"] for row in dataset.rows] == [0, 1.4, 0]
     assert [row["meta/episodes/file_index"] for row in dataset.rows] == [0, 0, 0]
     assert check_lerobot(out) == []
     by_size = tmp_path / "by_size"
     run(trajectory, by_size, include_failed=True, limits=Limits(video_mb=1e-6))
-    assert [row["depth/base_camera/file_index"] for row in LeRobotDataset(by_size).rows] == [0, 1, 2]
+    assert [row[f"{depth}/file_index"] for row in LeRobotDataset(by_size).rows] == [0, 1, 2]
     assert check_lerobot(by_size) == []
 
 
@@ -200,7 +204,7 @@ def test_fewer_pictures_and_another_rate(trajectory, tmp_path):
     run(trajectory, out, rate_hz=10, pictures=Pictures(("static_camera",), (80, 60), depth=False))
     dataset = LeRobotDataset(out)
     assert (dataset.cameras, dataset.has_depth, dataset.rate_hz) == (("static_camera",), False, 10)
-    assert not (out / "depth").exists()
+    assert sorted(path.name for path in (out / "videos").iterdir()) == ["observation.images.static_camera"]
     assert dataset.episode(0).rgb("static_camera", 5).shape == (60, 80, 3)
     assert dataset.episode(0).columns["timestamp"][3, 0] == pytest.approx(0.3)
     assert check_lerobot(out) == []
@@ -233,6 +237,8 @@ def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
         run(trajectory, out, codec="av1")
     with pytest.raises(DatasetError, match="can't resume with other settings .expected codec h264, found codec av1"):
         run(trajectory, out, codec="av1", resume=True)
+    with pytest.raises(DatasetError, match="expected lerobot_version 0.6, found lerobot_version 2.1"):
+        run(trajectory, out, lerobot_version="2.1", resume=True)
     with pytest.raises(DatasetError, match="these episodes are not what was begun here"):
         run(trajectory, out, include_failed=True, resume=True)
     with pytest.raises(DatasetError):
@@ -370,7 +376,7 @@ def test_killed_and_resumed_is_as_if_never_killed(trajectory, lerobot, tmp_path,
         assert check_lerobot(out) == []
     run(trajectory, out, resume=True)
     assert files_of(out) == files_of(lerobot)
-    assert {path.name for path in out.iterdir()} == {"meta", "data", "videos", "depth"}
+    assert {path.name for path in out.iterdir()} == {"meta", "data", "videos", ".annotate_staging"}
 
 
 def test_the_split_is_that_of_robocas(lerobot, made):

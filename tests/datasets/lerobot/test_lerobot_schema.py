@@ -7,7 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.lerobot.schema import FEATURES, features_json, frame_columns, robocas_arrays, whole_rate
+from robocas_ms3.datasets.lerobot.arrays import frame_columns, robocas_arrays
+from robocas_ms3.datasets.lerobot.schema import FEATURES, features_json, whole_rate
+from robocas_ms3.datasets.lerobot.variants import VARIANTS
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.errors import DatasetError
 from robocas_ms3.poses import from_xyzw
@@ -66,12 +68,15 @@ def test_the_documentation_names_every_feature():
     text = (Path(__file__).parents[3] / "docs/lerobot.md").read_text()
     for feature in FEATURES:
         assert f"| `{feature.key}` | {feature.width} |" in text
-    assert set(features_json({})) <= set(re.findall(r"`([\w.]+)`", text))
+    for variant in VARIANTS.values():
+        assert set(features_json(variant, {})) <= set(re.findall(r"`([\w.]+)`", text))
+        assert f"| `{variant.version}` |" in text
 
 
-def test_no_text_is_an_observation():
+@pytest.mark.parametrize("variant", VARIANTS.values(), ids=VARIANTS)
+def test_no_text_is_an_observation(variant):
     """LeRobot stacks whatever begins with `observation.` into tensors."""
-    features = features_json({})
+    features = features_json(variant, {})
     assert not [key for key, ft in features.items() if ft["dtype"] == "string" and key.startswith("observation")]
 
 

@@ -47,7 +47,7 @@ def test_pictures_are_counted_exactly():
     rng = np.random.default_rng(0)
     pictures = rng.integers(0, 256, (4, 12, 16, 3), np.uint8)
     pictures[..., 1] //= 2
-    found, other = Levels(), Levels()
+    found, other = Levels.rgb(), Levels.rgb()
     for picture in pictures[:3]:
         found.add(picture)
     other.add(pictures[3])
@@ -63,6 +63,6 @@ def test_pictures_are_counted_exactly():
 
 
 def test_large_pictures_are_thinned():
-    found = Levels()
+    found = Levels.rgb()
     found.add(np.zeros((480, 640, 3), np.uint8))
     assert found.counts.sum() == 3 * 120 * 160

@@ -97,12 +97,12 @@ def test_of_a_lerobot_dataset(trajectory, made, tmp_path, monkeypatch, clock):
     monkeypatch.setattr(stage.Encoder, "add", slow(stage.Encoder.add, clock, 0.5))
     monkeypatch.setattr(stage.pq, "write_table", slow(stage.pq.write_table, clock, 0.25))
     monkeypatch.setattr(assemble, "assemble", slow(assemble.assemble, clock, 10))
-    done = convert_lerobot(trajectory, tmp_path / "out", open_source=slow_source(clock))
+    done = convert_lerobot(trajectory, tmp_path / "out", open_source=slow_source(clock), lerobot_version="0.5")
     assert done.joining == 10 + 2 * 0.25  # with the tables of tasks and sub-goals
     parts = {"encode": 2 * 42 * 0.5, "write": 2 * 0.25 + done.joining}
     assert done.timing == Timing(load=11, render=28, **parts, total=11 + 28 + 42 + 0.5)
     assert done.seconds == done.timing.total + done.joining
     # of a dataset pictures are read, not rendered
     monkeypatch.setattr(Episode, "rgb", slow(Episode.rgb, clock, 1))
-    done = convert_lerobot(made, tmp_path / "again")
+    done = convert_lerobot(made, tmp_path / "again", lerobot_version="0.5")
     assert done.timing == Timing(load=2 * 7 * 3, **parts, total=42 + 42 + 0.5)

@@ -10,6 +10,7 @@ from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.dataset import validate
+from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing import convert as conversion
 from robocas_ms3.datasets.writing.plan import still_missing
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
@@ -101,7 +102,8 @@ def test_actions_that_were_tried_at_another_rate(tmp_path, caplog, to, rates, ra
         pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
         from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 
-        convert_lerobot(trajectory, tmp_path / "out", rate_hz=rate_hz, open_source=RayCaster)
+        pictures = Pictures(depth=False)  # the made-up room is farther than a depth video reaches
+        convert_lerobot(trajectory, tmp_path / "out", rate_hz=rate_hz, open_source=RayCaster, pictures=pictures)
     warnings = [record.getMessage() for record in caplog.records if record.name.startswith("robocas_ms3")]
     assert len(warnings) == bool(said)
     assert not said or warnings[0].startswith(said)

@@ -130,7 +130,8 @@ def test_a_conversion(trajectory, made_up_pictures, tmp_path, monkeypatch, capsy
 def test_a_conversion_to_lerobot(made, tmp_path, monkeypatch, capsys, moment, last, parts):
     pytest.importorskip("av", reason="needs the extra 'lerobot'")
     pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
-    from robocas_ms3.datasets.lerobot import schema, stage
+    from robocas_ms3.datasets.lerobot import stage
+    from robocas_ms3.datasets.lerobot.variants import Layout
 
     out, source = tmp_path / "out", files_of(made)
     command = ["convert", str(made), "--to", "lerobot", "--out", str(out)]
@@ -139,7 +140,7 @@ def test_a_conversion_to_lerobot(made, tmp_path, monkeypatch, capsys, moment, la
         "video": (stage, "Encoder", to_dev_full(stage.Encoder, 0)),
         "frames": (stage.pq, "write_table", to_dev_full(stage.pq.write_table, 1)),
         "episode": text,
-        "joined": (schema, "data_file", named_dev_full(schema.data_file)),
+        "joined": (Layout, "path", named_dev_full(Layout.path)),
         "overview": text,
     }
     with monkeypatch.context() as patch:

@@ -104,6 +104,32 @@ def test_states_look_as_they_did(source, recording, recorded):
             assert np.mean(deeper > 2) < 0.01, (index, camera)
 
 
+def test_boxes_hold_the_target(recorded, recording):
+    """Where the target's centre is visible in an image, it is in the target's box."""
+    with TrajectoryFile(recorded[0]) as file:
+        frames = EnvFrames(file.env, "pd_joint_pos", Pictures(size=SIZE, boxes=True))
+    frames.load(recording)
+    frame = shown(frames, recording, 0)
+    base, cameras = frames.env.unwrapped, frames.cameras()
+    centre = base.target_center(base.object_states)[0]
+    seen = 0
+    for camera, (left, top, right, bottom) in frame.boxes.items():
+        assert 0 <= left <= right < SIZE[0]
+        assert 0 <= top <= bottom < SIZE[1]
+        matrix = base.scene.sensors[camera].camera.get_extrinsic_matrix()[0].numpy()
+        x, y, z = matrix[:3, :3] @ np.asarray(centre) + matrix[:3, 3]
+        fx, fy, cx, cy = cameras[camera].intrinsic
+        column, row = round(fx * x / z + cx - 0.5), round(fy * y / z + cy - 0.5)
+        inside = 0 <= column < SIZE[0] and 0 <= row < SIZE[1]
+        if inside and abs(frame.depth[camera][row, column] / 1000 - z) < 0.03:
+            seen += 1
+            assert left <= column <= right
+            assert top <= row <= bottom
+    frames.close()
+    assert seen
+    assert frame.boxes.keys() <= frame.rgb.keys()
+
+
 def test_nothing_moves_while_states_are_shown(source, recording):
     state = recording.state(5)
     shown(source, recording, 5)

@@ -1,0 +1,171 @@
+import json
+
+import pytest
+
+pa = pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
+
+from robocas_ms3.datasets.lerobot.check_language import check_language
+from robocas_ms3.datasets.lerobot.language import (
+    EVENTS,
+    EVENTS_TYPE,
+    PERSISTENT,
+    PERSISTENT_TYPE,
+    boxes_of,
+    event_rows,
+    goals_of,
+    paraphrases,
+    persistent_rows,
+    read_rows_of,
+)
+from robocas_ms3.errors import DatasetError
+from robocas_ms3.language.instructions import template_ids
+from robocas_ms3.recordings.subgoals import SubGoal
+
+GOALS = [SubGoal("move and grasp", "grasp it", 0, 2), SubGoal("transfer object", "drop it", 3, 6)]
+CAMERA = "observation.images.base_camera"
+INFO = {"fps": 5, "features": {CAMERA: {"dtype": "video", "shape": [48, 64, 3]}}}
+
+
+def test_persistent_rows_worked_out_by_hand():
+    rows = persistent_rows(GOALS, ["take it", "grab it", "take it"], fps=5)
+    assert [(row["timestamp"], row["style"], row["role"], row["content"]) for row in rows] == [
+        (0.0, "subtask", "assistant", "grasp it"),
+        (0.0, "task_aug", "user", "take it"),
+        (0.0, "task_aug", "user", "grab it"),
+        (pytest.approx(0.6), "subtask", "assistant", "drop it"),
+    ]
+    assert rows[3]["timestamp"] == 0.6000000238418579  # float32, as the column timestamp
+    assert {(row["camera"], row["tool_calls"]) for row in rows} == {(None, None)}
+
+
+def test_event_rows_worked_out_by_hand():
+    answer, question = event_rows({"base_camera": (3, 4, 10, 12)}, "sugar box")
+    assert question == {
+        "role": "user", "content": "Where is the sugar box?", "style": "vqa", "camera": CAMERA, "tool_calls": None
+    }  # fmt: skip
+    expected = {"detections": [{"bbox": [3, 4, 10, 12], "bbox_format": "xyxy", "label": "sugar box"}]}
+    assert json.loads(answer["content"]) == expected
+    assert (answer["role"], answer["style"], answer["camera"]) == ("assistant", "vqa", CAMERA)
+    assert event_rows({"base_camera": (0, 0, 1, 1)}, "scissors")[1]["content"] == "Where are the scissors?"
+    assert event_rows({}, "sugar box") == []
+    several = event_rows({"static_camera": (1, 1, 2, 2), "base_camera": (0, 0, 1, 1)}, "pear")
+    assert [(row["role"], row["camera"].removeprefix("observation.images.")) for row in several] == [
+        ("assistant", "base_camera"), ("assistant", "static_camera"), ("user", "base_camera"), ("user", "static_camera")
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("fps", [1, 3, 5, 7, 20, 30, 100])
+def test_goals_of_frames(fps):
+    rows = persistent_rows(GOALS, [], fps)
+    assert goals_of(rows, 7, fps) == ["grasp it"] * 3 + ["drop it"] * 4
+    assert goals_of(rows[1:], 7, fps) == [""] * 3 + ["drop it"] * 4
+    assert goals_of([], 2, fps) == ["", ""]
+
+
+@pytest.mark.parametrize(
+    "answer", [None, "", "{", "[]", '{"count": 3}', '{"detections": []}', '{"detections": [{"bbox": [1, 2, "x", 4]}]}']
+)
+def test_answers_without_one_box_are_passed_over(answer):
+    rows = event_rows({"base_camera": (1, 2, 3, 4)}, "pear")
+    assert boxes_of(rows) == {"base_camera": (1, 2, 3, 4)}
+    assert boxes_of([{**rows[0], "content": answer}, rows[1]]) == {}
+
+
+SCENE = {
+    "task": "pick",
+    "target": {"slot": 0, "asset_id": "pear", "name": "pear"},
+    "recorded": {"support": "table", "relation": ""},
+}
+
+
+def test_paraphrases_are_those_of_training():
+    texts = paraphrases(SCENE, "grasp the pear on the table and move it to the basket")
+    assert texts[0] == "grasp the pear on the table and move it to the basket"
+    assert "put the pear into the basket" in texts
+    assert len(texts) == 1 + len(template_ids("pick", "train"))
+    assert "fetch the pear from the table and deposit it in the basket" not in texts  # held out
+
+
+def test_paraphrases_with_a_relation_and_a_part():
+    related = {**SCENE, "task": "select", "recorded": {"support": "table", "relation": "nearest"}}
+    assert all("nearest pear" in text or "closest" in text for text in paraphrases(related, "")[1:])
+    opened = {**SCENE, "task": "open_pick", "config": {"opening": {"handle": "door_left"}}}
+    assert any("left door" in text for text in paraphrases(opened, ""))
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        {},
+        {**SCENE, "task": "dance"},
+        {**SCENE, "target": None},
+        {**SCENE, "recorded": None},
+        {**SCENE, "task": "open_pick"},
+    ],
+)
+def test_no_paraphrases_of_unknown_scenes(scene):
+    assert paraphrases(scene, "do it") == []
+
+
+def table_of(persistent, events):
+    return pa.table(
+        {PERSISTENT: pa.array([persistent] * len(events), PERSISTENT_TYPE), EVENTS: pa.array(events, EVENTS_TYPE)}
+    )
+
+
+def found(persistent, events):
+    return [str(wrong) for wrong in check_language(table_of(persistent, events), "file", 0, INFO)]
+
+
+ROWS = persistent_rows(GOALS, ["take it"], 5)
+EVENT = event_rows({"base_camera": (3, 4, 63, 47)}, "pear")
+
+
+def test_valid_rows():
+    assert found(ROWS, [EVENT, *[[]] * 6]) == []
+    speech = {"role": "assistant", "content": None, "style": None, "camera": None, "tool_calls": ["say"]}
+    assert found(ROWS, [[speech], *[[]] * 6]) == []
+
+
+@pytest.mark.parametrize(
+    ("persistent", "events", "message"),
+    [
+        ([{**ROWS[0], "style": "dance"}], [[]], "style: expected memory, motion, plan, subtask, task_aug"),
+        ([*ROWS[:2], {**ROWS[2], "timestamp": 0.7}], [[]] * 7, "timestamp: expected that of a frame"),
+        (ROWS, [[]] * 3, "timestamp: expected that of a frame, 0 to 0.4 s, found 0.6 s"),
+        ([ROWS[2]], [[]] * 7, "subtask: expected one from the first frame on"),
+        ([ROWS[0], ROWS[0]], [[]], "subtask: expected one at a time"),
+        (ROWS, [[{**EVENT[0], "camera": None}], *[[]] * 6], "expected a camera of the dataset"),
+        (ROWS, [[{**EVENT[0], "style": "subtask"}], *[[]] * 6], "expected style interjection"),
+        (ROWS, [[*EVENT, *EVENT], *[[]] * 6], "expected one question and answer per camera"),
+        (ROWS, [event_rows({"base_camera": (3, 4, 64, 5)}, "pear"), *[[]] * 6], "expected a box in 64 x 48 pixels"),
+        (ROWS, [event_rows({"base_camera": (9, 4, 8, 5)}, "pear"), *[[]] * 6], "expected a box in 64 x 48 pixels"),
+    ],
+)
+def test_rows_that_are_wrong(persistent, events, message):
+    texts = found(persistent, events)
+    assert any(message in text for text in texts), texts
+
+
+def test_rows_that_differ_between_frames():
+    table = pa.table({PERSISTENT: pa.array([ROWS, ROWS[:1]], PERSISTENT_TYPE), EVENTS: pa.array([[], []], EVENTS_TYPE)})
+    assert "the same rows in each frame" in str(next(check_language(table, "file", 0, INFO)))
+
+
+@pytest.mark.parametrize(
+    "column",
+    [[1, 2], ["a", "b"], [["a"], []], [[{"role": "user"}], []], [[{**ROWS[0], "timestamp": float("nan")}], []],
+     [[{**ROWS[0], "content": 3}], []]],
+)  # fmt: skip
+def test_columns_that_hold_no_rows(column):
+    with pytest.raises(DatasetError):
+        read_rows_of(pa.table({PERSISTENT: pa.array(column)}), PERSISTENT, "file")
+
+
+def test_columns_as_arrow_infers_them():
+    """``lerobot-annotate`` writes no types: times become float64, and a field of nulls has the type null."""
+    table = pa.table({PERSISTENT: pa.array([ROWS, ROWS]), EVENTS: pa.array([[], []])})
+    assert read_rows_of(table, PERSISTENT, "file")[0] == ROWS
+    assert read_rows_of(table, EVENTS, "file") == [[], []]
+    with pytest.raises(DatasetError):
+        read_rows_of(table.drop([EVENTS]), EVENTS, "file")
