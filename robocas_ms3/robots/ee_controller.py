@@ -138,8 +138,7 @@ class RoboCASEEPoseController(EvenDrives, _ArmChainController):
 
     def _reference_pose(self) -> Any:
         """`reference_pose`, (N, 7) native."""
-        position, quaternion = self._chain.forward(as_double(self._now()))
-        now = as_float(join([position, rotations.positive(quaternion)]))
+        now = _relative_pose(cast("Link", self.root_link), self.ee_link)
         if not self.config.use_target or self._target_pose is None:
             return now
         far, turned = EE_HELD_BACK

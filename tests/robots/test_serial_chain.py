@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from robocas_ms3.errors import RobocasError
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -178,6 +179,29 @@ def test_a_batch_of_tensors_is_solved_as_single_arrays_are():
     assert 20 < np.sum(~solved) < 60
     found = np.concatenate([qpos for qpos, _ in alone])
     np.testing.assert_allclose(together[solved], found[solved], atol=1e-6)
+
+
+class Operations(TorchDispatchMode):
+    """Records the names of the tensor operations within it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: set[str] = set()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.names.add(func.overloadpacket.__name__)
+        return func(*args, **(kwargs or {}))
+
+
+def test_no_operation_waits_for_a_gpu():
+    """Neither values are read, nor errors of linear algebra checked, nor rows counted that a mask selects."""
+    arm = SerialChain(*ARM, device=torch.device("cpu"))
+    goals = nearby_goals(arm, tensors, count=5, away=0.1, seed=9)
+    with Operations() as operations:
+        arm.inverse(*goals)
+    assert "bmm" in operations.names
+    waits = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "_linalg_check_errors", "masked_select", "index"}
+    assert not operations.names & waits
 
 
 def test_tensors_are_never_read():
