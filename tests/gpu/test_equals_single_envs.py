@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import pytest
+import torch
 from batches import check_equals_singles, set_control_mode
 from gpu_emulation import emulated_envs
+
+from robocas_ms3.tasks import TASKS
 
 JOINT_MODES = ("pd_joint_pos", "pd_joint_delta_pos", "pd_joint_pos_base", "pd_joint_delta_pos_base")
 END_EFFECTOR_MODES = ("pd_ee_delta_pose", "pd_ee_pose", "pd_ee_delta_pose_base", "pd_ee_pose_base")
@@ -27,3 +31,19 @@ def test_end_effector_modes(task, batch_and_singles, mode):
     batch, singles = batch_and_singles
     set_control_mode([batch, *singles], mode)
     check_equals_singles(batch, singles, mode, steps=50, heap=task == "search")
+
+
+@pytest.mark.emulated_gpu_full
+def test_images(needs_renderer, task):
+    settings = dict(obs_mode="rgb+depth", reward_mode="none", sensor_configs=dict(width=64, height=48))
+    spec, count = TASKS[task].env_id, emulated_envs()
+    batch = gym.make(spec, num_envs=count, seeds=(0, count - 1), **settings)
+    single = gym.make(spec, sim_backend="physx_cpu", **settings)
+    observed, _ = batch.reset(seed=list(range(count)))
+    for env in range(count):
+        expected, _ = single.reset(seed=env)
+        for camera, images in expected["sensor_data"].items():
+            for kind, image in images.items():
+                assert torch.equal(observed["sensor_data"][camera][kind][env].cpu(), image[0]), (env, camera, kind)
+    batch.close()
+    single.close()
