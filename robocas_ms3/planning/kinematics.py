@@ -12,7 +12,9 @@ from robocas_ms3.planning.protocol import Array
 LINE_STEP = 0.01  # m between two poses of a straight line
 LINE_TURN = np.deg2rad(3)  # rad between two poses of a straight line
 MAX_JUMP = 0.15  # rad that a joint may turn between two poses of a straight line
-ITERATIONS = 30  # Newton steps towards all poses of a line
+STRIDE = 4  # poses between two first estimates
+TOGETHER = 8  # Newton steps of all poses of a line together
+IN_TURN = 60  # Newton steps of one pose
 TOLERANCE = 1e-7  # accepted pose error, m and rad together
 HALF_TURN = -0.99  # cosine below which a rotation counts as nearly a half turn
 DAMPING = 1e-8  # added to the diagonal of J J^T, so that it can be inverted at singularities
@@ -100,20 +102,52 @@ def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str
     """
     start = np.asarray(start, dtype=np.float64)
     goals = _line_poses(chain.tcp(start[None])[0], tcp_in_base)
-    path = np.empty((len(goals) + 1, 7))
-    path[0] = start
-    for i, goal in enumerate(goals):  # one step each from the previous pose's estimate, then all together
-        path[i + 1] = newton_step(chain, path[i : i + 1], goal[None])[0][0]
-    for _ in range(ITERATIONS):
-        following, error = newton_step(chain, path[1:], goals)
-        if error.max() <= TOLERANCE:
-            break
-        path[1:] = following
-    else:
+    path = _solve_together(chain, start, goals)
+    if path is None or _largest_jump(path) > MAX_JUMP:
+        path = _solve_in_turn(chain, start, goals)
+    if path is None:
         raise PlanningFailed(stage, "line_unreachable")
-    if np.abs(np.diff(path, axis=0)).max() > MAX_JUMP:
+    if _largest_jump(path) > MAX_JUMP:
         raise PlanningFailed(stage, "line_joint_jump")
     return path
+
+
+def _solve_together(chain: ArmChain, start: Array, goals: Array) -> Array | None:
+    """Return a path (n + 1, 7) along poses (n, 4, 4): one step to every few poses, then steps of all poses together."""
+    path = np.empty((len(goals) + 1, 7))
+    path[0] = start
+    for before in range(0, len(goals), STRIDE):
+        after = min(before + STRIDE, len(goals))
+        estimate = newton_step(chain, path[before, None], goals[after - 1, None])[0][0]
+        path[before : after + 1] = np.linspace(path[before], estimate, after - before + 1)
+    for _ in range(TOGETHER):
+        following, error = newton_step(chain, path[1:], goals)
+        if error.max() <= TOLERANCE:
+            return path
+        path[1:] = following
+    return None
+
+
+def _solve_in_turn(chain: ArmChain, start: Array, goals: Array) -> Array | None:
+    """Return a path (n + 1, 7) along poses (n, 4, 4), each solved from the one before it."""
+    path = [start]
+    for goal in goals:
+        qpos = path[-1][None]
+        for _ in range(IN_TURN):
+            following, error = newton_step(chain, qpos, goal[None])
+            if error[0] <= TOLERANCE:
+                break
+            qpos = following
+        else:
+            return None
+        path.append(qpos[0])
+        if _largest_jump(np.array(path[-2:])) > MAX_JUMP:
+            break
+    return np.array(path)
+
+
+def _largest_jump(path: Array) -> float:
+    return float(np.abs(np.diff(path, axis=0)).max())
 
 
 def _line_poses(first: Array, last: Array) -> Array:
