@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
+from robocas_ms3.datasets.lerobot import schema
+from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.poses import from_wxyz, inverse
 from robocas_ms3.recordings.motion import Motion, gripper_open
@@ -22,14 +23,14 @@ KEYS = {
     "gripper_open": "observation.gripper_open",
 }
 """Key of an environment's observation -> column of our LeRobot datasets."""
-WIDTHS = {name: next(one.width for one in FEATURES if one.key == column) for name, column in KEYS.items()}
+WIDTHS = {name: next(one.width for one in schema.FEATURES if one.key == column) for name, column in KEYS.items()}
 _TURNS = {"agent_pos": slice(3, 7), "arm_base": slice(3, 7)}  # quaternions
 _YAW = 17  # index in agent_pos
 
 
 def depth_key(camera: str) -> str:
     """Return the key of a camera's depth in observations; LeRobot puts ``observation.`` before it."""
-    return f"images.{camera}_depth"
+    return schema.depth_key(camera).removeprefix("observation.")
 
 
 @dataclass

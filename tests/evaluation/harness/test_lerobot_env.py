@@ -83,7 +83,7 @@ def test_observations_have_the_names_and_shapes_of_the_policys_features(no_physi
     assert {name: tuple(value.shape[1:]) for name, value in seen.items()} == inputs
     states = {one.key: (one.width,) for one in schema.FEATURES if one.key.startswith("observation.")}
     images = {schema.image_key("base_camera"): (3, 4, 6)}
-    depths = {f"{schema.image_key('base_camera')}_depth": (1, 4, 6)} if depth else {}
+    depths = {schema.depth_key("base_camera"): (1, 4, 6)} if depth else {}
     assert inputs == {**states, **images, **depths}
     assert features["action"].shape == (7,)
 

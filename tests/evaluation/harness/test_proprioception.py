@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from robocas_ms3.datasets.lerobot.schema import FEATURES, frame_columns
+from robocas_ms3.datasets.lerobot.arrays import frame_columns
+from robocas_ms3.datasets.lerobot.schema import FEATURES
 from robocas_ms3.datasets.sources.arrays import episode_arrays
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, Proprioception
 from robocas_ms3.poses import from_wxyz
