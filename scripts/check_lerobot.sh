@@ -8,7 +8,7 @@
 #                  it: 0.6.1, 0.5.1 or 0.3.3
 # ROBOCAS_DATASET  RoboCAS folder of the same recordings: sub-goals and depth are compared with it
 #
-# LeRobot gets an environment of its own, see lerobot_environment.sh. Nothing is fetched from a model hub.
+# Runs in LeRobot's environment, see lerobot_environment.sh. Nothing is fetched from a model hub.
 set -euo pipefail
 
 usage() { sed -n '5p' "$0" >&2; exit 2; }
@@ -23,4 +23,7 @@ paths=()
 for path in "$@"; do paths+=("$(cd "$path" && pwd)"); done
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 . scripts/lerobot_environment.sh
+if [ "$lerobot_version" = 0.6 ]; then # lerobot-annotate sends its requests with openai, which LeRobot does not install
+    "$venv/bin/python" -m pip --disable-pip-version-check install -qq "openai>=1.40,<2"
+fi
 exec "$venv/bin/python" -W ignore scripts/check_lerobot.py "${paths[@]}"

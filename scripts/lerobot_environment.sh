@@ -1,15 +1,15 @@
-# Sourced by check_lerobot.sh, train_lerobot.sh and serve_lerobot.sh, in the checkout's folder: makes an environment with
+# Sourced by check_lerobot.sh, train_lerobot.sh and serve_lerobot.sh, in the checkout's folder: creates an environment with
 # LeRobot and sets $venv. The first call downloads gigabytes (torch with its CUDA libraries); no GPU is needed.
 #
 # lerobot_version         of the dataset: 0.6 (default), 0.5 or 2.1; see docs/lerobot.md
-# ROBOCAS_LEROBOT_VENV    folder of the environment (default: .venv-lerobot in the checkout; of older versions
+# ROBOCAS_LEROBOT_VENV    folder of the environment (default: .venv-lerobot, as of `setup.sh --lerobot`; for older versions
 #                         .venv-lerobot-0.5 and .venv-lerobot-2.1)
-# ROBOCAS_LEROBOT_PYTHON  interpreter to make it with (default: python3.12)
+# ROBOCAS_LEROBOT_PYTHON  interpreter to create it with (default: python3.12)
 
 lerobot_version=${lerobot_version:-0.6}
+packages=()
 case $lerobot_version in
-# openai: lerobot-annotate talks to its server with it.
-0.6) packages=("lerobot[training,diffusion]==0.6.1" torch==2.11.0 torchvision==0.26.0 "openai>=1.40,<2") ;;
+0.6) ;;
 0.5) packages=(lerobot==0.5.1 torch==2.10.0 torchvision==0.25.0) ;;
 # The last release that reads format v2.1. It sets no upper bound on PyAV, and torchvision 0.22 needs one of 15 or less.
 2.1) packages=(lerobot==0.3.3 torch==2.7.1 torchvision==0.22.1 av==15.1.0) ;;
@@ -18,19 +18,17 @@ case $lerobot_version in
     exit 2
     ;;
 esac
-socket=("msgpack>=1.0.5" "websockets>=15" "pydantic>=2" scipy PyYAML platformdirs)
 suffix=-$lerobot_version
 venv=${ROBOCAS_LEROBOT_VENV:-.venv-lerobot${suffix#-0.6}}
+base=${ROBOCAS_LEROBOT_PYTHON:-python3.12}
 
-if [ "$(cat "$venv/.packages" 2>/dev/null)" != "${packages[*]}" ]; then
+if [ "$lerobot_version" = 0.6 ]; then
+    ROBOCAS_VENV=$venv ROBOCAS_PYTHON=$base ROBOCAS_SKIP_BROWSER=1 bash scripts/setup.sh --lerobot
+elif [ "$(cat "$venv/.packages" 2>/dev/null)" != "${packages[*]}" ]; then
     echo "environment $venv: ${packages[*]} (minutes and gigabytes the first time)"
-    "${ROBOCAS_LEROBOT_PYTHON:-python3.12}" -m venv --clear "$venv"
+    "$base" -m venv --clear "$venv"
     "$venv/bin/python" -m pip --disable-pip-version-check install -qq "${packages[@]}"
     echo "${packages[*]}" >"$venv/.packages"
-fi
-if [ "${with_socket:-}" ] && [ "$(cat "$venv/.socket" 2>/dev/null)" != "${socket[*]}" ]; then
-    "$venv/bin/python" -m pip --disable-pip-version-check install -qq "${socket[@]}"
-    echo "${socket[*]}" >"$venv/.socket"
 fi
 venv=$(cd "$venv" && pwd)
 export HF_HUB_OFFLINE=${HF_HUB_OFFLINE:-1} HF_HOME=${HF_HOME:-$venv/hub} # tables are cached there; nothing is downloaded

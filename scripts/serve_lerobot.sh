@@ -9,7 +9,5 @@ set -euo pipefail
 run=$(cd "$1" && pwd)
 shift
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-with_socket=1
 . scripts/lerobot_environment.sh
-export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH}
 exec "$venv/bin/python" -W ignore -m robocas_ms3.baselines.lerobot.serve "$run" "$@"

@@ -11,8 +11,7 @@
 #   OUT/dataset   the dataset as the policy socket shows things (robocas_ms3.baselines.lerobot.prepare)
 #   OUT/train     of lerobot-train; scripts/serve_lerobot.sh OUT serves its last checkpoint
 #
-# ROBOCAS_PYTHON  interpreter that has robocas_ms3 (default: .venv's in the checkout); LeRobot gets an environment of its
-# own, see lerobot_environment.sh
+# Runs in LeRobot's environment, see lerobot_environment.sh.
 set -euo pipefail
 
 usage() { sed -n '4p' "$0" >&2; exit 2; }
@@ -51,11 +50,9 @@ if [ -d "$out/dataset" ] && [ ! -f "$out/asked" ]; then
 fi
 echo "$asked" >"$out/asked"
 
-with_socket=1
 . scripts/lerobot_environment.sh
-export PYTHONPATH=$PWD${PYTHONPATH:+:$PYTHONPATH}
 if [ ! -d "$out/dataset" ]; then
-    "${ROBOCAS_PYTHON:-.venv/bin/python}" -m robocas_ms3.baselines.lerobot.prepare "$dataset" "$out/dataset" "${language[@]}"
+    "$venv/bin/python" -m robocas_ms3.baselines.lerobot.prepare "$dataset" "$out/dataset" "${language[@]}"
 fi
 begun=$out/train/checkpoints/last/pretrained_model/train_config.json
 if [ -f "$begun" ]; then
