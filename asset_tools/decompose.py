@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -239,8 +240,10 @@ def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
         raise MissingExtraError("CoACD is not installed", fix="pip install 'robocas-ms3[assets]'") from error
     coacd.set_log_level("error")
     least = SLIVER * float(body.volume)
+    vertices: Any = np.asarray(body.vertices)
+    faces: Any = np.asarray(body.faces)
     parts = coacd.run_coacd(
-        coacd.Mesh(np.asarray(body.vertices), np.asarray(body.faces)),
+        coacd.Mesh(vertices, faces),
         threshold=threshold,
         max_convex_hull=MAX_HULLS,
         preprocess_mode="off",  # it thickens thin walls; what comes in is closed already

@@ -160,7 +160,7 @@ def _reachable(pairs: _Pairs, points: Array, rng: np.random.Generator) -> tuple[
     turn = (np.arange(ANGLES) + rng.random((count, 1)))[..., None] * (2 * np.pi / ANGLES)
     approach = (np.cos(turn) * u[:, None] + np.sin(turn) * v[:, None]).reshape(-1, 3)
     closing = np.repeat(pairs.axes, ANGLES, axis=0)
-    rotations = np.stack([np.cross(closing, approach), closing, approach], axis=2)
+    rotations = np.stack([np.cross(closing, approach), closing, approach], axis=2, dtype=np.float64)
     pair = np.repeat(np.arange(count), ANGLES)
     clear = np.zeros((len(pair), len(DEPTHS)), dtype=bool)
     for start in range(0, len(pair), CHUNK):

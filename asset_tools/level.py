@@ -40,7 +40,7 @@ def level_base(
     outline = _edge_distance(np.asarray(closed.vertices)[:, :2], center)
     if base < BROAD * outline or _reach(closed, low + FEET, center) >= ROCKS * base:
         return mesh, closed
-    for depth in np.arange(2 * STEP, deepest, STEP):
+    for depth in np.arange(2 * STEP, deepest, STEP).tolist():
         if _reach(closed, low + depth, center) >= FLAT * base:
             vertices = np.array(mesh.vertices)
             vertices[:, 2] = np.maximum(vertices[:, 2], low + depth)

@@ -57,7 +57,8 @@ def merge_poses(directions: Array, probabilities: Array, heights: Array) -> tupl
     kept: list[int] = []
     sums: list[float] = []
     # rounded, so that noise does not decide between equals
-    for i in np.argsort(-np.round(probabilities, 9), kind="stable"):
+    ranking: list[int] = np.argsort(-np.round(probabilities, 9), kind="stable").tolist()
+    for i in ranking:
         if kept:
             cosines = directions[kept] @ directions[i]
             if cosines.max() > np.cos(np.radians(SAME_DEG)):

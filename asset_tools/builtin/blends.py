@@ -235,7 +235,7 @@ def _sampled(field: Field, low: np.ndarray, high: np.ndarray, step: float) -> tu
     # Level 0, where feet are cut off, falls between two levels of the grid: on one it would give slivers.
     corner = (np.floor(low / step) - 0.5) * step
     blocks = np.ceil((high - corner) / (step * BLOCK)).astype(int)
-    middles = corner + (np.indices(blocks).reshape(3, -1).T + 0.5) * (BLOCK * step)
+    middles = corner + (np.indices(tuple(blocks.tolist())).reshape(3, -1).T + 0.5) * (BLOCK * step)
     distance = field(middles.astype(np.float32))
     values = np.repeat(distance[:, None], BLOCK**3, axis=1).astype(np.float32)
     near = np.flatnonzero(np.abs(distance) < SLACK * (np.sqrt(3) * BLOCK / 2 + 1) * step)

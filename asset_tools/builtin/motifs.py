@@ -96,7 +96,7 @@ def citrus(pen: Pen, x: float, y: float, r: float) -> None:
     """A slice of orange."""
     _disc(pen, x, y, r, (240, 130, 20))
     _disc(pen, x, y, 0.86 * r, (255, 236, 196))
-    for angle in np.arange(8) * 45:
+    for angle in range(0, 360, 45):
         pen.pieslice((x - 0.8 * r, y - 0.8 * r, x + 0.8 * r, y + 0.8 * r), angle + 4, angle + 41, fill=(250, 160, 40))
 
 

@@ -141,7 +141,7 @@ def _fall(solid: Solid, seed: int, drops: int) -> tuple[Array, Array, Array, Arr
 
 def _energy(body: physx.PhysxRigidDynamicComponent, solid: Solid) -> float:
     """Kinetic energy, J."""
-    speed, spin = body.linear_velocity, body.angular_velocity
+    speed, spin = np.asarray(body.linear_velocity), np.asarray(body.angular_velocity)
     axes = (body.entity_pose * body.cmass_local_pose).to_transformation_matrix()[:3, :3]
     return 0.5 * float(solid.mass * (speed @ speed) + solid.inertia @ (spin @ axes) ** 2)
 

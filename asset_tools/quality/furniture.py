@@ -237,7 +237,7 @@ def _pull(stage: Stage, link: Link, point: Array, way: float, reach: float) -> N
     speed = way * stage.speed(link.joint.name) * reach
     # a light part would be thrown about by the full force within a step
     force = min(FORCE, 0.5 * link.mass * HAND_SPEED / TIME_STEP) * np.clip(1 - speed / HAND_SPEED, -1, 1)
-    stage.links[link.name].add_force_at_point((way * force * axis).astype(np.float32), place.astype(np.float32))
+    stage.links[link.name].add_force_at_point((way * force * axis).tolist(), place.tolist())
 
 
 def _try_surface(model: Model, surface: Surface) -> SurfaceReport:

@@ -87,7 +87,7 @@ class Stage:
         self._attach(part, pieces)
         part.mass = link.mass
         part.cmass_local_pose = sapien.Pose(link.center_of_mass, link.inertia_wxyz)
-        part.inertia = np.asarray(link.inertia, np.float32)
+        part.set_inertia(link.inertia)
         frame = sapien.Pose(joint_frame(link.joint))
         part.joint.name = link.joint.name
         part.joint.type = link.joint.kind

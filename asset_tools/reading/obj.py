@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from manifold3d import triangulate
@@ -253,7 +254,8 @@ def _with_concave(triangles: Ints, source: Ints, counts: Ints, points: Array) ->
         across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
         plane = np.stack([across, np.cross(normal, across)], axis=1)
         own = int(starts[polygon]) + np.arange(int(counts[polygon]))
-        ears = np.asarray(triangulate([points[own] @ plane]), np.int64)
+        outline: Any = points[own] @ plane
+        ears = np.asarray(triangulate([outline]), np.int64)
         if len(ears) == counts[polygon] - 2:  # else it crosses itself
             triangles[first[polygon] : first[polygon] + len(ears)] = own[ears]
     return triangles

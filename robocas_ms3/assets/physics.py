@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import sapien
@@ -51,7 +52,8 @@ class Solid:
 def engine_settings() -> Iterator[None]:
     """The environments' settings; the engine keeps them for the whole process, so they are put back afterwards."""
     scene, body, shape = physx.get_scene_config(), physx.get_body_config(), physx.get_shape_config()
-    physx.set_scene_config(gravity=np.array([0, 0, -9.81]))
+    gravity: Any = np.array([0, 0, -9.81])  # SAPIEN's stubs ask for a shape type that no NumPy array has
+    physx.set_scene_config(gravity=gravity)
     physx.set_body_config(solver_position_iterations=15, solver_velocity_iterations=1, sleep_threshold=0.005)
     physx.set_shape_config(contact_offset=CONTACT_OFFSET, rest_offset=0.0)
     try:
@@ -84,7 +86,7 @@ def add_body(scene: sapien.Scene, solid: Solid, pose: Array) -> physx.PhysxRigid
         raise AssetError("the physics engine refused a convex hull", found=error) from error
     free.mass = solid.mass
     free.cmass_local_pose = sapien.Pose(solid.center_of_mass, solid.inertia_wxyz)
-    free.inertia = np.asarray(solid.inertia)
+    free.set_inertia(np.asarray(solid.inertia, np.float64).tolist())
     free.linear_damping = free.angular_damping = DAMPING
     add_component(scene, free, sapien.Pose(pose))
     return free
@@ -170,7 +172,7 @@ def _load(path: Path, material: physx.PhysxMaterial) -> list[physx.PhysxCollisio
 
 
 def _box_shape(box: Box, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeBox:
-    shape = physx.PhysxCollisionShapeBox(np.asarray(box.half_size, np.float32), material)
+    shape = physx.PhysxCollisionShapeBox(box.half_size.tolist(), material)
     shape.local_pose = sapien.Pose(box.pose)
     return shape
 

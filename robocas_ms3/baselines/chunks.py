@@ -25,7 +25,7 @@ def state_of(poses: NDArray[np.floating], widths: NDArray[np.floating]) -> NDArr
     return np.concatenate([poses[:, :3, 3], turns, widths[:, None] / 0.08], axis=1).astype(np.float32)
 
 
-def encode(poses: NDArray[np.floating], opened: NDArray[Any], steps: int) -> NDArray[np.float32]:
+def encode(poses: Array, opened: NDArray[Any], steps: int) -> NDArray[np.float32]:
     """Chunks of an episode.
 
     Args:
@@ -41,7 +41,7 @@ def encode(poses: NDArray[np.floating], opened: NDArray[Any], steps: int) -> NDA
     return _rows(inverse(poses)[:, None] @ poses[ahead], np.asarray(opened, np.float64)[ahead])
 
 
-def next_keys(poses: NDArray[np.floating], opened: NDArray[Any]) -> NDArray[np.float32]:
+def next_keys(poses: Array, opened: NDArray[Any]) -> NDArray[np.float32]:
     """(T, 9) where the TCP will be when the gripper's command changes next, or at the end; rows as above."""
     length = len(poses)
     changes = np.flatnonzero(np.diff(np.asarray(opened, np.int8))).tolist()  # the last steps before a change

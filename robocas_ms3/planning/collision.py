@@ -143,7 +143,8 @@ class FclWorld:
         self._obstacles = {}
         self._obstacle_names = [name for name, pieces, _ in bodies for _ in pieces.geometries]
         self._pieces = [(pieces, piece, pose) for _, pieces, pose in bodies for piece in range(len(pieces.geometries))]
-        low, high = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        low: list[Array] = [np.zeros((0, 3))]
+        high: list[Array] = [np.zeros((0, 3))]
         for _, pieces, pose in bodies:
             vertices = pieces.vertices @ pose[:3, :3].T + pose[:3, 3]
             low.append(np.minimum.reduceat(vertices, pieces.first))

@@ -79,7 +79,7 @@ def candidates(
     ahead = Rotation.from_euler("z", turn_deg, degrees=True).apply(ahead)
     lowest = frame[2, 3] + TIP_CLEARANCE + TIP_BELOW_TCP
     top = points[:, 2].max()
-    heights = [h for h in np.arange(max(target[2], points[:, 2].min(), lowest), top - BELOW_TOP, 0.015)]
+    heights = np.arange(max(target[2], points[:, 2].min(), lowest), top - BELOW_TOP, 0.015).tolist()
     if not heights and top - 0.01 >= lowest:
         heights = [top - 0.01]
     near = others[np.linalg.norm(others[:, :2] - center[:2], axis=1) < 0.3]

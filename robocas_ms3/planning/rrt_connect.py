@@ -287,4 +287,4 @@ def _dense(points: Array) -> Array:
 
 
 def _fractions(a: Array, b: Array) -> Array:
-    return np.linspace(0, 1, int(np.ceil(np.linalg.norm(b - a) / FINE_SPACING)) + 1)
+    return np.linspace(0, 1, int(np.ceil(np.linalg.norm(b - a) / FINE_SPACING)) + 1, dtype=np.float64)

@@ -154,7 +154,7 @@ class PlanningScene:
         to_base = inverse(self.arm_base_in_world)
         center = np.zeros(3) if around is None else around
         left_out = {without} if isinstance(without, int) else without
-        pieces = [np.zeros((0, 3))]
+        pieces: list[Array] = [np.zeros((0, 3))]
         for _, part, spacing, pose in self._bodies(left_out, without_link):
             in_base, points = to_base @ pose, part.surface_points(spacing)
             middle = (center - in_base[:3, 3]) @ in_base[:3, :3]

@@ -94,7 +94,7 @@ class CollisionShapes:
         return made
 
 
-def fcl_convex(fcl: Any, corners: Array, faces: NDArray[np.int_]) -> Any:
+def fcl_convex(fcl: Any, corners: Array, faces: NDArray[np.integer]) -> Any:
     """Build FCL's convex geometry from the corners (V, 3) and triangles (F, 3) of a hull."""
     counted = np.concatenate([np.full((len(faces), 1), 3), faces], axis=1)  # each polygon starts with its size
     return fcl.Convex(np.ascontiguousarray(corners, dtype=np.float64), len(faces), counted.ravel().tolist())
@@ -125,6 +125,6 @@ def inflated(vertices: Array, margin: float) -> tuple[Array, NDArray[np.int32]]:
     return hull, faces
 
 
-def _normals(vertices: Array, faces: NDArray[np.int_]) -> Array:
+def _normals(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.floating]:
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     return np.cross(b - a, c - a)

@@ -61,11 +61,11 @@ class JointPath(AbstractGeometricPath):
 
     def dense(self, spacing: float) -> Array:
         """Give configurations (m, n) at most ``spacing`` rad apart, both ends included."""
-        return self(np.linspace(0, self.length, max(2, int(np.ceil(self.length / spacing)) + 1)))
+        return self(np.linspace(0, self.length, max(2, int(np.ceil(self.length / spacing)) + 1), dtype=np.float64))
 
     def grid(self) -> Array:
         """Give grid points for TOPP-RA: even ones, and both sides of every joint of the pieces."""
-        even = np.linspace(0, self.length, max(20, int(np.ceil(self.length / GRID))) + 1)
+        even = np.linspace(0, self.length, max(20, int(np.ceil(self.length / GRID))) + 1, dtype=np.float64)
         inner = self._curve.x[1:-1] if len(self._curve.x) < 40 else self._curve.x[:0]
         beside = np.concatenate([inner - 1e-4 * self.length, inner + 1e-4 * self.length])
         points = np.sort(np.concatenate([even, beside[(beside > 0) & (beside < self.length)]]))
@@ -180,6 +180,6 @@ def stopping(waypoints: Array, *, velocity: float, acceleration: float, dt: floa
 def sampled(motion: Callable[[Array], Array], duration: float, goal: Array, dt: float) -> Trajectory:
     """Sample a motion at exact steps; the last row is ``goal``, a vanishing motion has that row alone."""
     count = max(1, int(np.ceil(duration / dt - 1e-9)))
-    qpos = np.array(motion(np.arange(1, count + 1) * (duration / count)), dtype=np.float64)
+    qpos = np.array(motion(np.arange(1, count + 1, dtype=np.float64) * (duration / count)), dtype=np.float64)
     qpos[-1] = goal
     return Trajectory(qpos, dt)

@@ -59,8 +59,8 @@ class PicturesConfig(StrictModel):
 
     def chosen(self) -> Pictures:
         """For writers of datasets."""
-        cameras = {} if self.cameras is None else {"cameras": tuple(self.cameras)}
-        return Pictures(size=self.size, depth=self.depth, image_format=self.image_format, **cameras)
+        cameras = Pictures.cameras if self.cameras is None else tuple(self.cameras)
+        return Pictures(cameras=cameras, size=self.size, depth=self.depth, image_format=self.image_format)
 
 
 class LimitsConfig(StrictModel):

@@ -40,7 +40,7 @@ def _relative_pose(frame: Link, link: Link) -> Any:
     pose = frame._bodies[0].entity_pose.inv() * link._bodies[0].entity_pose
     position, quaternion = pose.p, pose.q
     if quaternion[0] < 0:  # as ManiSkill's products
-        quaternion = -quaternion
+        quaternion = np.negative(quaternion)
     return np.concatenate([position, quaternion])[None]
 
 

@@ -142,7 +142,7 @@ def _joint_constants(fixed: list[NDArray[np.float64]]) -> tuple[NDArray[np.float
     q / 2 + 90 deg turn quaternions.
     """
     count = len(fixed) - 1
-    angles = np.kron(np.eye(count), [1, 1, 0.5, 0.5])
+    angles = np.asarray(np.kron(np.eye(count), [1, 1, 0.5, 0.5]), dtype=np.float64)
     shift = np.tile([0, np.pi / 2], 2 * count)
     weights, constant = np.zeros((count, 4, count + 1, 2, 4, 4)), np.zeros((count + 1, 2, 4, 4))
     quarter_turn = np.zeros((4, 4))

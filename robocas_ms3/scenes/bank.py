@@ -189,8 +189,11 @@ def about(model: SceneModel) -> dict[str, Any]:
 def write_layout(layout: Layout, path: Path) -> None:
     """Write a layout as ``.npz``."""
     values = {f.name: getattr(layout, f.name) for f in fields(Layout)}
+    arrays: dict[str, Any] = {
+        name: np.zeros(0) if value is None else np.asarray(value) for name, value in values.items()
+    }
     made = BytesIO()  # a zip file that meets a full disk complains once more when it is forgotten
-    np.savez(made, **{name: np.zeros(0) if value is None else np.asarray(value) for name, value in values.items()})
+    np.savez(made, **arrays)
     with replacing(path) as tmp:
         tmp.write_bytes(made.getbuffer())
 

@@ -204,5 +204,5 @@ def _within(distance: float, limit: float, what: str, fix: str) -> None:
 
 def _distance(points: Array, frame: Array, low: Array, high: Array) -> float:
     """Least distance of points (P, 3) in the world from a box in a frame, m."""
-    local = transform(np.linalg.inv(frame), points)
+    local = transform(np.asarray(np.linalg.inv(frame), dtype=np.float64), points)
     return float(np.linalg.norm(local - np.clip(local, low, high), axis=1).min())

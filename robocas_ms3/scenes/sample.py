@@ -226,7 +226,7 @@ def placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableObject:
         asset.asset.id,
         notes.resting_poses[low],
         notes.resting_probabilities[low],
-        [notes.footprint(i) for i in low],
+        [notes.footprint(i) for i in low.tolist()],
         int(np.flatnonzero(low == notes.display_pose)[0]) if notes.display_pose in low else -1,
     )
 

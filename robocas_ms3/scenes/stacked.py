@@ -178,7 +178,7 @@ def _add_walls(scene: sapien.Scene, middle: Array, half: Array, z: float) -> lis
         center = np.array([*middle, z + 1.0])
         center[axis] += sign * (half[axis] + WALL)
         body = physx.PhysxRigidStaticComponent()
-        body.attach(physx.PhysxCollisionShapeBox(size, slippery))
+        body.attach(physx.PhysxCollisionShapeBox(size.tolist(), slippery))
         add_component(scene, body, sapien.Pose(center))
         walls.append(body.entity)
     return walls

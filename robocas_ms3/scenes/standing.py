@@ -84,7 +84,7 @@ def body_is_free(base_in_world: Array, cloud: Array) -> bool:
         base_in_world: 4x4 of a frame on the floor, turned as the mobile base is: the robot's root, base joints at 0.
         cloud: (P, 3) world, m.
     """
-    local = transform(np.linalg.inv(base_in_world), cloud)
+    local = transform(np.asarray(np.linalg.inv(base_in_world), dtype=np.float64), cloud)
     x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
     inside = [(x <= half_x) & (y <= half_y) & (z <= height) for half_x, half_y, height in _BODY_BOXES]
     return not ((z > 0) & np.logical_or.reduce(inside)).any()

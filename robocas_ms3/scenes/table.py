@@ -192,7 +192,7 @@ def check_record(dtype: np.dtype) -> None:
     Raises:
         ValueError: it isn't.
     """
-    slots, words = dtype["present"].shape[0], dtype["relation"].itemsize // 4
+    slots, words = dtype["present"].itemsize, dtype["relation"].itemsize // 4
     if dtype != _record(slots, words):
         raise ValueError("other fields than a table's")
 

@@ -35,9 +35,9 @@ HINGE_FRICTION, HINGE_DAMPING = 0.02, 6.0  # -, N m s/rad
 
 def block(low: Corner, high: Corner, bevel: float = 0.0) -> Array:
     """Corners (8, 3) of a box, or (24, 3) of one with bevelled edges."""
-    low, high = np.minimum(low, high), np.maximum(low, high)
+    lower, upper = np.minimum(low, high), np.maximum(low, high)
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-    center, half = (low + high) / 2, (high - low) / 2
+    center, half = (lower + upper) / 2, (upper - lower) / 2
     if bevel <= 0:
         return center + signs * half
     return np.concatenate([center + signs * (half - bevel * (1 - axis)) for axis in np.eye(3)])

@@ -55,7 +55,7 @@ def _walls() -> list[Quad]:
         back = np.array([-right[1], right[0], 0.0])
         for across in np.arange(-HALF, HALF, TILE):
             for z in np.arange(0, HEIGHT, TILE):
-                corner = back * HALF + right * across + (0, 0, z)
+                corner = back * HALF + right * across + np.array([0, 0, z])
                 quads.append((corner, right * TILE, np.array([0, 0, TILE])))
     return quads
 

@@ -160,7 +160,7 @@ def _write(folder: Path, episode: Episode, taken: EpisodeImport, surveyed: Surve
                 source = episode.image_path(camera, kind, step)
                 placer.file(source, schema.image_path(folder, camera, kind, step, pictures.image_format))
     write_cameras(folder, cameras)
-    arrays = {key: taken.stored.arrays[key] for key in SPECS if key in taken.stored.arrays}
+    arrays: dict[str, Any] = {key: taken.stored.arrays[key] for key in SPECS if key in taken.stored.arrays}
     np.savez(folder / schema.EPISODE_FILE, **arrays)
     text = json_text(_scene(episode, taken, surveyed), episode.folder, indent=1, error=DatasetError)
     (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")

@@ -50,7 +50,7 @@ def planar_base(root: Array, qpos: Array) -> Array:
     x, y, yaw = qpos[:, RobotDescription.base_slice].T
     position = root[:, :3, 3] + np.einsum("tij,tj->ti", root[:, :3, :3], np.stack([x, y, 0 * x], axis=1))
     root_yaw = np.arctan2(root[:, 1, 0], root[:, 0, 0])
-    return np.column_stack([position[:, :2], np.unwrap(wrap_angle(root_yaw + yaw))])
+    return np.column_stack([position[:, :2], np.asarray(np.unwrap(wrap_angle(root_yaw + yaw)), dtype=np.float64)])
 
 
 def episode_arrays(

@@ -89,4 +89,4 @@ def _edges(low: float, high: float, points: Array) -> Array:
     cell = (high - low) / max(1, round((high - low) / CELL)) if high - low > CELL / 2 else CELL
     before = np.ceil((low - points.min(initial=low)) / cell - 1e-9)
     after = np.ceil((points.max(initial=high) - low) / cell - 1e-9)
-    return low + cell * np.arange(-int(before), max(1, int(after)) + 1)
+    return low + cell * np.arange(-int(before), max(1, int(after)) + 1, dtype=np.float64)

@@ -9,6 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +88,7 @@ def write_episode(
         with timing.measure("write"):
             cameras = played.cameras()
             write_cameras(folder, {name: cameras[name] for name in pictures.cameras})
-            arrays = with_embeddings(played.arrays, embed) if embed else played.arrays
+            arrays: dict[str, Any] = with_embeddings(played.arrays, embed) if embed else played.arrays
             np.savez(folder / schema.EPISODE_FILE, **arrays)
             text = json_text(played.scene(), f"episode {source}", indent=1, error=DatasetError)
             (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")

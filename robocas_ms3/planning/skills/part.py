@@ -59,7 +59,7 @@ class Part:
         left = (far - start) * np.sign(far)
         if left < STEP[self.joint.kind]:
             raise PlanningFailed("pull", "at_the_end")
-        return np.linspace(start, far, int(np.ceil(left / STEP[self.joint.kind])) + 1)
+        return np.linspace(start, far, int(np.ceil(left / STEP[self.joint.kind])) + 1, dtype=np.float64)
 
     def least(self, arm: Arm) -> float:
         """How far a pull has to lead to be worth it, m or rad."""
