@@ -19,6 +19,10 @@ case "${1:-}" in
     --lerobot) lerobot=1 default_venv=.venv-lerobot pythons="python3.12 python3 python" ;;
     *) echo "usage: bash scripts/setup.sh [--lerobot]" >&2; exit 2 ;;
 esac
+if [ "$lerobot" = 1 ] && [ -n "${ROBOCAS_NUMPY:-}" ]; then
+    echo "setup: error: ROBOCAS_NUMPY=$ROBOCAS_NUMPY with --lerobot: LeRobot determines the version of numpy." >&2
+    exit 2
+fi
 venv=${ROBOCAS_VENV:-$default_venv}
 python=$venv/bin/python
 stamp_file=$venv/.robocas-setup

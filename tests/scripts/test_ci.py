@@ -1,6 +1,7 @@
 """On CI nothing is passed over in silence: a missing browser or renderer fails."""
 
 import importlib.util
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -11,12 +12,21 @@ ROOT = Path(__file__).resolve().parents[2]
 OUTCOMES = (pytest.fail.Exception, pytest.skip.Exception)
 
 
-def test_ci_says_that_it_is_ci(tmp_path):
-    for name, text in ((".ci/run", (ROOT / ".ci" / "run").read_text()), ("scripts/test.sh", 'echo "$PWD $CI"\n')):
-        (tmp_path / name).parent.mkdir()
-        (tmp_path / name).write_text(text)
-    done = subprocess.run(["bash", tmp_path / ".ci" / "run"], capture_output=True, text=True, check=True, env={})
-    assert done.stdout == f"{tmp_path} true\n"
+def test_ci_runs_the_tests_with_both_versions_of_numpy(tmp_path):
+    fake_python = tmp_path / ".venv-numpy1" / "bin" / "python"
+    for path, text in (
+        (tmp_path / ".ci" / "run", (ROOT / ".ci" / "run").read_text()),
+        (tmp_path / "scripts" / "test.sh", 'echo "test $PWD $CI ${ROBOCAS_NUMPY:-locked}"\n'),
+        (tmp_path / "scripts" / "setup.sh", 'echo "setup $ROBOCAS_VENV $ROBOCAS_NUMPY"\n'),
+        (fake_python, '#!/bin/bash\necho "python $2 $CI"\n'),
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    fake_python.chmod(0o755)
+    command = ["bash", tmp_path / ".ci" / "run"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env={"PATH": os.environ["PATH"]})
+    lines = [f"test {tmp_path} true locked", "setup .venv-numpy1 1.26.4", "python pytest true"]
+    assert done.stdout.splitlines() == lines
 
 
 @pytest.mark.parametrize(
