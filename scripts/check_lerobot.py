@@ -15,6 +15,7 @@ from pathlib import Path
 from shutil import copytree
 
 import numpy as np
+import pandas as pd
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
@@ -52,7 +53,7 @@ def load(root: Path) -> LeRobotDataset:
 
 def check_items(dataset: LeRobotDataset) -> None:
     """Index the first, middle and last frame of each episode; compare texts and statistics with the tables."""
-    starts = np.cumsum([0, *lengths(dataset)])
+    starts, subgoals = np.cumsum([0, *lengths(dataset)]), subtask_texts(dataset, Path(dataset.root))
     for episode, (first, end) in enumerate(zip(starts, starts[1:], strict=False)):
         for number in (first, (first + end) // 2, end - 1):
             item = dataset[int(number)]
@@ -62,7 +63,8 @@ def check_items(dataset: LeRobotDataset) -> None:
             if "next.done" in item:
                 assert bool(item["next.done"]) == (number == end - 1)
                 assert float(item["next.reward"]) == float(item["next.success"])
-            assert item.get("subtask", "of LeRobot 0.5 only")
+            if subgoals:
+                assert item["subtask"] == subgoals[int(item["subtask_index"])]
     for key, value in item.items():
         shown = f"{tuple(value.shape)} {value.dtype}" if isinstance(value, torch.Tensor) else repr(value)[:100]
         say(f"  {key}: {shown}")
@@ -75,6 +77,14 @@ def lengths(dataset: LeRobotDataset) -> list[int]:
     """Return the number of frames of each episode; format v2.1 has a dictionary of episodes, v3.0 a table."""
     episodes = dataset.meta.episodes
     return [int(row["length"]) for row in (episodes.values() if isinstance(episodes, dict) else episodes)]
+
+
+def subtask_texts(dataset: LeRobotDataset, root: Path) -> dict[int, str]:
+    """Return the texts of meta/subtasks.parquet by subtask_index; empty where LeRobot ignores them (0.6 and 2.1)."""
+    if dataset.meta.info["codebase_version"] != "v3.0" or "subtask_index" not in dataset.meta.features:
+        return {}
+    table = pd.read_parquet(root / "meta/subtasks.parquet")
+    return dict(zip(table["subtask_index"].tolist(), table.index.tolist(), strict=True))
 
 
 def instruction(dataset: LeRobotDataset, episode: int) -> str:

@@ -22,8 +22,6 @@ fi
 paths=()
 for path in "$@"; do paths+=("$(cd "$path" && pwd)"); done
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+test_packages=("openai>=1.40,<2") # lerobot-annotate imports it, and LeRobot does not install it
 . scripts/lerobot_environment.sh
-if [ "$lerobot_version" = 0.6 ]; then # lerobot-annotate sends its requests with openai, which LeRobot does not install
-    "$venv/bin/python" -m pip --disable-pip-version-check install -qq "openai>=1.40,<2"
-fi
 exec "$venv/bin/python" -W ignore scripts/check_lerobot.py "${paths[@]}"

@@ -1,7 +1,10 @@
-# Sourced by check_lerobot.sh, train_lerobot.sh and serve_lerobot.sh, in the checkout's folder: creates an environment with
-# LeRobot and sets $venv. The first call downloads gigabytes (torch with its CUDA libraries); no GPU is needed.
+# Sourced by check_lerobot.sh, check_lerobot_env.sh, train_lerobot.sh and serve_lerobot.sh, in the checkout's folder: creates
+# an environment with LeRobot and sets $venv. The first call downloads gigabytes (torch with its CUDA libraries); no GPU is
+# needed.
 #
 # lerobot_version         of the dataset: 0.6 (default), 0.5 or 2.1; see docs/lerobot.md
+# test_packages           array of further packages to install with LeRobot 0.6 (default: none)
+# needs_renderer          1: install a software renderer too (default: 0)
 # ROBOCAS_LEROBOT_VENV    folder of the environment (default: .venv-lerobot, as of `setup.sh --lerobot`; for older versions
 #                         .venv-lerobot-0.5 and .venv-lerobot-2.1)
 # ROBOCAS_LEROBOT_PYTHON  interpreter to create it with (default: python3.12)
@@ -23,7 +26,11 @@ venv=${ROBOCAS_LEROBOT_VENV:-.venv-lerobot${suffix#-0.6}}
 base=${ROBOCAS_LEROBOT_PYTHON:-python3.12}
 
 if [ "$lerobot_version" = 0.6 ]; then
-    ROBOCAS_VENV=$venv ROBOCAS_PYTHON=$base ROBOCAS_SKIP_BROWSER=1 bash scripts/setup.sh --lerobot
+    ROBOCAS_VENV=$venv ROBOCAS_PYTHON=$base ROBOCAS_SKIP_BROWSER=1 \
+        ROBOCAS_SKIP_RENDERER=$((1 - ${needs_renderer:-0})) bash scripts/setup.sh --lerobot
+    if [ -n "${test_packages[*]:-}" ]; then
+        "$venv/bin/python" -m pip --disable-pip-version-check install -qq "${test_packages[@]}"
+    fi
 elif [ "$(cat "$venv/.packages" 2>/dev/null)" != "${packages[*]}" ]; then
     echo "environment $venv: ${packages[*]} (minutes and gigabytes the first time)"
     "$base" -m venv --clear "$venv"

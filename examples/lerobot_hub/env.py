@@ -1,12 +1,14 @@
 """RoboCAS for LeRobot's EnvHub: upload this file as ``env.py`` to a repository of the Hugging Face Hub.
 
-Whoever loads it needs robocas_ms3 with the extra ``lerobot-env``::
+Loading it requires robocas_ms3 with the extra ``lerobot-env``::
 
     from lerobot.envs import make_env
     envs = make_env("USER/REPOSITORY", n_envs=2, trust_remote_code=True)    # {"pick": {0: vector environment}}
 """
 
 from dataclasses import fields
+
+from lerobot.envs import EnvConfig  # pyright: ignore[reportMissingImports]
 
 from robocas_ms3.evaluation.harness.lerobot import RoboCASEnvConfig
 
@@ -19,13 +21,15 @@ def make_env(n_envs=1, use_async_envs=False, cfg=None):
     Args:
         n_envs: episodes at a time.
         use_async_envs: ignored, because envs on a CPU run in processes anyway.
-        cfg: an object whose attributes are settings of `RoboCASEnvConfig`; None: `SETTINGS`.
+        cfg: an object whose attributes override `SETTINGS`, named as in `RoboCASEnvConfig`. Attributes that are None or
+            that equal LeRobot's defaults (``fps=30``) are ignored.
 
     Returns:
         ``{task: {0: vector environment}}``.
     """
-    settings = SETTINGS
-    if cfg is not None:
-        names = {one.name for one in fields(RoboCASEnvConfig)} - {"features", "features_map"}
-        settings = {name: getattr(cfg, name) for name in names if hasattr(cfg, name)}
+    names = {field.name for field in fields(RoboCASEnvConfig)} - {"features", "features_map"}
+    defaults = {field.name: field.default for field in fields(EnvConfig)}
+    given = {name: getattr(cfg, name, None) for name in names}
+    changed = {name: value for name, value in given.items() if value is not None and value != defaults.get(name)}
+    settings = {**SETTINGS, **changed}
     return RoboCASEnvConfig(**settings).create_envs(n_envs, use_async_envs)

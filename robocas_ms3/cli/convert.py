@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from robocas_ms3.datasets.writing.convert import Conversion
 
 from robocas_ms3.cli.options import Maybe
+from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 
 
 @dataclass
@@ -29,7 +30,7 @@ class Convert:
     """Folder of the dataset."""
     to: str = "robocas"
     """Format of the dataset: robocas, lerobot (needs the extra 'lerobot'), or another package's."""
-    lerobot_version: Literal["0.6", "0.5", "2.1"] = "0.6"
+    lerobot_version: Version = NEWEST
     """What reads the LeRobot dataset: 0.6: LeRobot 0.6 and later (format v3.0, language columns, depth as video);
     0.5: LeRobot 0.4 and 0.5 (v3.0, subtask_index); 2.1: readers of format v2.1, as openpi and GR00T."""
     codec: Literal["h264", "av1"] = "h264"
@@ -124,7 +125,7 @@ def _format(cfg: Convert) -> Format:
         "leave_out": cfg.leave_out,
         "image_format": cfg.image_format != "png",
         "codec": cfg.codec != "h264",
-        "lerobot_version": cfg.lerobot_version != "0.6",
+        "lerobot_version": cfg.lerobot_version != NEWEST,
     }
     for option, given in flags.items():
         if given and option not in chosen.options:

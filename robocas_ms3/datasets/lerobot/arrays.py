@@ -1,4 +1,4 @@
-"""The arrays of an episode as features of LeRobot, and back."""
+"""Convert the arrays of an episode to LeRobot features and back."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from robocas_ms3.recordings.motion import relative_motion
 
 
 def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
-    """The numeric features (T, D) of an episode, from the arrays of ``episode_info.npz``."""
+    """Return the numeric features (T, D) of an episode, from the arrays of ``episode_info.npz``."""
     turn = Rotation.from_quat(arrays["rel_orn"].astype(np.float64)).as_euler("xyz")
     status = arrays["gripper_status"].astype(np.float32)[:, None]
     command, joints = _next(status), _next(arrays["robot_joints"])
@@ -36,7 +36,10 @@ def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
 def robocas_arrays(
     columns: dict[str, NDArray], instruction: str, subgoals: list[str], types: list[str]
 ) -> dict[str, NDArray]:
-    """The way back: arrays of ``episode_info.npz`` but the embeddings; relative turns come from the absolute ones."""
+    """Return the arrays of ``episode_info.npz`` without embeddings; `frame_columns` is the inverse.
+
+    Relative rotations are computed from the absolute ones.
+    """
     state, base = columns["observation.state"], columns["observation.arm_base"]
     values: dict[str, Any] = {
         "ee_pos": state[:, :3],

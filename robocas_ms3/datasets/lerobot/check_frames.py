@@ -27,14 +27,22 @@ from robocas_ms3.errors import DatasetError
 from robocas_ms3.words import count_of
 
 Ranges = Mapping[str, tuple[NDArray, NDArray, int]]
-"""Feature -> least and greatest of each of its numbers, and how many frames."""
+"""Feature -> minimum and maximum of each of its numbers, and the number of frames."""
 Texts = Mapping[str, list[str]]
-"""Index feature -> texts that it is of."""
+"""Name of an index column, such as ``task_index`` -> the texts that it numbers."""
 
 
 @dataclass(frozen=True)
 class Frames:
-    """An episode's frames: where they are, its row, numeric features (T, D) and types of sub-goals (T,) or none."""
+    """The frames of an episode.
+
+    Attributes:
+        file: path of their table in the dataset.
+        row: of the episode in ``meta/episodes``.
+        count: number of frames.
+        columns: numeric features (T, D).
+        types: types of the sub-goals (T,); empty without that column.
+    """
 
     file: str
     row: Mapping[str, Any]
@@ -43,7 +51,7 @@ class Frames:
     types: list[Any]
 
     def violation(self, key: str, expected: object, found: object) -> Violation:
-        """One of this episode."""
+        """Return a violation in this episode."""
         where = f"episode {self.row['episode_index']}"
         return Violation(self.file, f"{where}, {key}" if key else where, str(expected), str(found))
 
@@ -51,7 +59,7 @@ class Frames:
 def check_data(
     dataset: LeRobotDataset, texts: Texts, on_episode: Callable[[int, int], None]
 ) -> tuple[list[Violation], Ranges]:
-    """Return what is wrong with the frames, each file opened once, and the ranges of their numbers."""
+    """Return the violations in all frames, and the ranges of their numbers."""
     root, layout, features = dataset.root, dataset.layout, dataset.info["features"]
     wanted = sorted(key for key, feature in features.items() if feature["dtype"] != "video")
     by_file: dict[Path, list[dict[str, Any]]] = defaultdict(list)
@@ -100,7 +108,7 @@ def _frames(table: pa.Table, name: str, row: Mapping[str, Any], features: Mappin
 
 
 def _widened(ranges: Ranges, frames: Frames, features: Mapping[str, Any]) -> Ranges:
-    """Ranges with another episode's; what is no finite number does not count."""
+    """Return the ranges extended by an episode; features with NaN or infinite values are ignored."""
     wide = dict(ranges)
     for key, values in frames.columns.items():
         if len(values) and not _fault(values, features[key]):
@@ -110,7 +118,7 @@ def _widened(ranges: Ranges, frames: Frames, features: Mapping[str, Any]) -> Ran
 
 
 def _fault(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str] | None:
-    """What is expected of numbers, and found."""
+    """Return expected and found, if the width is wrong or a number is NaN or infinite."""
     if values.shape[1] != int(np.prod(feature["shape"])):
         return f"{feature['shape']} numbers", str(values.shape[1])
     wrong = np.argwhere(~np.isfinite(values))
@@ -118,7 +126,7 @@ def _fault(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str] | Non
 
 
 def check_frames(frames: Frames, info: Mapping[str, Any], texts: Texts) -> Iterator[Violation]:
-    """Check an episode's frames: what they count, when, of what; and that they agree with each other."""
+    """Check the indices, timestamps, texts and outcome of an episode's frames, and that features are consistent."""
     length, columns = frames.row["length"], frames.columns
     if frames.count != length or length == 0:
         yield frames.violation("", count_of(length, "frame") if length else "frames", frames.count or "none")
@@ -168,7 +176,7 @@ def _check_texts(frames: Frames, texts: Texts) -> Iterator[Violation]:
 
 
 def _check_content(frames: Frames) -> Iterator[Violation]:
-    """Check what frames of ours say as the arrays of a RoboCAS folder are, and that actions lead to the next state."""
+    """Check the values by the rules for RoboCAS folders, and that each action leads to the next state."""
     columns, key = frames.columns, schema.SUBGOAL_TYPE.key
     arrays: dict[str, NDArray] = {"step_goal_type": np.array([str(kind) for kind in frames.types], np.str_)}
     if {feature.key for feature in schema.FEATURES} <= set(columns):

@@ -6,13 +6,15 @@ Written here: level = depth in mm, so depths up to 4095 mm are exact and farther
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from robocas_ms3.datasets.lerobot.schema import MAX_DEPTH_MM
 from robocas_ms3.errors import DatasetError
+from robocas_ms3.strict import parse
 
 LEVELS = 4096
 DEPTH_INFO: Mapping[str, Any] = {
@@ -27,7 +29,26 @@ DEPTH_INFO: Mapping[str, Any] = {
     "video.extra_options": {"x265-params": "lossless=1"},
 }
 """What ``info.json`` says of a depth video besides its stream: range in m, and how LeRobot's tools encode it again."""
-_LEROBOT = {"video.depth_min": 0.01, "video.depth_max": 10.0, "video.shift": 3.5, "video.use_log": True}
+_Metres = Annotated[float, Field(gt=-1e6, lt=1e6, allow_inf_nan=False)]
+
+
+class _Range(BaseModel):
+    """The range of depth that the levels of a video cover; the defaults are LeRobot's."""
+
+    model_config = ConfigDict(strict=True)
+
+    depth_min: _Metres = Field(0.01, alias="video.depth_min")
+    depth_max: _Metres = Field(10.0, alias="video.depth_max")
+    shift: _Metres = Field(3.5, alias="video.shift")
+    use_log: bool = Field(True, alias="video.use_log")
+
+    @model_validator(mode="after")
+    def _check_range(self) -> _Range:
+        if not self.depth_min < self.depth_max:
+            raise ValueError(f"expected depth_min < depth_max, found {self.depth_min:g} and {self.depth_max:g}")
+        if self.use_log and self.depth_min + self.shift <= 0:
+            raise ValueError(f"expected depth_min + shift > 0, found {self.depth_min:g} and {self.shift:g}")
+        return self
 
 
 def to_levels(depth: NDArray[np.uint16]) -> NDArray[np.uint16]:
@@ -43,17 +64,12 @@ def to_depth(levels: NDArray[np.uint16], info: Mapping[str, Any]) -> NDArray[np.
         info: ``info`` of the video's feature; missing values are LeRobot's defaults.
 
     Raises:
-        DatasetError: the range is none.
+        DatasetError: a value of the range has the wrong type, or the range is empty.
     """
-    low, high, shift, log = (info.get(key, default) for key, default in _LEROBOT.items())
-    numbers = all(isinstance(value, int | float) and abs(value) < 1e6 for value in (low, high, shift))
-    if not numbers or not low < high or (log and low + shift <= 0):
-        found = {"depth_min": low, "depth_max": high, "shift": shift}
-        raise DatasetError(
-            "invalid range of a depth video", where="info", expected="depth_min < depth_max", found=found
-        )
+    values = parse(_Range, dict(info), DatasetError, where="info", about="invalid range of a depth video")
+    low, high, shift = values.depth_min, values.depth_max, values.shift
     share = levels.astype(np.float64) / (LEVELS - 1)
-    if log:
+    if values.use_log:
         first, last = np.log(low + shift), np.log(high + shift)
         metres = np.exp(first + share * (last - first)) - shift
     else:

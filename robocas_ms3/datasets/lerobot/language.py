@@ -20,14 +20,15 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from pydantic import BaseModel, ValidationError
 
 from robocas_ms3.datasets.checks.scene_values import sound
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.pictures.boxes import Box
-from robocas_ms3.documents import json_values
 from robocas_ms3.errors import DatasetError, RobocasError
 from robocas_ms3.language.instructions import instruction, is_plural, part_name, template_ids
 from robocas_ms3.recordings.subgoals import SubGoal
+from robocas_ms3.strict import validate_json
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 Row = dict[str, Any]
@@ -135,7 +136,7 @@ def goals_of(rows: Sequence[Row], count: int, fps: int) -> list[str]:
 
 
 def boxes_of(rows: Sequence[Row]) -> dict[str, Box]:
-    """Return the box of the target in a frame's event rows, by camera; answers of other forms are passed over."""
+    """Return the box of the target in a frame's event rows, by camera; answers of other forms are ignored."""
     boxes = {}
     for row in rows:
         if row["style"] == "vqa" and row["role"] == "assistant" and row["camera"] and (box := box_in(row["content"])):
@@ -143,14 +144,21 @@ def boxes_of(rows: Sequence[Row]) -> dict[str, Box]:
     return boxes
 
 
+class _Detection(BaseModel):
+    bbox: Box
+
+
+class _Answer(BaseModel):
+    detections: tuple[_Detection]
+
+
 def box_in(answer: str | None) -> Box | None:
-    """Return the box in an answer; None where it is not JSON of one box."""
+    """Return the box in an answer; None where it is not JSON of one detection whose box is four integers."""
     try:
-        (detection,) = json_values(answer or "")["detections"]
-        left, top, right, bottom = detection["bbox"]
-        return (int(left), int(top), int(right), int(bottom))
-    except (KeyError, TypeError, ValueError, OverflowError):
+        (detection,) = validate_json(_Answer, answer or "").detections
+    except ValidationError:
         return None
+    return detection.bbox
 
 
 def read_rows_of(table: pa.Table, key: str, where: object) -> list[list[Row]]:

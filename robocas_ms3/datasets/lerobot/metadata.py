@@ -1,4 +1,4 @@
-"""What ``meta`` says of a LeRobot dataset, whichever format it is in."""
+"""Read the folder ``meta`` of a LeRobot dataset of format v3.0 or v2.1."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from robocas_ms3.strict import parse
 
 
 class Metadata:
-    """The ``meta`` folder of a dataset; each file is read when it is asked for.
+    """The ``meta`` folder of a dataset; each file is read at its first use.
 
     Attributes:
         root: folder of the dataset.
@@ -83,7 +83,7 @@ class Metadata:
 
     @property
     def layout(self) -> Layout:
-        """Where the files are."""
+        """Paths of the files of this format version."""
         return LAYOUTS[self.info["codebase_version"]]
 
     @cached_property
@@ -101,10 +101,10 @@ class Metadata:
 
     @property
     def has_depth(self) -> bool:
-        """Whether there is depth of the first camera."""
+        """Whether the first camera has depth, as FFV1 files or as a depth feature."""
         first = self.cameras[:1]
-        beside = bool(self.rows) and any(f"depth/{camera}/file_index" in self.rows[0] for camera in first)
-        return beside or any(self.depth_feature(camera) is not None for camera in first)
+        has_files = bool(self.rows) and any(f"depth/{camera}/file_index" in self.rows[0] for camera in first)
+        return has_files or any(self.depth_feature(camera) is not None for camera in first)
 
     @property
     def has_language(self) -> bool:
@@ -113,12 +113,12 @@ class Metadata:
 
     @property
     def is_ours(self) -> bool:
-        """Whether it has the columns of those written here."""
+        """Whether it has all columns of a dataset that ``robocas convert`` writes."""
         return of_our_shapes(self.info["features"])
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
-        """What ``meta/episodes`` says of each episode, but statistics.
+        """The rows of ``meta/episodes``, without statistics.
 
         Raises:
             DatasetError: a table is damaged, too long, or lacks a column; or two rows are of one episode.

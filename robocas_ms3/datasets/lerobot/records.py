@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, StringConstraints, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, StringConstraints, model_validator
 
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBERS, TEXT, TEXTS, Column, Kind
@@ -45,10 +45,16 @@ class FeatureRecord(_Record):
     info: dict[str, Any] | None = None
 
 
+def _check_version(version: str) -> str:
+    if version not in LAYOUTS:
+        raise ValueError(f"expected {' or '.join(LAYOUTS)}, found {version!r}")
+    return version
+
+
 class InfoRecord(_Record):
     """``meta/info.json``. Paths have LeRobot's own patterns: a pattern of a file could lead anywhere."""
 
-    codebase_version: Literal["v3.0", "v2.1"]
+    codebase_version: Annotated[str, AfterValidator(_check_version)]
     robot_type: str | None = None
     total_episodes: Annotated[int, Field(ge=0, le=MAX_EPISODES)]
     total_frames: Annotated[int, Field(ge=0, le=MAX_FRAMES)]

@@ -17,14 +17,14 @@ from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES
 
 
 def column(values: NDArray) -> pa.Array:
-    """(T, D) as lists of D numbers, (T, 1) and (T,) as numbers."""
+    """Return an array as a column: (T, D) as lists of D numbers, (T, 1) and (T,) as numbers."""
     flat = pa.array(np.ascontiguousarray(values).reshape(-1))
     width = values.shape[1] if values.ndim == 2 else 1
     return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
 
 
 class RollingTable:
-    """Write a table over numbered files; rows wait until there is a row group of them."""
+    """Write a table to numbered files, row group by row group."""
 
     def __init__(
         self, path: Callable[[int, int], Path], limit_mb: float, group: int = 1, compression: str = "snappy"
@@ -45,14 +45,14 @@ class RollingTable:
         self._schema: pa.Schema | None = None
 
     def place(self, size: int = 0) -> tuple[int, int]:
-        """Chunk and file of what is added next, which takes about ``size`` bytes."""
+        """Return chunk and file number for the next rows, of about ``size`` bytes."""
         if self._file is not None and self._file.tell() + size > self._limit and self._file.tell() > 4:  # its head
             self.close()
         number = self._count if self._file is None else self._count - 1
         return divmod(number, CHUNK_FILES)
 
     def add(self, table: pa.Table) -> None:
-        """Append rows, into the file that `place` told."""
+        """Append rows to the file that `place` returned."""
         if self._file is None:
             path = self._path(*divmod(self._count, CHUNK_FILES))
             path.parent.mkdir(parents=True, exist_ok=True)

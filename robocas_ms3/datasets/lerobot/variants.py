@@ -1,10 +1,10 @@
-"""The forms of a LeRobot dataset that are written here, in one table: by the version of LeRobot that reads them."""
+"""Layouts and features of LeRobot datasets, by the version of LeRobot that reads them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from robocas_ms3.errors import DatasetError
 
@@ -58,6 +58,9 @@ LAYOUTS = {layout.codebase_version: layout for layout in (V3, V21)}
 """Layouts by ``codebase_version``."""
 
 
+Version = Literal["0.6", "0.5", "2.1"]  # a literal, because the command line and type checkers read it
+
+
 @dataclass(frozen=True)
 class Variant:
     """What is written for a version of LeRobot.
@@ -71,15 +74,13 @@ class Variant:
         outcome: whether ``next.reward``, ``next.success`` and ``next.done`` are written.
     """
 
-    version: str
+    version: Version
     layout: Layout
     language: bool = False
     native_depth: bool = False
     outcome: bool = False
 
 
-Version = Literal["0.6", "0.5", "2.1"]
-NEWEST: Version = "0.6"
 VARIANTS: dict[str, Variant] = {
     variant.version: variant
     for variant in (
@@ -88,6 +89,7 @@ VARIANTS: dict[str, Variant] = {
         Variant("2.1", V21, outcome=True),
     )
 }
+NEWEST: Version = get_args(Version)[0]
 
 
 def find_variant(version: str) -> Variant:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 from lerobot.configs import FeatureType, PolicyFeature  # pyright: ignore[reportMissingImports]
 from lerobot.envs import EnvConfig  # pyright: ignore[reportMissingImports]
 
+from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, depth_key
 from robocas_ms3.evaluation.policy import CAMERAS, Reference, Wants
@@ -77,7 +78,7 @@ class RoboCASEnvConfig(EnvConfig):
         """What the policy sees, and what its actions mean.
 
         Raises:
-            EvaluationError: a setting is none of those that exist.
+            EvaluationError: no camera is named, or a value is unknown.
         """
         size = (self.observation_width, self.observation_height)
         cameras = dict.fromkeys(_names(self.cameras, "env.cameras"), size)
@@ -96,8 +97,9 @@ class RoboCASEnvConfig(EnvConfig):
             use_async_envs: ignored, because envs on a CPU run in processes anyway.
 
         Raises:
-            EvaluationError: the settings don't fit the protocol.
+            EvaluationError: no task is named, or the settings don't fit the protocol.
             DatasetError: there is no render device.
+            RobocasError: another process writes to a folder of the results.
         """
         from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
         from robocas_ms3.evaluation.run import Settings
@@ -119,5 +121,5 @@ class RoboCASEnvConfig(EnvConfig):
 def _names(text: str, where: str) -> list[str]:
     names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     if not names:
-        raise ValueError(f"{where}: expected at least one name, found {text!r}")
+        raise EvaluationError("no name given", where=where, expected="names separated by commas", found=repr(text))
     return names

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.run import Settings, chosen
+from robocas_ms3.outputs import locked_folder
 from robocas_ms3.robots.table import find_robot
 
 
@@ -46,6 +48,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         EvaluationError: the protocol has no such task or split, the policy does not fit it, N > 1 and the task has
             several configurations, or the folder holds a result.
         DatasetError: there are cameras, and no render device.
+        RobocasError: another process or environment writes to the folder.
     """
 
     def __init__(
@@ -69,11 +72,15 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._driven = DrivenEpisodes(protocol, wants, settings, name)
         self._task = self._episodes[0].task
         self._max_steps = self._driven.max_steps(self._task)
+        self._lock = ExitStack()
         self._folder, self._recorded = folder, set[int]()  # episodes that the result has
         if folder is not None:
-            if (folder / results.OUTCOMES).exists():
-                raise EvaluationError("there is a result already", where=folder, fix="Choose another folder.")
-            results.begin(folder, self._driven.about, resume=False)
+            with ExitStack() as lock:
+                lock.enter_context(locked_folder(folder))
+                if (folder / results.OUTCOMES).exists():
+                    raise EvaluationError("there is a result already", where=folder, fix="Choose another folder.")
+                results.begin(folder, self._driven.about, resume=False)
+                self._lock = lock.pop_all()  # held until `close`
         self._convention = CONVENTIONS[wants.convention]
         self._proprioception = Proprioception()
         self._wants, self._next = wants, 0
@@ -178,8 +185,9 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         return self.render() if name == "render" else self.get_attr(name)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the environment."""
+        """Close the environment and unlock the folder of the result."""
         self._driven.close()
+        self._lock.close()
 
     def _commands(self, actions: NDArray[np.float32]) -> list[float]:
         """Gripper commands of actions (E, A), -1 closed to 1 open."""

@@ -1,28 +1,90 @@
-"""The scripts around LeRobot's environment, as far as they go without it."""
+"""The scripts that run LeRobot, with stand-ins for Python and for setup.sh that log their calls."""
 
-import re
+import os
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
-from robocas_ms3.datasets.lerobot.variants import VARIANTS
+from robocas_ms3.datasets.lerobot.variants import NEWEST, VARIANTS
 
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
+SETUP = """
+echo "setup $* renderer=$((1 - ${ROBOCAS_SKIP_RENDERER:-0})) python=$ROBOCAS_PYTHON" >>"$LOG"
+mkdir -p "$ROBOCAS_VENV/bin"
+cp "$STAND_IN" "$ROBOCAS_VENV/bin/python"
+cp "$STAND_IN" "$ROBOCAS_VENV/bin/lerobot-train"
+"""
+STAND_IN = """#!/usr/bin/env bash
+echo "$(basename "$0") $*" >>"$LOG"
+if [ "$1 $2" = "-m venv" ]; then mkdir -p "${@: -1}/bin" && cp "$0" "${@: -1}/bin/python"; fi
+"""
 
 
-@pytest.mark.parametrize("name", ["check_lerobot.sh", "train_lerobot.sh", "serve_lerobot.sh"])
-def test_all_scripts_share_one_environment(name):
-    """A second list of packages would make the environment again at each change of the script."""
-    text = (SCRIPTS / name).read_text()
-    assert ". scripts/lerobot_environment.sh" in text
-    assert "-m pip" not in text
+@pytest.fixture
+def checkout(tmp_path):
+    """A folder with the scripts, a stand-in for setup.sh, and a dataset without episodes."""
+    root = tmp_path / "checkout"
+    (root / "scripts").mkdir(parents=True)
+    for path in (*SCRIPTS.glob("*lerobot*.sh"), *SCRIPTS.glob("*lerobot*.py")):
+        shutil.copy(path, root / "scripts")
+    (root / "scripts" / "setup.sh").write_text(SETUP)
+    (root / "stand-in").write_text(STAND_IN)
+    (root / "stand-in").chmod(0o755)
+    (root / "data" / "meta").mkdir(parents=True)
+    (root / "data" / "meta" / "info.json").write_text("{}")
+    return root
 
 
-@pytest.mark.parametrize("version", VARIANTS)
-def test_each_version_has_a_reader(version):
-    text = (SCRIPTS / "lerobot_environment.sh").read_text()
-    assert re.search(rf"^{re.escape(version)}\) packages=\(.*lerobot.*==", text, re.MULTILINE)
+def run_script(checkout, name, *words):
+    """Run a script and return the calls that it made."""
+    log = checkout / "log"
+    log.write_text("")
+    paths = {"LOG": log, "STAND_IN": checkout / "stand-in", "ROBOCAS_LEROBOT_PYTHON": checkout / "stand-in"}
+    env = {**os.environ, **{key: str(path) for key, path in paths.items()}}
+    for key in ("ROBOCAS_LEROBOT_VENV", "ROBOCAS_SKIP_RENDERER"):
+        env.pop(key, None)
+    command = ["bash", checkout / "scripts" / name, *words]
+    subprocess.run(command, env=env, cwd=checkout, check=True, capture_output=True, text=True, timeout=60)
+    return log.read_text().splitlines()
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "renderer", "last"),
+    [
+        ("check_lerobot.sh", ["data"], 0, "python -W ignore scripts/check_lerobot.py"),
+        ("check_lerobot_env.sh", [], 1, "python -W ignore scripts/check_lerobot_env.py"),
+        ("train_lerobot.sh", ["act", "data", "out"], 0, "lerobot-train --policy.type=act"),
+        ("serve_lerobot.sh", ["data"], 0, "python -W ignore -m robocas_ms3.baselines.lerobot.serve"),
+    ],
+)
+def test_scripts_run_in_the_environment_of_setup(checkout, name, words, renderer, last):
+    calls = run_script(checkout, name, *words)
+    assert calls[0] == f"setup --lerobot renderer={renderer} python={checkout / 'stand-in'}"
+    assert calls[-1].startswith(last)
+    assert [path.name for path in checkout.glob(".venv*")] == [".venv-lerobot"]
+
+
+def test_the_checks_install_what_they_import_before_they_run(checkout):
+    _, install, _ = run_script(checkout, "check_lerobot.sh", "data")
+    assert install.startswith("python -m pip") and "openai" in install
+    _, install, check, tests, _ = run_script(checkout, "check_lerobot_env.sh")
+    assert install.startswith("python -m pip") and "pytest" in install and "hypothesis" in install
+    assert check.endswith("check")
+    folders = [word for word in tests.split() if word.startswith("tests/")]
+    assert tests.startswith("python -m pytest") and folders
+    assert all((SCRIPTS.parent / folder).exists() for folder in folders)
+
+
+@pytest.mark.parametrize("version", [version for version in VARIANTS if version != NEWEST])
+def test_older_versions_have_environments_of_their_own(checkout, version):
+    create, install, check = run_script(checkout, "check_lerobot.sh", "--version", version, "data")
+    assert create.startswith("stand-in -m venv")
+    assert "lerobot==" in install and "openai" not in install
+    assert "scripts/check_lerobot.py" in check
+    assert (checkout / f".venv-lerobot-{version}" / "bin" / "python").exists()
+    assert run_script(checkout, "check_lerobot.sh", "--version", version, "data") == [check]
 
 
 def test_an_unknown_version_is_refused(tmp_path):
@@ -34,7 +96,7 @@ def test_an_unknown_version_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("begun", ["diffusion 0123 ", None])
-def test_an_out_of_something_else_is_not_gone_on_with(tmp_path, begun):
+def test_an_output_of_another_training_is_refused(tmp_path, begun):
     (tmp_path / "data" / "meta").mkdir(parents=True)
     (tmp_path / "data" / "meta" / "info.json").write_text("{}")
     (tmp_path / "out" / "dataset").mkdir(parents=True)
@@ -57,7 +119,7 @@ def test_an_out_of_something_else_is_not_gone_on_with(tmp_path, begun):
         ("check_lerobot.sh", ["--version", "0.6", "nowhere"]),
     ],
 )
-def test_wrong_words_are_told_how(tmp_path, name, words):
+def test_wrong_arguments_print_the_usage(tmp_path, name, words):
     done = subprocess.run(
         ["bash", SCRIPTS / name, *words], cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
     )

@@ -36,9 +36,14 @@ def test_levels_of_lerobots_own_datasets():
         {"video.depth_max": "far"},
         {"video.shift": -1.0},
         {"video.depth_max": 1e9},
+        {"video.depth_max": float("nan")},
+        {"video.depth_max": True},
+        {"video.depth_max": "10"},
+        {"video.use_log": "no"},
+        {"video.use_log": 0},
     ],
 )
-def test_ranges_that_are_none(info):
+def test_invalid_ranges_are_refused(info):
     with pytest.raises(DatasetError, match="invalid range of a depth video"):
         to_depth(np.zeros((2, 2), np.uint16), info)
 

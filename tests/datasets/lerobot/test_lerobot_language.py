@@ -63,9 +63,20 @@ def test_goals_of_frames(fps):
 
 
 @pytest.mark.parametrize(
-    "answer", [None, "", "{", "[]", '{"count": 3}', '{"detections": []}', '{"detections": [{"bbox": [1, 2, "x", 4]}]}']
+    "answer",
+    [
+        None,
+        "",
+        "{",
+        "[]",
+        '{"count": 3}',
+        '{"detections": []}',
+        '{"detections": [{"bbox": [1, 2, 3, 4]}, {"bbox": [1, 2, 3, 4]}]}',
+        *(f'{{"detections": [{{"bbox": {box}}}]}}' for box in ("[1, 2, 3]", "[1, 2, 3, 4, 5]", '"1234"', "null")),
+        *(f'{{"detections": [{{"bbox": [1, 2, {n}, 4]}}]}}' for n in ('"x"', '"3"', "3.5", "true", "null", "1e400")),
+    ],
 )
-def test_answers_without_one_box_are_passed_over(answer):
+def test_answers_without_exactly_one_integer_box_are_ignored(answer):
     rows = event_rows({"base_camera": (1, 2, 3, 4)}, "pear")
     assert boxes_of(rows) == {"base_camera": (1, 2, 3, 4)}
     assert boxes_of([{**rows[0], "content": answer}, rows[1]]) == {}
@@ -157,7 +168,7 @@ def test_rows_that_differ_between_frames():
     [[1, 2], ["a", "b"], [["a"], []], [[{"role": "user"}], []], [[{**ROWS[0], "timestamp": float("nan")}], []],
      [[{**ROWS[0], "content": 3}], []]],
 )  # fmt: skip
-def test_columns_that_hold_no_rows(column):
+def test_columns_without_language_rows_are_refused(column):
     with pytest.raises(DatasetError):
         read_rows_of(pa.table({PERSISTENT: pa.array(column)}), PERSISTENT, "file")
 

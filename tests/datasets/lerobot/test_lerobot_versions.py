@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.variants import VARIANTS
+from robocas_ms3.datasets.lerobot.variants import NEWEST, VARIANTS, Version
 from robocas_ms3.datasets.pictures.boxes import box_of
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.errors import DatasetError
@@ -39,11 +40,16 @@ def version(request):
     return request.param
 
 
+def test_the_versions_of_the_command_line_are_those_of_the_table():
+    assert get_args(Version) == tuple(VARIANTS)
+    assert NEWEST in VARIANTS
+
+
 def files_of(root):
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-def test_each_version_is_valid_and_comes_back(datasets, version, made, tmp_path):
+def test_each_version_passes_the_check_and_restores_the_episodes(datasets, version, made, tmp_path):
     root = datasets / version
     assert check_lerobot(root, decode=True) == []
     dataset, source = open_source(root), Dataset(made)

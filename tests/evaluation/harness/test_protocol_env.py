@@ -7,13 +7,14 @@ import shutil
 import numpy as np
 import pytest
 
-from robocas_ms3.errors import EvaluationError, VectorEnvError
+from robocas_ms3.errors import EvaluationError, RobocasError, VectorEnvError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness import driven
 from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.run import Settings, evaluate
+from robocas_ms3.outputs import locked_folder
 
 SMOKE = load_protocol("smoke")
 WANTS = Wants(reference="tcp", rate_hz=5, cameras={"base_camera": (6, 4)}, depth=True)
@@ -133,10 +134,22 @@ def test_outcomes_are_written_once_per_episode(make, tmp_path):
             env.reset(seed=seed)
             while not env.step(act(1))[2].all():
                 pass
+    env.close()
     result = results.read(tmp_path / "result")
     assert sorted(result.outcomes) == [0, 1] and result.run["policy"]["name"] == "mine"
-    with pytest.raises(EvaluationError, match="there is a result already"):
+    for _ in range(2):  # a refused environment does not keep the lock
+        with pytest.raises(EvaluationError, match="there is a result already"):
+            make(1, folder=tmp_path / "result")
+
+
+def test_the_folder_of_a_result_is_locked_until_the_environment_is_closed(make, tmp_path):
+    first = make(1, folder=tmp_path / "result")
+    with pytest.raises(RobocasError, match="another process is writing here"):
         make(1, folder=tmp_path / "result")
+    with pytest.raises(RobocasError, match="another process is writing here"), locked_folder(tmp_path / "result"):
+        pass
+    first.close()
+    make(1, folder=tmp_path / "result").reset(seed=0)
 
 
 @pytest.mark.parametrize(
