@@ -1,18 +1,14 @@
 import json
 import shutil
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
+from lerobot_folders import convert, files_of
 from synthetic import RayCaster, write_trajectory
 
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
-
 
 from robocas_ms3.cli import main
 from robocas_ms3.datasets.lerobot import schema
@@ -20,32 +16,14 @@ from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.schema import Limits
-from robocas_ms3.datasets.manage.importing import import_robocas
-from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.writing.dataset_player import open_player
 from robocas_ms3.datasets.writing.players import Request
-from robocas_ms3.errors import DatasetError, IncompleteError, OutputExistsError, RobocasError
+from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.outputs import locked_folder
 from robocas_ms3.recordings.reading import TrajectoryFile
-
-
-def run(source, out, **kwargs):
-    return convert_lerobot(source, out, open_source=RayCaster, **kwargs)
-
-
-def files_of(root):
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
-
-
-@pytest.fixture(scope="module")
-def lerobot(trajectory, tmp_path_factory):
-    """A dataset of two episodes that nobody may change."""
-    out = tmp_path_factory.mktemp("lerobot") / "dataset"
-    run(trajectory, out)
-    return out
 
 
 def test_the_folder_of_version_0_6(lerobot):
@@ -81,7 +59,7 @@ def test_the_folder_of_version_0_6(lerobot):
 
 
 def test_texts_of_version_0_5(trajectory, tmp_path):
-    run(trajectory, tmp_path / "out", lerobot_version="0.5")
+    convert(trajectory, tmp_path / "out", lerobot_version="0.5")
     dataset = LeRobotDataset(tmp_path / "out")
     instructions = [f"grasp the cube {seed} on the table and move it to the basket" for seed in (3, 5)]
     assert dataset.tasks == instructions
@@ -97,7 +75,7 @@ def test_texts_of_version_0_5(trajectory, tmp_path):
 def test_from_a_folder_as_from_the_trajectory(trajectory, made, tmp_path):
     """Nothing is rendered the second time, and it is the same but for where it comes from."""
     lerobot, out = tmp_path / "lerobot", tmp_path / "out"
-    run(trajectory, lerobot, lerobot_version="0.5")
+    convert(trajectory, lerobot, lerobot_version="0.5")
     convert_lerobot(made, out, open_source=None, lerobot_version="0.5")  # type: ignore[arg-type]
     before, after = files_of(lerobot), files_of(out)
     different = {name for name in before if before[name] != after.get(name)}
@@ -108,7 +86,7 @@ def test_from_a_folder_as_from_the_trajectory(trajectory, made, tmp_path):
 
 @pytest.mark.parametrize("codec", ["h264", "av1"])
 def test_and_back(made, tmp_path, codec):
-    run(made, tmp_path / "out", codec=codec)
+    convert(made, tmp_path / "out", codec=codec)
     dataset, source = LeRobotDataset(tmp_path / "out"), Dataset(made)
     assert dataset.info["features"]["observation.images.base_camera"]["info"]["video.codec"] == codec
     for number in source.numbers:
@@ -185,7 +163,7 @@ def test_statistics_are_those_of_the_data(lerobot):
 
 def test_files_roll_over_at_their_limits(trajectory, tmp_path):
     out = tmp_path / "out"
-    run(trajectory, out, include_failed=True, limits=Limits(data_mb=1e-6, video_mb=100, video_seconds=14 / 5))
+    convert(trajectory, out, include_failed=True, limits=Limits(data_mb=1e-6, video_mb=100, video_seconds=14 / 5))
     dataset = LeRobotDataset(out)
     assert [row["data/file_index"] for row in dataset.rows] == [0, 1, 2]
     assert [row["videos/observation.images.base_camera/file_index"] for row in dataset.rows] == [0, 0, 1]
@@ -194,14 +172,14 @@ def test_files_roll_over_at_their_limits(trajectory, tmp_path):
     assert [row["meta/episodes/file_index"] for row in dataset.rows] == [0, 0, 0]
     assert check_lerobot(out) == []
     by_size = tmp_path / "by_size"
-    run(trajectory, by_size, include_failed=True, limits=Limits(video_mb=1e-6))
+    convert(trajectory, by_size, include_failed=True, limits=Limits(video_mb=1e-6))
     assert [row[f"{depth}/file_index"] for row in LeRobotDataset(by_size).rows] == [0, 1, 2]
     assert check_lerobot(by_size) == []
 
 
 def test_fewer_pictures_and_another_rate(trajectory, tmp_path):
     out = tmp_path / "out"
-    run(trajectory, out, rate_hz=10, pictures=Pictures(("static_camera",), (80, 60), depth=False))
+    convert(trajectory, out, rate_hz=10, pictures=Pictures(("static_camera",), (80, 60), depth=False))
     dataset = LeRobotDataset(out)
     assert (dataset.cameras, dataset.has_depth, dataset.rate_hz) == (("static_camera",), False, 10)
     assert sorted(path.name for path in (out / "videos").iterdir()) == ["observation.images.static_camera"]
@@ -212,7 +190,7 @@ def test_fewer_pictures_and_another_rate(trajectory, tmp_path):
 
 def fails(match, source, out, kind=RobocasError, **kwargs):
     with pytest.raises(kind, match=match) as caught:
-        run(source, out, **kwargs)
+        convert(source, out, **kwargs)
     assert "\n" not in str(caught.value)
     assert not Path(out).exists()
 
@@ -231,23 +209,23 @@ def test_errors_leave_nothing_behind(trajectory, made, tmp_path):
 
 def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
     out = tmp_path / "out"
-    run(trajectory, out)
+    convert(trajectory, out)
     before = files_of(out)
     with pytest.raises(OutputExistsError, match="--resume to go on, --overwrite to replace"):
-        run(trajectory, out, codec="av1")
+        convert(trajectory, out, codec="av1")
     with pytest.raises(DatasetError, match="can't resume with other settings .expected codec h264, found codec av1"):
-        run(trajectory, out, codec="av1", resume=True)
+        convert(trajectory, out, codec="av1", resume=True)
     with pytest.raises(DatasetError, match="expected lerobot_version 0.6, found lerobot_version 2.1"):
-        run(trajectory, out, lerobot_version="2.1", resume=True)
+        convert(trajectory, out, lerobot_version="2.1", resume=True)
     with pytest.raises(DatasetError, match="these episodes are not what was begun here"):
-        run(trajectory, out, include_failed=True, resume=True)
+        convert(trajectory, out, include_failed=True, resume=True)
     with pytest.raises(DatasetError):
-        run(tmp_path / "missing.h5", out, overwrite=True)
+        convert(tmp_path / "missing.h5", out, overwrite=True)
     assert files_of(out) == before
-    done = run(trajectory, out, resume=True)
+    done = convert(trajectory, out, resume=True)
     assert (done.episodes, done.kept) == ([], 2)
     assert files_of(out) == before
-    run(trajectory, out, overwrite=True, include_failed=True)
+    convert(trajectory, out, overwrite=True, include_failed=True)
     assert LeRobotDataset(out).info["total_episodes"] == 3
 
 
@@ -255,19 +233,19 @@ def test_overwrite_deletes_lerobot_datasets_only(trajectory, made, tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     for folder in (tmp_path, made):
         with pytest.raises(DatasetError, match="refusing to overwrite what is not a LeRobot dataset"):
-            run(trajectory, folder, overwrite=True)
+            convert(trajectory, folder, overwrite=True)
         with pytest.raises(DatasetError, match="no conversion to LeRobot was begun here"):
-            run(trajectory, folder, resume=True)
+            convert(trajectory, folder, resume=True)
     assert (tmp_path / "thesis.tex").exists()
     with locked_folder(tmp_path / "out"), pytest.raises(RobocasError, match="another process is writing here"):
-        run(trajectory, tmp_path / "out")
+        convert(trajectory, tmp_path / "out")
 
 
 def test_failed_episodes_of_a_folder_stay_out(made, tmp_path):
     source = shutil.copytree(made, tmp_path / "source")
     scene = json.loads((source / "episode_0000000/scene.json").read_text())
     (source / "episode_0000000/scene.json").write_text(json.dumps({**scene, "success": False}))
-    run(source, tmp_path / "out")
+    convert(source, tmp_path / "out")
     dataset = LeRobotDataset(tmp_path / "out")
     assert [entry["source"] for entry in dataset.settings["episodes"]] == [1]
     assert dataset.numbers == [0]
@@ -275,7 +253,7 @@ def test_failed_episodes_of_a_folder_stay_out(made, tmp_path):
 
 
 def test_processes_write_the_same(trajectory, lerobot, tmp_path):
-    run(trajectory, tmp_path / "out", jobs=2)
+    convert(trajectory, tmp_path / "out", jobs=2)
     assert files_of(tmp_path / "out") == files_of(lerobot)
 
 
@@ -290,93 +268,6 @@ def test_episodes_of_unknown_recordings_are_told_by_their_arrays(dataset, source
     entries = open_player(Request(dataset, None, Pictures(), False, RayCaster)).entries()
     expected = arrays_fingerprint(Dataset(dataset).episode(1).arrays)
     assert entries[1]["recording"] == f"arrays {expected}"
-
-
-def test_what_breaks_is_gone_on_with(trajectory, lerobot, tmp_path):
-    class Breaking(RayCaster):
-        def frames(self, recording, samples):
-            for step, frame in enumerate(super().frames(recording, samples)):
-                if recording.seed == 5 and step == 3:
-                    raise DatasetError("it broke")
-                yield frame
-
-    out = tmp_path / "out"
-    with pytest.raises(DatasetError, match="it broke"):
-        convert_lerobot(trajectory, out, open_source=Breaking)
-    assert {path.name for path in out.iterdir()} == {".parts"}
-    assert not (out / ".parts" / "episode_0000001").exists()
-    done = run(trajectory, out, resume=True)
-    assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
-    assert files_of(out) == files_of(lerobot)
-
-
-def test_with_other_versions_it_does_not_go_on(lerobot, trajectory, tmp_path):
-    out = tmp_path / "out"
-    shutil.copytree(lerobot, out)
-    path = out / "meta/robocas/conversion.json"
-    about = json.loads(path.read_text())
-    about["made_with"]["sapien"] = "2.2.2"
-    path.write_text(json.dumps(about))
-    with pytest.raises(DatasetError, match="can't resume with other versions .expected sapien 2.2.2"):
-        run(trajectory, out, resume=True)
-
-
-def test_a_recording_that_is_mended_is_gone_on_with(lerobot, trajectory, tmp_path):
-    broken, out = tmp_path / trajectory.name, tmp_path / "out"
-    shutil.copy(trajectory.with_suffix(".json"), broken.with_suffix(".json"))
-    shutil.copy(trajectory, broken)
-    with h5py.File(broken, "a") as file:
-        del file["traj_2/actions"]
-    with pytest.raises(IncompleteError, match="found episode_0000001: .*traj_2: this episode is damaged"):
-        run(broken, out)
-    shutil.copy(trajectory, broken)
-    run(broken, out, resume=True)
-    assert files_of(out) == files_of(lerobot)
-
-
-def test_an_imported_folder_is_gone_on_with(dataset, tmp_path):
-    """Nobody knows its recordings, so its episodes are told by their arrays."""
-    for path in [dataset / "conversion.json", *dataset.glob("*/scene.json")]:
-        path.unlink()
-    imported, out, whole = tmp_path / "imported", tmp_path / "out", tmp_path / "whole"
-    import_robocas(survey(dataset), imported)
-
-    def stop(episode):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        run(imported, out, on_episode=stop)
-    assert {path.name for path in out.iterdir()} == {".parts"}
-    done = run(imported, out, resume=True)
-    assert (done.kept, [e.number for e in done.episodes]) == (1, [1])
-    run(imported, whole)
-    assert files_of(out) == files_of(whole)
-    marks = [f"arrays {arrays_fingerprint(Dataset(imported).episode(number).arrays)}" for number in (0, 1)]
-    assert [entry["recording"] for entry in LeRobotDataset(out).settings["episodes"]] == marks
-    assert run(imported, out, resume=True).kept == 2
-    with pytest.raises(DatasetError, match="these episodes are not what was begun here"):
-        shutil.rmtree(imported / "episode_0000001")
-        run(imported, out, resume=True)
-
-
-@pytest.mark.parametrize("moment", ["frame", "part", "plan", "join", "table", "overview", "rename", "joined", "sweep"])
-def test_killed_and_resumed_is_as_if_never_killed(trajectory, lerobot, tmp_path, moment):
-    """kill -9 in a process of its own; nothing lies under a final name that is not whole."""
-    out = tmp_path / "out"
-    command = [
-        sys.executable,
-        str(Path(__file__).parents[2] / "support" / "dying_lerobot.py"),
-        moment,
-        str(trajectory),
-        str(out),
-    ]
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    if (out / schema.INFO_FILE).exists():
-        assert check_lerobot(out) == []
-    run(trajectory, out, resume=True)
-    assert files_of(out) == files_of(lerobot)
-    assert {path.name for path in out.iterdir()} == {"meta", "data", "videos", ".annotate_staging"}
 
 
 def test_the_split_is_that_of_robocas(lerobot, made):

@@ -1,0 +1,30 @@
+"""Convert small trajectories to LeRobot datasets, and read and change their files."""
+
+import json
+
+from synthetic import RayCaster
+
+DATA = "data/chunk-000/file-000.parquet"
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+VIDEO = "videos/observation.images.base_camera/chunk-000/file-000.mp4"
+DEPTH = "depth/base_camera/chunk-000/file-000.mkv"
+"""Files of a dataset of version 0.5."""
+
+
+def convert(source, out, **kwargs):
+    """Convert with made-up images."""
+    from robocas_ms3.datasets.lerobot.convert import convert_lerobot  # needs the extra 'lerobot'
+
+    return convert_lerobot(source, out, open_source=RayCaster, **kwargs)
+
+
+def files_of(root):
+    """Return the bytes of each file by its path."""
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def edit_json(root, name, edit):
+    """Change a JSON file in place."""
+    content = json.loads((root / name).read_text())
+    edit(content)
+    (root / name).write_text(json.dumps(content))
