@@ -53,7 +53,7 @@ def load(root: Path) -> LeRobotDataset:
 
 def check_items(dataset: LeRobotDataset) -> None:
     """Index the first, middle and last frame of each episode; compare texts and statistics with the tables."""
-    starts, subgoals = np.cumsum([0, *lengths(dataset)]), subtask_texts(dataset, Path(dataset.root))
+    starts, subgoals = np.cumsum([0, *lengths(dataset)]), subtask_texts(dataset)
     for episode, (first, end) in enumerate(zip(starts, starts[1:], strict=False)):
         for number in (first, (first + end) // 2, end - 1):
             item = dataset[int(number)]
@@ -79,11 +79,11 @@ def lengths(dataset: LeRobotDataset) -> list[int]:
     return [int(row["length"]) for row in (episodes.values() if isinstance(episodes, dict) else episodes)]
 
 
-def subtask_texts(dataset: LeRobotDataset, root: Path) -> dict[int, str]:
+def subtask_texts(dataset: LeRobotDataset) -> dict[int, str]:
     """Return the texts of meta/subtasks.parquet by subtask_index; empty where LeRobot ignores them (0.6 and 2.1)."""
     if dataset.meta.info["codebase_version"] != "v3.0" or "subtask_index" not in dataset.meta.features:
         return {}
-    table = pd.read_parquet(root / "meta/subtasks.parquet")
+    table = pd.read_parquet(Path(dataset.root) / "meta/subtasks.parquet")
     return dict(zip(table["subtask_index"].tolist(), table.index.tolist(), strict=True))
 
 
