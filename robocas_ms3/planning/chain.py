@@ -1,20 +1,19 @@
 """The arm as a chain of links: forward kinematics and Jacobians of many configurations at once, in numpy.
 
-No BLAS: its threads take longer to start than 3 x 3 matrices take, and the last bits would hang on their number.
+Batches are computed without BLAS: its threads take longer to start than products of 3 x 3 matrices take, and the last
+bits of its results depend on the number of threads.
 """
 
 from __future__ import annotations
 
 from copy import copy
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import RobotDescriptionError
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.description_file import DescriptionFile
 
 LIMIT_MARGIN = 0.02  # rad kept from every joint limit
 
@@ -22,12 +21,16 @@ LIMIT_MARGIN = 0.02  # rad kept from every joint limit
 class ArmChain:
     """Seven joints that turn about z of their own links, and the TCP fixed to the last.
 
+    ``robots.kinematics.SerialChain`` describes revolute joints too. It runs on tensors of a GPU, as controllers need,
+    and gives only the pose of its tip. This class runs on NumPy's arrays alone. It gives the frames of all links, which
+    collision checks need, without BLAS, so that plans repeat exactly.
+
     Args:
         arm_urdf: the arm alone, rooted at its base.
-        robot: whose arm it is.
+        robot: description of the robot that carries the arm.
 
     Attributes:
-        robot: the same.
+        robot: description of the robot that carries the arm.
         links: eight fixed transforms 4x4: from each link to the next one at 0 rad, the last to the TCP.
         hand_in_tcp: 4x4.
         limits: (7, 2) lower and upper joint limits, rad.
@@ -35,43 +38,34 @@ class ArmChain:
         upper: (7,) upper joint limits with a margin, rad.
 
     Raises:
-        RobotDescriptionError: the file is missing or is not that arm's.
+        RobotDescriptionError: the file is missing or malformed, or it does not describe that arm.
     """
 
     def __init__(self, arm_urdf: Path | str, robot: RobotDescription) -> None:
         self.robot = robot
-        if not Path(arm_urdf).is_file():
-            raise RobotDescriptionError("no such robot description", where=arm_urdf)
-        root = ElementTree.parse(arm_urdf).getroot()
-        joints = {child.attrib["link"]: joint for joint in root.iterfind("joint") for child in joint.findall("child")}
-        chain: list[ElementTree.Element] = []
-        link = robot.tcp_link
-        while link in joints and link != robot.arm_base_link:
-            chain.insert(0, joints[link])
-            link = next(parent.attrib["link"] for parent in joints[link].findall("parent"))
-        turning = [joint for joint in chain if joint.attrib["type"] == "revolute"]
-        names = tuple(joint.attrib["name"] for joint in turning)
-        axes = [axis.attrib["xyz"].split() for joint in turning for axis in joint.findall("axis")]
-        about_z = all([float(v) for v in axis] == [0, 0, 1] for axis in axes)
-        if link != robot.arm_base_link or names != robot.arm_joints or not about_z:
-            what = f"not the arm of {robot.uid}"
+        file = DescriptionFile(arm_urdf)
+        chain = file.joints_between(robot.arm_base_link, robot.tcp_link)
+        turning = [joint for joint in chain if joint.kind == "revolute"]
+        names = tuple(joint.name for joint in turning)
+        if names != robot.arm_joints or not all(joint.axis.tolist() == [0, 0, 1] for joint in turning):
             expected = f"{', '.join(robot.arm_joints)}, each about z"
-            raise RobotDescriptionError(what, where=arm_urdf, expected=expected, found=", ".join(names))
+            raise file.error(f"not the arm of {robot.uid}", expected, ", ".join(names))
         self.links, self.hand_in_tcp = [], np.eye(4)
         pending, after_hand = np.eye(4), False
         for joint in chain:
-            pending = pending @ joint_origin(joint)
+            pending = pending @ joint.origin
             if after_hand:
-                self.hand_in_tcp = self.hand_in_tcp @ joint_origin(joint)
+                self.hand_in_tcp = self.hand_in_tcp @ joint.origin
             if joint in turning:
                 self.links.append(pending)
                 pending = np.eye(4)
-            after_hand |= any(child.attrib["link"] == robot.hand_link for child in joint.findall("child"))
+            after_hand |= joint.child == robot.hand_link
         self.links.append(pending)
         self.hand_in_tcp = np.linalg.inv(self.hand_in_tcp)
-        self.limits = np.array(
-            [[float(e.attrib[key]) for key in ("lower", "upper")] for joint in turning for e in joint.findall("limit")]
-        )
+        without = [joint.name for joint in turning if joint.limits is None]
+        if without:
+            raise file.error("joints without limits", "a <limit> in each joint of the arm", ", ".join(without))
+        self.limits = np.array([joint.limits for joint in turning])
         self.lower, self.upper = self.limits[:, 0] + LIMIT_MARGIN, self.limits[:, 1] - LIMIT_MARGIN
 
     def ending_behind(self, distance: float) -> ArmChain:
@@ -126,17 +120,3 @@ def _poses(rotation: Array, position: Array) -> Array:
     pose = np.tile(np.eye(4), (len(position), 1, 1))
     pose[:, :3, :3], pose[:, :3, 3] = rotation, position
     return pose
-
-
-def joint_origin(element: ElementTree.Element) -> Array:
-    """Return the pose (4, 4) of a URDF element's ``origin``, the identity where it has none."""
-    pose, origin = np.eye(4), element.find("origin")
-    if origin is not None:
-        pose[:3, :3] = Rotation.from_euler("xyz", read_numbers(origin.attrib.get("rpy", "0 0 0"))).as_matrix()
-        pose[:3, 3] = read_numbers(origin.attrib.get("xyz", "0 0 0"))
-    return pose
-
-
-def read_numbers(text: str) -> list[float]:
-    """Return the numbers of a URDF attribute."""
-    return [float(value) for value in text.split()]

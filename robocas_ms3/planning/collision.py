@@ -16,11 +16,11 @@ import fcl
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import RobocasError, RobotDescriptionError
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.collision_geometry import BASE, TCP, read_collision_parts, read_link_pairs
 from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle
 from robocas_ms3.planning.shapes import CollisionShapes, Pieces
+from robocas_ms3.planning.validation import require_finite
 from robocas_ms3.robots.description import RobotDescription
 
 CLOUD, ATTACHED = "cloud", "attached"
@@ -77,7 +77,6 @@ class FclWorld:
 
     Attributes:
         chain: kinematic chain of the arm.
-        checks: number of configurations checked so far.
         open_width: distance between the pads of the open gripper, m.
         finger_width: distance between the pads in checks that name none, m.
 
@@ -87,12 +86,9 @@ class FclWorld:
     """
 
     def __init__(self, urdf: Path | str, srdf: Path | str, robot: RobotDescription, *, voxel: float = 0.005) -> None:
-        if not Path(srdf).is_file():
-            raise RobotDescriptionError("missing SRDF", where=srdf, fix="Write one next to the arm's URDF.")
         self.chain = ArmChain(urdf, robot)
-        self.checks = 0
         self.open_width = self.finger_width = robot.open_width
-        self._shapes = CollisionShapes(fcl, voxel)
+        self._shapes = CollisionShapes(voxel)
         self._request, self._result = fcl.CollisionRequest(), fcl.CollisionResult()
         self._held = False
         self._pieces: list[tuple[Pieces, int, Array]] = []
@@ -103,7 +99,7 @@ class FclWorld:
     def _read_arm(self, urdf: Path | str, srdf: Path | str) -> None:
         """Read the parts of the arm. The held object is the last part, with no geometry until it is attached."""
         robot = self.chain.robot
-        parts = read_collision_parts(urdf, self.chain, fcl)
+        parts = read_collision_parts(urdf, self.chain)
         held, pairs = len(parts), read_link_pairs(urdf, srdf, parts)
         self._names = [*(part.link for part in parts), ATTACHED]
         self._frames = np.array([*(part.frame for part in parts), TCP])
@@ -127,8 +123,7 @@ class FclWorld:
     def set_points(self, points_in_base: Array) -> None:
         """Replace the obstacles by points (P, 3); points inside the robot's own base or out of reach are dropped."""
         points = np.asarray(points_in_base, dtype=np.float64).reshape(-1, 3)
-        if not np.isfinite(points).all():
-            raise RobocasError("obstacle points must be finite", where="set_scene")
+        require_finite(points, "obstacle points")
         points = np.ascontiguousarray(points[self.keeps(points)])
         self._set_pieces([(CLOUD, self._shapes.cloud(points), np.eye(4))] if len(points) else [])
 
@@ -201,8 +196,12 @@ class FclWorld:
         return sorted({name for pair in found for name in pair})
 
     def _collisions(self, qpos: Array, width: float, obstacles: bool) -> Iterator[Iterator[tuple[str, str]]]:
-        """Yield for each configuration (M, 7) an iterator over the names of its colliding pairs, checked one by one."""
-        self.checks += len(qpos)
+        """Yield for each configuration (M, 7) an iterator over the names of its colliding pairs, checked one by one.
+
+        Raises:
+            RobocasError: a joint position is NaN or infinite.
+        """
+        require_finite(qpos, "qpos")
         if not len(qpos):
             return
         rotations, positions = self.chain.frames(qpos)

@@ -7,16 +7,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
+import fcl
 import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.errors import RobotDescriptionError
-from robocas_ms3.planning.chain import ArmChain, joint_origin, read_numbers
+from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.shapes import convex_hull, fcl_convex
+from robocas_ms3.robots.description_file import DescriptionFile, Joint
 
 BASE, TCP = -1, 7  # frames of parts, next to 0 to 6 of links 1 to 7
 HULL_SUFFIX = ".convex.stl"  # a file of this suffix next to a mesh holds the mesh's convex hull
@@ -48,7 +49,7 @@ class CollisionPart:
         return np.array([points.min(axis=0), points.max(axis=0)])
 
 
-def read_collision_parts(urdf: Path | str, chain: ArmChain, fcl: Any) -> list[CollisionPart]:
+def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPart]:
     """Read the collision parts of all links from the arm's base link downwards.
 
     A joint that is neither an arm joint nor a finger joint is taken at its zero position.
@@ -56,33 +57,34 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain, fcl: Any) -> list[Co
     Args:
         urdf: URDF of the arm, rooted at its base.
         chain: kinematic chain of the same arm.
-        fcl: the ``fcl`` module.
 
     Raises:
-        RobotDescriptionError: a mesh is missing or unreadable, a geometry has another type than mesh, box, cylinder or
-            sphere, or a finger joint is not prismatic.
+        RobotDescriptionError: the URDF is malformed, a mesh is missing or unreadable, a geometry has another type than
+            mesh, box, cylinder or sphere, or a finger joint is not prismatic.
     """
-    robot, root = chain.robot, ElementTree.parse(urdf).getroot()
-    links = {link.attrib["name"]: link for link in root.iterfind("link")}
-    joints_below: dict[str, list[tuple[str, Element]]] = {}
-    for parent, child, joint in _joints(root):
-        joints_below.setdefault(parent, []).append((child, joint))
+    robot, file = chain.robot, DescriptionFile(urdf)
+    links = {file.attribute(link, "name"): link for link in file.root.iterfind("link")}
+    joints_below: dict[str, list[Joint]] = {}
+    for joint in file.joints():
+        joints_below.setdefault(joint.parent, []).append(joint)
     link7_in_tcp = np.linalg.inv(chain.links[7])
 
     def visit(name: str, frame: int, pose: Array, slide: Array) -> Iterator[CollisionPart]:
-        for geometry, corners, origin in _collision_geometries(links[name], Path(urdf), fcl):
+        if name not in links:
+            raise file.error("missing link", f'<link name="{name}">, which a joint names', "none")
+        for geometry, corners, origin in _collision_geometries(links[name], name, file):
             yield CollisionPart(name, frame, pose @ origin, slide, geometry, corners)
         if frame == 6:  # links that hang from link 7 are rigid with the TCP
             frame, pose = TCP, link7_in_tcp @ pose
-        for child, joint in joints_below.get(name, []):
-            if child in robot.arm_links:
-                yield from visit(child, robot.arm_links.index(child), np.eye(4), np.zeros(3))
+        for joint in joints_below.get(name, []):
+            if joint.child in robot.arm_links:
+                yield from visit(joint.child, robot.arm_links.index(joint.child), np.eye(4), np.zeros(3))
                 continue
-            child_pose = pose @ joint_origin(joint)
+            child_pose = pose @ joint.origin
             child_slide = slide
-            if joint.attrib["name"] in robot.finger_joints:
-                child_slide = slide + child_pose[:3, :3] @ _slide_axis(joint, urdf)
-            yield from visit(child, frame, child_pose, child_slide)
+            if joint.name in robot.finger_joints:
+                child_slide = slide + child_pose[:3, :3] @ _slide_axis(joint, file.path)
+            yield from visit(joint.child, frame, child_pose, child_slide)
 
     return list(visit(robot.arm_base_link, BASE, np.eye(4), np.zeros(3)))
 
@@ -94,10 +96,14 @@ def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPar
         urdf: URDF of the arm; links that a joint connects are adjacent.
         srdf: SRDF with ``disable_collisions`` elements.
         parts: parts of the arm.
+
+    Raises:
+        RobotDescriptionError: a file is missing or malformed.
     """
-    ignored = {frozenset((parent, child)) for parent, child, _ in _joints(ElementTree.parse(urdf).getroot())}
-    for pair in ElementTree.parse(srdf).getroot().iterfind("disable_collisions"):
-        ignored.add(frozenset((pair.attrib["link1"], pair.attrib["link2"])))
+    ignored = {frozenset((joint.parent, joint.child)) for joint in DescriptionFile(urdf).joints()}
+    file = DescriptionFile(srdf)
+    for pair in file.root.iterfind("disable_collisions"):
+        ignored.add(frozenset((file.attribute(pair, "link1"), file.attribute(pair, "link2"))))
     return [
         (i, j)
         for i, j in itertools.combinations(range(len(parts)), 2)
@@ -105,52 +111,45 @@ def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPar
     ]
 
 
-def _joints(root: Element) -> Iterator[tuple[str, str, Element]]:
-    for joint in root.iterfind("joint"):
-        parent, child = (next(joint.iterfind(tag)).attrib["link"] for tag in ("parent", "child"))
-        yield parent, child, joint
-
-
-def _slide_axis(joint: Element, urdf: Path | str) -> Array:
-    if joint.attrib["type"] != "prismatic":
+def _slide_axis(joint: Joint, urdf: Path) -> Array:
+    if joint.kind != "prismatic":
         raise RobotDescriptionError(
-            f"finger joint {joint.attrib['name']!r} does not slide",
+            f"finger joint {joint.name!r} does not slide",
             where=urdf,
             expected="type prismatic",
-            found=joint.attrib["type"],
+            found=joint.kind,
             fix="Name sliding joints as finger_joints of the robot's description.",
         )
-    axis = joint.find("axis")
-    return np.array(read_numbers(axis.attrib["xyz"]) if axis is not None else [1.0, 0.0, 0.0])
+    return joint.axis
 
 
-def _collision_geometries(link: Element, urdf: Path, fcl: Any) -> Iterator[tuple[Any, Array, Array]]:
+def _collision_geometries(link: Element, name: str, file: DescriptionFile) -> Iterator[tuple[Any, Array, Array]]:
     """Return the FCL geometry, the corners (V, 3) and the pose (4, 4) of each collision element of a link."""
     for collision in link.iterfind("collision"):
-        origin = joint_origin(collision)
+        origin = file.origin(collision)
         for shape in collision.iterfind("geometry/*"):
-            geometry, corners = _geometry(shape, link.attrib["name"], urdf, fcl)
+            geometry, corners = _geometry(shape, name, file)
             yield geometry, corners, origin
 
 
-def _geometry(shape: Element, link: str, urdf: Path, fcl: Any) -> tuple[Any, Array]:
+def _geometry(shape: Element, link: str, file: DescriptionFile) -> tuple[Any, Array]:
     if shape.tag == "mesh":
-        scale = np.array(read_numbers(shape.attrib.get("scale", "1 1 1")))
-        path = _mesh_path(urdf, shape.attrib["filename"], link)
+        scale = np.array(file.numbers(shape, "scale", 3, "1 1 1"))
+        path = _mesh_path(file.path, file.attribute(shape, "filename"), link)
         corners, faces = _read_hull(path, scale, link)
-        return fcl_convex(fcl, corners, faces), corners
+        return fcl_convex(corners, faces), corners
     if shape.tag == "box":
-        size = read_numbers(shape.attrib["size"])
-        return fcl.Box(*size), _box_corners(*size)
+        x, y, z = file.numbers(shape, "size", 3)
+        return fcl.Box(x, y, z), _box_corners(x, y, z)
     if shape.tag == "cylinder":
-        radius, length = float(shape.attrib["radius"]), float(shape.attrib["length"])
+        (radius,), (length,) = file.numbers(shape, "radius", 1), file.numbers(shape, "length", 1)
         return fcl.Cylinder(radius, length), _box_corners(2 * radius, 2 * radius, length)
     if shape.tag == "sphere":
-        radius = float(shape.attrib["radius"])
+        (radius,) = file.numbers(shape, "radius", 1)
         return fcl.Sphere(radius), _box_corners(2 * radius, 2 * radius, 2 * radius)
     raise RobotDescriptionError(
         f"unsupported collision geometry of link {link!r}",
-        where=urdf,
+        where=file.path,
         expected="mesh, box, cylinder or sphere",
         found=shape.tag,
         fix="Replace it by one of these.",

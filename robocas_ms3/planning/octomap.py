@@ -13,6 +13,8 @@ OCCUPIED, INNER = 2, 3  # two bits per child; 0: unknown
 def encode_octree(points: Array, voxel: float) -> list[int]:
     """Encode the voxels that contain points.
 
+    A tree holds 2^16 voxels along each axis, centred at the origin; points outside of it are dropped.
+
     The stream lists the inner nodes depth first; each is 16 bits, two for each of its 8 children.
 
     Args:
@@ -20,9 +22,12 @@ def encode_octree(points: Array, voxel: float) -> list[int]:
         voxel: edge length of a voxel, m.
 
     Returns:
-        Bytes as signed integers, as python-fcl expects them.
+        Bytes as signed integers, as python-fcl expects them; empty where the tree contains no point.
     """
-    keys = np.floor(points / voxel).astype(np.int64) + (1 << (DEPTH - 1))
+    keys = np.floor(points / voxel) + (1 << (DEPTH - 1))
+    keys = keys[np.all((keys >= 0) & (keys < 1 << DEPTH), axis=1)].astype(np.int64)
+    if not len(keys):
+        return []
     codes = np.zeros(len(keys), dtype=np.int64)  # Morton order is the order of a depth-first traversal
     for bit in range(DEPTH):
         for axis in range(3):

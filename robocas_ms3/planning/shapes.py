@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import fcl
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
@@ -42,12 +43,11 @@ class CollisionShapes:
     """Build FCL geometries and cache them.
 
     Args:
-        fcl: the ``fcl`` module.
         voxel: edge length of the voxels of point clouds, equal to the spacing of their points, m.
     """
 
-    def __init__(self, fcl: Any, voxel: float) -> None:
-        self._fcl, self._voxel = fcl, voxel
+    def __init__(self, voxel: float) -> None:
+        self._voxel = voxel
         self._shapes: WeakKeyDictionary[Shape, dict[float, Pieces]] = WeakKeyDictionary()
         self._recent: OrderedDict[bytes, Pieces] = OrderedDict()
 
@@ -59,7 +59,7 @@ class CollisionShapes:
         return sizes[room]
 
     def cloud(self, points: Array) -> Pieces:
-        """Return an octree of points (P, 3)."""
+        """Return an octree of points (P, 3), or no piece where all of them are too far away for one."""
         return self._remember(points, self._tree)
 
     def hull(self, vertices: Array) -> Pieces:
@@ -71,18 +71,20 @@ class CollisionShapes:
             return self._tree(np.ascontiguousarray(shape.points))
         hulls = [inflated(np.asarray(vertices, dtype=np.float64), MARGIN + room) for vertices in shape.hulls]
         first = np.cumsum([0, *(len(vertices) for vertices, _ in hulls[:-1])])
-        geometries = [fcl_convex(self._fcl, vertices, faces) for vertices, faces in hulls]
+        geometries = [fcl_convex(vertices, faces) for vertices, faces in hulls]
         return Pieces(geometries, np.concatenate([vertices for vertices, _ in hulls]), first)
 
     def _tree(self, points: Array) -> Pieces:
+        stream = encode_octree(points, self._voxel)
+        if not stream:
+            return Pieces([], np.zeros((0, 3)), np.zeros(0, dtype=int))
         ends = np.array([points.min(axis=0) - self._voxel, points.max(axis=0) + self._voxel])
         corners = np.array(list(itertools.product(*ends.T)))
-        tree = self._fcl.OcTree(self._voxel, encode_octree(points, self._voxel))
-        return Pieces([tree], corners, np.zeros(1, dtype=int))
+        return Pieces([fcl.OcTree(self._voxel, stream)], corners, np.zeros(1, dtype=int))
 
     def _hull(self, vertices: Array) -> Pieces:
         corners, faces, _ = convex_hull(vertices)
-        return Pieces([fcl_convex(self._fcl, corners, faces)], corners, np.zeros(1, dtype=int))
+        return Pieces([fcl_convex(corners, faces)], corners, np.zeros(1, dtype=int))
 
     def _remember(self, points: Array, make: Callable[[Array], Pieces]) -> Pieces:
         """Return the pieces built from points, from the cache where they are recent."""
@@ -94,7 +96,7 @@ class CollisionShapes:
         return made
 
 
-def fcl_convex(fcl: Any, corners: Array, faces: NDArray[np.integer]) -> Any:
+def fcl_convex(corners: Array, faces: NDArray[np.integer]) -> Any:
     """Build FCL's convex geometry from the corners (V, 3) and triangles (F, 3) of a hull."""
     counted = np.concatenate([np.full((len(faces), 1), 3), faces], axis=1)  # each polygon starts with its size
     return fcl.Convex(np.ascontiguousarray(corners, dtype=np.float64), len(faces), counted.ravel().tolist())

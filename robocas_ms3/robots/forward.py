@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.robots.description_file import DescriptionFile, Joint
 from robocas_ms3.robots.table import RobotSpec
 
 Array = NDArray[np.float64]
@@ -56,39 +55,11 @@ def chain(urdf: Path, root: str, tip: str, positions: Array) -> Array:
     return pose
 
 
-@dataclass(frozen=True)
-class Joint:
-    """A joint of a URDF.
-
-    Attributes:
-        name, kind: its ``name`` and ``type``.
-        origin: (4, 4) m, its frame in the parent link's.
-        axis: (3,) in its own frame.
-    """
-
-    name: str
-    kind: str
-    origin: Array
-    axis: Array
-
-
 @lru_cache(maxsize=8)
-def read_joints(urdf: Path, root: str, tip: str) -> list[Joint]:
-    """Read the joints from one link of a URDF to another, fixed ones included, in this order."""
-    by_child = {joint.find("child").attrib["link"]: joint for joint in ElementTree.parse(urdf).iterfind("joint")}  # type: ignore[union-attr]
-    found: list[Joint] = []
-    while tip != root:
-        joint = by_child[tip]
-        origin, axis = np.eye(4), joint.find("axis")
-        at = joint.find("origin")
-        if at is not None:
-            origin[:3, 3] = _numbers(at.get("xyz", "0 0 0"))
-            origin[:3, :3] = Rotation.from_euler("xyz", _numbers(at.get("rpy", "0 0 0"))).as_matrix()
-        direction = _numbers("1 0 0" if axis is None else axis.attrib["xyz"])
-        found.append(Joint(joint.attrib["name"], joint.attrib["type"], origin, direction))
-        tip = joint.find("parent").attrib["link"]  # type: ignore[union-attr]
-    return found[::-1]
+def read_joints(urdf: Path, root: str, tip: str) -> tuple[Joint, ...]:
+    """Read the joints from one link of a URDF down to another, fixed ones included, in this order.
 
-
-def _numbers(text: str) -> Array:
-    return np.array([float(word) for word in text.split()])
+    Raises:
+        RobotDescriptionError: the file is missing or malformed, or no joints lead from one link to the other.
+    """
+    return tuple(DescriptionFile(urdf).joints_between(root, tip))

@@ -29,6 +29,8 @@ IK_CONVERGED = 1e-5  # m and rad together below which a configuration is not imp
 class SerialChain:
     """Revolute joints between two links of a robot, with constants read from its URDF.
 
+    Controllers use this class, on either array type; the planner uses ``ArmChain``, whose docstring compares the two.
+
     All arrays are float64: float32 leaves errors near the tolerance, and TF32 of a GPU's products would exceed it.
 
     Args:
@@ -40,6 +42,7 @@ class SerialChain:
         joint_names: the n joints, from the root to the tip.
 
     Raises:
+        RobotDescriptionError: the URDF is missing or malformed, or no joints lead from the root to the tip.
         RobocasError: a joint between the links is neither fixed nor revolute.
     """
 
@@ -89,7 +92,8 @@ class SerialChain:
 
         Args:
             position: (N, 3) m, targets of the tip in the root's frame.
-            quaternion: (N, 4) wxyz.
+            quaternion: (N, 4) wxyz, of norm 1 and either sign. The norm is not checked; it scales the rotation error,
+                and so the result of any other norm is wrong.
             qpos: (N, n) rad, where the search starts.
             lower, upper: (n,) rad, limits.
 

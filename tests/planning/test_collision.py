@@ -41,7 +41,7 @@ def test_a_cloud_of_5_mm_spacing_has_no_holes(world):
         assert world.free(REST[None])[0]
 
 
-def test_the_cloud_counts_in_the_very_first_check_and_can_be_replaced(world, make_planner):
+def test_first_check_includes_the_cloud_which_can_be_replaced(world, make_planner):
     wide = Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))
     planner = make_planner()
     planner.set_scene(cloud([wide]))
@@ -53,7 +53,7 @@ def test_the_cloud_counts_in_the_very_first_check_and_can_be_replaced(world, mak
     assert planner.collisions(REST) == []
 
 
-def test_recent_clouds_come_back_unchanged(world):
+def test_cached_clouds_give_the_same_verdicts(world):
     wide = cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))])
     clouds = [cloud([Box((0.6, 0, 0.1 * i), (0.1, 0.1, 0.1))]) for i in range(20)]
     for _ in range(2):
@@ -65,7 +65,7 @@ def test_recent_clouds_come_back_unchanged(world):
     assert len(world._shapes._recent) == 16
 
 
-def test_points_at_the_robots_own_base_are_cut_and_far_ones_too(world):
+def test_points_in_the_base_and_out_of_reach_are_dropped(world):
     grid = np.arange(-0.5, 0.5, 0.005)
     x, y = (axis.ravel() for axis in np.meshgrid(grid, grid))
     inside_pedestal = np.stack([x, y, np.full(len(x), -0.001)], axis=1)
@@ -80,11 +80,34 @@ def test_points_at_the_robots_own_base_are_cut_and_far_ones_too(world):
 
 
 def test_points_must_be_finite(world):
-    with pytest.raises(RobocasError, match="finite"):
+    with pytest.raises(RobocasError) as caught:
         world.set_points(np.array([[0.5, np.nan, 0.0]]))
+    assert caught.value.where == "obstacle points"
 
 
-def test_without_the_cloud_the_robot_still_counts(world):
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_configurations_must_be_finite(world, value):
+    qpos = np.array([REST, REST])
+    qpos[1, 3] = value
+    checks = (world.free, world.free_until, world.all_free, lambda rows: world.contacts(rows[1], 0.08))
+    for check in checks:
+        with pytest.raises(RobocasError) as caught:
+            check(qpos)
+        assert caught.value.where == "qpos"
+
+
+def test_points_beyond_the_octree_are_no_obstacles(world):
+    """Keys of octomap have 16 bits: 327.68 m away a point has the key of a point at the TCP."""
+    at_tcp = Shape(points=world.tcp(REST)[None, :3, 3] + np.array([[0, 0, 0], [0.042, 0, 0], [0, 0.042, 0]]))
+    world.set_obstacles([Obstacle("near", at_tcp, np.eye(4))])
+    assert "near" in world.contacts(REST, 0.0)
+    far = [Shape(points=at_tcp.points + offset) for offset in ([327.68, 0, 0], [0, -327.68, 0], [0, 0, 1e300])]
+    mixed = Shape(points=np.concatenate([far[0].points, [[-1, -1, -1], [0, 1, 1]]]))  # a box around all holds the arm
+    world.set_obstacles([Obstacle("far", shape, np.eye(4)) for shape in (*far, mixed)])
+    assert world.contacts(REST, 0.0) == []
+
+
+def test_self_collisions_are_checked_without_obstacles(world):
     world.set_points(cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))]))
     assert not world.free(REST[None])[0]
     assert world.free(REST[None], obstacles=False)[0]
@@ -93,7 +116,7 @@ def test_without_the_cloud_the_robot_still_counts(world):
     assert len(world.contacts(folded, 0.08)) >= 2
 
 
-def test_closed_fingers_fit_where_open_ones_do_not(world):
+def test_collisions_depend_on_the_finger_width(world):
     tcp = world.tcp(REST)
     beside = tcp[:3, 3] + 0.042 * tcp[:3, 1]  # where a pad of the open gripper is
     world.set_points(beside[None])
@@ -134,7 +157,7 @@ def body(box: Box) -> Obstacle:
     return Obstacle("box", Shape((corners(*(np.array(box.size) / 2)),)), pose)
 
 
-def test_bodies_are_met_where_their_clouds_are(world):
+def test_bodies_and_their_clouds_give_the_same_verdicts(world):
     """Random configurations over a table of boxes: as FCL finds them with a tree of points, within the margin."""
     boxes = table_scene(0)
     low, high = world.chain.lower, world.chain.upper
@@ -153,7 +176,7 @@ def test_bodies_are_met_where_their_clouds_are(world):
     assert world.all_free(qpos[by_bodies])
 
 
-def test_no_pair_that_touches_is_lost_in_the_broad_phase(world, checker: Checker):
+def test_broad_phase_keeps_all_pairs_in_collision(world, checker: Checker):
     """Whatever an independent check finds more than the margin deep is found."""
     rng = np.random.default_rng(2)
     places = rng.uniform((0.25, -0.5, 0.1), (0.7, 0.5, 0.8), (15, 3))
@@ -183,7 +206,7 @@ def test_a_body_is_larger_by_the_margin_and_can_be_moved(world):
     assert touched(tip + 0.001) == ["panda_leftfinger", "panda_rightfinger", "plate"]
 
 
-def test_an_attached_body_is_met_by_bodies(world):
+def test_attached_body_collides_with_bodies(world):
     held = np.eye(4)
     held[2, 3] = 0.05
     world.attach(AttachedBody(corners(0.03, 0.03, 0.03), held))
@@ -224,7 +247,7 @@ def test_a_fork_gives_the_same_verdicts(panda_files):
     os.waitpid(child, 0)
 
 
-def test_a_world_that_was_made_before_a_fork_gives_the_same_verdicts_after_it(world):
+def test_world_made_before_a_fork_gives_the_same_verdicts(world):
     world.set_obstacles([body(box) for box in table_scene(0)])
     qpos = REST + np.random.default_rng(0).uniform(-0.8, 0.8, (300, 7))
     reading, writing = os.pipe()
@@ -247,7 +270,7 @@ def test_worlds_in_threads_give_the_same_verdicts(panda_files):
         assert set(pool.map(verdicts, [panda_files] * 4)) == {verdicts(panda_files)}
 
 
-def test_a_shape_that_several_obstacles_share_counts_at_each_of_their_places(world):
+def test_obstacles_that_share_a_shape_are_all_checked(world):
     """Also in the next scene, which uses the same FCL objects again at other places."""
     cube, tcp = Shape((corners(0.02, 0.02, 0.02),)), world.tcp(REST)
     near, far = np.eye(4), np.eye(4)

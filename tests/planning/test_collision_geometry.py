@@ -65,7 +65,7 @@ def touches_cube(world: FclWorld, checker: Checker, position: np.ndarray) -> boo
 )
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("side", [-1, 1])
-def test_primitives_reach_as_far_as_they_are_large(files, checker, tag, size, reach, axis, side):
+def test_primitives_have_their_size(files, checker, tag, size, reach, axis, side):
     replace_hand(files, Element(tag, size))
     world, direction = load(files), side * np.eye(3)[axis]
     assert touches_cube(world, checker, direction * (reach[axis] + 0.002))
@@ -88,7 +88,7 @@ def test_geometries_are_placed_by_their_origin(files, checker):
     assert not touches_cube(world, checker, np.array([0.1, 0, 0.1]))
 
 
-def test_a_mesh_without_a_hull_file_counts_as_its_convex_hull(files, checker):
+def test_mesh_without_a_hull_file_is_replaced_by_its_convex_hull(files, checker):
     """Two balls 40 cm apart in one file: what is between them counts too."""
     balls = [trimesh.creation.icosphere(radius=0.05).apply_translation((x, 0, 0)) for x in (-0.2, 0.2)]
     trimesh.util.concatenate(balls).export(files / "collision" / "balls.stl")
@@ -150,3 +150,41 @@ def test_a_finger_joint_that_turns_is_refused(files):
     error = refused(files)
     assert (error.expected, error.found) == ("type prismatic", "revolute")
     assert "panda_finger_joint1" in error.what
+
+
+DAMAGE = {
+    "not XML": ("panda_arm.urdf", "<robot", "<<robot"),
+    "empty axis": ("panda_arm.urdf", 'axis xyz="0 0 1"', 'axis xyz=""'),
+    "limit that is no number": ("panda_arm.urdf", ' upper="', ' upper="abc'),
+    "no limits": ("panda_arm.urdf", "<limit", "<limits"),
+    "no upper limits": ("panda_arm.urdf", ' upper="', ' uper="'),
+    "joint without a parent": ("panda_arm.urdf", "<parent", "<parents"),
+    "parent without a link": ("panda_arm.urdf", "<parent link=", "<parent name="),
+    "joint without a type": ("panda_arm.urdf", ' type="revolute"', ""),
+    "link without a name": ("panda_arm.urdf", '<link name="panda_hand"', '<link title="panda_hand"'),
+    "link that is not there": ("panda_arm.urdf", '<link name="panda_hand"', '<link name="hand"'),
+    "box without a size": ("panda_arm.urdf", "<box size=", "<box length="),
+    "box of two numbers": ("panda_arm.urdf", '<box size="', '<box size="0.1 0.1" length="'),
+    "origin with NaN": ("panda_arm.urdf", 'xyz="0 0 ', 'xyz="0 nan '),
+    "mesh without a file name": ("panda_arm.urdf", "<mesh filename=", "<mesh file="),
+    "SRDF that is not XML": ("panda_arm.srdf", "</robot>", ""),
+    "pair of one link": ("panda_arm.srdf", "link2=", "link="),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_description_is_refused(files, damage):
+    name, old, new = DAMAGE[damage]
+    text = (files / name).read_text()
+    assert old in text
+    (files / name).write_text(text.replace(old, new))
+    error = refused(files)
+    assert error.where == files / name
+    assert str(error.expected)
+    assert str(error.found)
+
+
+@pytest.mark.parametrize("name", ["panda_arm.urdf", "panda_arm.srdf"])
+def test_a_missing_description_is_refused(files, name):
+    (files / name).unlink()
+    assert refused(files).where == files / name

@@ -20,7 +20,7 @@ def test_an_inflated_box_has_its_faces_moved_out():
     assert larger[:, 0].min() >= -0.004 - 1e-9
 
 
-def test_faces_of_a_hull_are_seen_from_outside():
+def test_normals_of_a_hull_point_outwards():
     vertices, faces, normals = convex_hull(np.concatenate([corners(1, 1, 1), np.zeros((1, 3))]))
     assert len(vertices) == 8  # the one inside is gone
     a, b, c = vertices[faces].transpose(1, 0, 2)

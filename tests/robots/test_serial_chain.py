@@ -112,7 +112,7 @@ def nearby_goals(arm: SerialChain, kind: Callable[..., tuple], *, count: int, aw
 
 
 @pytest.mark.parametrize(("away", "least"), [(0.02, 1.0), (0.1, 0.995), (0.3, 0.98), (0.6, 0.95)])
-def test_inverse_kinematics_reach_what_is_within_the_limits(kind, arm, away, least):
+def test_inverse_kinematics_reach_targets_within_the_limits(kind, arm, away, least):
     position, quaternion, start, lower, upper = nearby_goals(arm, kind, count=400, away=away, seed=2)
     qpos, solved = arm.inverse(position, quaternion, start, lower, upper)
     assert np.mean(np.asarray(solved)) >= least
@@ -123,7 +123,7 @@ def test_inverse_kinematics_reach_what_is_within_the_limits(kind, arm, away, lea
     assert turn.magnitude().max() < 1.01e-4
 
 
-def test_what_is_out_of_reach_is_not_solved(kind, arm):
+def test_targets_out_of_reach_are_not_solved(kind, arm):
     position, quaternion, start, lower, upper = nearby_goals(arm, kind, count=50, away=0.1, seed=4)
     position[:, 0] = 2.0
     qpos, solved = arm.inverse(position, quaternion, start, lower, upper)
@@ -131,7 +131,7 @@ def test_what_is_out_of_reach_is_not_solved(kind, arm):
     assert ((qpos >= lower) & (qpos <= upper)).all()
 
 
-def test_a_joint_does_not_go_beyond_its_limit(kind, tmp_path):
+def test_solutions_stay_within_the_joint_limits(kind, tmp_path):
     chain = SerialChain(two_links(tmp_path), "base", "tip", torch.device("cpu") if kind is tensors else None)
     goals = np.array([[0.1, 0.4], [0.1, 0.6], [-0.7, 0.3]])
     position, quaternion = chain.forward(*kind(goals))
@@ -143,7 +143,7 @@ def test_a_joint_does_not_go_beyond_its_limit(kind, tmp_path):
     assert qpos[2][0] == -0.5
 
 
-def test_a_half_turn_is_not_taken_for_none(kind, tmp_path):
+def test_a_target_turned_by_180_degrees_is_not_solved(kind, tmp_path):
     chain = SerialChain(two_links(tmp_path), "base", "upper", torch.device("cpu") if kind is tensors else None)
     position, quaternion = chain.forward(*kind(np.array([[np.pi]])))
     qpos, solved = chain.inverse(position, quaternion, *kind(np.zeros((1, 1)), np.array([-2.0]), np.array([2.0])))

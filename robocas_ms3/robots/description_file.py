@@ -1,0 +1,136 @@
+"""Read elements, joints, poses and numbers of URDF and SRDF files, with errors that name the file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.errors import RobotDescriptionError
+
+Array = NDArray[np.float64]
+FIX = "Correct the file, or export it again."
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint of a URDF.
+
+    Attributes:
+        name, kind: its ``name`` and ``type``.
+        parent, child: names of the links that it connects.
+        origin: (4, 4) pose of the joint's frame in the parent link's frame, m.
+        axis: (3,) in the joint's frame; x where the file names none.
+        limits: lower and upper limit, rad or m; None where the file does not name both.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    origin: Array
+    axis: Array
+    limits: tuple[float, float] | None
+
+
+class DescriptionFile:
+    """A parsed URDF or SRDF file.
+
+    Every method raises ``RobotDescriptionError`` where an element, an attribute or a number is missing or malformed.
+
+    Args:
+        path: the file.
+
+    Attributes:
+        path: the file.
+        root: its root element.
+
+    Raises:
+        RobotDescriptionError: the file is missing or is not XML.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise RobotDescriptionError(
+                "missing robot description", where=self.path, fix="Correct the path, or write the file."
+            )
+        try:
+            self.root = ElementTree.parse(self.path).getroot()
+        except ElementTree.ParseError as error:
+            raise self.error("invalid robot description", "XML", error) from error
+
+    def error(self, what: str, expected: object, found: object) -> RobotDescriptionError:
+        """Return an error about this file."""
+        return RobotDescriptionError(what, where=self.path, expected=expected, found=found, fix=FIX)
+
+    def attribute(self, element: Element, key: str) -> str:
+        """Return an attribute of an element."""
+        if key not in element.attrib:
+            found = " ".join(f'{name}="{value}"' for name, value in element.attrib.items()) or "no attributes"
+            raise self.error(f"missing attribute of <{element.tag}>", key, found)
+        return element.attrib[key]
+
+    def numbers(self, element: Element, key: str, count: int, default: str | None = None) -> list[float]:
+        """Return an attribute that consists of ``count`` finite numbers, or those of ``default`` where it is absent."""
+        text = self.attribute(element, key) if default is None else element.attrib.get(key, default)
+        try:
+            numbers = [float(word) for word in text.split()]
+        except ValueError:
+            numbers = []
+        if len(numbers) != count or not np.isfinite(numbers).all():
+            noun = "finite number" if count == 1 else "finite numbers"
+            raise self.error(f"invalid attribute {key!r} of <{element.tag}>", f"{count} {noun}", repr(text))
+        return numbers
+
+    def origin(self, element: Element) -> Array:
+        """Return the pose (4, 4) of an element's ``origin``, the identity where it has none."""
+        pose, origin = np.eye(4), element.find("origin")
+        if origin is not None:
+            pose[:3, :3] = Rotation.from_euler("xyz", self.numbers(origin, "rpy", 3, "0 0 0")).as_matrix()
+            pose[:3, 3] = self.numbers(origin, "xyz", 3, "0 0 0")
+        return pose
+
+    def joints(self) -> list[Joint]:
+        """Return all joints, in the order of the file."""
+        return [self._joint(element) for element in self.root.iterfind("joint")]
+
+    def joints_between(self, root: str, tip: str) -> list[Joint]:
+        """Return the joints from one link down to another, fixed ones included, in this order."""
+        by_child, found, link = {joint.child: joint for joint in self.joints()}, [], tip
+        while link != root:
+            if link not in by_child:
+                raise self.error("no joints between two links", f"{root} above {tip}", f"no joint above {link}")
+            joint = by_child.pop(link)
+            found.append(joint)
+            link = joint.parent
+        return found[::-1]
+
+    def _joint(self, element: Element) -> Joint:
+        axis = element.find("axis")
+        return Joint(
+            name=self.attribute(element, "name"),
+            kind=self.attribute(element, "type"),
+            parent=self._link(element, "parent"),
+            child=self._link(element, "child"),
+            origin=self.origin(element),
+            axis=np.array([1.0, 0.0, 0.0] if axis is None else self.numbers(axis, "xyz", 3)),
+            limits=self._limits(element),
+        )
+
+    def _link(self, joint: Element, tag: str) -> str:
+        element = joint.find(tag)
+        if element is None:
+            raise self.error(f"incomplete joint {self.attribute(joint, 'name')!r}", f"<{tag}>", "none")
+        return self.attribute(element, "link")
+
+    def _limits(self, joint: Element) -> tuple[float, float] | None:
+        limit = joint.find("limit")
+        if limit is None or "lower" not in limit.attrib or "upper" not in limit.attrib:
+            return None
+        return self.numbers(limit, "lower", 1)[0], self.numbers(limit, "upper", 1)[0]
