@@ -33,19 +33,12 @@ def rotation_vector(rotations: Array) -> Array:
     return vectors
 
 
-def pose_error(found: Array, wanted: Array) -> tuple[float, float]:
-    """Return the distance (m) and the angle (rad) between two poses (4, 4)."""
-    cosine = (np.trace(found[:3, :3].T @ wanted[:3, :3]) - 1) / 2
-    sine = np.linalg.norm(found[:3, :3] - wanted[:3, :3]) / (2 * np.sqrt(2))  # sin(angle / 2), exact for small angles
-    angle = 2 * np.arcsin(min(1.0, float(sine))) if cosine > 0 else float(np.arccos(np.clip(cosine, -1, 1)))
-    return float(np.linalg.norm(found[:3, 3] - wanted[:3, 3])), angle
-
-
 def newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Array]:
     """Move each configuration by one damped Newton step towards its own TCP pose, within the joint limits.
 
-    The step has the smallest norm over the joints. No BLAS or LAPACK routine is used: their last bits depend on the
-    machine.
+    The step has the smallest norm over the joints. It is computed without BLAS and LAPACK, whose last bits depend on
+    the processor and on the number of threads. This holds for the configurations of lines alone: the margin of obstacle
+    hulls (``shapes.inflated``) and ``SerialChain`` do use LAPACK.
 
     Args:
         chain: the arm.

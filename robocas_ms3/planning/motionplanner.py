@@ -24,6 +24,7 @@ from robocas_ms3.errors import RobocasError
 from robocas_ms3.planning import backends
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.scene import seen_from
+from robocas_ms3.planning.validation import require_finite
 from robocas_ms3.poses import from_wxyz, inverse
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -57,7 +58,8 @@ class PandaArmMotionPlanningSolver:
         gripper_state: gripper command that motions hold, 1 open to -1 closed.
 
     Raises:
-        RobocasError: the environment has several envs, another control mode or another robot.
+        RobocasError: the environment has several envs, another control mode or another robot, or the base's pose has a
+            NaN or infinite number.
         ExtensionError: no motion planner has this name.
     """
 
@@ -97,7 +99,7 @@ class PandaArmMotionPlanningSolver:
             spec.description, arm_velocity_limit=joint_vel_limits, arm_acceleration_limit=joint_acc_limits
         )
         self._joints = [joint.name for joint in self.robot.active_joints]
-        self._base_pose = None if base_pose is None else _matrix(base_pose)
+        self._base_pose = None if base_pose is None else _matrix(base_pose, "base_pose")
         self._obstacles: list[Obstacle] = []
         self.planner = backends.make_planner(
             backend, replace(spec, description=self.description), dt=self.base_env.control_timestep
@@ -127,7 +129,9 @@ class PandaArmMotionPlanningSolver:
 
         Raises:
             PlanningFailed: the pose is out of reach or in collision, or no path was found.
+            RobocasError: ``refine_steps`` is negative, or a number of the pose is NaN or infinite.
         """
+        _require_count(refine_steps, "refine_steps", 0)
         start, goal = self._prepare(pose)
         result = self.planner.plan_to_pose(start, goal, stage="move_to_pose_with_RRTConnect")
         return result if dry_run else self.follow_path(result, refine_steps)
@@ -145,7 +149,9 @@ class PandaArmMotionPlanningSolver:
 
         Raises:
             PlanningFailed: the line leaves the arm's reach or touches an obstacle.
+            RobocasError: ``refine_steps`` is negative, or a number of the pose is NaN or infinite.
         """
+        _require_count(refine_steps, "refine_steps", 0)
         start, goal = self._prepare(pose)
         result = self.planner.plan_straight(start, goal, stage="move_to_pose_with_screw")
         return result if dry_run else self.follow_path(result, refine_steps)
@@ -156,7 +162,12 @@ class PandaArmMotionPlanningSolver:
         Args:
             result: a trajectory with at least one row, as a dry run returns it.
             refine_steps: how many times to send the last joint target again.
+
+        Raises:
+            RobocasError: the trajectory has no row, or ``refine_steps`` is negative.
         """
+        _require_count(len(result.qpos), "rows of the trajectory", 1)
+        _require_count(refine_steps, "refine_steps", 0)
         qpos = np.concatenate([result.qpos, np.repeat(result.qpos[-1:], refine_steps, axis=0)])
         qvel = np.gradient(np.concatenate([self._arm_qpos[None], qpos]), result.dt, axis=0)[1:]
         qvel[len(result.qpos) - 1 :] = 0
@@ -168,6 +179,9 @@ class PandaArmMotionPlanningSolver:
         Args:
             t: number of control steps, at least 1.
             gripper_state: gripper command, also for the motions that follow.
+
+        Raises:
+            RobocasError: ``t`` is less than 1.
         """
         return self._move_gripper(t, gripper_state)
 
@@ -181,30 +195,44 @@ class PandaArmMotionPlanningSolver:
         Args:
             extents: (3,) edge lengths, m.
             pose: of the box's centre.
+
+        Raises:
+            RobocasError: an edge length is not positive, or a number is NaN or infinite.
         """
-        corners = np.array(list(product((-0.5, 0.5), repeat=3))) * np.asarray(extents, dtype=np.float64)
-        self.add_obstacles([Obstacle("box", Shape(hulls=(corners,)), _matrix(pose))])
+        edges = np.asarray(extents, dtype=np.float64)
+        if edges.shape != (3,) or not ((edges > 0) & (edges < np.inf)).all():
+            raise RobocasError(
+                "invalid extents of a box",
+                where="add_box_collision",
+                expected="three positive edge lengths in m",
+                found=edges.tolist(),
+                fix="Give a flat box a thickness, such as 0.001.",
+            )
+        corners = np.array(list(product((-0.5, 0.5), repeat=3))) * edges
+        self.add_obstacles([Obstacle("box", Shape(hulls=(corners,)), _matrix(pose, "add_box_collision"))])
 
     def add_collision_pts(self, pts: Array) -> None:
         """Add surface points to the obstacles.
 
         Args:
-            pts: (P, 3) m, about 5 mm apart.
+            pts: (P, 3) m, about 5 mm apart. No points add no obstacle.
 
         Raises:
-            RobocasError: a coordinate is NaN or infinite.
+            RobocasError: the array has another shape, or a coordinate is NaN or infinite.
         """
-        points = np.asarray(pts, dtype=np.float64).reshape(-1, 3)
-        if not np.isfinite(points).all():
-            bad = int((~np.isfinite(points)).any(axis=1).sum())
+        points = np.asarray(pts, dtype=np.float64)
+        if not points.size:
+            return
+        if points.shape[-1:] != (3,):
             raise RobocasError(
-                "NaN or infinite points",
+                "invalid shape of points",
                 where="add_collision_pts",
-                expected="finite coordinates",
-                found=f"{bad} of {len(points)} points",
-                fix="Remove them, e.g. pts[np.isfinite(pts).all(axis=1)].",
+                expected="(P, 3)",
+                found=points.shape,
+                fix="Put x, y and z of a point into one row.",
             )
-        self.add_obstacles([Obstacle("points", Shape(points=points), np.eye(4))])
+        require_finite(points, "add_collision_pts", "Remove the points, e.g. pts[np.isfinite(pts).all(axis=1)].")
+        self.add_obstacles([Obstacle("points", Shape(points=points.reshape(-1, 3)), np.eye(4))])
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Add rigid bodies to the obstacles, such as those of ``PlanningScene.obstacles_in_world``.
@@ -233,11 +261,13 @@ class PandaArmMotionPlanningSolver:
     def _prepare(self, pose: sapien.Pose | Pose) -> tuple[Array, Array]:
         """Give the planner the present scene; return the start (7,) and the goal in the arm's base frame (4x4)."""
         base = self.arm_base_in_world
+        goal = inverse(base) @ _matrix(pose, "pose")
         self.planner.set_scene(seen_from(self._obstacles, base))
         self.planner.finger_width = float(self._qpos(self.description.finger_joints).sum())
-        return self._arm_qpos, inverse(base) @ _matrix(pose)
+        return self._arm_qpos, goal
 
     def _move_gripper(self, t: int, gripper_state: float) -> Step:
+        _require_count(t, "t", 1)
         self.gripper_state = gripper_state
         return self._run(np.tile(self._arm_qpos, (t, 1)), np.zeros((t, 7)))
 
@@ -256,8 +286,16 @@ class PandaArmMotionPlanningSolver:
         return cast("Step", step)
 
 
-def _matrix(pose: sapien.Pose | Pose) -> Array:
-    return to_sapien_pose(pose).to_transformation_matrix().astype(np.float64)
+def _matrix(pose: sapien.Pose | Pose, where: str) -> Array:
+    matrix = to_sapien_pose(pose).to_transformation_matrix().astype(np.float64)
+    require_finite(matrix, where)
+    return matrix
+
+
+def _require_count(count: int, where: str, least: int) -> None:
+    if not count >= least:
+        fix = f"Pass {least} or more."
+        raise RobocasError("number too small", where=where, expected=f"at least {least}", found=count, fix=fix)
 
 
 def _robot_spec(agent: BaseAgent) -> RobotSpec:

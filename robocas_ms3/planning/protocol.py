@@ -79,7 +79,10 @@ class Obstacle:
 
 
 class Planner(Protocol):
-    """What a backend offers. Every planning method raises ``PlanningFailed(stage, reason)``, never a sentinel."""
+    """What a backend offers. Every planning method raises ``PlanningFailed(stage, reason)``, never a sentinel.
+
+    ``RRTConnectPlanner`` lists its reasons at each method.
+    """
 
     @property
     def finger_width(self) -> float:

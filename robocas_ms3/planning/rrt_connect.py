@@ -19,6 +19,7 @@ from robocas_ms3.planning.path_search import PathSearch
 from robocas_ms3.planning.protocol import Array, AttachedBody, Obstacle, Trajectory
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.timing import JointPath, blended, rounded, stopping, thinned, through, timed
+from robocas_ms3.planning.validation import require_finite
 from robocas_ms3.robots.description import RobotDescription
 
 CHECKS_PER_SECOND = 10_000  # turns a planning time into a budget of collision checks, which load can't change
@@ -91,11 +92,6 @@ class RRTConnectPlanner:
     def finger_width(self, width: float) -> None:
         self._world.finger_width = float(np.clip(width, 0.0, self._world.open_width))
 
-    @property
-    def collision_checks(self) -> int:
-        """Collision checks made so far, for measurements."""
-        return self._world.checks
-
     def seed(self, seed: int) -> None:
         """Make everything that follows repeat exactly for the same calls."""
         self._rng = np.random.default_rng(seed)
@@ -126,8 +122,15 @@ class RRTConnectPlanner:
         return self._world.free(np.asarray(qpos, dtype=np.float64).reshape(-1, 7), finger_width=width)
 
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
-        """Solve inverse kinematics; see the protocol."""
-        found = self._reachability.solutions(tcp_in_base, np.asarray(near, dtype=np.float64))
+        """Solve inverse kinematics; see the protocol.
+
+        Raises:
+            RobocasError: a number of an argument is NaN or infinite.
+        """
+        near = np.asarray(near, dtype=np.float64)
+        require_finite(near, "near")
+        require_finite(tcp_in_base, "tcp_in_base")
+        found = self._reachability.solutions(tcp_in_base, near)
         if not avoid_collisions or not found:
             return found
         return [qpos for qpos, ok in zip(found, self._world.free(np.array(found)), strict=True) if ok]
@@ -137,6 +140,7 @@ class RRTConnectPlanner:
 
         Raises:
             PlanningFailed: ``no_ik``, ``goal_in_collision``, or as ``plan_to_qpos``.
+            RobocasError: a number of an argument is NaN or infinite.
         """
         goals = self.ik(tcp_in_base, start, avoid_collisions=False)
         if not goals:
@@ -153,13 +157,20 @@ class RRTConnectPlanner:
             search: look for a way around what is in the way of a straight motion.
 
         Raises:
-            PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``goal_in_collision``, ``not_straight``,
-                ``rrt_timeout``, ``path_blocked``, ``timing_failed``.
+            PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``no_goals`` (the list is empty),
+                ``goal_outside_limits`` (all goals are), ``goal_in_collision`` (all goals within the limits are),
+                ``not_straight``, ``rrt_timeout``, ``path_blocked``, ``timing_failed``.
+            RobocasError: a joint position is NaN or infinite.
         """
         start = self._checked_start(start, stage)
         wanted = np.array(goals, dtype=np.float64).reshape(-1, 7)
+        require_finite(wanted, "goals")
+        if not len(wanted):
+            raise PlanningFailed(stage, "no_goals")
         lower, upper = self._world.chain.limits.T
         wanted = wanted[np.all((wanted >= lower) & (wanted <= upper), axis=1)]
+        if not len(wanted):
+            raise PlanningFailed(stage, "goal_outside_limits")
         wanted = wanted[self._world.free(wanted)]
         if not len(wanted):
             raise PlanningFailed(stage, "goal_in_collision")
@@ -201,8 +212,10 @@ class RRTConnectPlanner:
         Raises:
             PlanningFailed: ``start_in_collision``, ``start_outside_limits``, ``line_unreachable``, ``line_joint_jump``,
                 ``straight_line_blocked``, ``timing_failed``.
+            RobocasError: a number of an argument is NaN or infinite.
         """
         start = self._checked_start(start, stage, obstacles=check_collisions)
+        require_finite(tcp_in_base, "tcp_in_base")
         waypoints = follow_line(self._world.chain, start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
         if np.linalg.norm(waypoints[-1] - start) < STILL:
             return Trajectory(waypoints[-1:].copy(), self._dt)
@@ -228,7 +241,7 @@ class RRTConnectPlanner:
             lower, upper = self._world.chain.limits.T  # the sum of two motions may leave what either keeps to
             # up to the end of the corner: what follows was planned among other obstacles
             corner = int(np.linalg.norm(driven - end, axis=1).argmin()) + 1
-            if np.any((driven < lower) | (driven > upper)) or not self._world.all_free(driven[:corner]):
+            if not np.all((lower <= driven) & (driven <= upper)) or not self._world.all_free(driven[:corner]):
                 continue
             trajectory = self._timed(partial(timed, path))
             if trajectory is not None and len(trajectory.qpos) < len(best.qpos):
@@ -237,8 +250,9 @@ class RRTConnectPlanner:
 
     def _checked_start(self, start: Array, stage: str, *, obstacles: bool = True) -> Array:
         start = np.asarray(start, dtype=np.float64)
+        require_finite(start, "start")
         lower, upper = self._world.chain.limits.T
-        if np.any(start < lower - 1e-3) or np.any(start > upper + 1e-3):
+        if not np.all((lower - 1e-3 <= start) & (start <= upper + 1e-3)):
             raise PlanningFailed(stage, "start_outside_limits")
         if not self._world.all_free(start[None], obstacles=obstacles):
             raise PlanningFailed(stage, "start_in_collision")

@@ -157,3 +157,11 @@ def top_down(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:
 
 def corners(x: float, y: float, z: float) -> np.ndarray:
     return np.array(list(itertools.product((-x, x), (-y, y), (-z, z))))
+
+
+def pose_error(found: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
+    """Return the distance (m) and the angle (rad) between two poses (4, 4)."""
+    cosine = (np.trace(found[:3, :3].T @ wanted[:3, :3]) - 1) / 2
+    sine = np.linalg.norm(found[:3, :3] - wanted[:3, :3]) / (2 * np.sqrt(2))  # sin(angle / 2), exact for small angles
+    angle = 2 * np.arcsin(min(1.0, float(sine))) if cosine > 0 else float(np.arccos(np.clip(cosine, -1, 1)))
+    return float(np.linalg.norm(found[:3, 3] - wanted[:3, 3])), angle

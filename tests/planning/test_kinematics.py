@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from planning_scenes import REST, top_down
+from planning_scenes import REST, pose_error, top_down
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.chain import ArmChain
-from robocas_ms3.planning.kinematics import follow_line, newton_step, pose_error, rotation_vector, solve_positive
+from robocas_ms3.planning.kinematics import follow_line, newton_step, rotation_vector, solve_positive
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.robots.description import MOBILE_PANDA
 
@@ -27,7 +27,7 @@ def test_pose_error_by_hand(turn, expected):
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.5, np.pi / 2, 3.0, np.pi - 1e-4, np.pi - 1e-9, np.pi])
-def test_rotation_vectors_are_the_ones_that_the_matrices_came_from(angle):
+def test_rotation_vectors_invert_rotation_matrices(angle):
     axes = np.random.default_rng(0).normal(size=(20, 3))
     axes = np.concatenate([axes / np.linalg.norm(axes, axis=1, keepdims=True), np.eye(3)])
     matrices = Rotation.from_rotvec(angle * axes).as_matrix()
@@ -36,7 +36,7 @@ def test_rotation_vectors_are_the_ones_that_the_matrices_came_from(angle):
     np.testing.assert_allclose(Rotation.from_rotvec(vectors).as_matrix(), matrices, atol=1e-7)
 
 
-def test_linear_systems_are_solved():
+def test_solve_positive_solves_positive_definite_systems():
     rng = np.random.default_rng(0)
     roots, expected = rng.normal(size=(50, 6, 7)), rng.normal(size=(50, 6))
     matrices = roots @ roots.transpose(0, 2, 1) + 1e-8 * np.eye(6)
@@ -44,7 +44,7 @@ def test_linear_systems_are_solved():
     np.testing.assert_allclose(solve_positive(matrices, values), expected, rtol=1e-6)
 
 
-def test_a_goal_turned_by_half_a_turn_is_far_away(chain):
+def test_pose_error_of_a_half_turn_is_pi(chain):
     """The sine of the error is zero there."""
     goals = chain.tcp(np.tile(REST, (3, 1)))
     for goal, axis in zip(goals, np.eye(3), strict=True):
@@ -53,7 +53,7 @@ def test_a_goal_turned_by_half_a_turn_is_far_away(chain):
     np.testing.assert_allclose(error, np.pi, atol=1e-6)
 
 
-def test_newton_steps_come_to_poses_nearby(chain):
+def test_newton_steps_converge_to_nearby_poses(chain):
     rng = np.random.default_rng(0)
     qpos = REST + rng.uniform(-0.3, 0.3, (50, 7))
     goals = chain.tcp(qpos + rng.uniform(-0.05, 0.05, (50, 7)))

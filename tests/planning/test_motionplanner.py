@@ -96,7 +96,7 @@ def test_a_motion_returns_the_last_step(env, verb):
     assert distance(tcp(env), goal) < 1e-3
 
 
-def test_poses_are_seen_from_a_base_pose_that_is_given(env):
+def test_base_pose_replaces_the_pose_of_the_simulation(env):
     goal = sapien.Pose([0, 0, -0.1]) * tcp(env)
     moved = sapien.Pose([0, 0, 0.2])
     planned = PandaArmMotionPlanningSolver(env).move_to_pose_with_screw(goal, dry_run=True)
@@ -150,13 +150,52 @@ def test_an_obstacle_blocks_the_straight_line_and_is_passed_on_another_path(env,
     assert not solver.planner.free(straight.qpos).all()
 
 
-def test_nan_points_are_an_error(env):
-    """Depth images have NaN where the camera measured nothing."""
-    solver = PandaArmMotionPlanningSolver(env)
+NOWHERE = sapien.Pose([np.nan, 0, 0.2])
+EMPTY = Trajectory(np.zeros((0, 7)), 0.05)
+POINTS_WITH_NAN = np.array([[0.5, 0, 0.2], [np.nan, 0, 0]])  # depth images have NaN where the camera measured nothing
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "where"),
+    [
+        *((verb, (NOWHERE,), "pose") for verb in VERBS),
+        *((verb, (sapien.Pose(), True, -1), "refine_steps") for verb in VERBS),
+        ("follow_path", (Trajectory(np.zeros((1, 7)), 0.05), -1), "refine_steps"),
+        ("follow_path", (EMPTY,), "rows of the trajectory"),
+        ("open_gripper", (0,), "t"),
+        ("close_gripper", (-1,), "t"),
+        ("add_box_collision", ([1, 1, 0], sapien.Pose()), "add_box_collision"),
+        ("add_box_collision", ([1, 1, np.inf], sapien.Pose()), "add_box_collision"),
+        ("add_box_collision", ([1, 1], sapien.Pose()), "add_box_collision"),
+        ("add_box_collision", ([1, 1, 1], NOWHERE), "add_box_collision"),
+        ("add_collision_pts", (POINTS_WITH_NAN,), "add_collision_pts"),
+        ("add_collision_pts", (np.zeros((3, 4)),), "add_collision_pts"),
+    ],
+)
+def test_invalid_arguments_raise_at_the_call(joint_env, method, arguments, where):
+    solver = PandaArmMotionPlanningSolver(joint_env)
+    gripper, before = solver.gripper_state, steps(joint_env)
     with pytest.raises(RobocasError) as caught:
-        solver.add_collision_pts(np.array([[0.5, 0, 0.2], [np.nan, 0, 0]]))
-    assert caught.value.where == "add_collision_pts"
-    assert caught.value.found == "1 of 2 points"
+        getattr(solver, method)(*arguments)
+    assert caught.value.where == where
+    assert caught.value.expected
+    assert str(caught.value.found)
+    assert caught.value.fix
+    assert (solver.gripper_state, steps(joint_env)) == (gripper, before)
+
+
+def test_a_base_pose_with_nan_raises(joint_env):
+    with pytest.raises(RobocasError) as caught:
+        PandaArmMotionPlanningSolver(joint_env, base_pose=NOWHERE)
+    assert caught.value.where == "base_pose"
+
+
+@pytest.mark.parametrize("points", [[], np.zeros((0, 3))])
+def test_no_points_add_no_obstacle(env, points):
+    solver, goal = PandaArmMotionPlanningSolver(env), sapien.Pose([0, 0.1, 0]) * tcp(env)
+    planned = solver.move_to_pose_with_screw(goal, dry_run=True)
+    solver.add_collision_pts(points)
+    np.testing.assert_array_equal(solver.move_to_pose_with_screw(goal, dry_run=True).qpos, planned.qpos)
 
 
 def test_the_gripper_moves_while_the_arm_stays(env):
@@ -191,7 +230,7 @@ def test_vis_shows_every_step(joint_env, monkeypatch):
     [("pd_ee_delta_pose", "panda", "control_mode"), ("pd_joint_delta_pos", "panda", "control_mode")]
     + [("pd_joint_pos", robot, "robot") for robot in ("panda_stick", "fetch")],
 )
-def test_an_env_that_it_cannot_step_is_an_error_with_a_fix(control_mode, robot, where):
+def test_unsupported_env_is_an_error_with_a_fix(control_mode, robot, where):
     env = make(control_mode, robot)
     with pytest.raises(RobocasError) as caught:
         PandaArmMotionPlanningSolver(env)

@@ -76,7 +76,7 @@ def test_edges_are_checked_everywhere_and_sparsely_first(count):
         assert looked_at[:12] == pytest.approx(0.08 * np.arange(1, 13), abs=1e-5)
 
 
-def test_a_tree_grows_up_to_what_is_in_the_way():
+def test_tree_grows_up_to_an_obstacle():
     """Towards the wall's middle: the other tree is reached only through the gap, but nodes lie right before it."""
     finder = search(lambda q: q[0] < -0.1)
     assert finder.connect(START, [GOAL], np.random.default_rng(0), max_checks=300) is None

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from planning_scenes import REST, Box, cloud, corners, table_scene, top_down
+from planning_scenes import REST, Box, cloud, corners, pose_error, table_scene, top_down
 
 from robocas_ms3.errors import PlanningFailed, RobocasError, RobotDescriptionError
 from robocas_ms3.planning.chain import ArmChain
-from robocas_ms3.planning.kinematics import pose_error
 from robocas_ms3.planning.protocol import AttachedBody, Planner, Trajectory
 from robocas_ms3.planning.rrt_connect import TCP_SPEED_LIMIT, RRTConnectPlanner
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -30,7 +29,7 @@ def check_limits(start, trajectory, velocity=0.5, acceleration=0.5):
     assert np.abs(np.diff(speeds, axis=0) / trajectory.dt).max() <= acceleration * 1.05
 
 
-def test_it_is_a_planner_of_the_protocol(planner):
+def test_planner_implements_the_protocol(planner):
     typed: Planner = planner
     assert all(hasattr(typed, name) for name in vars(Planner) if not name.startswith("_"))
     typed.finger_width = 0.05
@@ -38,7 +37,7 @@ def test_it_is_a_planner_of_the_protocol(planner):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_driven_trajectories_touch_nothing_by_an_independent_check(make_planner, checker, seed):
+def test_trajectories_are_free_by_an_independent_check(make_planner, checker, seed):
     boxes = [*table_scene(seed), WALL]
     planner, rng = make_planner(dt=0.01), np.random.default_rng(seed)
     planner.seed(seed)
@@ -75,7 +74,7 @@ def shifted(z):
     return pose
 
 
-def test_the_way_around_a_wall_is_found_and_is_not_a_straight_one(make_planner, checker):
+def test_path_leads_around_a_wall(make_planner, checker):
     planner = make_planner()
     planner.seed(0)
     planner.set_scene(cloud([WALL]))
@@ -91,7 +90,7 @@ def test_the_way_around_a_wall_is_found_and_is_not_a_straight_one(make_planner, 
 
 
 @pytest.mark.parametrize("dt", [0.05, 0.2])
-def test_no_motion_short_motions_and_exact_ends(make_planner, dt):
+def test_short_motions_end_exactly_at_their_goals(make_planner, dt):
     planner = make_planner(dt=dt)
     still = planner.plan_to_qpos(REST, [REST.copy()], stage="x")
     np.testing.assert_array_equal(still.qpos, [REST])
@@ -168,7 +167,7 @@ def test_motions_are_joined_only_where_all_of_the_first_is_free(planner):
     assert planner.join(REST, reach, down).qpos.tolist() == [*reach.qpos.tolist(), *down.qpos.tolist()]
 
 
-def test_joined_motions_keep_to_joint_limits(planner, panda_files):
+def test_joined_motions_stay_within_joint_limits(planner, panda_files):
     planner.set_scene([])
     limit = ArmChain(panda_files.arm_urdf, MOBILE_PANDA).limits[
         5, 0
@@ -191,7 +190,11 @@ def test_failures_have_reasons(make_planner):
     assert reason_of(planner.plan_to_qpos, REST + [0, -1, 0, 0, 0, 0, 0], [REST]) == "start_outside_limits"
     assert reason_of(planner.plan_to_qpos, REST, [REST + [0, -1, 0, 0, 0, 0, 0]]) == "start_in_collision"
     planner.set_scene(np.zeros((0, 3)))
-    assert reason_of(planner.plan_to_qpos, REST, [REST + [0, -1, 0, 0, 0, 0, 0]]) == "goal_in_collision"
+    outside = REST + [0, -1, 0, 0, 0, 0, 0]
+    assert reason_of(planner.plan_to_qpos, REST, [outside]) == "goal_outside_limits"
+    assert reason_of(planner.plan_to_qpos, REST, []) == "no_goals"
+    folded = np.array([0.0, -1.7, 0.0, -3.0, 0.0, 0.0, 0.0])
+    assert reason_of(planner.plan_to_qpos, REST, [outside, folded]) == "goal_in_collision"
 
     hurried = make_planner(planning_time=0.005)  # 50 checks
     hurried.set_scene(cloud([WALL]))
@@ -199,7 +202,27 @@ def test_failures_have_reasons(make_planner):
     assert reason_of(hurried.plan_to_qpos, start, hurried.ik(top_down(0.5, -0.25, 0.1), start)[:1]) == "rrt_timeout"
 
 
-def test_a_start_in_collision_is_refused_not_perturbed(planner):
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_numbers_must_be_finite(planner, value):
+    qpos, pose = REST.copy(), planner.tcp(REST)
+    qpos[2], pose[1, 3] = value, value
+    calls = [
+        ("start", lambda: planner.plan_to_qpos(qpos, [REST + 0.1], stage="x")),
+        ("goals", lambda: planner.plan_to_qpos(REST, [REST + 0.1, qpos], stage="x")),
+        ("near", lambda: planner.plan_to_pose(qpos, planner.tcp(REST), stage="x")),
+        ("tcp_in_base", lambda: planner.plan_to_pose(REST, pose, stage="x")),
+        ("start", lambda: planner.plan_straight(qpos, planner.tcp(REST), stage="x")),
+        ("tcp_in_base", lambda: planner.plan_straight(REST, pose, stage="x")),
+        ("qpos", lambda: planner.free(qpos[None])),
+        ("qpos", lambda: planner.collisions(qpos)),
+    ]
+    for where, call in calls:
+        with pytest.raises(RobocasError) as caught:
+            call()
+        assert caught.value.where == where
+
+
+def test_start_in_collision_is_an_error(planner):
     start = REST + [0, 0, 0, 0, 0, 0, 0.01]
     pad = planner.tcp(start) @ np.array([[1, 0, 0, 0], [0, 1, 0, 0.042], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     planner.set_scene(pad[None, :3, 3])  # a single point, on the left pad
@@ -232,7 +255,7 @@ class TestStraightLines:
         assert reason_of(planner.plan_straight, start, goal) == "straight_line_blocked"
         assert len(planner.plan_straight(start, goal, stage="x", check_collisions=False).qpos) > 5
 
-    def test_the_robot_itself_always_counts(self, planner):
+    def test_self_collisions_are_always_checked(self, planner):
         start = planner.ik(top_down(0.3, 0, 0.2), REST)[0]
         for check in (True, False):
             reason = reason_of(planner.plan_straight, start, top_down(0.12, 0, 0.0), check_collisions=check)
@@ -262,7 +285,7 @@ class TestStraightLines:
 
 
 class TestAttachedBodies:
-    def test_it_counts_against_the_cloud(self, planner):
+    def test_it_collides_with_the_cloud(self, planner):
         start = planner.ik(top_down(0.5, 0, 0.3), REST)[0]
         planner.set_scene(cloud([Box((0.5, 0, 0.05), (0.3, 0.3, 0.02))]))  # top at 0.06, 0.24 m below the TCP
         assert planner.collisions(start) == []
@@ -274,7 +297,7 @@ class TestAttachedBodies:
         planner.attach(None)
         assert planner.collisions(start) == []
 
-    def test_it_counts_against_the_links_and_the_base(self, planner):
+    def test_it_collides_with_the_links_and_the_base(self, planner):
         planner.attach(AttachedBody(corners(0.02, 0.02, 0.2), shifted(0.2)))
         assert planner.collisions(REST) == []
         planner.attach(AttachedBody(corners(0.02, 0.02, 0.2), shifted(-0.05)))

@@ -55,6 +55,8 @@ def plan_look(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> 
     near = qpos[np.argsort(np.abs(qpos - arm.at).max(axis=1), kind="stable")]
     near = near[: 4 * VIEWS_PLANNED]
     goals = near[arm.planner.free(near, arm.planner.finger_width)][:VIEWS_PLANNED]
+    if not len(goals):
+        raise PlanningFailed("look", "goal_in_collision")
     return arm.planner.plan_to_qpos(arm.at, list(goals), stage="look")
 
 
