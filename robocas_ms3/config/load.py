@@ -14,7 +14,7 @@ from robocas_ms3.config.compose import EXTENDS, Composition
 from robocas_ms3.config.overrides import parse_override
 from robocas_ms3.config.supports import SUPPORTS
 from robocas_ms3.config.task import TaskConfig
-from robocas_ms3.documents import DocumentError, load_yaml
+from robocas_ms3.documents import YAML_LIMIT, DocumentError, load_yaml, read_text
 from robocas_ms3.errors import ConfigError
 from robocas_ms3.paths import task_configs_dir
 from robocas_ms3.strict import nearest, parse
@@ -95,9 +95,17 @@ def load_task_config(
 def check_no_base(path: Path) -> None:
     """Check that a file has no base, as a file in a frozen protocol: it must neither depend on nor read other files.
 
+    A file whose text has no such key is not parsed, to save time.
+
     Raises:
-        ConfigError: it has one, or it is not a configuration.
+        ConfigError: the file has a base, or cannot be read.
     """
+    try:
+        text = read_text(path, YAML_LIMIT)
+    except (OSError, DocumentError) as error:
+        raise ConfigError("can't read this file", where=path, found=error) from error
+    if EXTENDS not in text and "\\" not in text:  # the key may be written with escapes
+        return
     data = _read(path)
     if EXTENDS in data:
         raise ConfigError(
@@ -135,7 +143,7 @@ def _chain(path: Path) -> list[tuple[Path, dict[Any, Any]]]:
             )
         if len(chain) == CHAIN_LIMIT:
             expected = f"at most {CHAIN_LIMIT} files"
-            raise ConfigError("too long a chain of configurations", where=where, expected=expected, found=files[0])
+            raise ConfigError("too many base configurations", where=where, expected=expected, found=files[0])
         found = _base(data.pop(EXTENDS), path, where) if EXTENDS in data else None
         chain.append((path, data))
     return chain

@@ -206,7 +206,7 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
 
     Raises:
         EvaluationError: there is none, or it is not what it should be.
-        ConfigError: one of its configurations is not a mapping, or extends another file.
+        ConfigError: one of its configurations extends another file, or cannot be read.
     """
     shipped = shipped_protocols()
     folder = shipped.get(str(name), Path(name)).absolute()

@@ -73,11 +73,12 @@ def test_a_copy_has_the_same_hash_and_a_change_another(folder):
     assert replace(mine).hash == before
 
 
+@pytest.mark.parametrize("key", ["extends", '"e\\x78tends"'])
 @pytest.mark.parametrize("inside", ["configs", "train"])
-def test_a_configuration_that_extends_another_file_is_refused(folder, inside):
+def test_a_configuration_that_extends_another_file_is_refused(folder, inside, key):
     (folder / inside).mkdir(exist_ok=True)
     path = next((folder / inside).glob("*.yaml"), folder / inside / "new.yaml")
-    path.write_text("extends: pick_table_scattered\n")
+    path.write_text(f"{key}: pick_table_scattered\n")
     with pytest.raises(ConfigError, match="'extends' is not allowed in a protocol") as caught:
         load_protocol(folder)
     assert caught.value.where == path
