@@ -26,6 +26,8 @@ class RemotePolicy:
     gets one request per env, each over a connection of its own, and all of them are in flight together. Answers are
     read in the order of the envs, so the order in which they arrive changes nothing.
 
+    A forked process cannot use the policy of its parent; it makes its own.
+
     A lost connection is opened again when the next episode starts: a server that restarted does not know the present
     one.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
 import time
 from collections.abc import Coroutine
@@ -22,7 +23,8 @@ MAX_REPLY = 16 * 2**20  # bytes
 _RETRY_S = 0.2  # between attempts to connect
 _CLOSE_S = 1.0  # for a server's answer to a close frame
 _LOST = (OSError, EOFError, asyncio.TimeoutError, WebSocketException)
-_LOOP_LOCK = threading.Lock()  # for the start of the loop
+_LOOP_LOCK = threading.Lock()  # for the start of the loop; held during a fork, so that no child inherits it locked
+os.register_at_fork(before=_LOOP_LOCK.acquire, after_in_parent=_LOOP_LOCK.release, after_in_child=_LOOP_LOCK.release)
 _T = TypeVar("_T")
 
 
@@ -150,9 +152,9 @@ class AnswerTimer:
 
 
 def run_in_loop(work: Coroutine[Any, Any, _T]) -> _T:
-    """Run a coroutine in the thread of the event loop and return its result."""
+    """Run a coroutine in the thread of this process's event loop and return its result."""
     with _LOOP_LOCK:
-        loop = _loop()
+        loop = _loop(os.getpid())
     future = asyncio.run_coroutine_threadsafe(work, loop)
     try:
         return future.result()
@@ -168,8 +170,11 @@ def error_line(text: str) -> str:
 
 
 @cache
-def _loop() -> asyncio.AbstractEventLoop:
-    """Start the loop's thread, which answers pings while the caller simulates."""
+def _loop(process: int) -> asyncio.AbstractEventLoop:
+    """Start the thread of a process's event loop, which answers pings while the caller simulates.
+
+    A forked process has no threads of its parent, so it needs an event loop of its own.
+    """
     loop = asyncio.new_event_loop()
     threading.Thread(target=loop.run_forever, name="robocas-remote", daemon=True).start()
     return loop

@@ -1,5 +1,6 @@
 """Our client and our server, and openpi's client and a server as openpi writes one."""
 
+import multiprocessing
 import urllib.request
 from dataclasses import fields, replace
 
@@ -69,6 +70,27 @@ def test_two_clients_have_envs_of_their_own():
             remote.reset([a_start(0)])
             remote.act(some_observations(0))
     assert [start.env for start in policy.starts] == [0, 1]
+
+
+def test_a_forked_process_asks_over_a_connection_of_its_own():
+    with serving(Told()) as url:
+        remote = RemotePolicy(url)  # starts the event loop of this process
+        child = multiprocessing.get_context("fork").Process(target=ask_once, args=(url,))
+        child.start()
+        child.join(30)
+        child.kill()
+        child.join()
+        assert child.exitcode == 0
+        remote.reset([a_start(0)])
+        assert remote.act(some_observations(0)).shape == (1, 3, 7)
+        remote.close()
+
+
+def ask_once(url):
+    remote = RemotePolicy(url)
+    remote.reset([a_start(0)])
+    assert remote.act(some_observations(0)).shape == (1, 3, 7)
+    remote.close()
 
 
 def test_healthz():
