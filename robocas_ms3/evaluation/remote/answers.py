@@ -100,7 +100,7 @@ class Answers:
         if said in envs:
             return envs[said], bool(reset)
         if reset is False:
-            raise WireError("no episode has begun", where=f"{ENV} {said}", expected=RESET)
+            raise WireError("no episode is running", where=f"{ENV} {said}", expected=f"{RESET}: true first")
         if len(self._used) >= _MAX_ENVS:
             raise WireError("too many envs", expected=f"{_MAX_ENVS} at most")
         wished = [said] if 0 <= said < _MAX_ENVS else []  # the client's number, where it is free

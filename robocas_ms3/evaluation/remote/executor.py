@@ -34,7 +34,7 @@ class CallerThreadExecutor(Executor):
                 continue
             try:
                 result = call()
-            except Exception as error:  # belongs to whoever waits for the future
+            except Exception as error:  # raised by future.result() in the waiting thread
                 future.set_exception(error)
             else:
                 future.set_result(result)

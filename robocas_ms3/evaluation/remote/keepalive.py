@@ -11,9 +11,11 @@ TCP_OPTIONS = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}  # s, 
 
 
 def enable_tcp_keepalive(connection: Any) -> None:
-    """Let the kernel close a websocket connection 60 s after the other machine stopped answering.
+    """Let the kernel close an idle websocket connection 60 s after the other machine stopped answering.
 
-    The other machine's kernel answers, so a process that is busy keeps its connections.
+    The other machine's kernel answers, so a process that is busy keeps its connections. The kernel sends no probes
+    while sent data are unacknowledged: pings and ``timeout_s`` detect a network that is lost then. ``TCP_USER_TIMEOUT``
+    is not set, as it also closes a connection to a server that reads no data for that time during inference.
 
     Args:
         connection: a connection of `websockets.asyncio`.

@@ -140,7 +140,7 @@ class PolicyServer:
                 message = await asyncio.wait_for(client.recv(), _IDLE)
                 reply = asyncio.get_running_loop().run_in_executor(self._executor, self._reply, message, envs)
                 await asyncio.wait({reply, closed}, return_when=asyncio.FIRST_COMPLETED)
-                if not reply.done():  # nobody waits for the answer
+                if not reply.done():  # the client closed the connection
                     reply.cancel()
                     return
                 answer, code = reply.result()
