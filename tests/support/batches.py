@@ -16,7 +16,6 @@ from robocas_ms3.tasks import TASKS
 JOINT_TOLERANCE = 1e-5  # rad, m and rewards
 HEAP_TOLERANCE = 2.5e-3  # m and rewards, of objects in a heap, whose contacts amplify the last bit
 HEAP_QUATERNION_TOLERANCE = 5e-3
-TCP_TOLERANCE = 1e-3  # m, where inverse kinematics of a batch and of a single env are different solvers
 _SETTINGS = dict(obs_mode="state_dict", reward_mode="normalized_dense", render_backend="none")
 
 
@@ -140,10 +139,8 @@ def check_equals_singles(batch: gym.Env, singles: Sequence[gym.Env], mode: str, 
     _close(found.objects[..., :3], expected.objects[..., :3], objects, "positions of objects")
     _close(found.objects[..., 3:], expected.objects[..., 3:], quaternions, "quaternions of objects")
     assert torch.equal(found.flags, expected.flags), "flags differ"
-    if "ee" in mode:
-        _close(found.tcp[..., :3], expected.tcp[..., :3], TCP_TOLERANCE, "TCP")
-        return
     _close(found.qpos, expected.qpos, JOINT_TOLERANCE, "qpos")
+    _close(found.tcp, expected.tcp, JOINT_TOLERANCE, "TCP")
     _close(found.rewards, expected.rewards, objects, "rewards")
 
 

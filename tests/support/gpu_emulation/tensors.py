@@ -1,7 +1,7 @@
 """Tensors of an emulated device ``cuda:0``: values are in CPU memory, the rules are those of a separate device.
 
-An operation on emulated and CPU tensors raises RuntimeError, as on a GPU; ``.numpy()`` raises TypeError. Operations
-for which the host would wait are counted. There is no autograd.
+An operation on emulated and CPU tensors raises RuntimeError, as on a GPU; so does ``.numpy()``, where a GPU's tensors
+raise TypeError. Operations for which the host would wait are counted. There is no autograd.
 """
 
 from __future__ import annotations
