@@ -126,10 +126,11 @@ def test_resuming_adds_episodes_and_equals_an_uninterrupted_run(run, tmp_path):
     whole, parts = load(summary.trajectory), load(resumed.trajectory)
     for name in ("traj_0", "traj_1"):
         assert np.array_equal(whole[name]["actions"], parts[name]["actions"])
-    with pytest.raises(RobocasError, match="settings differ"):
-        generate(
-            EpisodeSettings("pick", "pick_table_scattered", "builtin", control_freq=5), out, episodes=2, resume=True
-        )
+    other = EpisodeSettings("pick", "pick_table_scattered", "builtin", control_freq=5)
+    with pytest.raises(RobocasError) as caught:
+        generate(other, out, episodes=2, resume=True)
+    assert "settings.control_freq" in caught.value.what
+    assert (caught.value.where, caught.value.expected, caught.value.found) == (out / "run.json", 20, 5)
 
 
 def test_files_that_cannot_be_read_are_one_clear_line(run, tmp_path):
