@@ -32,7 +32,8 @@ PROBES = Path(__file__).with_name("probes.py")
 GIGABYTE = 1e9
 LEAST_DISK, ENOUGH_DISK = 1.0, 10.0  # GB; a converted episode of pick takes about 0.1
 
-# Extra -> what it is for.
+# Extra -> what it is for. lerobot-env, slurm and ray have no row: setup.sh does not install them into the package's own
+# environment, where installing lerobot-env would replace torch and numpy.
 EXTRAS = {
     "language": "sentence embeddings in datasets, and policies that read words",
     "train": "training baselines, and playing what they learned",
