@@ -36,7 +36,7 @@ def session(planner) -> str:
     return digest.hexdigest()
 
 
-def test_again_in_one_process_whatever_came_before(make_planner):
+def test_same_seed_in_one_process_gives_the_same_paths(make_planner):
     planner = make_planner()
     planner.seed(7)
     first = session(planner)

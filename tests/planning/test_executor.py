@@ -39,7 +39,7 @@ def act(made: Simulated, *values: float) -> None:
         made._step(made._action(np.full(7, value)))
 
 
-def test_a_reset_forgets_all_that_was_done():
+def test_reset_clears_the_record():
     made = executor()
     made.label("find the object", "find it")
     made.gripper, made.facts["pushes"] = CLOSED, 1

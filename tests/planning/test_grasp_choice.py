@@ -57,7 +57,7 @@ def test_the_filter_knows_the_approach():
     assert index("top") == [0, 0]
 
 
-def test_nothing_in_nothing_out():
+def test_no_grasps_give_no_grasps():
     kept = filter_grasps(
         np.zeros((0, 4, 4)),
         np.zeros(0),
@@ -131,7 +131,7 @@ class TestRanking:
         assert np.mean(first) == pytest.approx(1 / (1 + np.e), abs=0.04)
 
 
-def test_a_batch_of_grasps_is_counted_as_one_by_one():
+def test_batch_gives_the_counts_of_single_grasps():
     asset = load_pack("builtin").objects["sugar_box"]
     notes, pose = asset.annotations, np.eye(4)
     pose[:3] = notes.resting_poses[notes.display_pose][:3]

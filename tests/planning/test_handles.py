@@ -45,7 +45,7 @@ def angle_about_bar(found: np.ndarray, goal: np.ndarray) -> float:
     return float(np.arctan2(turn[2, 1], turn[1, 1]))
 
 
-def test_a_turn_about_the_bar_keeps_the_bar_and_its_place():
+def test_turn_about_the_bar_keeps_the_pose_of_the_bar():
     hold = level_hold(0.7, 0.1, 0.3)
     turned = turned_about_bar(hold, np.pi / 2)
     assert turned[:3, 3] == pytest.approx([0.7, 0.1, 0.3])
@@ -72,7 +72,7 @@ def test_every_pose_of_a_pull_holds_the_bar_where_the_joint_has_it(reachability,
     assert max(slips) <= limit + 5e-3
 
 
-def test_a_pull_ends_where_the_arm_does(reachability):
+def test_pull_ends_at_the_limit_of_the_reach(reachability):
     hold = level_hold(0.6, 0.1, 0.5)
     away = Joint(name="away", kind="prismatic", axis=(1, 0, 0), limits=(0, 2), friction=0, damping=0)
     goals = np.array([joint_motion(away, q) @ hold for q in np.arange(0, 1.0, 0.02)])
@@ -106,7 +106,7 @@ def test_a_detour_backs_out_of_the_narrow_end_against_its_heading():
     assert arriving[1] == pytest.approx(narrow)
 
 
-def test_a_drive_keeps_what_is_held_clear(planner):
+def test_drive_keeps_the_held_object_free_of_collisions(planner):
     robot = SimpleNamespace(pose=SimpleNamespace(raw_pose=torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]])))
     env = SimpleNamespace(agent=SimpleNamespace(robot=robot))
     arm = SimpleNamespace(env=env, robot=MOBILE_PANDA, planner=planner, at=np.array(REST))
@@ -131,7 +131,7 @@ def standing_at(position, joint, monkeypatch):
 
 
 @pytest.mark.parametrize("towards", [1, -1])
-def test_a_pull_goes_on_from_where_the_joint_stands(towards, monkeypatch):
+def test_pull_continues_from_the_position_of_the_joint(towards, monkeypatch):
     limits = tuple(sorted((0.0, towards * 0.4)))
     joint = Joint(name="slide", kind="prismatic", axis=(1, 0, 0), limits=limits, friction=0, damping=0)
     way = standing_at(towards * 0.1, joint, monkeypatch).way(None)

@@ -64,7 +64,7 @@ def test_room_is_kept_to_furniture_and_basket_not_to_objects():
     assert [(body.name, body.room) for body in bodies[:3]] == [("table", 0.02), ("basket", 0.02), ("object 0", 0.0)]
 
 
-def test_a_pose_becomes_the_matrix_that_scipy_gives():
+def test_pose_matrix_agrees_with_scipy():
     raw = torch.tensor([0.1, -0.2, 0.3, 0.5, -0.1, 0.7, 0.2])  # not quite a unit quaternion
     pose = from_wxyz(raw)
     values = raw.numpy().astype(float)

@@ -86,7 +86,7 @@ def test_a_removed_object_stands_on_a_free_place_of_the_table(generator, monkeyp
     assert float(arm.env.agent.gripper_width[0]) > 0.07
 
 
-def test_a_look_at_grasps_changes_nothing_that_follows(generator):
+def test_ranking_grasps_does_not_change_later_results(generator):
     arm, target, _ = begin(generator, 3)
     state = arm.rng.bit_generator.state
     seen = [(clear_grasps(arm, target), blockers(arm, target)) for _ in range(2)]
@@ -114,7 +114,7 @@ def test_a_push_moves_an_object_away_from_the_target(generator):
     assert np.abs(arm.env.gripper_forces()).max() == 0  # it has let go of everything
 
 
-def test_a_push_that_moves_nothing_is_none(generator, monkeypatch):
+def test_push_that_moves_nothing_is_a_failure(generator, monkeypatch):
     arm, target, slots = begin(generator, 3)
     heap, facts = Heap(arm, target), arm.executor.facts
     pushed = arm.env.objects[slots[0]]

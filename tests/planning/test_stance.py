@@ -52,7 +52,7 @@ def grasps_in_world(arm) -> np.ndarray:
     return arm_base_in_world(arm, np.zeros(3)) @ poses
 
 
-def test_of_all_configurations_one_is_free_where_the_nearest_is_not(arm):
+def test_thorough_check_finds_a_free_configuration_besides_the_nearest(arm):
     grasps, here = grasps_in_world(arm), np.zeros(3)
     assert stance.reach_share(arm, here, grasps, []) == 1.0
     assert stance.reach_share(arm, here, grasps, [], thorough=True) == 1.0
@@ -76,7 +76,7 @@ def test_a_grasp_counts_only_with_its_pregrasp(arm):
     assert stance.reach_share(arm, here, grasps, [], thorough=True) == pytest.approx(7 / 8)
 
 
-def test_out_of_reach_and_none_are_worth_nothing(arm):
+def test_unreachable_grasps_and_no_grasps_score_zero(arm):
     grasps = grasps_in_world(arm)
     for far in (grasps + np.array([[0, 0, 0, 2.0]] + [[0, 0, 0, 0]] * 3), grasps[:0]):
         assert stance.reach_share(arm, np.zeros(3), far, []) == 0.0

@@ -17,7 +17,7 @@ def corners(shift):
 
 
 @pytest.mark.parametrize("turned_deg", [(20, 0, 0), (0, -35, 0), (0, 0, 70)])
-def test_what_leans_is_set_upright_about_level_axes_only(turned_deg):
+def test_leaning_object_is_turned_upright_about_level_axes(turned_deg):
     leant = Rotation.from_euler("xyz", turned_deg, degrees=True)
     expected = leant.inv().as_matrix() if turned_deg[2] == 0 else np.eye(3)
     turn = turn_to_stand(leant.apply(BOX), np.zeros(3))
@@ -31,7 +31,7 @@ def test_beyond_half_of_a_right_angle_it_is_laid_on_the_next_side():
     np.testing.assert_allclose(turn[:3, :3], Rotation.from_euler("x", 40, degrees=True).as_matrix(), atol=1e-9)
 
 
-def test_a_face_that_does_not_carry_the_centre_of_mass_is_none_to_stand_on():
+def test_face_beside_the_centre_of_mass_is_not_a_standing_face():
     # its foot reaches to x = 2 cm, its middle is at 1.5 cm, then at 2.5 cm: it falls onto the side (3, 4) cm long
     np.testing.assert_array_equal(turn_to_stand(corners(0.01), corners(0.01).mean(axis=0)), np.eye(4))
     turn = turn_to_stand(corners(0.03), corners(0.03).mean(axis=0))
