@@ -10,7 +10,7 @@ from irregular import KINDS, replace_file
 from robocas_ms3.assets.hulls import read_hulls
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.documents import DocumentError
-from robocas_ms3.errors import AssetError, EvaluationError, PlanError
+from robocas_ms3.errors import AssetError, ConfigError, EvaluationError, PlanError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 from robocas_ms3.ledger import Ledger
@@ -41,8 +41,8 @@ def test_protocols(tmp_path, kind):
     root = shutil.copytree(source, tmp_path / "protocol")
     assert load_protocol(root).hash == load_protocol(source).hash
     path = replace_file(root / "configs" / "other.yaml", kind)
-    with pytest.raises(EvaluationError) as error:
-        _ = load_protocol(root).hash
+    with pytest.raises(ConfigError) as error:
+        load_protocol(root)
     assert error.value.where == path
     path = replace_file(root / "episodes.jsonl", kind)
     with pytest.raises(EvaluationError) as error:
