@@ -66,8 +66,8 @@ install_packages() {
     local pip=("$python" -m pip --disable-pip-version-check install --quiet)
     "${pip[@]}" --upgrade 'pip>=24'
     if [ "$lerobot" = 1 ]; then
-        say "robocas-ms3[lerobot-env] (minutes and gigabytes the first time)"
-        "${pip[@]}" -e '.[lerobot-env]' ./lerobot_env_robocas
+        say "robocas-ms3[lerobot-env,language] (minutes and gigabytes the first time)"
+        "${pip[@]}" -e '.[lerobot-env,language]' ./lerobot_env_robocas
     else
         say "packages, at the versions of requirements.lock (minutes the first time)"
         # torch first, with its dependencies: a CPU build satisfies it where pip finds one, and nothing later replaces it.
