@@ -12,7 +12,15 @@ import pytest
 from gpu_emulation import unsupported_torch
 
 ROOT = Path(__file__).resolve().parents[1]
-pytestmark = pytest.mark.skipif(unsupported_torch() is not None, reason=str(unsupported_torch()))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def needs_supported_torch() -> None:
+    """Skip the tests with another build of torch; on CI fail, as setup.sh installs the right one there."""
+    problem = unsupported_torch()
+    if problem is not None and os.environ.get("CI", "").lower() in ("", "0", "false"):
+        pytest.skip(problem)
+    assert problem is None, problem
 
 
 def run(*arguments: str) -> int:

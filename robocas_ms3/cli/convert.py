@@ -32,7 +32,7 @@ class Convert:
     """Format of the dataset: robocas, lerobot (needs the extra 'lerobot'), or another package's."""
     lerobot_version: Version = NEWEST
     """What reads the LeRobot dataset: 0.6: LeRobot 0.6 and later (format v3.0, language columns, depth as video);
-    0.5: LeRobot 0.4 and 0.5 (v3.0, subtask_index); 2.1: readers of format v2.1, as openpi and GR00T."""
+    0.5: LeRobot 0.4.4 to 0.5.1 (v3.0, subtask_index); 2.1: readers of format v2.1, as openpi and GR00T."""
     codec: Literal["h264", "av1"] = "h264"
     """Of lerobot's videos; AV1 takes half the space."""
     rate: Maybe[float] = None

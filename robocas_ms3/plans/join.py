@@ -222,7 +222,7 @@ def _convert_lerobot(plan: Plan, robocas: Path, out: Path, jobs: int) -> None:
 
     limits = Limits(plan.limits.render_seconds, plan.limits.memory_gb)
     jobs = min(jobs, os.cpu_count() or 1)  # those of a plan may be a cluster's
-    convert_lerobot(robocas, out, resume=True, jobs=jobs, episode_limits=limits)
+    convert_lerobot(robocas, out, resume=True, jobs=jobs, episode_limits=limits, lerobot_version=plan.lerobot_version)
 
 
 def _write_statistics(out: Path) -> None:

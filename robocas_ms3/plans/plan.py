@@ -12,6 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from robocas_ms3.assets.pack import MANIFEST, pack_folders, sha256
 from robocas_ms3.benchmark import TASKS
 from robocas_ms3.config import load_config_of, shipped_configs
+from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
 from robocas_ms3.documents import DocumentError, load_yaml
 from robocas_ms3.errors import PlanError, RobocasError
 from robocas_ms3.paths import plans_dir
@@ -31,6 +32,7 @@ class Plan(StrictModel):
     parts: Annotated[list[PartConfig], Field(min_length=1)]
     stages: Annotated[list[Stage], Field(min_length=1)] = ["demonstrations", "datasets", "statistics"]
     formats: list[Literal["robocas", "lerobot"]] = ["robocas"]
+    lerobot_version: Version = Field(default=NEWEST, description="of the LeRobot dataset, as `robocas convert` has it")
     recording: RecordingConfig = RecordingConfig()
     pictures: PicturesConfig = PicturesConfig()
     rate: Annotated[float, Field(gt=0, le=100)] = Field(default=5.0, description="steps of a dataset a second")

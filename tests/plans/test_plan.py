@@ -148,6 +148,7 @@ def test_what_fails_while_a_part_is_opened_ends_the_run(written, tmp_path, error
         ("parts:\n  - {task: fly, episodes: 1}\n", "no such task .expected pick, select, search, open_pick"),
         (GOOD + "block: 10\nblok: 3\n", "unknown key 'blok'.*Did you mean block"),
         (GOOD + "formats: [lerobot]\n", "robocas comes first"),
+        (GOOD + "lerobot_version: '9'\n", "lerobot_version"),
         (GOOD + "stages: [datasets]\n", "datasets needs demonstrations"),
         (GOOD + "stages: [demonstrations]\nformats: [robocas, lerobot]\n", "lerobot needs the stage datasets"),
         (

@@ -60,6 +60,13 @@ def test_a_plan_makes_demonstrations_and_one_dataset_of_all_parts(undisturbed):
     assert not list((undisturbed / "units").rglob("*.h5"))  # nothing is kept twice
 
 
+def test_the_lerobot_dataset_has_the_version_of_the_plan(tmp_path):
+    plan = PLAN.model_copy(update={"formats": ["robocas", "lerobot"], "lerobot_version": "2.1"})
+    run(tmp_path / "out", plan)
+    info = json.loads((tmp_path / "out" / "datasets" / "lerobot" / "meta" / "info.json").read_text())
+    assert (info["codebase_version"], info["total_episodes"]) == ("v2.1", 7)
+
+
 def test_more_slots_make_the_same(undisturbed, tmp_path):
     run(tmp_path / "out", jobs=2)
     assert_same(undisturbed, tmp_path / "out")
