@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # All that only a GPU can show, in one command on a CUDA machine: tests marked gpu (contracts with 16 and 256
-# envs, scenes as on a CPU, partial resets, restored states, contact buffers, heaps tried by its engine; baselines that
-# train and act), then steps a second of 1 to 4096 envs.
+# envs, scenes as on a CPU, partial resets, restored states, host synchronisation per step, contact buffers, heaps tried
+# by its engine; baselines that train and act), then steps a second of 1 to 4096 envs.
 #
 #   bash scripts/gpu_checks.sh [FOLDER]     # reports go there; default: gpu_checks
 #
@@ -9,7 +9,7 @@
 # ~/.sapien/physx/<version>/libPhysXGpu_64.so; carry that file along.
 #
 # PYTHON names the interpreter; default: the one scripts/setup.sh made, else python3. It needs what the environments need
-# (sapien, mani_skill, torch with CUDA, ...), the train extra and pytest; the planner and mplib are not used.
+# (sapien, mani_skill, torch with CUDA, ...), the train extra and pytest; the motion planner is not used.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -21,7 +21,8 @@ export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" OMP_NUM_THREADS=1 PYTHONWARN
 
 if ! device=$("$python" -c 'import torch; print(torch.cuda.get_device_name())' 2>/dev/null); then
     echo "No CUDA device here. Skipped, and so unproven: contracts with 16 and 256 envs, scenes as on a CPU, partial"
-    echo "resets, restored states, contact buffers, heaps tried by its engine, training, steps a second of more than one env."
+    echo "resets, restored states, host synchronisation per step, contact buffers, heaps tried by its engine, training, steps"
+    echo "a second of more than one env."
     "$python" benchmarks/fps.py --envs 1 --modes state --steps 50 | tee "$out/fps.json"
     exit 0
 fi
