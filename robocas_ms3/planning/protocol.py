@@ -14,6 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.errors import RobocasError
+
 Array = NDArray[np.float64]
 
 
@@ -55,10 +57,23 @@ class Shape:
     Attributes:
         hulls: vertices (V, 3) of its convex pieces, m.
         points: (P, 3) samples at 5 mm of surfaces that no hulls describe, m.
+
+    Raises:
+        RobocasError: there are neither hulls nor points.
     """
 
     hulls: tuple[Array, ...] = ()
     points: Array | None = None
+
+    def __post_init__(self) -> None:
+        if not self.hulls and self.points is None:
+            raise RobocasError(
+                "a shape has neither hulls nor points",
+                where="Shape",
+                expected="at least one hull, or points",
+                found="hulls=(), points=None",
+                fix="Leave out an obstacle that has no collision geometry.",
+            )
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Convex hulls with a margin, calculated by hand."""
+"""Convex hulls with a margin, calculated by hand, and shapes without geometry."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from planning_scenes import corners
 
+from robocas_ms3.errors import RobocasError
+from robocas_ms3.planning.protocol import Shape
 from robocas_ms3.planning.shapes import convex_hull, inflated
 
 
@@ -25,3 +27,9 @@ def test_normals_of_a_hull_point_outwards():
     assert len(vertices) == 8  # the one inside is gone
     a, b, c = vertices[faces].transpose(1, 0, 2)
     assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), normals) > 0).all()
+
+
+def test_a_shape_without_hulls_and_points_is_an_error():
+    with pytest.raises(RobocasError) as caught:
+        Shape(hulls=())
+    assert caught.value.where == "Shape"
