@@ -63,6 +63,10 @@ def test_there_are_no_numpy_arrays_of_device_tensors():
         (lambda x: torch.ones(3).to("cuda"), 1),
         (lambda x: torch.tensor([1.0], device="cuda"), 1),
         (lambda x: bool((x > 0).any()), 1),
+        (lambda x: x.repeat_interleave(x.long()), 1),
+        (lambda x: x.repeat_interleave(x.long(), output_size=3), 0),
+        (lambda x: x.histc(4), 1),
+        (lambda x: x.histc(4, 0, 1), 0),
     ],
 )
 def test_synchronisations_are_counted(operation, synchronisations):

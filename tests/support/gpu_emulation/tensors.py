@@ -127,7 +127,7 @@ def _dispatch(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         return args[0]  # no copy: C++ does not know that "cuda" is "cuda:0"
     if emulated:
         _check_devices(func, args, tensors)
-    _count(func, args, emulated, to_device)
+    _count(func, args, kwargs, to_device)
     inner_kwargs = {name: _apply(_inner, value) for name, value in kwargs.items()}
     if func is _aten._to_copy.default and wanted is not None:
         del inner_kwargs["device"]  # a copy even though both are in the same memory
@@ -191,9 +191,19 @@ def _check_devices(func: Any, args: Any, tensors: list[torch.Tensor]) -> None:
         raise RuntimeError(f"Expected all tensors to be on the same device, but found at least two: {func}")
 
 
-def _count(func: Any, args: Any, emulated: list[EmulatedTensor], to_device: bool) -> None:
+def _depends_on_values(func: Any, args: Any, kwargs: dict[str, Any]) -> bool:
+    """Whether an operation reads values on the device, because its arguments leave the result's size or range open."""
+    if func is _aten.repeat_interleave.Tensor:
+        return kwargs.get("output_size") is None
+    if func is _aten.histc.default:  # equal limits, the default, stand for the smallest and the largest value
+        lowest, highest = (args[i] if len(args) > i else 0 for i in (2, 3))
+        return lowest == highest
+    return False
+
+
+def _count(func: Any, args: Any, kwargs: dict[str, Any], to_device: bool) -> None:
     """Count an operation if the host waits for it."""
-    name = ""
+    name, emulated = "", any(isinstance(x, EmulatedTensor) for x in _tensors(args))
     if func is _aten._to_copy.default and isinstance(args[0], EmulatedTensor) != to_device:
         name = "copy to the device" if to_device else "copy to the host"
     elif func is _aten.copy_.default and isinstance(args[0], EmulatedTensor) != isinstance(args[1], EmulatedTensor):
@@ -201,7 +211,7 @@ def _count(func: Any, args: Any, emulated: list[EmulatedTensor], to_device: bool
     elif emulated and func in _INDEXING:
         masks = [x for x in args[1] if isinstance(x, torch.Tensor) and x.dtype in (torch.bool, torch.uint8)]
         name = "index with a mask" if masks else ""
-    elif emulated and func in _SYNCHRONISING:
+    elif emulated and (func in _SYNCHRONISING or _depends_on_values(func, args, kwargs)):
         name = func._schema.name
     if name:
         _synchronisations[name] += 1
