@@ -95,7 +95,7 @@ def check_python() -> list[Finding]:
 
 
 def check_packages() -> list[Finding]:
-    """Versions of everything this package needs, against what its metadata (and mani_skill's) ask for."""
+    """Compare the installed version of each required package with this package's metadata."""
     wanted = {_key(item.name): item for item in requirements(DISTRIBUTION)}
     if not wanted:
         return [Finding(DISTRIBUTION, "fail", "not installed", "Run bash scripts/setup.sh, or pip install -e .")]
