@@ -35,7 +35,7 @@ from robocas_ms3.assets.pack import (
     sha256,
 )
 from robocas_ms3.assets.physics import Solid
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 SURFACE_POINTS = 1024
 GRASPS = 800  # many, since of an object on a table most are from below or blocked by neighbours

@@ -16,7 +16,7 @@ from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.assets.cooking import OBLONG, SHRINKAGE, cook_hulls
 from robocas_ms3.assets.hulls import box_of, center_of, slenderness
 from robocas_ms3.assets.physics import cook
-from robocas_ms3.errors import AssetError, MissingExtraError
+from robocas_ms3.core.errors import AssetError, MissingExtraError
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from trimesh.visual.color import to_rgba
 from trimesh.visual.material import PBRMaterial
 
-from robocas_ms3.errors import AssetError
-from robocas_ms3.files import replacing
+from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.files import replacing
 
 DEFAULT_ROUGHNESS = 0.6
 JPEG_QUALITY = 88

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from robocas_ms3.assets.gripper import GRIPPER_BOXES
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 

@@ -22,7 +22,7 @@ from asset_tools.reading.files import files_below
 from asset_tools.scan import Unit, Up, guess_unit, guess_units
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 # Filled packages weigh about what water does, half-empty ones and boxes of cereal far less.
 DENSITY = 600.0  # kg/m3 of the whole body

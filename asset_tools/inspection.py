@@ -11,8 +11,8 @@ from typing import TypeAlias
 
 from asset_tools.reading.limits import SECONDS, reading_limits
 from asset_tools.reading.model import read_model
-from robocas_ms3.errors import AssetError, RobocasError
-from robocas_ms3.processes import Calls, Limits, Pool
+from robocas_ms3.core.errors import AssetError, RobocasError
+from robocas_ms3.core.processes import Calls, Limits, Pool
 
 Inspect: TypeAlias = "Callable[[Mapping[str, ModelSource]], Mapping[str, Inspection]]"
 

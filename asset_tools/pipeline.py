@@ -25,12 +25,12 @@ from robocas_ms3.assets.manifest import (
     check_asset_name,
 )
 from robocas_ms3.assets.pack import MANIFEST, sha256
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import AssetError, RobocasError
-from robocas_ms3.files import replacing_folder, write_json
-from robocas_ms3.outputs import check_overwrite
-from robocas_ms3.processes import Calls, Pool
-from robocas_ms3.strict import validate_json
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import AssetError, RobocasError
+from robocas_ms3.core.files import replacing_folder, write_json
+from robocas_ms3.core.outputs import check_overwrite
+from robocas_ms3.core.processes import Calls, Pool
+from robocas_ms3.core.strict import validate_json
 
 MADE_FROM = "made_from.json"  # of a pack: asset id -> hash of what it was made from
 ENTRY = "asset.json"  # what the manifest says of a kept asset; written last

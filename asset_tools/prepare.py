@@ -14,7 +14,7 @@ from asset_tools.reading.model import read_model
 from asset_tools.reading.surface import Textures
 from asset_tools.repair import close
 from asset_tools.scan import METRES, PLAUSIBLE, Unit, Up, guess_unit, guess_up, upright
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 NAMES = {"cm": "centimetres", "mm": "millimetres", "inch": "inches"}
 

@@ -15,7 +15,7 @@ from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.clean import clean
 from asset_tools.solids import to_mesh, to_solid
-from robocas_ms3.errors import AssetError, MissingExtraError
+from robocas_ms3.core.errors import AssetError, MissingExtraError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

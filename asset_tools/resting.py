@@ -30,7 +30,7 @@ from robocas_ms3.assets.physics import (
     places,
     pose_matrix,
 )
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 

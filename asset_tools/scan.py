@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from shapely import MultiPoint
 
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 Unit = Literal["m", "cm", "mm", "inch"]

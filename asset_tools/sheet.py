@@ -17,8 +17,8 @@ from robocas_ms3.assets.hulls import Hull
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import FurnitureAsset, ObjectAsset
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
-from robocas_ms3.errors import AssetError
-from robocas_ms3.poses import from_wxyz
+from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.poses import from_wxyz
 
 Array = NDArray[np.float64]
 Picture = tuple[str, Image.Image]

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from robocas_ms3.errors import MissingExtraError
+from robocas_ms3.core.errors import MissingExtraError
 
 try:
     from manifold3d import Error, Manifold, Mesh64

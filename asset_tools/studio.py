@@ -11,7 +11,7 @@ import sapien
 from numpy.typing import NDArray
 from PIL import Image
 
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float]  # 0 to 1

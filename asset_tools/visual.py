@@ -17,7 +17,7 @@ from trimesh.visual.texture import TextureVisuals
 from asset_tools.glb import rgba_of, roughness_of
 from asset_tools.reading.surface import TEXTURE, TINT, Textures, decode_srgb, encode_srgb
 from asset_tools.simplify import outward, simplified, welded
-from robocas_ms3.errors import AssetError, MissingExtraError
+from robocas_ms3.core.errors import AssetError, MissingExtraError
 
 Array = NDArray[np.float64]
 

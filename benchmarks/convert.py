@@ -33,8 +33,8 @@ from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.render import EnvFrames
-from robocas_ms3.recordings.motion import sample_states, sample_stride
-from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
 
 ROOT = Path(__file__).resolve().parents[1]
 CASES = {  # name -> format, whether with depth

@@ -22,12 +22,12 @@ import tyro
 from numpy.typing import NDArray
 
 import robocas_ms3
-from robocas_ms3.benchmark import TASKS
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.stage import make_env, start_of
 from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.scenes.task_specs import TASKS
 
 RATE = 20  # Hz
 REACH = 0.3  # rad that the joints go to and fro

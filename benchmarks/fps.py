@@ -28,11 +28,11 @@ from sapien import physx
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import load_task_config
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.bank import layout_bank
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.gpu_memory import gpu_memory
 
 SIZE = dict(width=128, height=128)

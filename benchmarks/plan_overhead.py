@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from robocas_ms3.errors import PlanError
+from robocas_ms3.core.errors import PlanError
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.run import run_plan

@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.reachability import Reachability

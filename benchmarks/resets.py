@@ -14,8 +14,8 @@ import numpy as np
 import torch
 import tyro
 
-from robocas_ms3.config import load_task_config
 from robocas_ms3.scenes.bank import LayoutBank
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.fill import fill, pairs_of
 from robocas_ms3.tasks import TASKS
 

@@ -17,9 +17,9 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from robocas_ms3.config import load_task_config
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.tasks import TASKS
 
 BLUE, ORANGE, GREY = "#2f6fa8", "#e08a2e", "#9aa3ab"

@@ -16,8 +16,8 @@ import numpy as np
 import tyro
 
 from robocas_ms3.assets.pack import VisualLevel, load_pack
-from robocas_ms3.config import load_task_config
-from robocas_ms3.poses import transform
+from robocas_ms3.core.poses import transform
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.sample import sample_layout

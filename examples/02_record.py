@@ -6,10 +6,10 @@ python examples/02_record.py OUT
 import sys
 from pathlib import Path
 
-from robocas_ms3.config import load_task_config
 from robocas_ms3.demos.episode import EpisodeSettings, recordable_config
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.replay import replay
+from robocas_ms3.scenes.config import load_task_config
 
 out = Path(sys.argv[1])
 name = "pick_table_scattered"

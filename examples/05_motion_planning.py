@@ -16,13 +16,13 @@ import tyro
 from mani_skill.examples.motionplanning.base_motionplanner.utils import compute_grasp_info_by_obb, get_actor_obb
 
 import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.drops import overhangs, sample_drops
 from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import AttachedBody
 from robocas_ms3.planning.scene import SPACING, PlanningScene
-from robocas_ms3.poses import inverse, transform
 
 
 def solve_pick_cube(env, seed=None, debug=False, vis=False):

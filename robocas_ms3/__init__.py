@@ -7,7 +7,7 @@ robot, as ``import robocas_ms3.tasks`` does.
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
-from robocas_ms3.after_import import after_import as _after_import
+from robocas_ms3.core.after_import import after_import as _after_import
 
 if _TYPE_CHECKING:
     from robocas_ms3.tasks.rl import rl_kwargs as rl_kwargs

@@ -6,8 +6,8 @@ import logging
 from functools import partial
 from typing import Any
 
-from robocas_ms3.after_import import after_import
-from robocas_ms3.benchmark import TASKS, TaskSpec
+from robocas_ms3.core.after_import import after_import
+from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 
 _log = logging.getLogger(__name__)
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Sets up, then lints, checks types and runs every test. Arguments go to pytest: bash scripts/test.sh tests/config -x
+# Sets up, then lints, checks types and runs every test. Arguments go to pytest: bash scripts/test.sh tests/scenes/config -x
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 

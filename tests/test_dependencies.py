@@ -45,7 +45,7 @@ def third_party(path: Path) -> set[str]:
 EXTRAS = {  # files that may import what an extra brings
     "robocas_ms3/baselines/": "train",
     "robocas_ms3/baselines/lerobot/": "lerobot",
-    "robocas_ms3/language/": "language",
+    "robocas_ms3/scenes/language/": "language",
     "robocas_ms3/datasets/lerobot/": "lerobot",
     "robocas_ms3/datasets/statistics/plots.py": "plots",
     "robocas_ms3/evaluation/remote/": "remote",

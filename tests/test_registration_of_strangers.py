@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 MODULE = """
 {first}
-from robocas_ms3.benchmark import TaskSpec
+from robocas_ms3.scenes.task_specs import TaskSpec
 
 SPEC = TaskSpec("juggle", "RoboCASJuggle-v1", "{module}:Env", "pick_table_scattered", "a:b", "c:d", 7, 7, "juggle")
 {last}

@@ -12,7 +12,7 @@ from asset_tools.builtin.furniture import MAKERS
 from asset_tools.pipeline import Job, content_hash
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import FurnitureAsset, ObjectAsset
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 NAME = "builtin"
 DESCRIPTION = "Everyday objects, furniture and a room, made of formulas"

@@ -17,9 +17,9 @@ from asset_tools.builtin import animals, bottles, fruits, labels, planes, shapes
 from asset_tools.builtin.mesh import Shape
 from asset_tools.builtin.models import Model
 from robocas_ms3.assets.manifest import Name, Positive, Share
-from robocas_ms3.documents import DocumentError, load_yaml
-from robocas_ms3.errors import AssetError
-from robocas_ms3.strict import StrictModel, parse
+from robocas_ms3.core.documents import DocumentError, load_yaml
+from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.strict import StrictModel, parse
 
 FOLDER = Path(__file__).parent / "products"
 

@@ -20,7 +20,7 @@ from asset_tools.pipeline import Job, content_hash, failing_job
 from asset_tools.prepare import prepare
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 LICENCE = "CC BY-NC-SA 4.0"
 ATTRIBUTION = "GraspNet-1Billion (H.-S. Fang, C. Wang, M. Gou, C. Lu, CVPR 2020)"

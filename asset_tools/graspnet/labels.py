@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from asset_tools.grasps import Grasps, local_points, spread_out, surface_samples
 from robocas_ms3.assets.gripper import GRIPPER_BOXES
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from asset_tools.decompose import few_vertices
 from asset_tools.repair import close
 from robocas_ms3.assets.cooking import OBLONG
 from robocas_ms3.assets.hulls import box_of, slenderness
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 

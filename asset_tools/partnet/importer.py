@@ -24,7 +24,7 @@ from asset_tools.reading.files import LARGEST_FILE, files_below
 from asset_tools.reading.limits import reading_limits
 from asset_tools.sources import FurnitureSource, LinkSource
 from robocas_ms3.assets.manifest import BODY, FurnitureAsset, Handle, Joint, Surface
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 

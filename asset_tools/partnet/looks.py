@@ -21,7 +21,7 @@ from asset_tools.partnet.obj import Faces
 from asset_tools.reading.files import read_file
 from asset_tools.reading.images import open_texture
 from asset_tools.visual import _crease_normals
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from asset_tools.reading.files import ModelFiles, check_inside
 from asset_tools.reading.obj import MtlMaterial, ObjMesh, decode_text, find_material, parse_mtl, parse_obj
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 

@@ -21,8 +21,8 @@ from robocas_ms3.assets.physics import (
     places,
     pose_matrix,
 )
-from robocas_ms3.errors import AssetError
-from robocas_ms3.poses import inverse
+from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.poses import inverse
 
 # The fingers of robots/mobile_panda.py and robots/urdf.py: drives in N/m and N s/m, N, m, kg, kg m2
 STIFFNESS, DAMPING, FORCE_LIMIT = 1e3, 1e2, 100.0

@@ -10,9 +10,9 @@ from asset_tools.quality.furniture import measure_furniture
 from asset_tools.quality.measure import HULL_VERTICES, Violation, remeasure
 from robocas_ms3.assets.manifest import FurnitureQuality, ObjectQuality
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
-from robocas_ms3.errors import AssetError
-from robocas_ms3.processes import Calls
-from robocas_ms3.processes import Pool as Processes
+from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.processes import Calls
+from robocas_ms3.core.processes import Pool as Processes
 
 Quality = ObjectQuality | FurnitureQuality
 

@@ -14,7 +14,7 @@ from robocas_ms3.assets.kinematics import joint_frame
 from robocas_ms3.assets.manifest import Handle, Link, Surface
 from robocas_ms3.assets.pack import LoadedFurniture
 from robocas_ms3.assets.physics import add_component, new_scene, pose_matrix, shape_of
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from asset_tools.reading.files import TEXTURE_FOLDERS
 from asset_tools.reading.surface import Part
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from asset_tools.reading.files import LARGEST_FILE, ModelFiles
 from asset_tools.reading.images import open_texture
 from asset_tools.reading.obj import MOST_FACES, MOST_VERTICES, decode_text
 from asset_tools.reading.surface import Material, Part, decode_srgb
-from robocas_ms3.errors import AssetError, MissingExtraError
+from robocas_ms3.core.errors import AssetError, MissingExtraError
 
 TEXTURE_COMMENT = re.compile(rb"comment\s+TextureFile\s+(.*)", re.IGNORECASE)
 PLY_UVS = {b"s", b"t", b"u", b"v", b"texture_u", b"texture_v", b"texcoord"}

@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from urllib.parse import unquote
 
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 LARGEST_FILE = 200 * 2**20  # bytes
 TEXTURE_FOLDERS = {"textures", "texture", "tex", "materials", "images", "maps", "thumbnails"}

@@ -20,8 +20,8 @@ from asset_tools.reading.gltf_buffers import Buffers, entry
 from asset_tools.reading.gltf_materials import READ_EXTENSIONS, Materials
 from asset_tools.reading.obj import MOST_FACES
 from asset_tools.reading.surface import Material, Part
-from robocas_ms3.documents import json_values
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.documents import json_values
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from asset_tools.reading import gltf_schema as schema
 from asset_tools.reading.files import LARGEST_FILE, ModelFiles
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 Item = TypeVar("Item")

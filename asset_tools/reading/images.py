@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 LARGEST_IMAGE = 16384**2  # pixels: 0.8 GB once unpacked
 USEFUL_SIDE = 4096  # pixels of the longer side; larger textures are shrunk before anything is done with them

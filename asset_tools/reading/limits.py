@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 SECONDS = 25.0
 MEMORY = 2 * 2**30  # bytes

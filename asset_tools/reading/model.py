@@ -19,7 +19,7 @@ from asset_tools.reading.gltf import read_gltf
 from asset_tools.reading.obj import MOST_FACES
 from asset_tools.reading.obj_model import read_obj
 from asset_tools.reading.surface import Part, to_mesh
-from robocas_ms3.errors import AssetError, RobocasError
+from robocas_ms3.core.errors import AssetError, RobocasError
 
 READERS: dict[str, Callable[[Path, ModelFiles], list[Part]]] = {
     ".obj": read_obj,

@@ -11,7 +11,7 @@ import numpy as np
 from manifold3d import triangulate
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -12,7 +12,7 @@ from asset_tools.reading.files import ModelFiles, missing_path
 from asset_tools.reading.images import open_texture
 from asset_tools.reading.obj import MtlMaterial, ObjMesh, decode_text, find_material, parse_mtl, parse_obj
 from asset_tools.reading.surface import WHITE, Material, Part, decode_srgb
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Ints = NDArray[np.int64]
 

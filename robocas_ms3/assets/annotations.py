@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from robocas_ms3.assets.hulls import Array
-from robocas_ms3.documents import DAMAGED, open_arrays
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.documents import DAMAGED, open_arrays
+from robocas_ms3.core.errors import AssetError
 
 
 @dataclass(frozen=True)

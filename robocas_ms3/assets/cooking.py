@@ -18,8 +18,8 @@ from scipy.spatial import ConvexHull
 from robocas_ms3.assets.hulls import Array, box_of, read_hulls, slenderness
 from robocas_ms3.assets.pack import HULLS
 from robocas_ms3.assets.physics import cook
-from robocas_ms3.errors import AssetError
-from robocas_ms3.processes import Calls, Pool
+from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.processes import Calls, Pool
 
 # m that a hull may lose anywhere: PhysX leaves out vertices, and makes faces one, within 0.7 mm each
 SHRINKAGE = 0.0015

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from robocas_ms3.documents import read_text
-from robocas_ms3.errors import AssetError
-from robocas_ms3.words import count_of
+from robocas_ms3.core.documents import read_text
+from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.words import count_of
 
 Array = NDArray[np.float64]
 

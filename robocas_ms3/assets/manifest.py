@@ -23,9 +23,9 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from robocas_ms3.errors import AssetError
-from robocas_ms3.names import LONGEST
-from robocas_ms3.strict import StrictModel
+from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.names import LONGEST
+from robocas_ms3.core.strict import StrictModel
 
 SCHEMA_VERSION = 2
 

@@ -17,10 +17,10 @@ from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import Array, Hull, read_hulls, sample_surface
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, FurnitureAsset, ObjectAsset, PackManifest
-from robocas_ms3.documents import JSON_LIMIT, DocumentError, check_regular, read_bytes
-from robocas_ms3.errors import AssetError
-from robocas_ms3.paths import builtin_packs_dir, data_dir
-from robocas_ms3.strict import mistakes, refusal, validate_json
+from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, check_regular, read_bytes
+from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.paths import builtin_packs_dir, data_dir
+from robocas_ms3.core.strict import mistakes, refusal, validate_json
 
 VisualLevel = Literal["fast", "full"]
 

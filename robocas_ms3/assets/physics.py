@@ -14,7 +14,7 @@ from sapien import physx
 
 from robocas_ms3.assets.hulls import Box, box_of
 from robocas_ms3.assets.pack import LoadedObject, Part
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 

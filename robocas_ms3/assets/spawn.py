@@ -14,7 +14,7 @@ from robocas_ms3.assets.kinematics import joint_frame
 from robocas_ms3.assets.manifest import BODY, FurnitureAsset, Link, ObjectAsset
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Part, VisualLevel
 from robocas_ms3.assets.physics import DAMPING, shapes_of
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 
 def spawn(

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, Protocol
 import torch
 from pydantic import Field
 
+from robocas_ms3.core.strict import StrictModel
 from robocas_ms3.evaluation.policy import Policy
-from robocas_ms3.strict import StrictModel
 
 Precision = Literal["auto", "fp32", "bf16"]
 Split = Literal["train", "val"]

@@ -11,8 +11,8 @@ from typing import Any
 
 from robocas_ms3.baselines.baseline import Baseline, BaselineConfig
 from robocas_ms3.baselines.runs import CHECKPOINT, RUN, WEIGHTS, RunRecord, find_run, hash_of_weights, read_run
-from robocas_ms3.errors import TrainingError
-from robocas_ms3.strict import parse
+from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.core.strict import parse
 
 _SEEN = ("rate_hz", "pictures", "cameras", "calibration", "observed", "acted")
 """Facts that a run shares with the one it begins with; others, as scales, only have as many numbers as there."""

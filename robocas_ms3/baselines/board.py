@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.files import make_folder, naming
+from robocas_ms3.core.files import make_folder, naming
 
 
 class Board:

@@ -14,8 +14,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 
 from robocas_ms3.baselines.runs import CHECKPOINT, WEIGHTS
-from robocas_ms3.errors import TrainingError
-from robocas_ms3.files import replacing
+from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.core.files import replacing
 
 _HINTS = {
     CHECKPOINT: "It is damaged, or of another program: train anew with --overwrite.",

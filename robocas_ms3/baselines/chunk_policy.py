@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.chunks import decode
+from robocas_ms3.core.poses import Array, from_wxyz
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
-from robocas_ms3.poses import Array, from_wxyz
 
 _EMPTY = 0.004
 """m; between fingers that hold nothing."""

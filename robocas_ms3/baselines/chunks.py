@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.poses import Array, from_parts, inverse
+from robocas_ms3.core.poses import Array, from_parts, inverse
 
 ROW = 10
 _FLOOR = np.array([0.004] * 3 + [0.02] * 6)  # m and 1: deviations below that are noise to be left as it is

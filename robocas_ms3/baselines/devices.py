@@ -12,7 +12,7 @@ from accelerate.state import AcceleratorState
 from accelerate.utils import DataLoaderConfiguration
 
 from robocas_ms3.baselines.baseline import Precision
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of malloc.h
 

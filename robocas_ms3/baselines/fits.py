@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
-from robocas_ms3.errors import DatasetError
 
 
 def check_fits(

@@ -12,7 +12,7 @@ from typing import Any
 
 from robocas_ms3.baselines.board import Board
 from robocas_ms3.baselines.runs import BOARD, METRICS
-from robocas_ms3.files import naming, open_for_append, replacing
+from robocas_ms3.core.files import naming, open_for_append, replacing
 
 _FIRST = ("step", "split", "epoch", "seconds", "learning_rate")
 

@@ -7,9 +7,9 @@ from typing import Any
 
 from robocas_ms3.baselines.runs import RUN, SHIPPED, WEIGHTS, RunRecord, hash_of_weights, read_run
 from robocas_ms3.baselines.table import find_baseline
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.core.strict import parse
 from robocas_ms3.evaluation.policy import Observations, Policy, Start, Wants
-from robocas_ms3.strict import parse
 
 
 def shipped_small() -> RunPolicy:

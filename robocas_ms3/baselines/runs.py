@@ -15,10 +15,10 @@ import hashlib
 from pathlib import Path
 from typing import Any, Literal
 
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import TrainingError
-from robocas_ms3.files import write_json
-from robocas_ms3.strict import StrictModel, parse
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.core.files import write_json
+from robocas_ms3.core.strict import StrictModel, parse
 
 RUN, METRICS, BOARD = "run.json", "metrics.csv", "tensorboard"
 CHECKPOINT, WEIGHTS = "checkpoint.safetensors", "weights.safetensors"

@@ -23,10 +23,10 @@ from robocas_ms3.baselines.begin import (
 )
 from robocas_ms3.baselines.runs import RUN, DataRecord, RunRecord, hash_of, read_run, write_run
 from robocas_ms3.baselines.table import find_baseline, need_extra
-from robocas_ms3.errors import EmptySplitError, OutputExistsError, TrainingError
-from robocas_ms3.exits import no_exit
-from robocas_ms3.files import make_folder
-from robocas_ms3.outputs import (
+from robocas_ms3.core.errors import EmptySplitError, OutputExistsError, TrainingError
+from robocas_ms3.core.exits import no_exit
+from robocas_ms3.core.files import make_folder
+from robocas_ms3.core.outputs import (
     check_one_way,
     check_overwrite,
     check_run,

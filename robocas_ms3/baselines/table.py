@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from robocas_ms3.errors import MissingExtraError, TrainingError
-from robocas_ms3.exits import no_exit
-from robocas_ms3.extensions import Table
-from robocas_ms3.strict import nearest
+from robocas_ms3.core.errors import MissingExtraError, TrainingError
+from robocas_ms3.core.exits import no_exit
+from robocas_ms3.core.extensions import Table
+from robocas_ms3.core.strict import nearest
 
 if TYPE_CHECKING:
     from robocas_ms3.baselines.baseline import Baseline  # which imports torch

@@ -21,9 +21,9 @@ from robocas_ms3.baselines.log import MetricsLog
 from robocas_ms3.baselines.metrics import means_of, summed
 from robocas_ms3.baselines.runs import CHECKPOINT, RunRecord
 from robocas_ms3.baselines.schedule import Batches, epochs_at, learning_rate
-from robocas_ms3.errors import RobocasError, TrainingError
-from robocas_ms3.exits import deferred_interrupts, exit_error, uninterrupted
-from robocas_ms3.outputs import check_there
+from robocas_ms3.core.errors import RobocasError, TrainingError
+from robocas_ms3.core.exits import deferred_interrupts, exit_error, uninterrupted
+from robocas_ms3.core.outputs import check_there
 
 
 class Trainer:

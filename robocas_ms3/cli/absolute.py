@@ -7,8 +7,8 @@ from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from robocas_ms3.errors import RobocasError
-from robocas_ms3.paths import CACHE, DATA
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.paths import CACHE, DATA
 
 _Config = TypeVar("_Config")
 

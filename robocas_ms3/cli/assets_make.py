@@ -13,7 +13,7 @@ import tyro
 
 from robocas_ms3.cli.assets_show import mesh_tools
 from robocas_ms3.cli.options import Maybe, Several
-from robocas_ms3.words import count_of
+from robocas_ms3.core.words import count_of
 
 CONTACT_SHEET = "contact_sheet.png"
 SHEET = 60  # assets on the contact sheet of an import
@@ -146,7 +146,7 @@ def import_ycb(command: ImportYCB) -> int:
 
 def import_partnet(command: ImportPartNet) -> int:
     """Run ``import-partnet``."""
-    from robocas_ms3.errors import AssetError
+    from robocas_ms3.core.errors import AssetError
 
     with mesh_tools():
         from asset_tools.partnet.importer import partnet_jobs
@@ -163,8 +163,8 @@ def import_partnet(command: ImportPartNet) -> int:
 
 def build(command: Build) -> int:
     """Run ``build``."""
-    from robocas_ms3.errors import AssetError
-    from robocas_ms3.paths import builtin_packs_dir
+    from robocas_ms3.core.errors import AssetError
+    from robocas_ms3.core.paths import builtin_packs_dir
 
     try:
         with mesh_tools():
@@ -207,8 +207,8 @@ def _target(name: str) -> Path:
         AssetError: no imported pack may have this name.
     """
     from asset_tools.pipeline import check_target
-    from robocas_ms3.errors import AssetError
-    from robocas_ms3.paths import builtin_packs_dir, data_dir
+    from robocas_ms3.core.errors import AssetError
+    from robocas_ms3.core.paths import builtin_packs_dir, data_dir
 
     if (builtin_packs_dir() / name).exists() or Path(name).name != name:
         raise AssetError("this can't be the name of an imported pack", found=name, fix="Choose another with --pack.")
@@ -221,7 +221,7 @@ def _make(jobs: list[Job], command: _Making, out: Path, what: str) -> int:
     from asset_tools.pipeline import check_jobs, made_of
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.errors import AssetError, OutputExistsError
+    from robocas_ms3.core.errors import AssetError, OutputExistsError
 
     if not command.skip_bad:
         check_jobs(jobs)
@@ -247,7 +247,7 @@ def _write(jobs: list[Job], command: _Making, out: Path, description: str, *, re
     from robocas_ms3.cli.assets_show import Info, info
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.paths import cache_dir
+    from robocas_ms3.core.paths import cache_dir
 
     with bar(f"assets of {out.name} processed") as shown:
         shown.start(len(jobs))
@@ -286,7 +286,7 @@ def _draw_sheet(folder: Path) -> None:
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.bars import working
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.errors import AssetError
+    from robocas_ms3.core.errors import AssetError
 
     pack = load_pack(folder)
     ids = [asset.id for asset in pack.manifest.assets]
@@ -301,8 +301,8 @@ def _draw_sheet(folder: Path) -> None:
 
 
 def _masses(path: Path | None) -> dict[str, float]:
-    from robocas_ms3.documents import load_yaml
-    from robocas_ms3.errors import AssetError
+    from robocas_ms3.core.documents import load_yaml
+    from robocas_ms3.core.errors import AssetError
 
     if path is None:
         return {}

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from robocas_ms3.assets.pack import Pack
 
 from robocas_ms3.cli.options import Maybe, Several
-from robocas_ms3.words import count_of, printable
+from robocas_ms3.core.words import count_of, printable
 
 
 @dataclass
@@ -67,7 +67,7 @@ def list_packs(command: ListPacks) -> int:
 
     from robocas_ms3.assets.pack import load_pack, pack_folders
     from robocas_ms3.cli.terminal import table_console
-    from robocas_ms3.errors import AssetError
+    from robocas_ms3.core.errors import AssetError
 
     table = Table(Column("pack", no_wrap=True), "objects", "furniture", "folder")
     for name, folder in pack_folders().items():
@@ -148,7 +148,7 @@ def sheet(command: Sheet) -> int:
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.bars import working
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.errors import AssetError
+    from robocas_ms3.core.errors import AssetError
 
     pack = load_pack(command.pack)
     out = command.out or Path(f"{pack.name}.png")
@@ -168,7 +168,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
         from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import table_console
-    from robocas_ms3.files import write_json
+    from robocas_ms3.core.files import write_json
 
     total = len(pack.manifest.assets)
     measured: dict[str, Any] = {}
@@ -203,7 +203,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
 @contextmanager
 def mesh_tools() -> Iterator[None]:
     """Say which extra to install where the mesh tools are missing."""
-    from robocas_ms3.errors import MissingExtraError
+    from robocas_ms3.core.errors import MissingExtraError
 
     try:
         yield

@@ -12,7 +12,7 @@ from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from robocas_ms3.cli.terminal import tell, terminal_of_stderr
-from robocas_ms3.words import printable
+from robocas_ms3.core.words import printable
 
 EVERY = 60.0  # s between two lines of a log
 

@@ -89,7 +89,7 @@ def main(cfg: Convert) -> int:
 
 
 def _check(cfg: Convert) -> None:
-    from robocas_ms3.errors import DatasetError
+    from robocas_ms3.core.errors import DatasetError
 
     ways = [flag for flag in ("overwrite", "resume", "append") if getattr(cfg, flag)]
     if cfg.overwrite and len(ways) > 1:
@@ -116,8 +116,8 @@ def _format(cfg: Convert) -> Format:
         ExtensionError: there is no such format.
         DatasetError: a flag does not suit it.
     """
+    from robocas_ms3.core.errors import DatasetError
     from robocas_ms3.datasets.formats import FORMATS
-    from robocas_ms3.errors import DatasetError
 
     chosen = FORMATS.find(cfg.to, where="--to")
     flags = {
@@ -137,9 +137,9 @@ def _format(cfg: Convert) -> Format:
 def _convert(cfg: Convert) -> int:
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
+    from robocas_ms3.core.processes import Limits
+    from robocas_ms3.core.words import count_of
     from robocas_ms3.datasets.pictures.stored import Pictures
-    from robocas_ms3.processes import Limits
-    from robocas_ms3.words import count_of
 
     chosen = _format(cfg)
     with bar("episodes written") as shown:

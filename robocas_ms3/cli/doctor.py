@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
-from robocas_ms3.words import count_of
+from robocas_ms3.core.words import count_of
 
 if TYPE_CHECKING:
     from robocas_ms3.doctor.checks import Finding

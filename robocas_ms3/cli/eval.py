@@ -74,7 +74,7 @@ WORDS = ("report", "merge", "compare", "verify", "videos", "protocols", "freeze"
 def main(cfg: Eval) -> int:
     """Run the command; gives the exit code."""
     from robocas_ms3.cli import eval_protocols, eval_results
-    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.core.errors import EvaluationError
 
     first = cfg.words[0] if cfg.words else ""
     if cfg.set and first != "freeze":
@@ -107,9 +107,9 @@ def main(cfg: Eval) -> int:
 
 def run(cfg: Eval) -> int:
     """Play what a result lacks."""
-    from robocas_ms3.benchmark import TASKS
-    from robocas_ms3.errors import EvaluationError
-    from robocas_ms3.strict import nearest
+    from robocas_ms3.core.errors import EvaluationError
+    from robocas_ms3.core.strict import nearest
+    from robocas_ms3.scenes.task_specs import TASKS
 
     for word in cfg.words:  # before seconds go by for what is imported next
         if word not in TASKS:
@@ -118,13 +118,13 @@ def run(cfg: Eval) -> int:
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.eval_results import write_pages
     from robocas_ms3.cli.terminal import say, say_lines
+    from robocas_ms3.core.processes import Limits, use_one_torch_thread
+    from robocas_ms3.core.strict import check_number
+    from robocas_ms3.core.words import count_of
     from robocas_ms3.evaluation.policies import check_policy, open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.results import read
     from robocas_ms3.evaluation.tables import markdown
-    from robocas_ms3.processes import Limits, use_one_torch_thread
-    from robocas_ms3.strict import check_number
-    from robocas_ms3.words import count_of
 
     for name, number in (("envs", cfg.envs), ("episodes", cfg.episodes), ("workers", cfg.workers)):
         if number is not None:
@@ -180,7 +180,7 @@ def shard_of(text: str) -> tuple[int, int]:
     Raises:
         EvaluationError: it is none.
     """
-    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.core.errors import EvaluationError
 
     number, _, of = text.partition("/")
     if not (number.isdecimal() and of.isdecimal() and int(number) < int(of)):
@@ -189,7 +189,7 @@ def shard_of(text: str) -> tuple[int, int]:
 
 
 def _one(about: list[Path], word: str) -> Path:
-    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.core.errors import EvaluationError
 
     if len(about) != 1:
         raise EvaluationError("takes one thing", where=word, expected="a folder or file", found=len(about))

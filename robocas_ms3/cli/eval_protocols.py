@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from robocas_ms3.words import count_of
+from robocas_ms3.core.words import count_of
 
 
 def protocols() -> int:
@@ -27,11 +27,11 @@ def freeze(plan: Path, out: Path | None, overrides: Sequence[str] = ()) -> int:
     """Make a protocol; ``overrides`` are set in all configurations of the plan."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.core.errors import EvaluationError
+    from robocas_ms3.core.outputs import check_absent
     from robocas_ms3.evaluation.freeze import freeze as make
     from robocas_ms3.evaluation.freeze import read_plan
     from robocas_ms3.evaluation.protocol import load_protocol
-    from robocas_ms3.outputs import check_absent
 
     if out is None:
         raise EvaluationError("where to?", where="--out", expected="a folder")

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from robocas_ms3.evaluation.protocol import LoadedProtocol
     from robocas_ms3.evaluation.results import Result
 
-from robocas_ms3.words import count_of
+from robocas_ms3.core.words import count_of
 
 
 def report(folders: list[Path], out: Path | None, protocol: str | None) -> int:
@@ -30,7 +30,7 @@ def report(folders: list[Path], out: Path | None, protocol: str | None) -> int:
 def merge(folders: list[Path], out: Path | None, protocol: str | None) -> int:
     """Write parts of a result as one."""
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.results import merge as write
 
     if out is None:
@@ -92,10 +92,10 @@ def videos(folder: Path, protocol: str | None, policy: str, count: int) -> int:
     """
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.core.errors import EvaluationError
+    from robocas_ms3.core.strict import check_number
     from robocas_ms3.evaluation.policies import POLICIES, open_policy
     from robocas_ms3.evaluation.results import read
-    from robocas_ms3.strict import check_number
 
     check_number("count", count, 1)
     result = read(folder)
@@ -104,8 +104,8 @@ def videos(folder: Path, protocol: str | None, policy: str, count: int) -> int:
     if name not in {*POLICIES.builtin, *POLICIES.points} and policy != name:
         fix = f"Name it yourself, if you trust it: --policy {name}"
         raise EvaluationError("this result is of a policy of somebody's own", where=folder, found=name, fix=fix)
+    from robocas_ms3.core.processes import use_one_torch_thread
     from robocas_ms3.evaluation.videos import failed_of_each_kind, film
-    from robocas_ms3.processes import use_one_torch_thread
 
     use_one_torch_thread()
     numbers = failed_of_each_kind(result, count)
@@ -125,7 +125,7 @@ def protocol_of(result: Result, given: str | None) -> LoadedProtocol:
     Raises:
         EvaluationError: none was given, and none of that name is shipped.
     """
-    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 
     name, shipped = result.run["protocol"], shipped_protocols()
@@ -140,7 +140,7 @@ def protocol_of(result: Result, given: str | None) -> LoadedProtocol:
 def write_pages(result: Result, out: Path, given: str | None) -> None:
     """Write the report, and say where it is."""
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.report import write_report
 
     try:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from robocas_ms3.benchmark import TASKS
 from robocas_ms3.cli.options import Maybe, Repeated
+from robocas_ms3.core.words import count_of
 from robocas_ms3.robots.table import DEFAULT
-from robocas_ms3.words import count_of
+from robocas_ms3.scenes.task_specs import TASKS
 
 if TYPE_CHECKING:
     TaskName = str
@@ -92,16 +92,16 @@ def main(cfg: Generate) -> int:
 
 def run(cfg: Generate) -> int:
     """Generate, with a progress bar."""
-    from robocas_ms3.config import load_task_config, shipped_configs
+    from robocas_ms3.scenes.config import load_task_config, shipped_configs
 
     name = cfg.config or TASKS[cfg.task].default_config
     loaded = load_task_config(name, overrides=cfg.set)  # before seconds go by for what is imported next
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
+    from robocas_ms3.core.processes import Limits
     from robocas_ms3.demos.checks import check_limits
     from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings, recordable_config
     from robocas_ms3.demos.generate import generate
-    from robocas_ms3.processes import Limits
 
     check_limits(cfg.episode_seconds, cfg.memory_gb)
     config = recordable_config(loaded, name if name in shipped_configs() and not cfg.set else None)

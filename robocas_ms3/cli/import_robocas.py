@@ -49,18 +49,18 @@ def main(cfg: ImportRobocas) -> int:
 
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say, say_lines
+    from robocas_ms3.core.outputs import claim_output
+    from robocas_ms3.core.words import count_of
     from robocas_ms3.datasets.manage.importing import import_robocas
     from robocas_ms3.datasets.manage.survey import survey
     from robocas_ms3.datasets.writing.output import check_apart
-    from robocas_ms3.outputs import claim_output
-    from robocas_ms3.words import count_of
 
     if cfg.out is not None:
         check_apart(cfg.out, [cfg.dataset])
         claim_output(cfg.out, resume=cfg.resume or cfg.overwrite)  # before minutes of reading
     embed = None
     if cfg.embeddings:
-        from robocas_ms3.language.embed import TextEmbedder
+        from robocas_ms3.scenes.language.embed import TextEmbedder
 
         embed = TextEmbedder()
     with bar("episodes read") as shown:
@@ -92,7 +92,7 @@ def _table(found: Survey) -> None:
     from rich.table import Table
 
     from robocas_ms3.cli.terminal import say, table_console
-    from robocas_ms3.words import count_of
+    from robocas_ms3.core.words import count_of
 
     rows: dict[tuple[str, str, str], list[int]] = defaultdict(list)
     for finding in found.findings:

@@ -13,7 +13,7 @@ import threading
 from contextlib import suppress
 from types import FrameType
 
-from robocas_ms3.exits import handle_interrupt
+from robocas_ms3.core.exits import handle_interrupt
 
 INTERRUPTED = 130  # what a shell reports of a program that Ctrl-C ended
 _TERMINATED = 143  # and of one that `timeout`, `kill` or a batch system did

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from robocas_ms3.scenes.table import Engine, Pair
 
 from robocas_ms3.cli.options import Maybe, Repeated
-from robocas_ms3.words import count_of
+from robocas_ms3.core.words import count_of
 
 
 @dataclass
@@ -79,8 +79,8 @@ def build(command: Build) -> int:
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.config import load_task_config
-    from robocas_ms3.strict import check_number
+    from robocas_ms3.core.strict import check_number
+    from robocas_ms3.scenes.config import load_task_config
 
     if command.jobs is not None:
         check_number("jobs", command.jobs, 1)
@@ -129,7 +129,7 @@ def choose_engine(wanted: Literal["auto", "cpu", "gpu"]) -> Engine:
     """
     from torch.cuda import is_available
 
-    from robocas_ms3.errors import ConfigError
+    from robocas_ms3.core.errors import ConfigError
 
     if wanted == "gpu" and not is_available():
         raise ConfigError("needs a GPU", where="--engine", found="no CUDA device", fix="Take --engine cpu.")
@@ -164,7 +164,7 @@ def info(command: Info) -> int:
     from rich.table import Table
 
     from robocas_ms3.cli.terminal import table_console
-    from robocas_ms3.documents import load_json
+    from robocas_ms3.core.documents import load_json
     from robocas_ms3.scenes.bank import ABOUT, banks_folder, count_layouts
 
     root = banks_folder(command.folder or "auto")
@@ -190,7 +190,7 @@ def seed_range(text: str) -> range:
     Raises:
         ConfigError: it isn't one, or it is empty.
     """
-    from robocas_ms3.errors import ConfigError
+    from robocas_ms3.core.errors import ConfigError
 
     match = re.fullmatch(r"(\d+):(\d+)", text)
     if match is None or int(match[1]) >= int(match[2]):
@@ -204,7 +204,7 @@ def objects_seeds(text: str) -> list[int]:
     Raises:
         ConfigError: they aren't any.
     """
-    from robocas_ms3.errors import ConfigError
+    from robocas_ms3.core.errors import ConfigError
 
     if re.fullmatch(r"\d+(,\d+)*", text):
         return list(dict.fromkeys(int(seed) for seed in text.split(",")))

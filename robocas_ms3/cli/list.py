@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.words import count_of
+from robocas_ms3.core.words import count_of
 
 
 @dataclass
@@ -44,12 +44,12 @@ def collect() -> dict[str, list[dict[str, Any]]]:
     """
     from robocas_ms3.assets.pack import load_pack, pack_folders
     from robocas_ms3.baselines.table import BASELINES
-    from robocas_ms3.benchmark import TASKS
-    from robocas_ms3.config import load_task_config, shipped_configs
-    from robocas_ms3.errors import AssetError
+    from robocas_ms3.core.errors import AssetError
+    from robocas_ms3.core.extensions import package_of
     from robocas_ms3.evaluation.policies import POLICIES
-    from robocas_ms3.extensions import package_of
     from robocas_ms3.robots.table import ROBOTS
+    from robocas_ms3.scenes.config import load_task_config, shipped_configs
+    from robocas_ms3.scenes.task_specs import TASKS
 
     tasks = [
         {"name": task.name, "env_id": task.env_id, "default_config": task.default_config, "summary": task.summary}

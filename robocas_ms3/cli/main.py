@@ -22,11 +22,11 @@ import tyro
 from robocas_ms3 import __version__
 from robocas_ms3.cli.absolute import with_absolute_paths
 from robocas_ms3.cli.interrupts import INTERRUPTED, heed_ctrl_c, leave
-from robocas_ms3.errors import RobocasError
-from robocas_ms3.exits import no_exit
-from robocas_ms3.files import FULL
-from robocas_ms3.paths import ensure_home, is_writable, temporary_cache, variable_of
-from robocas_ms3.words import escape_log_lines, escape_tracebacks, printable
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.exits import no_exit
+from robocas_ms3.core.files import FULL
+from robocas_ms3.core.paths import ensure_home, is_writable, temporary_cache, variable_of
+from robocas_ms3.core.words import escape_log_lines, escape_tracebacks, printable
 
 # Each names a module beside this one, with a dataclass called as the command and `main(cfg) -> int`; a dash in its name
 # is an underscore in the module's: import-robocas, import_robocas.py, ImportRobocas.
@@ -104,7 +104,9 @@ def run(argv: Sequence[str]) -> int:
             raise
         return _say(f"error: {' '.join(str(error).split())}", sys.stderr, 1)
     except ValueError as error:
-        from robocas_ms3.documents import DocumentError  # with YAML, which no command waits for that fails otherwise
+        from robocas_ms3.core.documents import (
+            DocumentError,  # with YAML, which no command waits for that fails otherwise
+        )
 
         if debug or not isinstance(error, DocumentError):
             raise
@@ -159,7 +161,7 @@ def _misspelt(of_command: type, known: dict[str, type], prog: str, words: list[s
 
 
 def _unknown(word: str, what: str, known: Iterable[str]) -> int:
-    from robocas_ms3.strict import nearest
+    from robocas_ms3.core.strict import nearest
 
     fix = nearest(word, known) or f"There are: {', '.join(known)}."
     return _say(f"error: {word}: no such {what}. {fix}", sys.stderr, 2)

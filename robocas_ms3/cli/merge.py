@@ -35,8 +35,8 @@ def main(cfg: Merge) -> int:
     """Merge, with a progress bar; gives the exit code."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
+    from robocas_ms3.core.words import count_of
     from robocas_ms3.datasets.manage.merging import merge
-    from robocas_ms3.words import count_of
 
     with bar("episodes written") as shown:
         done = merge(

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from robocas_ms3.cli.options import Maybe, Repeated
-from robocas_ms3.words import count_of
+from robocas_ms3.core.words import count_of
 
 
 @dataclass
@@ -118,7 +118,7 @@ def run(command: Run) -> int:
 
 
 def _option(word: str) -> tuple[str, str]:
-    from robocas_ms3.errors import PlanError
+    from robocas_ms3.core.errors import PlanError
 
     name, sign, value = word.partition("=")
     if not (name and sign):

@@ -13,10 +13,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from robocas_ms3.cli.bars import Log, span
 from robocas_ms3.cli.terminal import tell, terminal_of_stderr
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.words import count_of, printable
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.status import status
-from robocas_ms3.words import count_of, printable
 
 _BARS = 12  # parts; of more there is one bar for all
 _LOOK = 5.0  # s between two estimates, which read the folder

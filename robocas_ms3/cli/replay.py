@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from robocas_ms3.cli.options import Maybe
-from robocas_ms3.words import count_of
+from robocas_ms3.core.words import count_of
 
 
 @dataclass
@@ -45,12 +45,12 @@ def main(cfg: Replay) -> int:
 
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.recordings.entries import read_json
+    from robocas_ms3.demos.recordings.entries import read_json
 
     trajectory = cfg.trajectory / "trajectory.h5" if cfg.trajectory.is_dir() else cfg.trajectory
     total = len(read_json(trajectory)["episodes"][: cfg.count])
+    from robocas_ms3.core.processes import use_one_torch_thread
     from robocas_ms3.demos.replay import replay  # takes seconds to import
-    from robocas_ms3.processes import use_one_torch_thread
 
     use_one_torch_thread()
     replayed = replay(

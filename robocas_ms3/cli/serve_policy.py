@@ -36,7 +36,7 @@ class ServePolicy:
 def main(cfg: ServePolicy) -> int:
     """Run the command; gives the exit code."""
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.errors import EvaluationError
+    from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.policies import open_policy
     from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.remote.address import strip_brackets

@@ -11,7 +11,7 @@ import tyro
 from robocas_ms3.cli.options import Repeated
 
 if TYPE_CHECKING:
-    from robocas_ms3.config import TaskConfig
+    from robocas_ms3.scenes.config import TaskConfig
 
 
 @dataclass
@@ -40,10 +40,10 @@ class Show:
 def main(cfg: Show) -> int:
     """Run the command."""
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.config import load_task_config
-    from robocas_ms3.errors import RobocasError
-    from robocas_ms3.recordings.seeds import GREATEST_SEED
-    from robocas_ms3.strict import check_number
+    from robocas_ms3.core.errors import RobocasError
+    from robocas_ms3.core.strict import check_number
+    from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
+    from robocas_ms3.scenes.config import load_task_config
 
     check_number("seed", cfg.seed, 0, GREATEST_SEED)
     config = load_task_config(cfg.config, overrides=cfg.set)  # before seconds go by for what is imported next
@@ -55,9 +55,9 @@ def main(cfg: Show) -> int:
     import gymnasium as gym
 
     import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-    from robocas_ms3.benchmark import TASKS
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.files import make_folder, replacing
+    from robocas_ms3.core.files import make_folder, replacing
+    from robocas_ms3.scenes.task_specs import TASKS
     from robocas_ms3.tasks.transfer import TransferEnv
 
     shader = {"shader_pack": cfg.shader}
@@ -109,7 +109,7 @@ def _require_gpu(shader: str) -> None:
     """A software renderer says that it traces rays, and takes hours for a picture."""
     import sapien
 
-    from robocas_ms3.errors import RobocasError
+    from robocas_ms3.core.errors import RobocasError
 
     try:
         sapien.Device("cuda")

@@ -34,7 +34,7 @@ def misspelt(of_command: type, prog: str, words: Sequence[str]) -> str:
         prog: what it is called.
         words: after that.
     """
-    from robocas_ms3.strict import nearest
+    from robocas_ms3.core.strict import nearest
 
     options = list(_options(of_command))
     known = {name: option for option in options for name in option.names}

@@ -49,8 +49,8 @@ def main(cfg: Split) -> int:
     """Split, with a progress bar; gives the exit code."""
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
+    from robocas_ms3.core.words import count_of
     from robocas_ms3.datasets.manage.splitting import Share, resplit, write_parts
-    from robocas_ms3.words import count_of
 
     check(cfg)
     whole = cfg.out is not None and not cfg.parts  # each part is one task or target, which can't be cut by itself
@@ -82,7 +82,7 @@ def check(cfg: Split) -> None:
     Raises:
         DatasetError: none, several, or half of one.
     """
-    from robocas_ms3.errors import DatasetError
+    from robocas_ms3.core.errors import DatasetError
 
     sides = cfg.out_train is not None or cfg.out_val is not None
     ways = [cfg.in_place, sides, cfg.out is not None]

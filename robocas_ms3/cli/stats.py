@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from robocas_ms3.cli.options import Maybe
-from robocas_ms3.words import count_of
+from robocas_ms3.core.words import count_of
 
 
 @dataclass

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from robocas_ms3.words import printable
+from robocas_ms3.core.words import printable
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -100,9 +100,9 @@ def _default_out(cfg: Train) -> Path:
 def changes_of(cfg: Train) -> dict[str, Any]:
     """What differs from the defaults, as the file and the options have it; options win."""
     from robocas_ms3.baselines.begin import merged
-    from robocas_ms3.config.overrides import parse_override
-    from robocas_ms3.documents import load_yaml
-    from robocas_ms3.errors import TrainingError
+    from robocas_ms3.core.documents import load_yaml
+    from robocas_ms3.core.errors import TrainingError
+    from robocas_ms3.scenes.config.overrides import parse_override
 
     found: dict[str, Any] = {}
     if cfg.config is not None:

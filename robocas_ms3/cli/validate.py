@@ -13,8 +13,8 @@ import tyro
 from robocas_ms3.cli.bars import bar
 from robocas_ms3.cli.options import Maybe
 from robocas_ms3.cli.terminal import say, say_lines
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.words import count_of
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import count_of
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.checks.dataset import Report
@@ -79,8 +79,8 @@ def main(cfg: Validate) -> int:
 
 def _replay(root: Path, pack: str | None) -> ReplayReport:
 
+    from robocas_ms3.core.processes import use_one_torch_thread
     from robocas_ms3.datasets.checks.replay import replay_dataset
-    from robocas_ms3.processes import use_one_torch_thread
 
     use_one_torch_thread()
     with bar("episodes replayed", transient=True) as shown:

@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from robocas_ms3.cli.options import Maybe, Several
-from robocas_ms3.words import count_of
+from robocas_ms3.core.words import count_of
 
 
 @dataclass
@@ -65,7 +65,7 @@ def main(cfg: View) -> int:
 def _write(cfg: View, out: Path, source) -> int:
     from robocas_ms3.cli.bars import bar
     from robocas_ms3.cli.terminal import say
-    from robocas_ms3.outputs import check_overwrite, claim_output
+    from robocas_ms3.core.outputs import check_overwrite, claim_output
     from robocas_ms3.viewer.export import export
 
     if cfg.overwrite:

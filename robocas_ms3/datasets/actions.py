@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.motion import stored_actions
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.demos.recordings.motion import stored_actions
 
 ACTION_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 """Motion in m and Euler xyz angles in rad, both in the EEF frame at the step; gripper command, 1 = open."""

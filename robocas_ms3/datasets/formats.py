@@ -13,11 +13,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.exits import no_exit
+from robocas_ms3.core.extensions import Table
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.exits import no_exit
-from robocas_ms3.extensions import Table
 
 GROUP = "robocas_ms3.formats"
 _log = logging.getLogger(__name__)

@@ -25,9 +25,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.language.embed import DIMENSIONS
-from robocas_ms3.language.templates import GOAL_TYPES
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.scenes.language.embed import DIMENSIONS
+from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 DataType = Literal["float32", "int64", "bool", "str"]
 

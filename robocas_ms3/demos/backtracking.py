@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable
 from typing import Any, Protocol, TypeVar
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.decisions import Effort
 
 T = TypeVar("T")

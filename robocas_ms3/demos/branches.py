@@ -20,11 +20,11 @@ from collections.abc import Callable, Iterable
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn, TypeVar
 
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.processes import SentError
 from robocas_ms3.demos.backtracking import DeadEnd, Tally, turns
 from robocas_ms3.demos.forking import Child, ChildCrash, ChildGone, fork, set_up_child
-from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort
-from robocas_ms3.processes import SentError
 
 T = TypeVar("T")
 

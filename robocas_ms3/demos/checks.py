@@ -8,18 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.benchmark.spec import SIM_FREQ
-from robocas_ms3.config import load_config_of
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.outputs import check_same
+from robocas_ms3.core.strict import check_number
 from robocas_ms3.demos.episode import EpisodeSettings
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import RobocasError
-from robocas_ms3.outputs import check_same
+from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
 from robocas_ms3.planning.backends import BACKENDS
-from robocas_ms3.recordings.seeds import GREATEST_SEED
 from robocas_ms3.robots.table import find_robot
+from robocas_ms3.scenes.config import load_config_of
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.strict import check_number
+from robocas_ms3.scenes.task_specs import SIM_FREQ, TASKS
 
 WEIGHTS = "after_policy_weights"
 """Of ``run.json``; outputs that are older do not say."""

@@ -10,8 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.language.templates import subgoal
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.skills.arm import Arm, moved_back, raised
@@ -19,6 +18,7 @@ from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_ba
 from robocas_ms3.planning.skills.removing import hang_clear
 from robocas_ms3.planning.skills.retreating import BACK_OUT, plan_back_out
 from robocas_ms3.planning.skills.stance import drive_to_basket
+from robocas_ms3.scenes.language.templates import subgoal
 
 BRAKE_SECONDS = 0.2  # held where it was taken over, until it stands; a step of a dataset at 5 Hz
 LIFT = 0.10  # m that a held target is raised before it is carried, as after a grasp (`skills.grasping`)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.poses import from_wxyz, inverse
+from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.robots.ee_controller import RoboCASEEPoseController
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.robots.forward import chain

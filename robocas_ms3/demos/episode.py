@@ -6,13 +6,13 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
-from robocas_ms3.benchmark.spec import STANDARD_FREQ
-from robocas_ms3.config import TaskConfig
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.demos.ledger import Failure
-from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.backends import DEFAULT
 from robocas_ms3.planning.seconds import Seconds
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
+from robocas_ms3.scenes.config import TaskConfig
+from robocas_ms3.scenes.task_specs import STANDARD_FREQ
 
 AFTER_STEPS = 5, 60
 NOISY = "noisy_"  # begins the reasons of attempts that failed for noise alone

@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import torch
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
 
 _PR_SET_PDEATHSIG = 1
 _log = logging.getLogger(__name__)

@@ -11,14 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from robocas_ms3.demos.checks import WEIGHTS, check_arguments, check_same_run
-from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
-from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_stage, failed_attempts
-from robocas_ms3.demos.takeover import Takeover
-from robocas_ms3.demos.workers import generate_seeds, shard_name
-from robocas_ms3.errors import DatasetError, RobocasError
-from robocas_ms3.files import flush_to_disk, make_folder, write_json
-from robocas_ms3.outputs import (
+from robocas_ms3.core.errors import DatasetError, RobocasError
+from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
+from robocas_ms3.core.outputs import (
     check_one_way,
     check_overwrite,
     check_run,
@@ -27,12 +22,17 @@ from robocas_ms3.outputs import (
     locked_folder,
     while_there,
 )
+from robocas_ms3.core.processes import Limits, Worker
+from robocas_ms3.demos.checks import WEIGHTS, check_arguments, check_same_run
+from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
+from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_stage, failed_attempts
+from robocas_ms3.demos.recordings.entries import read_json, reason
+from robocas_ms3.demos.recordings.merging import merge
+from robocas_ms3.demos.recordings.stored import open_trajectory
+from robocas_ms3.demos.recordings.versions import versions
+from robocas_ms3.demos.takeover import Takeover
+from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.planning.seconds import Seconds
-from robocas_ms3.processes import Limits, Worker
-from robocas_ms3.recordings.entries import read_json, reason
-from robocas_ms3.recordings.merging import merge
-from robocas_ms3.recordings.stored import open_trajectory
-from robocas_ms3.recordings.versions import versions
 
 RUN = "run.json"
 _BEGINNINGS = {RUN, FAILURES_FILE, "episodes"}  # of a run that has not finished a seed yet

@@ -11,18 +11,20 @@ import gymnasium as gym
 import numpy as np
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import load_task_config
+from robocas_ms3.core.errors import EpisodeLost, LayoutError, PlanningFailed
+from robocas_ms3.core.extensions import load
 from robocas_ms3.demos.branches import ForkedBranches
 from robocas_ms3.demos.completing import complete
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.forking import say_once, why_not_fork
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
+from robocas_ms3.demos.recordings.environment import RecordedEnv
+from robocas_ms3.demos.recordings.motion import sample_stride
+from robocas_ms3.demos.recordings.subgoals import SubGoal
+from robocas_ms3.demos.recordings.writing import EpisodeRecorder
 from robocas_ms3.demos.resimulation import Resimulation
 from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.demos.trials import Trials
-from robocas_ms3.errors import EpisodeLost, LayoutError, PlanningFailed
-from robocas_ms3.extensions import load
 from robocas_ms3.planning.backends import make_planner
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.decisions import Decisions, StraightDecisions
@@ -31,11 +33,9 @@ from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.reachability import Reachability
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.retreating import back_out
-from robocas_ms3.recordings.environment import RecordedEnv
-from robocas_ms3.recordings.motion import sample_stride
-from robocas_ms3.recordings.subgoals import SubGoal
-from robocas_ms3.recordings.writing import EpisodeRecorder
 from robocas_ms3.robots.table import DEFAULT, find_robot
+from robocas_ms3.scenes.config import load_task_config
+from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.base import RoboCASEnv
 
 

@@ -10,8 +10,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from robocas_ms3 import ledger
-from robocas_ms3.recordings.seeds import GREATEST_SEED
+from robocas_ms3.core import ledger
+from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
 
 FAILURES_FILE = "failures.jsonl"
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.environment import RecordedEnv
-from robocas_ms3.recordings.motion import Array
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.demos.recordings.environment import RecordedEnv
+from robocas_ms3.demos.recordings.motion import Array
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.tasks.transfer import TransferEnv

@@ -11,9 +11,9 @@ import numpy as np
 from mani_skill.trajectory.utils import dict_to_list_of_dicts
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.entries import read_reset, was_taken_over
-from robocas_ms3.recordings.stored import (
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.demos.recordings.entries import read_reset, was_taken_over
+from robocas_ms3.demos.recordings.stored import (
     BODIES,
     check_bodies,
     check_finite,

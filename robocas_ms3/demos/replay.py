@@ -14,17 +14,17 @@ import numpy as np
 import torch
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES, parse_obs_mode_to_struct
 
+from robocas_ms3.core.errors import DatasetError, RobocasError
+from robocas_ms3.core.files import make_folder
+from robocas_ms3.core.outputs import claim_output
+from robocas_ms3.core.strict import check_number
 from robocas_ms3.demos.convert_actions import CONVERTIBLE, convert_action
 from robocas_ms3.demos.recorded import Recorded
-from robocas_ms3.errors import DatasetError, RobocasError
-from robocas_ms3.files import make_folder
-from robocas_ms3.outputs import claim_output
-from robocas_ms3.recordings.entries import read_json
-from robocas_ms3.recordings.environment import RecordedEnv, read_env
-from robocas_ms3.recordings.merging import merge
-from robocas_ms3.recordings.stored import open_trajectory
-from robocas_ms3.recordings.writing import EpisodeRecorder
-from robocas_ms3.strict import check_number
+from robocas_ms3.demos.recordings.entries import read_json
+from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env
+from robocas_ms3.demos.recordings.merging import merge
+from robocas_ms3.demos.recordings.stored import open_trajectory
+from robocas_ms3.demos.recordings.writing import EpisodeRecorder
 from robocas_ms3.tasks.base import RoboCASEnv
 
 

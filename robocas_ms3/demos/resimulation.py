@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable
 from typing import TypeVar
 
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.demos.backtracking import DeadEnd, Tally, turns
-from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.decisions import ONE_BY_ONE, Effort
 
 T = TypeVar("T")

@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import EpisodeLost
+from robocas_ms3.core.errors import EpisodeLost
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import EpisodeLost
 from robocas_ms3.demos.episode import NOISY
 from robocas_ms3.demos.open_loop import Noise, OpenLoop
+from robocas_ms3.demos.recordings.motion import Motion, sample_states
 from robocas_ms3.demos.takeover import Takeover
-from robocas_ms3.errors import EpisodeLost
-from robocas_ms3.recordings.motion import Motion, sample_states
 
 # m by which the target may be off the recording at the end of a part. What else lies about may roll elsewhere: where
 # that matters, what comes next goes wrong, and shows it.

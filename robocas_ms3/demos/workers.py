@@ -10,10 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from robocas_ms3.core.processes import NO_LIMITS, Limits, Pool, Worker, use_one_torch_thread
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.takeover import Takeover
-from robocas_ms3.processes import NO_LIMITS, Limits, Pool, Worker, use_one_torch_thread
 
 if TYPE_CHECKING:
     from robocas_ms3.demos.generator import EpisodeGenerator

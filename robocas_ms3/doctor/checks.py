@@ -22,7 +22,7 @@ from typing import Literal
 from packaging.requirements import Requirement
 from packaging.version import Version
 
-from robocas_ms3 import paths
+from robocas_ms3.core import paths
 from robocas_ms3.doctor.probes import ABSENT
 
 DISTRIBUTION = "robocas-ms3"

@@ -81,7 +81,7 @@ def planner() -> str:
 def packs() -> str:
     """Load and verify every asset pack."""
     from robocas_ms3.assets.pack import available_packs, load_pack
-    from robocas_ms3.words import count_of
+    from robocas_ms3.core.words import count_of
 
     loaded = [load_pack(name) for name in available_packs()]
     if not any(pack.name == "builtin" for pack in loaded):
@@ -115,7 +115,7 @@ def _main() -> int:
         sys.stderr.write(f"{error}\n")
         return ABSENT
     except Exception as error:  # whatever the trial meets is its answer
-        from robocas_ms3.words import printable
+        from robocas_ms3.core.words import printable
 
         sys.stderr.write(printable(f"{type(error).__name__}: {' '.join(str(error).split())}") + "\n")
         return 1

@@ -17,19 +17,19 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import load_task_config
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.processes import use_one_torch_thread
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.takeover import Takeover
-from robocas_ms3.errors import LayoutError
 from robocas_ms3.evaluation.policies import open_policy
 from robocas_ms3.evaluation.policy import Policy, Start, Wants
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.stage import looks
 from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, control_mode
-from robocas_ms3.processes import use_one_torch_thread
+from robocas_ms3.scenes.config import load_task_config
+from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import NumpyVectorEnv, RoboCASVectorEnv
 
 PROTOCOL = "paper-v1"

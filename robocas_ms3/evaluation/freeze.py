@@ -14,10 +14,11 @@ from pydantic import Field
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import TaskConfig, load_task_config, shipped_configs
-from robocas_ms3.documents import DocumentError, load_yaml
-from robocas_ms3.errors import EvaluationError, LayoutError
+from robocas_ms3.core.documents import DocumentError, load_yaml
+from robocas_ms3.core.errors import EvaluationError, LayoutError
+from robocas_ms3.core.files import make_folder, replacing, replacing_folder
+from robocas_ms3.core.names import LONGEST
+from robocas_ms3.core.strict import StrictModel, parse
 from robocas_ms3.evaluation.protocol import (
     CONFIG_NAME,
     CONFIGS,
@@ -29,12 +30,11 @@ from robocas_ms3.evaluation.protocol import (
     Episode,
     Protocol,
 )
-from robocas_ms3.files import make_folder, replacing, replacing_folder
-from robocas_ms3.names import LONGEST
 from robocas_ms3.robots.table import DEFAULT
+from robocas_ms3.scenes.config import TaskConfig, load_task_config, shipped_configs
 from robocas_ms3.scenes.frozen import write_frozen
 from robocas_ms3.scenes.layout import Layout
-from robocas_ms3.strict import StrictModel, parse
+from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.transfer import TransferEnv
 
 NO_PLAN = "no plan of a protocol"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
-from robocas_ms3.strict import mistakes
+from robocas_ms3.core.strict import mistakes
 
 
 class _Move(BaseModel):

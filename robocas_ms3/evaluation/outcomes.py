@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator
 
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.benchmark.spec import STAGES as STAGES_ON_THE_WAY
+from robocas_ms3.core.words import printable
 from robocas_ms3.evaluation.orders import check_order, order_of
 from robocas_ms3.evaluation.protocol import Episode
-from robocas_ms3.words import printable
+from robocas_ms3.scenes.task_specs import STAGES as STAGES_ON_THE_WAY
+from robocas_ms3.scenes.task_specs import TASKS
 
 if TYPE_CHECKING:
     from robocas_ms3.evaluation.rollout import Rollout  # which imports the tasks; results are read without

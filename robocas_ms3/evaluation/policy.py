@@ -11,10 +11,10 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.exits import no_exit
+from robocas_ms3.core.files import json_text
 from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.exits import no_exit
-from robocas_ms3.files import json_text
 from robocas_ms3.robots.table import DEFAULT
 
 Language = Literal["none", "text", "embedding"]

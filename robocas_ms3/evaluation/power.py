@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import root_scalar
 from scipy.stats import binom, norm
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.statistics import Comparison
 
 

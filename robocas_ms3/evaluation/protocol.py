@@ -22,17 +22,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config.load import check_no_base
-from robocas_ms3.documents import ARRAYS_LIMIT, JSON_LIMIT, DocumentError, load_yaml, read_bytes, read_text
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.documents import ARRAYS_LIMIT, JSON_LIMIT, DocumentError, load_yaml, read_bytes, read_text
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.names import LONGEST, FileName
+from robocas_ms3.core.paths import protocols_dir
+from robocas_ms3.core.strict import StrictModel, nearest, parse, parse_json
+from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Wants
-from robocas_ms3.names import LONGEST, FileName
-from robocas_ms3.paths import protocols_dir
-from robocas_ms3.recordings.seeds import GREATEST_SEED
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
-from robocas_ms3.strict import StrictModel, nearest, parse, parse_json
+from robocas_ms3.scenes.config.load import check_no_base
+from robocas_ms3.scenes.task_specs import TASKS
 
 NO_RULES = "no rules of a protocol"
 DEFAULT_HZ = 20  # where neither protocol nor policy says

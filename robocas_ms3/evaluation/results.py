@@ -18,14 +18,14 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.files import json_text, make_folder, replacing_folder, write_json
+from robocas_ms3.core.ledger import Ledger
+from robocas_ms3.core.outputs import check_absent, check_run
+from robocas_ms3.core.strict import parse, parse_json
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.statistics import Share, share
-from robocas_ms3.files import json_text, make_folder, replacing_folder, write_json
-from robocas_ms3.ledger import Ledger
-from robocas_ms3.outputs import check_absent, check_run
-from robocas_ms3.strict import parse, parse_json
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")

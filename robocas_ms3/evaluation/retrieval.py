@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from robocas_ms3.arrays import as_tensor, choose, native, none
+from robocas_ms3.core.arrays import as_tensor, choose, native, none
 from robocas_ms3.tasks.search import ENVS_AT_ONCE, RoboCASSearchEnv
 from robocas_ms3.tasks.transfer import Moment
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import EvaluationError, PolicyFailed
+from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Observations, Policy, Start, Wants, policy_code, privileged
 from robocas_ms3.evaluation.tracking import MEASURES, summed
-from robocas_ms3.language.embed import TextEmbedder
+from robocas_ms3.scenes.language.embed import TextEmbedder
 
 NOT_FINITE = "the policy's action is not finite"
 _WELDS = "welds"  # of `weld`, where there is one

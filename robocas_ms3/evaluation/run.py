@@ -11,8 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
+from robocas_ms3.core.errors import EvaluationError, WorkerDied
+from robocas_ms3.core.outputs import locked_folder, while_there
+from robocas_ms3.core.processes import NO_LIMITS, Limits
+from robocas_ms3.core.strict import nearest
 from robocas_ms3.datasets.writing.render import require_renderer
-from robocas_ms3.errors import EvaluationError, WorkerDied
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Policy, describe
@@ -20,9 +23,6 @@ from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
 from robocas_ms3.evaluation.rollout import Rollout, Rollouts, Rules
 from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
 from robocas_ms3.evaluation.weld import refuse
-from robocas_ms3.outputs import locked_folder, while_there
-from robocas_ms3.processes import NO_LIMITS, Limits
-from robocas_ms3.strict import nearest
 from robocas_ms3.tasks.vector.backend import Backend, choose_backend
 
 TRIES = 2

@@ -6,11 +6,11 @@ from functools import partial
 from typing import Any
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.benchmark import TASKS
 from robocas_ms3.evaluation.policy import CAMERAS, Start, Wants
 from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
 from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, control_mode
 from robocas_ms3.scenes.frozen import FrozenLayouts
+from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import make_vec
 
 _UNSEEN = 8  # pixels a side of cameras that nobody asked for, which are rendered all the same

@@ -10,7 +10,7 @@ import torch
 from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS, Motion
 from robocas_ms3.evaluation.policy import Reference
 from robocas_ms3.evaluation.tracking import Tracker

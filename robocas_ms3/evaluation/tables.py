@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 
+from robocas_ms3.core.words import count_of, in_markdown
 from robocas_ms3.evaluation.orders import orders
 from robocas_ms3.evaluation.outcomes import STAGES, Outcome
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Share, success_by
-from robocas_ms3.words import count_of, in_markdown
 
 P_VIS_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 WELDED = (

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from robocas_ms3.arrays import as_float, as_tensor, greater, length, native
+from robocas_ms3.core.arrays import as_float, as_tensor, greater, length, native
 from robocas_ms3.evaluation.retrieval import Retrieval
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.bodies import link_poses

@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from robocas_ms3.benchmark import TASKS
+from robocas_ms3.core.words import count_of
 from robocas_ms3.evaluation.outcomes import Outcome, failure_stage
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.words import count_of
+from robocas_ms3.scenes.task_specs import TASKS
 
 
 def problems(result: Result, protocol: LoadedProtocol) -> list[str]:

@@ -11,8 +11,9 @@ from typing import Any
 import imageio.v2 as imageio
 import torch
 
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.files import make_folder, replacing
 from robocas_ms3.datasets.writing.render import require_renderer
-from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Policy
 from robocas_ms3.evaluation.protocol import LoadedProtocol
@@ -21,7 +22,6 @@ from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.stage import make_env, object_ids, rate_of, start_of
 from robocas_ms3.evaluation.weld import refuse
-from robocas_ms3.files import make_folder, replacing
 
 SIZE = (480, 360)  # pixels
 _FRAMES = 5  # a second of the scene

@@ -12,7 +12,7 @@ from typing import Any
 import sapien
 import torch
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.tasks import terms
 
 RAISED = 0.03  # m above where it stood (evaluation_v0.md)

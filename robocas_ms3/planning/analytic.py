@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import Array
 

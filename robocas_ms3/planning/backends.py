@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from robocas_ms3.extensions import Table
+from robocas_ms3.core.extensions import Table
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.table import RobotSpec

@@ -13,7 +13,7 @@ import fcl
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import RobotDescriptionError
+from robocas_ms3.core.errors import RobotDescriptionError
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.shapes import convex_hull, fcl_convex

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
 
 T = TypeVar("T")
 TRIES = 3  # candidates of one decision that are gone on from before the decision before it is made otherwise

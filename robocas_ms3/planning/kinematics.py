@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import Array
 

@@ -20,12 +20,12 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.pose import to_sapien_pose
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.planning import backends
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.scene import seen_from
 from robocas_ms3.planning.validation import require_finite
-from robocas_ms3.poses import from_wxyz, inverse
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.table import RobotSpec

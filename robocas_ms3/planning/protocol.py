@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
 
 Array = NDArray[np.float64]
 

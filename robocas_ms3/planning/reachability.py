@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.extensions import load
+from robocas_ms3.core.extensions import load
 from robocas_ms3.planning.chain import ArmChain, turn_between
 from robocas_ms3.planning.protocol import Array
 

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import PlanningFailed, RobocasError
+from robocas_ms3.core.errors import PlanningFailed, RobocasError
 from robocas_ms3.planning.chain import turn_between
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.planning.kinematics import follow_line

@@ -11,8 +11,8 @@ from mani_skill.utils.structs import Articulation
 
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.pack import Part
+from robocas_ms3.core.poses import from_wxyz, inverse, transform
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape
-from robocas_ms3.poses import from_wxyz, inverse, transform
 from robocas_ms3.tasks.transfer import TransferEnv
 
 # Upstream's: samples of the meshes at 5 mm, none farther than 1.5 m from the robot

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.documents import DocumentError, load_json
-from robocas_ms3.errors import PlanError
-from robocas_ms3.outputs import check_same
+from robocas_ms3.core.documents import DocumentError, load_json
+from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.outputs import check_same
+from robocas_ms3.core.strict import parse
+from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import PLAN
-from robocas_ms3.recordings.versions import versions
-from robocas_ms3.strict import parse
 
 FREE = frozenset({"description", "limits"})
 """Keys of a plan that may be others when it goes on: no episode depends on them."""

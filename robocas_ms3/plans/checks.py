@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from robocas_ms3.errors import MissingExtraError, PlanError
+from robocas_ms3.core.errors import MissingExtraError, PlanError
 from robocas_ms3.plans.plan import Plan
 
 
@@ -13,15 +13,15 @@ def check_plan(plan: Plan) -> None:
         RobocasError: a rate, a size or a pack will not do, or an extra is missing.
     """
     from robocas_ms3.demos.checks import check_arguments
+    from robocas_ms3.demos.recordings.motion import sample_stride
     from robocas_ms3.plans.record import settings_of
-    from robocas_ms3.recordings.motion import sample_stride
 
     for number, part in enumerate(plan.parts):
         check_arguments(settings_of(plan, number), episodes=part.episodes, first_seed=part.seed, jobs=1)
     if plan.makes_datasets:
         sample_stride(plan.control_freq, plan.rate)
         if plan.embeddings:
-            from robocas_ms3.language.embed import TextEmbedder
+            from robocas_ms3.scenes.language.embed import TextEmbedder
 
             TextEmbedder()  # says what is missing; loads nothing
         if "lerobot" in plan.formats:

@@ -31,8 +31,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from robocas_ms3.errors import PlanError
-from robocas_ms3.files import make_folder
+from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.files import make_folder
 
 LEASE = 60.0
 """Seconds without news after which the holder of a claim counts as dead."""

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from robocas_ms3.documents import DocumentError, load_json
-from robocas_ms3.errors import PlanError
-from robocas_ms3.files import write_json
+from robocas_ms3.core.documents import DocumentError, load_json
+from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.files import write_json
 from robocas_ms3.plans.claims import LEASE, age_of, claimed, claims_of, is_of_here, lease_of, read_claim
 from robocas_ms3.plans.units import DRIVER
 

@@ -12,23 +12,23 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.core.documents import DAMAGED, load_array, load_json
+from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.files import flush_to_disk, json_text, make_folder, replacing, write_json
+from robocas_ms3.core.outputs import sweep
+from robocas_ms3.core.processes.child import Limits
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.provenance import recording_entry
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.plan import dataset_settings, header
-from robocas_ms3.documents import DAMAGED, load_array, load_json
-from robocas_ms3.errors import PlanError
-from robocas_ms3.files import flush_to_disk, json_text, make_folder, replacing, write_json
-from robocas_ms3.outputs import sweep
+from robocas_ms3.demos.recordings.entries import reason
+from robocas_ms3.demos.recordings.merging import damage_of, merge
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.sides import rule_of, sides_of
 from robocas_ms3.plans.units import EPISODES, REPORT, UNITS, Outcome, Task, Unit
-from robocas_ms3.processes.child import Limits
-from robocas_ms3.recordings.entries import reason
-from robocas_ms3.recordings.merging import damage_of, merge
-from robocas_ms3.recordings.reading import TrajectoryFile
 from robocas_ms3.scenes.frozen import join_frozen
-from robocas_ms3.words import count_of
 
 LAYOUTS, DEMOS, DATASETS, STATISTICS = "layouts", "demos", "datasets", "statistics"
 TRAJECTORY = "trajectory.h5"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import load_config_of
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.plans.units import Task
 from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.bank import layout_bank
+from robocas_ms3.scenes.config import load_config_of
 from robocas_ms3.scenes.frozen import write_frozen
 from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.task_specs import TASKS
 
 
 class LayoutMaker:

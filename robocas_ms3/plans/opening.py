@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from robocas_ms3.errors import MissingExtraError, PlanError
+from robocas_ms3.core.errors import MissingExtraError, PlanError
 from robocas_ms3.plans.plan import Plan, check_packs
 
 

@@ -10,15 +10,15 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from robocas_ms3.assets.pack import MANIFEST, pack_folders, sha256
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import load_config_of, shipped_configs
+from robocas_ms3.core.documents import DocumentError, load_yaml
+from robocas_ms3.core.errors import PlanError, RobocasError
+from robocas_ms3.core.paths import plans_dir
+from robocas_ms3.core.strict import StrictModel, nearest, parse
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
-from robocas_ms3.documents import DocumentError, load_yaml
-from robocas_ms3.errors import PlanError, RobocasError
-from robocas_ms3.paths import plans_dir
+from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
 from robocas_ms3.plans.settings import LimitsConfig, PartConfig, PicturesConfig, RecordingConfig, SplitConfig
-from robocas_ms3.recordings.seeds import GREATEST_SEED
-from robocas_ms3.strict import StrictModel, nearest, parse
+from robocas_ms3.scenes.config import load_config_of, shipped_configs
+from robocas_ms3.scenes.task_specs import TASKS
 
 Stage = Literal["layouts", "demonstrations", "datasets", "statistics"]
 _ALWAYS = "builtin"  # the pack of the furniture

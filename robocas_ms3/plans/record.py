@@ -6,16 +6,16 @@ import os
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.files import write_json
+from robocas_ms3.core.processes import use_one_torch_thread
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.files import write_json
+from robocas_ms3.demos.recordings.entries import read_json
 from robocas_ms3.plans.layouts import LayoutMaker
 from robocas_ms3.plans.opening import opening
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import Task
-from robocas_ms3.processes import use_one_torch_thread
-from robocas_ms3.recordings.entries import read_json
 
 
 def settings_of(plan: Plan, part: int) -> EpisodeSettings:

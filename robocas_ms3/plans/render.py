@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.processes import use_one_torch_thread
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.frames import FrameSource, OpenSource
 from robocas_ms3.datasets.writing.players import RecordingPlayer, Request, open_env
 from robocas_ms3.datasets.writing.writer import write_episode
+from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.plans.opening import opening
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import Task
-from robocas_ms3.processes import use_one_torch_thread
-from robocas_ms3.recordings.environment import RecordedEnv
 
 
 class Renders:
@@ -60,7 +60,7 @@ class Renders:
             return self._open_source(env, control_mode, pictures)
 
     def _embed(self, texts: list[str]) -> NDArray[np.float32]:
-        from robocas_ms3.language.embed import TextEmbedder
+        from robocas_ms3.scenes.language.embed import TextEmbedder
 
         self._embedder = self._embedder or TextEmbedder()
         # one at a time: in a batch the last bits depend on the others, and which are known already on who did what

@@ -14,10 +14,10 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from robocas_ms3.errors import PlanError
-from robocas_ms3.exits import responsive
-from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import (
+from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.exits import responsive
+from robocas_ms3.core.files import make_folder, write_json
+from robocas_ms3.core.outputs import (
     check_one_way,
     check_overwrite,
     check_run,
@@ -28,6 +28,7 @@ from robocas_ms3.outputs import (
     sweep,
     while_there,
 )
+from robocas_ms3.core.words import count_of
 from robocas_ms3.plans.begun import check_plan_of, content_of
 from robocas_ms3.plans.checks import check_plan
 from robocas_ms3.plans.claims import refuse_claimed
@@ -37,7 +38,6 @@ from robocas_ms3.plans.join import has_begun, join
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.tally import Tally, tally_path
 from robocas_ms3.plans.units import CLAIMS, DRIVER, PLAN, Outcome, Task, Unit, outcomes
-from robocas_ms3.words import count_of
 
 _AHEAD = 2  # units a slot that are under way, so that none waits for the next
 _ROUNDS = 3  # so often is made again what a disk does not keep

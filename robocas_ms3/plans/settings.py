@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from robocas_ms3.core.strict import StrictModel
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.recordings.seeds import GREATEST_SEED
-from robocas_ms3.strict import StrictModel
+from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
 
 Side = Literal["train", "val"]
 

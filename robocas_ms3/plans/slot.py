@@ -9,15 +9,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.errors import DatasetError, LayoutError, PlanError, PlanningFailed, RobocasError, SimulationError
-from robocas_ms3.files import flush_to_disk, make_folder, write_json
-from robocas_ms3.outputs import sweep
+from robocas_ms3.core.errors import DatasetError, LayoutError, PlanError, PlanningFailed, RobocasError, SimulationError
+from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
+from robocas_ms3.core.outputs import sweep
+from robocas_ms3.core.processes import Worker
+from robocas_ms3.core.processes.child import Child, ChildDied, NotBegun, Stopped
+from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.plans.begun import check_versions
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import DONE, EPISODES, Death, Outcome, Task, Unit, deaths, ledger, outcomes
-from robocas_ms3.processes import Worker
-from robocas_ms3.processes.child import Child, ChildDied, NotBegun, Stopped
-from robocas_ms3.recordings.versions import versions
 
 TRIES = 2
 """How often a seed is begun again whose process died, counting the first time."""

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from robocas_ms3.documents import JSON_LIMIT, DocumentError, read_bytes
-from robocas_ms3.files import write_json
+from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, read_bytes
+from robocas_ms3.core.files import write_json
+from robocas_ms3.core.strict import validate_json
 from robocas_ms3.plans.units import UNITS, Count, Outcome, Seconds
-from robocas_ms3.strict import validate_json
 
 RECENT = 600.0  # s that a rate is taken over
 

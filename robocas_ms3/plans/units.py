@@ -14,10 +14,10 @@ from typing import Annotated
 
 from pydantic import Field
 
+from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.ledger import Ledger
+from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
 from robocas_ms3.plans.plan import Plan
-from robocas_ms3.recordings.seeds import GREATEST_SEED
 
 PLAN, REPORT = "plan.json", "report.json"
 UNITS, LEDGER, DEATHS, DONE = "units", "seeds.jsonl", "deaths.jsonl", "done.json"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from math import pi
 from typing import ClassVar
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
 
 Limits = tuple[tuple[float, float], ...]
 _OF_EACH_JOINT = ("joints", "limits")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import RobotDescriptionError
+from robocas_ms3.core.errors import RobotDescriptionError
 
 Array = NDArray[np.float64]
 FIX = "Correct the file, or export it again."

@@ -8,7 +8,7 @@ import torch
 from mani_skill.agents.controllers import PDJointPosController
 from sapien.physx import PhysxArticulationJoint
 
-from robocas_ms3.arrays import as_tensor, clamp, native
+from robocas_ms3.core.arrays import as_tensor, clamp, native
 
 # Distances of a joint from its drive target (rad, m) that no motion explains: the state was set from outside.
 ARM_SET_FROM_OUTSIDE, HELD_SET_FROM_OUTSIDE = 0.3, 0.02

@@ -14,8 +14,8 @@ import torch
 from mani_skill.agents.controllers import PDEEPosController, PDEEPoseController, PDEEPoseControllerConfig
 from mani_skill.utils.structs import Link, Pose
 
-from robocas_ms3.arrays import as_double, as_float, as_tensor, choose, clamp, every, join, length, native, none
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.arrays import as_double, as_float, as_tensor, choose, clamp, every, join, length, native, none
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots import rotations
 from robocas_ms3.robots.drives import ARM_SET_FROM_OUTSIDE, EvenDrives
 from robocas_ms3.robots.ee_deltas import ee_delta_target

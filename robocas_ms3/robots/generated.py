@@ -9,8 +9,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from robocas_ms3.documents import load_json
-from robocas_ms3.files import make_folder, naming
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.files import make_folder, naming
 
 
 def made_once(folder: Path, make: Callable[[Path], None]) -> None:

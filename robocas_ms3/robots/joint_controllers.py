@@ -13,7 +13,7 @@ from mani_skill.agents.controllers import (
     PDJointPosMimicControllerConfig,
 )
 
-from robocas_ms3.arrays import as_tensor, choose, clamp, join, native
+from robocas_ms3.core.arrays import as_tensor, choose, clamp, join, native
 from robocas_ms3.robots.drives import (
     ARM_SET_FROM_OUTSIDE,
     HELD_SET_FROM_OUTSIDE,

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from robocas_ms3.arrays import Array, choose, clamp, join, matmul, none
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.arrays import Array, choose, clamp, join, matmul, none
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.forward import read_joints
 from robocas_ms3.robots.rotations import left_matrix, positive
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from robocas_ms3.arrays import Array, as_double, as_float, choose, join, matmul
+from robocas_ms3.core.arrays import Array, as_double, as_float, choose, join, matmul
 
 
 def from_euler(angles: Array) -> Array:

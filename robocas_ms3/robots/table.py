@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
-from robocas_ms3.errors import ExtensionError
-from robocas_ms3.extensions import Table
+from robocas_ms3.core.errors import ExtensionError
+from robocas_ms3.core.extensions import Table
 from robocas_ms3.robots.description import MOBILE_PANDA, RobotDescription
 from robocas_ms3.robots.urdf import RobotFiles, robot_files
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from robocas_ms3.errors import RobocasError
-from robocas_ms3.paths import cache_dir
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.robots.description import MOBILE_PANDA as c
 from robocas_ms3.robots.generated import made_once
 

@@ -13,7 +13,7 @@ from mani_skill.utils.structs.render_camera import RenderCamera
 
 from robocas_ms3.assets.pack import LoadedObject, VisualLevel
 from robocas_ms3.assets.spawn import spawn, spawn_articulation
-from robocas_ms3.config import TaskConfig
+from robocas_ms3.scenes.config import TaskConfig
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.randomise import draw_camera_shift, draw_finishes, draw_lights

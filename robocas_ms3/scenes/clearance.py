@@ -12,10 +12,10 @@ import numpy as np
 from robocas_ms3.assets.hulls import Hull
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.pack import LoadedFurniture
-from robocas_ms3.config.task import TaskConfig
-from robocas_ms3.errors import ConfigError
-from robocas_ms3.poses import transform
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.core.poses import transform
 from robocas_ms3.robots.description import Envelope, RobotDescription
+from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.placement import Array, Region
 
 _TOUCHING = 0.005  # m by which hulls may overlap: they are coarser than what is shown

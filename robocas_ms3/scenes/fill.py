@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable
 from functools import partial
 
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.processes import Calls, Pool
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.processes import Calls, Pool
 from robocas_ms3.scenes.bank import LayoutBank
 from robocas_ms3.scenes.table import Pair
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.documents import DAMAGED, load_array
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.files import replacing
+from robocas_ms3.core.documents import DAMAGED, load_array
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.files import replacing
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.table import as_records, check_record, read_record
 

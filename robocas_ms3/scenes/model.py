@@ -10,10 +10,10 @@ import numpy as np
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import Joint
 from robocas_ms3.assets.pack import LoadedFurniture, Pack
-from robocas_ms3.config.task import TaskConfig
-from robocas_ms3.poses import transform
+from robocas_ms3.core.poses import transform
 from robocas_ms3.robots.description import MOBILE_PANDA, RobotDescription
 from robocas_ms3.scenes.clearance import check_clearance
+from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.lookup import (
     check_joints,
     find_container,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.poses import planar
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.poses import planar
+from robocas_ms3.core.words import count_of
 from robocas_ms3.scenes.placement import Array, PlaceableObject, Region
-from robocas_ms3.words import count_of
 
 # Builtin products show their label to their own -y, and resting poses have no yaw of their own, so that in every one
 # the label looks to -y of the plane or up, text upright for someone who stands at -y.

@@ -8,9 +8,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.poses import planar
-from robocas_ms3.words import count_of
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.poses import planar
+from robocas_ms3.core.words import count_of
 
 Array = NDArray[np.float64]
 

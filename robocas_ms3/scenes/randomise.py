@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.pack import LoadedFurniture
-from robocas_ms3.config.randomisation import CameraRandomisation
-from robocas_ms3.config.task import TaskConfig
+from robocas_ms3.scenes.config.randomisation import CameraRandomisation
+from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.placement import Array
 
 _ROOM, _LIGHTS, _CAMERAS = range(200, 203)  # streams; those of layouts are in sample.py

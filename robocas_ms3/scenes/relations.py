@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robocas_ms3.config.relations import Relation
+from robocas_ms3.scenes.config.relations import Relation
 from robocas_ms3.scenes.placement import Array
 
 MARGIN = 0.03  # m by which the named object differs from every other in what the relation compares

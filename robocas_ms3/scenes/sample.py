@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config.task import OrderlyLayout, ScatteredLayout, StackedLayout
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.poses import planar, transform
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.poses import planar, transform
+from robocas_ms3.scenes.config.task import OrderlyLayout, ScatteredLayout, StackedLayout
 from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout, ObjectIds
 from robocas_ms3.scenes.lookup import resolve_ids
 from robocas_ms3.scenes.model import SceneModel
@@ -22,6 +21,7 @@ from robocas_ms3.scenes.settle import settle
 from robocas_ms3.scenes.stacked import drop_heap
 from robocas_ms3.scenes.standing import place_basket, place_robot
 from robocas_ms3.scenes.targets import Arrangement, choose_target, target_rule
+from robocas_ms3.scenes.task_specs import TASKS
 
 # Every random decision of a scene has a stream of its own, so that a new one never shifts the others.
 _OBJECTS, _LAYOUT, _TARGET, _ROBOT, _BASKET, _COUNT = range(6)

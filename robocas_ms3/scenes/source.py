@@ -13,7 +13,7 @@ from typing import Any
 
 from sapien import physx
 
-from robocas_ms3.errors import LayoutError, SimulationError
+from robocas_ms3.core.errors import LayoutError, SimulationError
 from robocas_ms3.scenes.layout import Layout, ObjectIds
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
@@ -28,7 +28,7 @@ _PROGRAM = """
 import os, pickle, sys
 answers = os.fdopen(os.dup(1), "wb")
 os.dup2(2, 1)
-from robocas_ms3.errors import LayoutError
+from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.scenes.sample import sample_layout
 model = pickle.load(sys.stdin.buffer)
 while True:

@@ -22,11 +22,11 @@ from robocas_ms3.assets.physics import (
     pose_matrix,
     solid_of,
 )
-from robocas_ms3.config.task import StackedLayout
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.poses import planar, transform
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.poses import planar, transform
+from robocas_ms3.core.words import count_of
+from robocas_ms3.scenes.config.task import StackedLayout
 from robocas_ms3.scenes.placement import Array, Region
-from robocas_ms3.words import count_of
 
 BUCKET_SECONDS = 1.0  # at most, after the last one
 SPREAD_SECONDS, OPEN_SECONDS = 2.0, 0.5  # at most: within a fence along the sides of the region, and without it

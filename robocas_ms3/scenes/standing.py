@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 
 from robocas_ms3.assets.physics import TIME_STEP, Solid, add_body, add_fixed, engine_settings, new_scene, pose_matrix
-from robocas_ms3.config.randomisation import PoseRandomisation
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.poses import planar, transform
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.poses import planar, transform
 from robocas_ms3.robots.description import PANDA_ENVELOPE
+from robocas_ms3.scenes.config.randomisation import PoseRandomisation
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.settle import add_furniture

@@ -16,10 +16,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.documents import DAMAGED, check_regular
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.files import replacing
-from robocas_ms3.poses import from_wxyz, to_wxyz
+from robocas_ms3.core.documents import DAMAGED, check_regular
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.files import replacing
+from robocas_ms3.core.poses import from_wxyz, to_wxyz
 from robocas_ms3.scenes.layout import Layout, ObjectIds
 
 Engine = Literal["cpu", "gpu"]

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from robocas_ms3.assets.gripper import GRIPPER_RADIUS
 from robocas_ms3.assets.pack import LoadedObject
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.extensions import load
-from robocas_ms3.poses import transform
+from robocas_ms3.core.extensions import load
+from robocas_ms3.core.poses import transform
 from robocas_ms3.scenes.grasping import PREGRASP_DISTANCE, has_free_grasps
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.relations import related
+from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.scenes.visibility import PinholeCamera, object_mesh, top_down_camera, visible_shares
 
 

@@ -15,7 +15,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import Part, VisualLevel
-from robocas_ms3.poses import transform
+from robocas_ms3.core.poses import transform
 from robocas_ms3.scenes.placement import Array
 
 PixelBox = tuple[slice, slice]  # rows, columns

@@ -2,10 +2,10 @@
 
 import logging
 
-from robocas_ms3.benchmark import TASKS, TaskSpec
-from robocas_ms3.extensions import load
+from robocas_ms3.core.extensions import load
 from robocas_ms3.registration import register
 from robocas_ms3.robots.table import ROBOTS
+from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 from robocas_ms3.tasks.open_pick import RoboCASOpenPickEnv
 from robocas_ms3.tasks.pick import RoboCASPickEnv
 from robocas_ms3.tasks.registry import env_class

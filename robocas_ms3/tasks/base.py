@@ -7,8 +7,8 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from robocas_ms3.arrays import as_tensor, native, none
 from robocas_ms3.assets.pack import LoadedObject
+from robocas_ms3.core.arrays import as_tensor, native, none
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.bodies import link_poses
 from robocas_ms3.tasks.scene import SceneEnv

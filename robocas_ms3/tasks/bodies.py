@@ -11,7 +11,7 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Articulation, Link
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
 
 BODY = 13
 """Numbers of a body: position m, quaternion wxyz, linear velocity m/s, angular velocity rad/s, all in the world."""

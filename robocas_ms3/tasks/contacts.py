@@ -11,7 +11,7 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Link
 from numpy.typing import NDArray
 
-from robocas_ms3.arrays import as_tensor
+from robocas_ms3.core.arrays import as_tensor
 
 # m between bodies that can't have touched in the last physics step, at whose beginning contacts are found: more than
 # they go in 10 ms, at 4 m/s, and where PhysX begins to look for contacts

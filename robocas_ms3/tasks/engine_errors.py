@@ -9,7 +9,7 @@ import tempfile
 from contextlib import suppress
 from typing import IO
 
-from robocas_ms3.errors import SimulationError
+from robocas_ms3.core.errors import SimulationError
 
 _TELLS = re.compile(
     rb"\[SAPIEN\].*\[(?:critical|error)\].*"

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 
-from robocas_ms3.arrays import every, native
+from robocas_ms3.core.arrays import every, native
 from robocas_ms3.tasks import rewards, terms
 from robocas_ms3.tasks.base import RoboCASEnv
 

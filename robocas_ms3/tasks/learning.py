@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from robocas_ms3.arrays import as_tensor, choose, join, native
+from robocas_ms3.core.arrays import as_tensor, choose, join, native
 from robocas_ms3.tasks import rewards, terms
 from robocas_ms3.tasks.goals import DenseGoal
 from robocas_ms3.tasks.transfer import TransferEnv

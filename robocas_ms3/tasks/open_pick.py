@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from mani_skill.utils.structs import Articulation
 
-from robocas_ms3.arrays import as_tensor, native, none
-from robocas_ms3.benchmark.tasks import OPEN_PICK
+from robocas_ms3.core.arrays import as_tensor, native, none
+from robocas_ms3.scenes.task_specs import OPEN_PICK
 from robocas_ms3.tasks import rewards, terms
 from robocas_ms3.tasks.bodies import link_poses
 from robocas_ms3.tasks.learning import LearningEnv, seen_from

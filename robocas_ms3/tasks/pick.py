@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from robocas_ms3.benchmark.tasks import PICK
+from robocas_ms3.scenes.task_specs import PICK
 from robocas_ms3.tasks.learning import LearningEnv
 
 

@@ -7,8 +7,8 @@ from typing import Any
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.registration import register as tell_mani_skill
 
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.extensions import load
+from robocas_ms3.core.extensions import load
+from robocas_ms3.scenes.task_specs import TASKS
 
 
 def env_class(name: str) -> Any:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from robocas_ms3.arrays import Array, as_float, choose, clamp, length
+from robocas_ms3.core.arrays import Array, as_float, choose, clamp, length
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE, MAX_OBSTACLES
 
 

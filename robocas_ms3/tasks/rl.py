@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.benchmark import TASKS, TaskSpec
-from robocas_ms3.config import TaskConfig, load_config_of
-from robocas_ms3.errors import ConfigError
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.scenes.config import TaskConfig, load_config_of
+from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 
 CONTROL_FREQ = 5  # Hz: `pd_ee_delta_pose` was made for it
 DRIVING_SECONDS = 30  # more where the base drives

@@ -16,18 +16,17 @@ from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
 from robocas_ms3.assets.pack import VISUALS, LoadedObject, VisualLevel, load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
-from robocas_ms3.benchmark import TaskSpec
-from robocas_ms3.benchmark.spec import SIM_FREQ, STANDARD_FREQ
-from robocas_ms3.config import TaskConfig, load_config_of
-from robocas_ms3.errors import ConfigError
-from robocas_ms3.extensions import load
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.core.extensions import load
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.table import DEFAULT, find_robot
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.bank import layout_bank
+from robocas_ms3.scenes.config import TaskConfig, load_config_of
 from robocas_ms3.scenes.layout import Array
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.source import LayoutSource
+from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ, TaskSpec
 from robocas_ms3.tasks.bodies import Bodies
 from robocas_ms3.tasks.contacts import Contacts
 from robocas_ms3.tasks.engine_errors import EngineErrors

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from robocas_ms3.arrays import as_tensor, native, none
-from robocas_ms3.benchmark.tasks import SEARCH
+from robocas_ms3.core.arrays import as_tensor, native, none
 from robocas_ms3.scenes.targets import selection_camera
+from robocas_ms3.scenes.task_specs import SEARCH
 from robocas_ms3.tasks import occlusion, rewards, terms
 from robocas_ms3.tasks.learning import DENSE, LearningEnv
 from robocas_ms3.tasks.schedule import PeriodicSchedule

@@ -12,7 +12,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import ConfigError, LayoutError, RobocasError
+from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.scenes.bank import LayoutBank
 from robocas_ms3.scenes.frozen import FrozenLayouts
 from robocas_ms3.scenes.layout import Layout, ObjectIds

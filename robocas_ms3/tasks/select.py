@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
-from robocas_ms3.arrays import native
-from robocas_ms3.benchmark.tasks import SELECT
+from robocas_ms3.core.arrays import native
+from robocas_ms3.scenes.task_specs import SELECT
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.learning import LearningEnv
 

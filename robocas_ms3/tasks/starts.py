@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.poses import to_wxyz
+from robocas_ms3.core.poses import to_wxyz
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.table import LayoutTable, good
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from robocas_ms3.arrays import Array, count_up, length
+from robocas_ms3.core.arrays import Array, count_up, length
 
 # The entries of a rotation matrix, row by row, in the products of a quaternion's numbers, ww, wx, wy, ..., zz.
 _PRODUCTS = np.array(

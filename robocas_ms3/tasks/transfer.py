@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from mani_skill.utils.structs import Articulation
 
-from robocas_ms3.arrays import as_tensor, count_up, native, none
 from robocas_ms3.assets.manifest import BODY
-from robocas_ms3.config.relations import Relation
-from robocas_ms3.language.instructions import Instruction, choose_instruction, part_name
+from robocas_ms3.core.arrays import as_tensor, count_up, native, none
+from robocas_ms3.scenes.config.relations import Relation
+from robocas_ms3.scenes.language.instructions import Instruction, choose_instruction, part_name
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses

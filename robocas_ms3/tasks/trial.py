@@ -7,11 +7,11 @@ from typing import Any
 
 import gymnasium as gym
 
-from robocas_ms3.benchmark import TASKS
 from robocas_ms3.scenes.bank import LayoutBank
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.settle import CHECK_SECONDS, MAX_SHIFT
 from robocas_ms3.scenes.table import Engine, Pair, State
+from robocas_ms3.scenes.task_specs import TASKS
 
 _ENVS = {"cpu": 1, "gpu": 256}  # at once
 _BACKENDS = {"cpu": "physx_cpu", "gpu": "physx_cuda"}

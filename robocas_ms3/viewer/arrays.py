@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.poses import from_xyzw
-from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import from_xyzw
+from robocas_ms3.core.words import called
+from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 from robocas_ms3.viewer.parts import plot, rounded
 from robocas_ms3.viewer.plots import ROLL_PITCH_YAW, XYZ, base_plot, gripper_plot, motion_plots
-from robocas_ms3.words import called
 
 NEEDED = (
     *("ee_pos", "ee_orn", "base_pos", "base_orn", "rel_pos", "rel_orn", "robot_joints", "gripper_width"),

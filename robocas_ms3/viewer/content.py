@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import called
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind
 from robocas_ms3.demos.ledger import Failure
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.seeds import one_seed
 from robocas_ms3.viewer import damage
 from robocas_ms3.viewer.arrays import facts_of, show_arrays
 from robocas_ms3.viewer.damage import attempt, readable, together
 from robocas_ms3.viewer.failures import Failures, describe, stages
 from robocas_ms3.viewer.parts import Picture, make_index, rounded, row
 from robocas_ms3.viewer.pictures import encode_jpeg
-from robocas_ms3.words import called
 
 
 class PageContent:

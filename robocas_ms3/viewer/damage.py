@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+from robocas_ms3.core.documents import DAMAGED
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.scene_values import check_rate, sound
-from robocas_ms3.documents import DAMAGED
-from robocas_ms3.errors import DatasetError
 
 T = TypeVar("T")
 _WRONG = (*DAMAGED, ArithmeticError, AttributeError, AssertionError, LookupError, RecursionError, TypeError)

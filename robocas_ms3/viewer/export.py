@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import make_folder, replacing_folder
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import make_folder, replacing_folder
 from robocas_ms3.viewer import pictures
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import readable, reason, together

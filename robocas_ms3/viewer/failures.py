@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.datasets.sources.provenance import environment_of
 from robocas_ms3.demos.ledger import FAILURES_FILE, Failure
-from robocas_ms3.ledger import Ledger
 from robocas_ms3.viewer.parts import row
 
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.sources.protocol import Kind
-from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import readable, split_of, table
 from robocas_ms3.viewer.kept import KeptPictures

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.pictures.video import colour_depth
-from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.parts import Picture
 
 THUMBNAIL = (96, 72)

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.headers import read_picture_bytes
 from robocas_ms3.datasets.sources.episode import DEFAULT_RATE
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import attempt, rate_of, split_of, table
 from robocas_ms3.viewer.parts import Picture

@@ -10,10 +10,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import urlsplit
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.words import print_traceback, printable
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.routes import Response, Routes
-from robocas_ms3.words import print_traceback, printable
 
 HOST = "127.0.0.1"
 MAX_CONNECTIONS = 256

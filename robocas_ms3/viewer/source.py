@@ -5,8 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.formats import format_of
-from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.content import PageContent
 
 _OURS = {"trajectory": "TrajectoryContent", "lerobot": "LeRobotContent", "robocas": "FolderContent"}

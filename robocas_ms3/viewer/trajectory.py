@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.core.poses import inverse
+from robocas_ms3.core.words import called
 from robocas_ms3.datasets.sources.arrays import planar_base
 from robocas_ms3.datasets.sources.provenance import succeeded, task_of
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
-from robocas_ms3.poses import inverse
-from robocas_ms3.recordings.motion import Motion
-from robocas_ms3.recordings.reading import Recording, TrajectoryFile
-from robocas_ms3.recordings.subgoals import SubGoal
+from robocas_ms3.demos.recordings.motion import Motion
+from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
+from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.viewer import damage
 from robocas_ms3.viewer.arrays import facts_of, show_motion
@@ -25,7 +26,6 @@ from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import readable
 from robocas_ms3.viewer.parts import plot
 from robocas_ms3.viewer.plots import ARM, ROLL_PITCH_YAW, XYZ
-from robocas_ms3.words import called
 
 NOTE = "A trajectory file holds states, no pictures: `robocas convert {name} --to robocas --out DIR` renders them."
 _STILL = 0.002  # m: an object that moves less is drawn where it stands

@@ -22,7 +22,7 @@ from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.prepare import prepare
 from asset_tools.visual import to_display
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 PROFILE = np.array([[0.03, 0.0], [0.03, 0.05], [0.03, 0.1], [0.012, 0.13], [0.012, 0.16]])  # radius, height in m
 COLORS = np.array([[220, 30, 30], [30, 200, 40], [30, 40, 220], [230, 220, 40]])

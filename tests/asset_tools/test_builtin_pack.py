@@ -16,7 +16,7 @@ from asset_tools.graspnet.catalogue import ENTRIES
 from asset_tools.quality.measure import judge
 from asset_tools.quality.packs import judge_furniture
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 DOWN = np.array([0.0, 0.0, -1.0])
 each = pytest.mark.parametrize("product", products().values(), ids=lambda product: product.id)

@@ -3,7 +3,7 @@
 import pytest
 
 from asset_tools.builtin.catalogue import load_products
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 CARTON = """
 box:

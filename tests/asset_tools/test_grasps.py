@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from asset_tools.grasps import sample_grasps
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 from robocas_ms3.scenes.grasping import gripper_is_clear
 
 

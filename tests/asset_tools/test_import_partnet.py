@@ -17,7 +17,7 @@ from asset_tools.pipeline import write_pack
 from asset_tools.quality.furniture import examine_furniture
 from robocas_ms3.assets.hulls import box_of
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 SIX = ("12038", "21473", "24931", "45855", "45949", "46166")
 

@@ -6,7 +6,7 @@ from asset_tools.import_scans import ImportSettings, estimate_mass, find_scans, 
 from asset_tools.pipeline import made_of, write_pack
 from asset_tools.reading.model import read_model
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 
 def write_box(folder, name, size=(4.0, 6.0, 10.0)):

@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from asset_tools.import_ycb import default_root, ycb_id, ycb_jobs, ycb_source
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 SIZES = {
     "003_cracker_box": (0.06, 0.16, 0.21),

@@ -15,7 +15,7 @@ from asset_tools.partnet.importer import partnet_jobs, read_partnet
 from asset_tools.partnet.template import template
 from asset_tools.pipeline import write_pack
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 NOTE = {"name": "chest", "category": "cabinet", "origin_lift": 0.0}
 BOX = '<geometry><box size="0.4 0.6 0.02"/></geometry>'

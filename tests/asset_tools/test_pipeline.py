@@ -16,7 +16,7 @@ from asset_tools.pipeline import Job, content_hash, made_of, make_assets, write_
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality
 from robocas_ms3.assets.pack import HULLS, VISUALS, load_pack, sha256
-from robocas_ms3.errors import AssetError, OutputExistsError
+from robocas_ms3.core.errors import AssetError, OutputExistsError
 
 CUBE = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)])
 BALL = 0.05 * np.asarray(trimesh.creation.icosphere(subdivisions=1).vertices)  # 80 faces: too many for a GPU

@@ -9,7 +9,7 @@ from asset_tools.inertia import principal_inertia
 from asset_tools.level import level_base
 from asset_tools.prepare import prepare
 from asset_tools.resting import resting_poses
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 QUARTER = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
 HOPE = ["alphabet_soup", "bbq_sauce", "butter", "chocolate_pudding", "cream_cheese", "ketchup", "orange_juice"]

@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from asset_tools.repair import close, winding_number
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 RADIUS, HEIGHT = 0.03, 0.1
 

@@ -12,7 +12,7 @@ from asset_tools.builtin.fruits import banana
 from asset_tools.builtin.shapes import mug
 from asset_tools.resting import RestingPoses, resting_poses
 from asset_tools.stability import toppling_angle
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 

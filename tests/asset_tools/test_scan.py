@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from asset_tools.scan import guess_unit, guess_units, guess_up, upright
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 
 @pytest.mark.parametrize(

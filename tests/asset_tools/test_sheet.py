@@ -21,7 +21,7 @@ from robocas_ms3.assets.annotations import Annotations, footprints
 from robocas_ms3.assets.hulls import Hull, write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, ObjectAsset, ObjectQuality, PackManifest
 from robocas_ms3.assets.pack import LINKS, load_pack, sha256
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 SIZE = np.array([0.04, 0.10, 0.06])
 BASE = {"source": "test", "licence": "MIT", "attribution": "none", "category": "test"}

@@ -22,7 +22,7 @@ from asset_tools.glb import write_glb
 from asset_tools.reading.surface import Material, Part, to_mesh
 from asset_tools.simplify import simplified
 from asset_tools.visual import to_display
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 SHARED = Path(os.environ.get("ROBOCAS_SHARED", Path(__file__).resolve().parents[3] / "shared"))
 COLORS = np.array([[220, 30, 30], [30, 200, 40], [30, 40, 220], [230, 220, 40], [200, 40, 210], [40, 210, 210]])

@@ -5,7 +5,7 @@ import trimesh
 
 from robocas_ms3.assets.cooking import SHRINKAGE, CookingFault, cook_hulls, cooking_faults
 from robocas_ms3.assets.hulls import write_hulls
-from robocas_ms3.paths import builtin_packs_dir
+from robocas_ms3.core.paths import builtin_packs_dir
 
 
 def box(*size):

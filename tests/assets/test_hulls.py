@@ -13,7 +13,7 @@ from robocas_ms3.assets.hulls import (
     slenderness,
     write_hulls,
 )
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 CUBE = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)], dtype=float)
 

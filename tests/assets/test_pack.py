@@ -17,7 +17,7 @@ from robocas_ms3.assets.manifest import (
     PackManifest,
 )
 from robocas_ms3.assets.pack import available_packs, load_pack, sha256
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 QUALITY = ObjectQuality(
     compact=True,

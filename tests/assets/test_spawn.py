@@ -12,7 +12,7 @@ from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, Joint,
 from robocas_ms3.assets.pack import LoadedFurniture, Part
 from robocas_ms3.assets.physics import shapes_of
 from robocas_ms3.assets.spawn import spawn, spawn_articulation
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 DRAWER = Joint(name="slide", kind="prismatic", axis=(1, 0, 0), limits=(0, 0.3), friction=0.05, damping=2.0)
 

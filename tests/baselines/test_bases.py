@@ -17,8 +17,8 @@ from robocas_ms3.baselines.rt1 import BASELINE as RT1
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.small import BASELINE as SMALL
 from robocas_ms3.baselines.small.config import SmallConfig
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.errors import DatasetError
 
 
 def test_a_base_that_trembles_stands():

@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 
 from robocas_ms3.baselines.begin import facts_of, find_start, merged
 from robocas_ms3.baselines.session import Said, train_run
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
 

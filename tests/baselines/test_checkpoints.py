@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from robocas_ms3.baselines import checkpoints
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
 
 ABOUT = {"baseline": "x", "version": "1", "dataset": "d"}
 

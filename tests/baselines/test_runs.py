@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.baselines.runs import WEIGHTS, hash_of, hash_of_weights
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
 
 
 def test_a_trajectory_is_both_of_its_files(tmp_path):

@@ -10,7 +10,7 @@ from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.runs import CHECKPOINT, SHIPPED, read_run
 from robocas_ms3.baselines.small import BASELINE
 from robocas_ms3.cli.main import run
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
 

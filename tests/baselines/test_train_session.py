@@ -23,7 +23,7 @@ from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.session import Said, train_run
 from robocas_ms3.baselines.train import Trainer
 from robocas_ms3.cli.main import run
-from robocas_ms3.errors import DatasetError, ExtensionError, OutputExistsError, TrainingError
+from robocas_ms3.core.errors import DatasetError, ExtensionError, OutputExistsError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
 

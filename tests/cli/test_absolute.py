@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.cli.absolute import with_absolute_paths
-from robocas_ms3.errors import RobocasError
-from robocas_ms3.paths import CACHE, DATA
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.paths import CACHE, DATA
 
 
 @dataclass

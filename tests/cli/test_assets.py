@@ -7,8 +7,8 @@ import trimesh
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli import main as cli
-from robocas_ms3.errors import AssetError
-from robocas_ms3.paths import builtin_packs_dir
+from robocas_ms3.core.errors import AssetError
+from robocas_ms3.core.paths import builtin_packs_dir
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 from robocas_ms3.cli import layouts
 from robocas_ms3.cli.layouts import Build, Info, Layouts, main, objects_seeds, seed_range
 from robocas_ms3.cli.main import run
-from robocas_ms3.errors import ConfigError, LayoutError
+from robocas_ms3.core.errors import ConfigError, LayoutError
 from robocas_ms3.scenes import bank, source
 from robocas_ms3.scenes.sample import sample_layout
 

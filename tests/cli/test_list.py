@@ -6,8 +6,8 @@ import pytest
 
 from robocas_ms3.baselines.table import BASELINES
 from robocas_ms3.cli.list import List, collect, main
-from robocas_ms3.config import load_task_config, shipped_configs
-from robocas_ms3.paths import data_dir
+from robocas_ms3.core.paths import data_dir
+from robocas_ms3.scenes.config import load_task_config, shipped_configs
 
 
 def test_tasks_and_configs_are_listed():

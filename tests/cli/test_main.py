@@ -12,8 +12,8 @@ import pytest
 
 from robocas_ms3.cli import main as cli
 from robocas_ms3.cli.spelling import misspelt
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import RobocasError
 
 ROOT = Path(__file__).resolve().parents[2]
 HEAVY = {"torch", "numpy", "scipy", "sapien", "mani_skill", "gymnasium", "pydantic", "h5py", "trimesh"}

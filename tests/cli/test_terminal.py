@@ -11,8 +11,8 @@ from rich.text import Text
 from robocas_ms3.cli import bars
 from robocas_ms3.cli import main as cli
 from robocas_ms3.cli.terminal import console, say, say_lines, tell
-from robocas_ms3.documents import DocumentError
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.documents import DocumentError
+from robocas_ms3.core.errors import RobocasError
 
 HOSTILE = "a\x1b[2J\x9b31m\u202eb\n\rc[bold]d[/e] :smile:"
 SHOWN = "a\\u001b[2J\\u009b31m\\u202eb"
@@ -78,7 +78,7 @@ WAYS_TO_FAIL = {
 @pytest.mark.parametrize("failing", WAYS_TO_FAIL.values(), ids=WAYS_TO_FAIL)
 def test_a_traceback(failing):
     script = (
-        "import threading; from robocas_ms3.words import escape_tracebacks; escape_tracebacks()\n"
+        "import threading; from robocas_ms3.core.words import escape_tracebacks; escape_tracebacks()\n"
         f"def fail(*_): raise ValueError({HOSTILE!r})\n"
         f"{failing}"
     )

@@ -10,7 +10,7 @@ from made_up_baseline import MadeUp
 from robocas_ms3.baselines.table import BASELINES
 from robocas_ms3.cli.main import run
 from robocas_ms3.cli.train import Train, changes_of
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
 
 
 def test_options_win_over_the_file_and_later_ones_over_earlier(tmp_path):

@@ -2,9 +2,9 @@ from pathlib import Path
 
 import pytest
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.provenance import task_of
-from robocas_ms3.errors import DatasetError
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "dataset.md"
 
@@ -52,7 +52,7 @@ def test_other_versions_are_refused(found, fix):
 
 
 def test_a_task_is_known_by_its_environment():
-    from robocas_ms3.benchmark import TASKS
+    from robocas_ms3.scenes.task_specs import TASKS
 
     assert [task_of(f"robocas_ms3:{spec.env_id}") for spec in TASKS.values()] == list(TASKS)
     assert task_of("PushCube-v1") is None

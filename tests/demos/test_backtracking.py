@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from branch_notes import Notes
 
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.demos.backtracking import DeadEnd, turns
-from robocas_ms3.errors import PlanningFailed
 from robocas_ms3.planning.decisions import Effort
 
 

@@ -12,20 +12,20 @@ import torch
 from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.structs import Pose
 
-from robocas_ms3.benchmark import TASKS
+from robocas_ms3.core.errors import DatasetError, EpisodeLost, OutputExistsError, PlanningFailed, RobocasError
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.forking import Child
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.demos.recordings.entries import read_json
+from robocas_ms3.demos.recordings.merging import merge
+from robocas_ms3.demos.recordings.stored import open_trajectory
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.trials import Trials
-from robocas_ms3.errors import DatasetError, EpisodeLost, OutputExistsError, PlanningFailed, RobocasError
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Trajectory
-from robocas_ms3.recordings.entries import read_json
-from robocas_ms3.recordings.merging import merge
-from robocas_ms3.recordings.stored import open_trajectory
 from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.scenes.task_specs import TASKS
 
 pytestmark = pytest.mark.slow
 SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")

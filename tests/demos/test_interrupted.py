@@ -7,14 +7,14 @@ from pathlib import Path
 import h5py
 import pytest
 
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.processes import Pool
 from robocas_ms3.demos import generate as module
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.generate import generate
 from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger
+from robocas_ms3.demos.recordings.entries import read_json
 from robocas_ms3.demos.workers import generate_seeds, shard_name
-from robocas_ms3.errors import RobocasError
-from robocas_ms3.processes import Pool
-from robocas_ms3.recordings.entries import read_json
 
 SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")
 HOPELESS = 2  # a seed without an episode

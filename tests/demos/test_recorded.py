@@ -10,9 +10,9 @@ import pytest
 from fuzzing import VALUES, flipped
 from synthetic import STEPS, write_trajectory
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.demos.recorded import Recorded
 from robocas_ms3.demos.replay import replay
-from robocas_ms3.errors import DatasetError
 
 SEED = "episode_seed"
 

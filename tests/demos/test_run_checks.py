@@ -8,7 +8,8 @@ import pytest
 from synthetic import write_trajectory
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.config import load_task_config
+from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.core.outputs import locked_folder
 from robocas_ms3.demos import generate as module
 from robocas_ms3.demos.checks import SIM_FREQ, WEIGHTS, check_same_run
 from robocas_ms3.demos.convert_actions import CONVERTIBLE
@@ -16,8 +17,7 @@ from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.generate import _recorded, generate
 from robocas_ms3.demos.ledger import Failure
 from robocas_ms3.demos.replay import replay
-from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.outputs import locked_folder
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.tasks.base import RoboCASEnv
 
 SETTINGS = EpisodeSettings("pick", "pick_table_scattered", "builtin")

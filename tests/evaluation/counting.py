@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from robocas_ms3.errors import WorkerDied
+from robocas_ms3.core.errors import WorkerDied
 from robocas_ms3.evaluation.tracking import SUMS
 
 

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 from robocas_ms3.baselines.runs import SHIPPED, hash_of_weights
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.datasets.checks.replay import replay_dataset
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.demos.recordings.entries import read_json
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.takeover import Takeover
-from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.acting import Player, check_acting, steps_of
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
-from robocas_ms3.recordings.entries import read_json
-from robocas_ms3.recordings.reading import TrajectoryFile
 
 CONFIG = "pick_upstream_eval"
 

@@ -6,7 +6,7 @@ import pytest
 from made_up_results import of_protocol, outcome, write
 
 from robocas_ms3.cli import eval as command
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.freeze import Plan, freeze
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
 from robocas_ms3.evaluation.protocol import load_protocol

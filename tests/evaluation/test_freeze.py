@@ -5,10 +5,10 @@ import yaml
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli import eval as command
-from robocas_ms3.config import load_task_config
-from robocas_ms3.errors import EvaluationError, RobocasError
+from robocas_ms3.core.errors import EvaluationError, RobocasError
 from robocas_ms3.evaluation.freeze import Plan, freeze, read_plan
 from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.frozen import FrozenLayouts
 
 PLAN = {

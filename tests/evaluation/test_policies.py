@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from counting import Counting
 
-from robocas_ms3.errors import EvaluationError, ExtensionError
+from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.evaluation.policies import make_policy, open_policy
 from robocas_ms3.evaluation.policies.plain import StillPolicy
 from robocas_ms3.evaluation.policies.scripted import BESIDE, beside

@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 import yaml
 
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import load_task_config
-from robocas_ms3.errors import ConfigError, EvaluationError
+from robocas_ms3.core.errors import ConfigError, EvaluationError
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.protocol import EPISODES, RULES, files_of, load_protocol, shipped_protocols
+from robocas_ms3.scenes.config import load_task_config
+from robocas_ms3.scenes.task_specs import TASKS
 
 
 @pytest.fixture

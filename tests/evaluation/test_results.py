@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from made_up_results import RUN_OF, outcome, write
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.outcomes import failure_stage
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, append, begin, merge, parts_of, read
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from counting import Counting
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 

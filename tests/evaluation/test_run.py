@@ -9,14 +9,14 @@ import pytest
 from counting import Dying
 
 from robocas_ms3.cli.main import run as cli
-from robocas_ms3.errors import DatasetError, EvaluationError, RobocasError, WorkerDied
+from robocas_ms3.core.errors import DatasetError, EvaluationError, RobocasError, WorkerDied
+from robocas_ms3.core.outputs import locked_folder
 from robocas_ms3.evaluation import results, run
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.run import Settings, chosen, evaluate
 from robocas_ms3.evaluation.verify import problems
-from robocas_ms3.outputs import locked_folder
 
 
 @pytest.fixture(scope="module")

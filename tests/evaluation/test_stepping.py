@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.stepping import PolicyStepping, control_mode
 from robocas_ms3.evaluation.tracking import summed
 from robocas_ms3.tasks.vector import make_vec

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import stage
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.protocol import load_protocol

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from made_up_results import outcome, write
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.comparison import comparison
 from robocas_ms3.evaluation.outcomes import Outcome

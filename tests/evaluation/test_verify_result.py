@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 from made_up_results import of_protocol
 
-from robocas_ms3.benchmark import TASKS
 from robocas_ms3.cli import eval as command
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, read
 from robocas_ms3.evaluation.verify import problems
+from robocas_ms3.scenes.task_specs import TASKS
 
 
 @pytest.fixture(scope="module")

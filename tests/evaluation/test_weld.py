@@ -14,7 +14,7 @@ import torch
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.cli.main import run as cli
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results, videos
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.protocol import load_protocol

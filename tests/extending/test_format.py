@@ -11,11 +11,11 @@ from strangers import install
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
+from robocas_ms3.core.extensions import Table
 from robocas_ms3.datasets import RoboCASDataset, formats
 from robocas_ms3.datasets.formats import format_of, open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.writing import convert as conversion
-from robocas_ms3.extensions import Table
 
 
 @pytest.fixture

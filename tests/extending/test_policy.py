@@ -11,11 +11,11 @@ import pytest
 from strangers import robocas
 
 from robocas_ms3.cli.list import collect
-from robocas_ms3.errors import EvaluationError, ExtensionError
+from robocas_ms3.core.errors import EvaluationError, ExtensionError
+from robocas_ms3.core.extensions import Table
 from robocas_ms3.evaluation import policies, results
 from robocas_ms3.evaluation.policies import GROUP, make_policy
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.extensions import Table
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8").split("## A policy\n")[1].split("\n## ")[0]

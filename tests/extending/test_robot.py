@@ -121,9 +121,9 @@ from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.demos.open_loop import OpenLoop
-from robocas_ms3.poses import from_wxyz, inverse
-from robocas_ms3.recordings.motion import sample_states, stored_actions
-from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.core.poses import from_wxyz, inverse
+from robocas_ms3.demos.recordings.motion import sample_states, stored_actions
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
 file, out = Path({str(recorded)!r}), Path({str(tmp_path)!r})
 convert(file, out / "folder", embeddings=False, open_source=RayCaster)
 convert_lerobot(out / "folder", out / "lerobot")

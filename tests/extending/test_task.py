@@ -107,9 +107,9 @@ def test_a_configuration_with_a_mistyped_task_is_told_its_name(site):
         site,
         "-c",
         """
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import load_config_of
-from robocas_ms3.errors import ConfigError
+from robocas_ms3.scenes.task_specs import TASKS
+from robocas_ms3.scenes.config import load_config_of
+from robocas_ms3.core.errors import ConfigError
 config = load_config_of(TASKS["push_zone"]).model_dump(mode="json")
 try:
     load_config_of(TASKS["push_zone"], config | {"task": "push_zones"})

@@ -13,22 +13,22 @@ from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli.layouts import Info, info
-from robocas_ms3.config import load_task_config
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.paths import builtin_packs_dir
+from robocas_ms3.core.poses import planar
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.errors import RobocasError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.comparison import comparison
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 from robocas_ms3.evaluation.report.page import page
 from robocas_ms3.evaluation.tables import markdown
-from robocas_ms3.paths import builtin_packs_dir
-from robocas_ms3.poses import planar
 from robocas_ms3.scenes.bank import ABOUT, LayoutBank
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.frozen import FrozenLayouts, write_frozen
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel

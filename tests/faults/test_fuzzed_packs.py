@@ -12,14 +12,14 @@ from fuzzing import SCALARS, flipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocas_ms3 import documents
 from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import read_hulls
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.documents import DocumentError, open_arrays
-from robocas_ms3.errors import AssetError, DatasetError
-from robocas_ms3.ledger import Ledger
-from robocas_ms3.paths import builtin_packs_dir
+from robocas_ms3.core import documents
+from robocas_ms3.core.documents import DocumentError, open_arrays
+from robocas_ms3.core.errors import AssetError, DatasetError
+from robocas_ms3.core.ledger import Ledger
+from robocas_ms3.core.paths import builtin_packs_dir
 
 QUICK = settings(max_examples=40, deadline=None, derandomize=True)
 PACK = builtin_packs_dir() / "builtin"

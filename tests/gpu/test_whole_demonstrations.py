@@ -13,7 +13,7 @@ import pytest
 import torch
 from gpu_emulation import emulated_envs
 
-from robocas_ms3.recordings.reading import Recording, TrajectoryFile
+from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
 from robocas_ms3.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from robocas_ms3.errors import ExtensionError
+from robocas_ms3.core.errors import ExtensionError
 from robocas_ms3.planning.backends import BACKENDS, DEFAULT, make_planner
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.robots.table import PANDA

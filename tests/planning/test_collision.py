@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from planning_scenes import REST, Box, Checker, cloud, corners, table_scene, top_down
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
 from robocas_ms3.robots.description import MOBILE_PANDA

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 from planning_scenes import REST, Checker, corners
 
-from robocas_ms3.errors import RobotDescriptionError
+from robocas_ms3.core.errors import RobotDescriptionError
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.planning.protocol import Obstacle, Shape
 from robocas_ms3.planning.shapes import MARGIN

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from planning_scenes import REST, Box, cloud, table_scene, top_down
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
 
 SCENE = [*table_scene(0), Box((0.55, 0.0, 0.15), (0.4, 0.03, 0.4))]
 

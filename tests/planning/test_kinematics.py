@@ -7,7 +7,7 @@ import pytest
 from planning_scenes import REST, pose_error, top_down
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.kinematics import follow_line, newton_step, rotation_vector, solve_positive
 from robocas_ms3.planning.reachability import Reachability

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import robocas_ms3.tasks  # noqa: F401
-from robocas_ms3.config import load_task_config
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.scene import PlanningScene
 from robocas_ms3.planning.skills import looking
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.looking import FAR, _shift, camera_in_base, plan_look
+from robocas_ms3.scenes.config import load_task_config
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ import pytest
 import sapien
 
 import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
-from robocas_ms3.errors import ExtensionError, PlanningFailed, RobocasError
+from robocas_ms3.core.errors import ExtensionError, PlanningFailed, RobocasError
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import Trajectory
 

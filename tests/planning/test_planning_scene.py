@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.planning.scene import FURNITURE_SPACING, SPACING, PlanningScene, seen_from
-from robocas_ms3.poses import from_wxyz
 
 
 class Parked(PlanningScene):

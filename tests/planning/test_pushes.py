@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
+from robocas_ms3.core.poses import transform
 from robocas_ms3.planning import pushes as pushing
 from robocas_ms3.planning.skills.looking import sample_views
 from robocas_ms3.planning.skills.removing import free_places
-from robocas_ms3.poses import transform
 
 SURFACE = 0.1  # height of the table, in the arm's base frame
 TABLE = np.eye(4)

@@ -10,7 +10,7 @@ import pytest
 from planning_scenes import REST, pose_error, top_down
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import RobocasError, RobotDescriptionError
+from robocas_ms3.core.errors import RobocasError, RobotDescriptionError
 from robocas_ms3.planning.analytic import PandaGeometry
 from robocas_ms3.planning.chain import ArmChain, turn_between
 from robocas_ms3.planning.pulling import twist

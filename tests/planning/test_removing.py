@@ -9,9 +9,10 @@ import pytest
 import torch
 from mani_skill.utils.structs import Pose
 
+from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.core.poses import transform
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.errors import EpisodeLost, PlanningFailed
 from robocas_ms3.planning.decisions import StraightDecisions
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Obstacle, Shape
@@ -22,7 +23,6 @@ from robocas_ms3.planning.skills.clearing import Heap, Move
 from robocas_ms3.planning.skills.pushing import push_away
 from robocas_ms3.planning.skills.removing import blockers, clear_grasps, remove
 from robocas_ms3.planning.solvers.search import tries
-from robocas_ms3.poses import transform
 
 pytestmark = pytest.mark.slow
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from planning_scenes import REST, top_down
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.protocol import Trajectory
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.retreating import back_out

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from planning_scenes import REST, Box, cloud, corners, pose_error, table_scene, top_down
 
-from robocas_ms3.errors import PlanningFailed, RobocasError, RobotDescriptionError
+from robocas_ms3.core.errors import PlanningFailed, RobocasError, RobotDescriptionError
 from robocas_ms3.planning.chain import ArmChain
 from robocas_ms3.planning.protocol import AttachedBody, Planner, Trajectory
 from robocas_ms3.planning.rrt_connect import TCP_SPEED_LIMIT, RRTConnectPlanner

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from robocas_ms3.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
 from robocas_ms3.planning.decisions import StraightDecisions
 from robocas_ms3.planning.solvers import search
 

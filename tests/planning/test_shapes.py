@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from planning_scenes import corners
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.planning.protocol import Shape
 from robocas_ms3.planning.shapes import convex_hull, inflated
 

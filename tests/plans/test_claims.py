@@ -11,7 +11,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from robocas_ms3.errors import PlanError
+from robocas_ms3.core.errors import PlanError
 from robocas_ms3.plans.claims import LEASE as DEFAULT_LEASE
 from robocas_ms3.plans.claims import claimed, claims_of, lease_of, refuse_claimed
 from robocas_ms3.plans.driver import sole

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from plan_stages import PLAN
 
-from robocas_ms3.errors import PlanError
-from robocas_ms3.files import write_json
+from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.files import write_json
 from robocas_ms3.plans import claims, driver
 from robocas_ms3.plans import run as module
 from robocas_ms3.plans.begun import check_plan_of, content_of, read_plan

@@ -7,7 +7,7 @@ import h5py
 import pytest
 from plan_stages import PLAN, assert_same, stages
 
-from robocas_ms3.errors import PlanError
+from robocas_ms3.core.errors import PlanError
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.run import run_plan
 

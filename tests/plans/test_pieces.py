@@ -6,8 +6,8 @@ import errno
 import pytest
 from plan_stages import PLAN
 
-from robocas_ms3.files import flush_to_disk
-from robocas_ms3.ledger import Ledger
+from robocas_ms3.core.files import flush_to_disk
+from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.plans.engines.pieces import Arriving, sent
 from robocas_ms3.plans.slot import Slot
 from robocas_ms3.plans.units import DEATHS, DONE, LEDGER, Outcome, Unit, outcomes

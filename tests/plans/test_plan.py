@@ -8,8 +8,8 @@ import pytest
 from plan_stages import MadeUp
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.errors import ConfigError, ExtensionError, MissingExtraError, PlanError
-from robocas_ms3.files import write_json
+from robocas_ms3.core.errors import ConfigError, ExtensionError, MissingExtraError, PlanError
+from robocas_ms3.core.files import write_json
 from robocas_ms3.plans.begun import check_plan_of, content_of
 from robocas_ms3.plans.checks import check_plan
 from robocas_ms3.plans.opening import opening
@@ -62,7 +62,7 @@ def test_parts_of_the_same_scenes_have_seeds_apart(written):
 
 
 def test_a_configuration_beside_the_plan_is_taken_whole(written, tmp_path):
-    from robocas_ms3.config import load_task_config
+    from robocas_ms3.scenes.config import load_task_config
 
     (tmp_path / "mine.yaml").write_text("extends: pick_shelf_scattered\nobjects: {count: 4}\n")
     plan = load_plan(written("parts:\n  - {task: pick, config: mine.yaml, episodes: 3}\n"))
@@ -72,7 +72,7 @@ def test_a_configuration_beside_the_plan_is_taken_whole(written, tmp_path):
 
 
 def test_a_configuration_in_the_working_directory_is_taken_whole(written, tmp_path, monkeypatch):
-    from robocas_ms3.config import load_task_config
+    from robocas_ms3.scenes.config import load_task_config
 
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")

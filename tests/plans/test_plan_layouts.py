@@ -5,12 +5,12 @@ import pytest
 from plan_stages import PLAN
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.config import load_task_config
-from robocas_ms3.errors import LayoutError
+from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.plans.join import LAYOUTS, join
 from robocas_ms3.plans.layouts import LayoutMaker
 from robocas_ms3.plans.record import Records
 from robocas_ms3.plans.units import Outcome, Task, Unit
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.frozen import FrozenLayouts
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout

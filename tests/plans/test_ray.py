@@ -18,7 +18,7 @@ ray = pytest.importorskip("ray", reason="needs the ray extra: plans on a cluster
 from plan_stages import PLAN, MadeUp, assert_same, render, stages
 from ray.cluster_utils import Cluster
 
-from robocas_ms3.errors import MissingExtraError, PlanError
+from robocas_ms3.core.errors import MissingExtraError, PlanError
 from robocas_ms3.plans.engines import ray as engine
 from robocas_ms3.plans.engines.ray import RayEngine
 from robocas_ms3.plans.engines.ray_cluster import RayOptions, read_options

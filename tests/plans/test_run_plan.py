@@ -13,18 +13,18 @@ import pytest
 from faults import running
 from plan_stages import PLAN, MadeUp, assert_same, cannot_begin, plan_faults, stages
 
+from robocas_ms3.core.errors import MissingExtraError, OutputExistsError, PlanError, RobocasError
+from robocas_ms3.core.files import write_json
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.errors import MissingExtraError, OutputExistsError, PlanError, RobocasError
-from robocas_ms3.files import write_json
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.plans.begun import content_of
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.run import _Part, run_plan
 from robocas_ms3.plans.slot import Slot, Stages
 from robocas_ms3.plans.status import status
 from robocas_ms3.plans.units import Outcome, Unit, deaths
-from robocas_ms3.recordings.reading import TrajectoryFile
-from robocas_ms3.recordings.versions import versions
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 

@@ -24,7 +24,7 @@ from slurm_runs import (
     wait_for,
 )
 
-from robocas_ms3.errors import MissingExtraError, PlanError
+from robocas_ms3.core.errors import MissingExtraError, PlanError
 from robocas_ms3.plans.claims import refuse_claimed
 from robocas_ms3.plans.engines import open_engine
 from robocas_ms3.plans.engines.local import LocalEngine

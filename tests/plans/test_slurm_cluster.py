@@ -14,7 +14,7 @@ from plan_stages import PLAN, assert_same, plan_faults
 from slurm_runs import NO_SLURM, SLURM, assert_done_once, holds, run, slurm_answers, stages_in_jobs, start, wait_for
 from slurm_runs import processes_of as processes_at
 
-from robocas_ms3.errors import PlanError
+from robocas_ms3.core.errors import PlanError
 from robocas_ms3.plans.run import run_plan
 from robocas_ms3.plans.units import Unit, deaths
 

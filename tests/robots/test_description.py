@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.assets.gripper import GRIPPER_BOXES
-from robocas_ms3.errors import ExtensionError, RobocasError
+from robocas_ms3.core.errors import ExtensionError, RobocasError
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.table import DEFAULT, PANDA, ROBOTS, find_robot
 from robocas_ms3.robots.urdf import robot_files

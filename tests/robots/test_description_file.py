@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robocas_ms3.errors import RobotDescriptionError
+from robocas_ms3.core.errors import RobotDescriptionError
 from robocas_ms3.robots.description_file import DescriptionFile
 from robocas_ms3.robots.forward import read_joints
 

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.forward import chain as urdf_pose
 from robocas_ms3.robots.kinematics import SerialChain

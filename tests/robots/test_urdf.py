@@ -11,7 +11,7 @@ import pytest
 from robot_checks import link_poses, numbers
 
 import robocas_ms3.robots
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.planning.collision import FclWorld
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import robot_files

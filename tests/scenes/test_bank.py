@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.config import load_task_config
-from robocas_ms3.errors import LayoutError
+from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.scenes import source
 from robocas_ms3.scenes.bank import LayoutBank, layout_bank
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.fill import fill, pairs_of
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.model import SceneModel
@@ -169,7 +169,7 @@ def test_a_process_whose_physx_has_a_gpu_makes_the_same_layouts():
     program = (
         "import sys\nfrom sapien import physx\n"
         "if sys.argv[1] == 'gpu':\n    physx._enable_gpu()\n"
-        "from robocas_ms3.assets.pack import load_pack\nfrom robocas_ms3.config import load_task_config\n"
+        "from robocas_ms3.assets.pack import load_pack\nfrom robocas_ms3.scenes.config import load_task_config\n"
         "from robocas_ms3.scenes.bank import layout_bank\nfrom robocas_ms3.scenes.model import SceneModel\n"
         "pack = load_pack('builtin')\n"
         "model = SceneModel.load(load_task_config('search_table_small_heap'), pack, pack)\n"

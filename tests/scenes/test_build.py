@@ -8,10 +8,10 @@ from mani_skill.utils.structs import Articulation
 import robocas_ms3  # noqa: F401
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.assets.spawn import spawn
-from robocas_ms3.config import TaskConfig
-from robocas_ms3.errors import ConfigError
-from robocas_ms3.paths import task_configs_dir
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.core.paths import task_configs_dir
 from robocas_ms3.scenes import build
+from robocas_ms3.scenes.config import TaskConfig
 from robocas_ms3.scenes.lookup import find_objects, furniture_pose
 
 

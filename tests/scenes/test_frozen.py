@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robocas_ms3.errors import LayoutError
+from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.scenes.frozen import FrozenLayouts, join_frozen, write_frozen
 from robocas_ms3.scenes.layout import Layout
 

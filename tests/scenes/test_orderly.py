@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocas_ms3.errors import LayoutError
+from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.scenes.orderly import sample_orderly
 from robocas_ms3.scenes.placement import PlaceableObject, Region
 

@@ -4,8 +4,8 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.poses import planar
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.poses import planar
 from robocas_ms3.scenes import placement
 from robocas_ms3.scenes.placement import PlaceableObject, Region, choose_objects, sample_scattered
 

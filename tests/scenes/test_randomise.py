@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.config import TaskConfig, load_task_config
-from robocas_ms3.config.randomisation import CameraRandomisation
+from robocas_ms3.scenes.config import TaskConfig, load_task_config
+from robocas_ms3.scenes.config.randomisation import CameraRandomisation
 from robocas_ms3.scenes.randomise import draw_camera_shift, draw_finishes, draw_lights
 
 

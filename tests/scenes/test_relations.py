@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robocas_ms3.config.relations import RELATIONS
+from robocas_ms3.scenes.config.relations import RELATIONS
 from robocas_ms3.scenes.relations import MARGIN, related
 
 # y = 0.2 is on the robot's left; distances 0.54, 0.6, 0.81, 0.7 m

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.config import load_task_config, shipped_configs
-from robocas_ms3.errors import ConfigError, LayoutError
-from robocas_ms3.poses import transform
+from robocas_ms3.core.errors import ConfigError, LayoutError
+from robocas_ms3.core.poses import transform
 from robocas_ms3.scenes import sample
+from robocas_ms3.scenes.config import load_task_config, shipped_configs
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import _failure, meets_basket, object_set, sample_layout

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.config import load_task_config
-from robocas_ms3.poses import planar
+from robocas_ms3.core.poses import planar
 from robocas_ms3.scenes import settle as settle_module
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.settle import settle
 

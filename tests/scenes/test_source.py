@@ -12,8 +12,8 @@ import pytest
 from sapien import physx
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.config import load_task_config
-from robocas_ms3.errors import LayoutError, SimulationError
+from robocas_ms3.core.errors import LayoutError, SimulationError
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import sample_layout
 from robocas_ms3.scenes.source import OtherProcess, Sampler

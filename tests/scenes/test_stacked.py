@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.config.task import StackedLayout
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.poses import transform
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.poses import transform
 from robocas_ms3.scenes import stacked
+from robocas_ms3.scenes.config.task import StackedLayout
 from robocas_ms3.scenes.placement import Region
 from robocas_ms3.scenes.stacked import SPREAD, drop_heap
 from robocas_ms3.scenes.visibility import object_mesh, top_down_camera, visible_shares

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import LayoutError
-from robocas_ms3.poses import to_wxyz
+from robocas_ms3.core.errors import LayoutError
+from robocas_ms3.core.poses import to_wxyz
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.table import LayoutTable, State, mark_table, write_table
 

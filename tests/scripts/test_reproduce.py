@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from robocas_ms3.config import shipped_configs
+from robocas_ms3.scenes.config import shipped_configs
 
 ROOT = Path(__file__).resolve().parents[2]
 STUB = '#!/bin/sh\nprintf "%s\\n" "$*" >> "$CALLS"\n[ "$1" != "$BREAKS" ] || exit 130\n'

@@ -6,7 +6,7 @@ import sys
 
 from synthetic import RayCaster
 
-from robocas_ms3 import files
+from robocas_ms3.core import files
 from robocas_ms3.datasets.writing import convert, writer
 
 PLACES = {  # moment -> (module, function, which call is the last)

@@ -6,7 +6,7 @@ from pathlib import Path
 from dying import die_at
 from synthetic import RayCaster
 
-from robocas_ms3 import files
+from robocas_ms3.core import files
 from robocas_ms3.datasets.lerobot import assemble, convert, stage, table_writing, video
 
 PLACES = {  # moment -> (module, name of the function or method's owner and it, which call is the last)

@@ -4,8 +4,8 @@ import sys
 
 from dying import die_at
 
-from robocas_ms3 import files
 from robocas_ms3.cli.main import run
+from robocas_ms3.core import files
 from robocas_ms3.datasets.manage import assemble, importing
 from robocas_ms3.datasets.writing import output
 

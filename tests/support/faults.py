@@ -21,9 +21,9 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.cut_off import cut_off
 from robocas_ms3.demos.ledger import FAILURES_FILE, Ledger
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.stored import open_trajectory
 from robocas_ms3.evaluation import results
-from robocas_ms3.recordings.reading import TrajectoryFile
-from robocas_ms3.recordings.stored import open_trajectory
 
 ROOT = Path(__file__).resolve().parents[2]
 SITE = Path(__file__).resolve().parent / "fault_site"

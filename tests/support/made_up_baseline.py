@@ -13,7 +13,7 @@ import torch
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
 from robocas_ms3.baselines.session import Said, train_run
 from robocas_ms3.baselines.table import BASELINES
-from robocas_ms3.errors import DatasetError, EmptySplitError
+from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.evaluation.policy import Wants
 
 

@@ -10,8 +10,8 @@ import time
 
 from synthetic import RayCaster, write_trajectory
 
-from robocas_ms3.errors import DatasetError, MissingExtraError, RobocasError
-from robocas_ms3.files import replacing_folder
+from robocas_ms3.core.errors import DatasetError, MissingExtraError, RobocasError
+from robocas_ms3.core.files import replacing_folder
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.plans.render import Renders
 from robocas_ms3.plans.slot import Stages

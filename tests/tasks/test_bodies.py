@@ -10,7 +10,7 @@ import torch
 from mani_skill.utils.structs import Articulation, Pose
 
 import robocas_ms3.tasks  # noqa: F401
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.tasks.bodies import Bodies, link_poses
 

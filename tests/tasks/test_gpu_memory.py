@@ -13,7 +13,7 @@ from contextlib import contextmanager
 import pytest
 from mani_skill.utils.structs.types import GPUMemoryConfig
 
-from robocas_ms3.errors import SimulationError
+from robocas_ms3.core.errors import SimulationError
 from robocas_ms3.tasks.engine_errors import EngineErrors
 from robocas_ms3.tasks.gpu_memory import gpu_memory
 

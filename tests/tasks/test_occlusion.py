@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocas_ms3.poses import to_wxyz
+from robocas_ms3.core.poses import to_wxyz
 from robocas_ms3.tasks.occlusion import Clutter, clutter, covering, moved_near, push_point, seen_from, surface_points
 
 
@@ -184,8 +184,8 @@ def test_what_is_near_in_the_picture_is_near():
 @pytest.mark.slow
 def test_hidden_shares_are_what_rays_say():
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.config import load_task_config
     from robocas_ms3.scenes.bank import layout_bank
+    from robocas_ms3.scenes.config import load_task_config
     from robocas_ms3.scenes.model import SceneModel
     from robocas_ms3.scenes.targets import selection_camera
     from robocas_ms3.tasks.search import _sample

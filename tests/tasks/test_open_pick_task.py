@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.config import load_task_config, shipped_configs
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.datasets.sources.arrays import episode_arrays, planar_base
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.demos.recordings.motion import sample_states
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.subgoals import sample_subgoals
 from robocas_ms3.demos.replay import replay
 from robocas_ms3.demos.trials import Trials
-from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.skills.driving import base_at, drive
 from robocas_ms3.planning.skills.grasping import plan_grasp
 from robocas_ms3.planning.skills.handles import DEEPER, open_part, plan_pull, pull_share
 from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.stance import drive_to_handle
-from robocas_ms3.recordings.motion import sample_states
-from robocas_ms3.recordings.reading import TrajectoryFile
-from robocas_ms3.recordings.subgoals import sample_subgoals
+from robocas_ms3.scenes.config import load_task_config, shipped_configs
+from robocas_ms3.scenes.language.templates import subgoal
 
 pytestmark = pytest.mark.slow
 

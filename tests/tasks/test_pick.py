@@ -7,7 +7,7 @@ import torch
 from mani_skill.utils.structs import Pose
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.errors import ConfigError
+from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.tasks.contacts import Contacts
 from robocas_ms3.tasks.transfer import STAGES
 
@@ -156,7 +156,7 @@ def test_configurations_that_do_not_fit_the_assets(changes, words):
 
 
 def changed(**changes) -> dict:
-    from robocas_ms3.config import load_task_config
+    from robocas_ms3.scenes.config import load_task_config
 
     return {**load_task_config("pick_table_scattered").model_dump(mode="json"), **changes}
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import robocas_ms3
-from robocas_ms3.config import load_task_config
-from robocas_ms3.errors import ConfigError
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.tasks import TASKS
 
 HORIZONS = {

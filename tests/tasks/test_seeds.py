@@ -10,9 +10,9 @@ from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from several_envs import Thing, several
 
 from robocas_ms3 import tasks
-from robocas_ms3.config import load_task_config
-from robocas_ms3.errors import ConfigError, LayoutError, RobocasError
+from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.scenes import source
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.tasks.seeds import SEVERAL_ENVS_SEEDS, SeededEnv
 
 STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}

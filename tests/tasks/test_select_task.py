@@ -12,14 +12,14 @@ import torch
 from mani_skill.utils.structs import Pose
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.config import load_task_config
-from robocas_ms3.config.load import shipped_configs
+from robocas_ms3.core.errors import AssetError
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.errors import AssetError
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.grasping import plan_grasp
+from robocas_ms3.scenes.config import load_task_config
+from robocas_ms3.scenes.config.load import shipped_configs
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.relations import MARGIN
 from robocas_ms3.scenes.sample import sample_layout

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.config import load_task_config
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.tasks import TASKS
 
 pytestmark = pytest.mark.slow

@@ -12,7 +12,7 @@ import torch
 from several_envs import several
 
 from robocas_ms3.cli.layouts import Build, Layouts, main
-from robocas_ms3.errors import LayoutError
+from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.scenes import bank, source
 from robocas_ms3.scenes.table import State
 from robocas_ms3.tasks.starts import Starts

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3 import arrays
+from robocas_ms3.core import arrays
 from robocas_ms3.tasks import terms
 
 YAW_90 = [math.sqrt(0.5), 0, 0, math.sqrt(0.5)]

@@ -7,8 +7,8 @@ import pytest
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli.layouts import try_all
-from robocas_ms3.config import load_task_config
 from robocas_ms3.scenes.bank import LayoutBank, write_layout
+from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.fill import fill, pairs_of
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.table import State

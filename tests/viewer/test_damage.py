@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from robocas_ms3.cli.view import View, main
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.failures import Failures
 from robocas_ms3.viewer.routes import Routes, script
 from robocas_ms3.viewer.source import open_source

@@ -6,9 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot.schema import MAX_DEPTH_MM
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.pictures import decode
 from robocas_ms3.viewer.source import open_source
 

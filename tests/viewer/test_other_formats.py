@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import formats
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.pictures import decode
 from robocas_ms3.viewer.routes import Routes
 from robocas_ms3.viewer.source import open_source

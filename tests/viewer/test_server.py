@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robocas_ms3.errors import RobocasError
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.viewer.routes import PAGE_FILES, Routes
 from robocas_ms3.viewer.server import HOST, Viewer
 from robocas_ms3.viewer.source import open_source

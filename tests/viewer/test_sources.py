@@ -6,9 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.parts import make_index, plot, rounded
 from robocas_ms3.viewer.plots import base_plot, motion_plots
 from robocas_ms3.viewer.source import open_source

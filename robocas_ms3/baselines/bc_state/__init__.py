@@ -14,9 +14,9 @@ from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.bc_state.data import StateSamples, inputs
 from robocas_ms3.baselines.bc_state.model import BcStateModel
 from robocas_ms3.baselines.chunk_policy import ChunkPolicy
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.evaluation.policy import Observations, Wants
-from robocas_ms3.poses import from_wxyz
 
 
 class BcState:

@@ -19,15 +19,15 @@ from robocas_ms3.baselines.bases import check_stands
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.chunks import encode, next_keys, spread, state_of
 from robocas_ms3.baselines.runs import hash_of
+from robocas_ms3.core.documents import DAMAGED
+from robocas_ms3.core.errors import DatasetError, EmptySplitError
+from robocas_ms3.core.files import replacing
+from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.documents import DAMAGED
-from robocas_ms3.errors import DatasetError, EmptySplitError
+from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.evaluation.policy import privileged
-from robocas_ms3.files import replacing
-from robocas_ms3.paths import cache_dir
-from robocas_ms3.recordings.motion import sample_states, sample_stride
-from robocas_ms3.recordings.reading import TrajectoryFile
-from robocas_ms3.recordings.versions import versions
 from robocas_ms3.robots.description import RobotDescription
 
 _VERSION = 2  # of what is kept

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.lerobot.observations import DIMENSIONS, EMBEDDING, STATE, STATE_NAMES, scaled, state_of
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import CAMERAS, Observations, Start, Wants
 from robocas_ms3.robots.description import RobotDescription
 

@@ -32,16 +32,16 @@ from robocas_ms3.baselines.lerobot.observations import (
     scaled,
     state_of,
 )
+from robocas_ms3.core.errors import DatasetError, RobocasError
+from robocas_ms3.core.files import replacing_folder, write_json
+from robocas_ms3.core.outputs import check_absent
+from robocas_ms3.core.words import printable
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import episode_columns, frame_columns
 from robocas_ms3.datasets.lerobot.schema import FEATURES, INDICES, INFO_FILE, STAGING, STATS_FILE, is_depth
 from robocas_ms3.datasets.lerobot.tables import Column, check_columns, numbers, open_table, read_columns
 from robocas_ms3.datasets.lerobot.variants import V3
 from robocas_ms3.datasets.sources.files import read_json
-from robocas_ms3.errors import DatasetError, RobocasError
-from robocas_ms3.files import replacing_folder, write_json
-from robocas_ms3.outputs import check_absent
-from robocas_ms3.words import printable
 
 Embed = Callable[[Sequence[str]], NDArray[np.float32]]
 _WIDTHS = {feature.key: feature.width for feature in FEATURES}
@@ -200,7 +200,7 @@ def main(words: Sequence[str] | None = None) -> int:
     try:
         embed = None
         if not cfg.no_language:
-            from robocas_ms3.language.embed import TextEmbedder
+            from robocas_ms3.scenes.language.embed import TextEmbedder
 
             embed = TextEmbedder()
         prepare(cfg.dataset, cfg.out, embed)

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.baselines.lerobot.policy import LeRobotPolicy
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import EvaluationError, RobocasError
+from robocas_ms3.core.words import escape_log_lines, escape_tracebacks, printable
 from robocas_ms3.datasets.lerobot.schema import checksum
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import EvaluationError, RobocasError
 from robocas_ms3.evaluation.remote.server import PolicyServer
-from robocas_ms3.words import escape_log_lines, escape_tracebacks, printable
 
 CHECKPOINT = "train/checkpoints/last/pretrained_model"
 INFO = "dataset/meta/info.json"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.trials import arm_action, seen
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.robots.ee_deltas import POSITION_SCALE, ROTATION_SCALE
 

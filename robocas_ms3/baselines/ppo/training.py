@@ -19,9 +19,9 @@ from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.rollouts import OUTCOMES, Rollouts, Tried, outcomes, steps_of
 from robocas_ms3.baselines.ppo.trials import FIRST_TRIAL, EnvTrials
 from robocas_ms3.baselines.runs import CHECKPOINT, RunRecord
-from robocas_ms3.errors import TrainingError
-from robocas_ms3.exits import deferred_interrupts, uninterrupted
-from robocas_ms3.outputs import check_there
+from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.core.exits import deferred_interrupts, uninterrupted
+from robocas_ms3.core.outputs import check_there
 
 
 class PpoTraining:

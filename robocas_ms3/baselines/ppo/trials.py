@@ -14,9 +14,9 @@ from gymnasium.vector.utils import batch_space
 
 import robocas_ms3
 from robocas_ms3.baselines.ppo.config import ONE_FRUIT, ONE_FRUIT_STEPS, PpoConfig
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.config import TaskConfig, load_task_config
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.scenes.config import TaskConfig, load_task_config
+from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.rl import CONTROL_FREQ
 
 FIRST_TRIAL = 20_000  # first seed of the layouts that are not learned from

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.datasets.actions import ActionScale
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 
 HORIZON = 11  # frames: the paper's appendix, RoboFlamingo

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.table import need_extra
-from robocas_ms3.language.embed import DIMENSIONS
+from robocas_ms3.scenes.language.embed import DIMENSIONS
 
 _SQUARE_PADDED = (5, 18)
 """EfficientNet-B3's blocks that halve an odd number of rows: of 300, its own size, 75 and 19; of 236 rows 59 and 15."""

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
 
 _PREFIX = "efficientnet."
 _EXPECTED = "EfficientNet's weights by transformers' names"

@@ -14,7 +14,7 @@ from robocas_ms3.baselines.rt1.image import ImageEncoder
 from robocas_ms3.baselines.rt1.image_weights import load_image_weights
 from robocas_ms3.baselines.rt1.tokens import ACTION_TOKENS, GO_ON, OVER, ActionBins
 from robocas_ms3.baselines.rt1.transformer import Transformer
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
 
 
 class RT1Model(nn.Module):

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import AfterValidator, Field, model_validator
 
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
+from robocas_ms3.core.strict import StrictModel
 from robocas_ms3.evaluation.policy import CAMERAS
-from robocas_ms3.strict import StrictModel
 
 
 class View(StrictModel):

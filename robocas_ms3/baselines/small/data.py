@@ -25,10 +25,10 @@ from robocas_ms3.baselines.fits import check_fits
 from robocas_ms3.baselines.small.config import SmallConfig, View
 from robocas_ms3.baselines.small.pointing import places_of
 from robocas_ms3.baselines.small.standing import Standing, calibration, looks_alike, seen_from, standing
+from robocas_ms3.core.errors import DatasetError, EmptySplitError
+from robocas_ms3.core.poses import Array, from_xyzw
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
-from robocas_ms3.errors import DatasetError, EmptySplitError
-from robocas_ms3.poses import Array, from_xyzw
 
 _log = logging.getLogger(__name__)
 _LEAST_HEIGHT = 0.01  # m

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from robocas_ms3.baselines.small.config import View
-from robocas_ms3.poses import Array, inverse, transform
+from robocas_ms3.core.poses import Array, inverse, transform
 
 CELL = 8
 """Pixels a side of what is told apart."""

@@ -13,8 +13,8 @@ from robocas_ms3.baselines.chunks import state_of
 from robocas_ms3.baselines.small.config import SmallConfig
 from robocas_ms3.baselines.small.data import looked_at
 from robocas_ms3.baselines.small.model import SmallModel
+from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.evaluation.policy import Observations, Wants
-from robocas_ms3.poses import from_wxyz
 
 
 def make_policy(config: SmallConfig, facts: dict[str, Any], model: SmallModel) -> ChunkPolicy:

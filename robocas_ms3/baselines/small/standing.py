@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.small.config import View
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import Array, from_xyzw, inverse, transform
 from robocas_ms3.datasets.schema import CAMERAS, SCENE_FILE
 from robocas_ms3.datasets.sources.protocol import SourceEpisode
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.poses import Array, from_xyzw, inverse, transform
 
 _ALIKE = {"mount": 1e-3, "intrinsic": 1e-2}
 _PARENTS = {camera.name: camera.parent for camera in CAMERAS}

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.rigid import ANGLE_TOLERANCE, NORM_TOLERANCE, POSITION_TOLERANCE, apart, same
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays, planar_motion
-from robocas_ms3.language.templates import GOAL_TYPES
-from robocas_ms3.poses import from_xyzw
-from robocas_ms3.recordings.motion import relative_motion
+from robocas_ms3.demos.recordings.motion import relative_motion
+from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 Check = Callable[[EpisodeArrays], Iterator[Violation]]
 """What is wrong with arrays, by one law; what is absent is told by `check_keys` alone."""

@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import DAMAGED, load_array, load_json
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line, read_arrays
-from robocas_ms3.documents import DAMAGED, load_array, load_json
 
 NO_FILE = "no file"
 SURPLUS = "a file beyond them"

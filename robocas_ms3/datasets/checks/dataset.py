@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks import pictures as seen
@@ -20,7 +21,6 @@ from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import no_dataset
 from robocas_ms3.datasets.writing.output import MARKS
-from robocas_ms3.errors import DatasetError
 
 
 @dataclass(frozen=True)

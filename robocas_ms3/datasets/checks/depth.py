@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.poses import inverse
+from robocas_ms3.core.poses import inverse
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.checks.content import NO_FILE, EpisodeContent, JsonObject, read_object
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.sources.tolerant import SPECS, is_declared
-from robocas_ms3.language.templates import GOAL_TYPES
+from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 FILE = schema.DATA_INFO_FILE
 RANGE_TOLERANCE = 1e-4

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.poses import from_xyzw
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import depth as geometry
 from robocas_ms3.datasets.checks.content import NO_FILE, SURPLUS, EpisodeContent, Headers
@@ -14,8 +16,6 @@ from robocas_ms3.datasets.checks.rigid import is_rigid
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.pictures.headers import PictureHeader
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.poses import from_xyzw
-from robocas_ms3.words import count_of
 
 _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
 Sizes = Mapping[str, tuple[int, int]]

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.tolerant import first_line
 from robocas_ms3.demos.open_loop import OpenLoop
-from robocas_ms3.errors import RobocasError
-from robocas_ms3.recordings.entries import read_reset_options, was_taken_over
-from robocas_ms3.recordings.environment import read_env
-from robocas_ms3.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.entries import read_reset_options, was_taken_over
+from robocas_ms3.demos.recordings.environment import read_env
+from robocas_ms3.demos.recordings.seeds import one_seed
 
 SAME_PLACE = 1e-3  # m
 BASE_STILL = 1e-3  # m that the base may move in all: 7-D actions do not move it

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.content import EpisodeContent, read_object
 from robocas_ms3.datasets.checks.scene_values import check_rate, check_settings_values, check_values
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint, first_line
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.seeds import one_seed
 
 FILE = schema.CONVERSION_FILE
 

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, NonNegativeInt, PlainValidator, ValidationError
 
+from robocas_ms3.core.strict import Mistake, mistakes
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import Violation
-from robocas_ms3.strict import Mistake, mistakes
 
 
 def one_seed(value: Any) -> int | None:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.poses import from_xyzw
-from robocas_ms3.recordings.motion import relative_motion
+from robocas_ms3.demos.recordings.motion import relative_motion
 
 
 def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from robocas_ms3.core.files import write_json
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.depth import DEPTH_INFO
 from robocas_ms3.datasets.lerobot.episodes import GROUP, open_episodes, stage_rows, write_tasks
@@ -26,8 +28,6 @@ from robocas_ms3.datasets.lerobot.table_writing import RollingTable, write_texts
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, Layout, Variant, find_variant
 from robocas_ms3.datasets.lerobot.video import Joiner, packet_times
 from robocas_ms3.datasets.sources.protocol import Kind
-from robocas_ms3.files import write_json
-from robocas_ms3.words import count_of
 
 _log = logging.getLogger(__name__)
 _FLOATS = {feature.key for feature in schema.FEATURES} | {"timestamp", schema.REWARD.key}

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from robocas_ms3.core.documents import DocumentError
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.content import read_object
 from robocas_ms3.datasets.checks.dataset import Report
 from robocas_ms3.datasets.checks.scene_values import check_form, check_values
@@ -29,8 +31,6 @@ from robocas_ms3.datasets.lerobot.records import (
 )
 from robocas_ms3.datasets.lerobot.tables import faults, open_table
 from robocas_ms3.datasets.sources.tolerant import first_line
-from robocas_ms3.documents import DocumentError
-from robocas_ms3.errors import DatasetError
 
 
 def is_lerobot(root: Path) -> bool:

@@ -13,6 +13,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
@@ -23,8 +25,6 @@ from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import frame_columns
 from robocas_ms3.datasets.lerobot.tables import faults, numbers, open_table, read_rows
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, first_line
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.words import count_of
 
 Ranges = Mapping[str, tuple[NDArray, NDArray, int]]
 """Feature -> minimum and maximum of each of its numbers, and the number of frames."""

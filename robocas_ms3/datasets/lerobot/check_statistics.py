@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.content import read_object
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
@@ -15,7 +16,6 @@ from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.records import StatsLine, read_lines
 from robocas_ms3.datasets.lerobot.stats import QUANTILES, shape_of
 from robocas_ms3.datasets.sources.tolerant import first_line
-from robocas_ms3.errors import DatasetError
 
 _NAMES = {"min", "max", "mean", "std", "count"}
 

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.variants import Layout
 from robocas_ms3.datasets.lerobot.video import packet_times, read_frames
-from robocas_ms3.errors import DatasetError
 
 TOLERANCE = 1e-4
 """Of times, s: what LeRobot tolerates."""

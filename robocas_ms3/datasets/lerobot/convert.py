@@ -12,6 +12,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+from robocas_ms3.core.errors import DatasetError, IncompleteError
+from robocas_ms3.core.files import flush_to_disk, make_folder, naming, remove, write_json
+from robocas_ms3.core.outputs import (
+    check_there,
+    claim_output,
+    kept_if_begun,
+    locked_folder,
+    sweep,
+    while_there,
+)
+from robocas_ms3.core.processes import Limits as EpisodeLimits
 from robocas_ms3.datasets.lerobot.plan import PARTS, PLAN, check_resume, only, plan_of
 from robocas_ms3.datasets.lerobot.schema import CONTENT, INFO_FILE, STAGING, Limits, require_extra, whole_rate
 from robocas_ms3.datasets.lerobot.variants import NEWEST, find_variant
@@ -22,17 +33,6 @@ from robocas_ms3.datasets.writing.frames import OpenSource
 from robocas_ms3.datasets.writing.output import check_overwrite
 from robocas_ms3.datasets.writing.players import Request, open_env
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
-from robocas_ms3.errors import DatasetError, IncompleteError
-from robocas_ms3.files import flush_to_disk, make_folder, naming, remove, write_json
-from robocas_ms3.outputs import (
-    check_there,
-    claim_output,
-    kept_if_begun,
-    locked_folder,
-    sweep,
-    while_there,
-)
-from robocas_ms3.processes import Limits as EpisodeLimits
 
 Codec = Literal["h264", "av1"]
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.lerobot.schema import MAX_DEPTH_MM
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.strict import parse
 
 LEVELS = 4096
 DEPTH_INFO: Mapping[str, Any] = {

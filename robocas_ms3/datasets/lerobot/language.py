@@ -22,13 +22,13 @@ import numpy as np
 import pyarrow as pa
 from pydantic import BaseModel, ValidationError
 
+from robocas_ms3.core.errors import DatasetError, RobocasError
+from robocas_ms3.core.strict import validate_json
 from robocas_ms3.datasets.checks.scene_values import sound
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.pictures.boxes import Box
-from robocas_ms3.errors import DatasetError, RobocasError
-from robocas_ms3.language.instructions import instruction, is_plural, part_name, template_ids
-from robocas_ms3.recordings.subgoals import SubGoal
-from robocas_ms3.strict import validate_json
+from robocas_ms3.demos.recordings.subgoals import SubGoal
+from robocas_ms3.scenes.language.instructions import instruction, is_plural, part_name, template_ids
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 Row = dict[str, Any]

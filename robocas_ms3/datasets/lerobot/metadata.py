@@ -11,6 +11,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.records import (
     SCENES,
@@ -32,9 +35,6 @@ from robocas_ms3.datasets.lerobot.tables import (
 )
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS, Layout
 from robocas_ms3.datasets.sources.tolerant import first_line
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.strict import parse
 
 
 class Metadata:

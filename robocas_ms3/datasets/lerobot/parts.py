@@ -13,6 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.language import (
     EVENTS,
@@ -28,9 +30,7 @@ from robocas_ms3.datasets.lerobot.stats import Range
 from robocas_ms3.datasets.lerobot.table_writing import column
 from robocas_ms3.datasets.lerobot.tables import numbers
 from robocas_ms3.datasets.lerobot.variants import Variant
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.subgoals import subgoal_runs
+from robocas_ms3.demos.recordings.subgoals import subgoal_runs
 
 
 @dataclass

@@ -7,17 +7,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.outputs import check_same, is_taken
+from robocas_ms3.core.strict import parse
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.lerobot.records import ConversionRecord
 from robocas_ms3.datasets.lerobot.schema import CONVERSION_FILE, INFO_FILE
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.writing.plan import LEFT_OUT, check_versions
 from robocas_ms3.datasets.writing.players import Player
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.outputs import check_same, is_taken
-from robocas_ms3.recordings.versions import versions
-from robocas_ms3.strict import parse
-from robocas_ms3.words import count_of
+from robocas_ms3.demos.recordings.versions import versions
 
 PARTS = ".parts"
 """Folder of the episodes done so far; gone when the dataset is there."""

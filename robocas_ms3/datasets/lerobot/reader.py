@@ -14,6 +14,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import DocumentError, json_values
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import robocas_arrays
 from robocas_ms3.datasets.lerobot.depth import to_depth
@@ -43,10 +46,7 @@ from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, Side, SourceEpisode
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.datasets.sources.tolerant import first_line
-from robocas_ms3.documents import DocumentError, json_values
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
-from robocas_ms3.strict import parse
+from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 
 
 class LeRobotDataset(Metadata, EpisodeSource):

@@ -8,14 +8,14 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, StringConstraints, model_validator
 
+from robocas_ms3.core.documents import JSON_LIMIT, json_values, read_text
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBERS, TEXT, TEXTS, Column, Kind
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS
 from robocas_ms3.datasets.sources.provenance import EntryRecord
 from robocas_ms3.datasets.sources.tolerant import first_line
-from robocas_ms3.documents import JSON_LIMIT, json_values, read_text
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.strict import parse
 
 MAX_EPISODES = 10**6
 MAX_FRAMES = 10**9

@@ -42,9 +42,9 @@ from typing import Any
 
 import numpy as np
 
+from robocas_ms3.core.documents import check_regular
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot.variants import Variant
-from robocas_ms3.documents import check_regular
-from robocas_ms3.errors import DatasetError
 from robocas_ms3.robots.table import DEFAULT
 
 ROBOT_TYPE = "mobile_panda"  # of the default robot; another one's is its name
@@ -252,7 +252,7 @@ def require_extra() -> None:
     """
     import importlib.util
 
-    from robocas_ms3.errors import MissingExtraError
+    from robocas_ms3.core.errors import MissingExtraError
 
     missing = [name for name in ("pyarrow", "av") if importlib.util.find_spec(name) is None]
     if missing:

@@ -15,6 +15,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import json_text, replacing_folder
+from robocas_ms3.core.processes import Limits
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.lerobot.depth import to_levels
 from robocas_ms3.datasets.lerobot.language import EVENTS, EVENTS_TYPE, event_rows
@@ -32,10 +36,6 @@ from robocas_ms3.datasets.writing.players import Player, Request
 from robocas_ms3.datasets.writing.pool import do_all
 from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import json_text, replacing_folder
-from robocas_ms3.processes import Limits
 
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
 SUBGOAL = "subgoal"  # column of texts, which become numbers when parts are joined

@@ -15,8 +15,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robocas_ms3.documents import check_regular
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.core.documents import check_regular
+from robocas_ms3.core.errors import DatasetError
 
 ARRAYS_LIMIT = 2**29
 """Bytes that the columns of one reading may have as arrays: 40 million rows of one value are 1 MB as a file."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.core.errors import DatasetError
 
 CHUNK_FILES = 1000
 """Files per chunk folder."""

@@ -16,9 +16,9 @@ import numpy as np
 from av.error import FFmpegError
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import DocumentError, check_regular
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES
-from robocas_ms3.documents import DocumentError, check_regular
-from robocas_ms3.errors import DatasetError
 
 
 @dataclass(frozen=True)

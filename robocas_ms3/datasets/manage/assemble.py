@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import robocas_ms3
+from robocas_ms3.core.files import replacing_folder
+from robocas_ms3.core.outputs import claim_output
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.input_check import check_episodes
 from robocas_ms3.datasets.manage.parts import Part
 from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.output import Placer, begun_output, check_apart
 from robocas_ms3.datasets.writing.plan import SETTINGS
-from robocas_ms3.files import replacing_folder
-from robocas_ms3.outputs import claim_output
-from robocas_ms3.words import count_of
 
 Side = Literal["train", "val"]
 OnStart = Callable[[int], None]

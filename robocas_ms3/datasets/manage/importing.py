@@ -11,6 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import robocas_ms3
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import json_text, replacing_folder, write_json
+from robocas_ms3.core.strict import parse
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.eef import about_z
 from robocas_ms3.datasets.manage.findings import EMBEDDINGS, EpisodeImport
@@ -26,10 +30,6 @@ from robocas_ms3.datasets.writing.info import write_info
 from robocas_ms3.datasets.writing.output import Placer, begun_output
 from robocas_ms3.datasets.writing.plan import dataset_settings
 from robocas_ms3.datasets.writing.writer import write_cameras
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import json_text, replacing_folder, write_json
-from robocas_ms3.strict import parse
-from robocas_ms3.words import count_of
 
 Embed = Callable[[list[str]], NDArray[np.float32]]
 REPORT_FILE = "import_report.json"

@@ -6,6 +6,8 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from robocas_ms3.core.documents import check_regular
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.content import SURPLUS, EpisodeContent, read_episode
@@ -17,8 +19,6 @@ from robocas_ms3.datasets.pictures.headers import PictureHeader, read_header
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import SPECS, read_arrays
-from robocas_ms3.documents import check_regular
-from robocas_ms3.errors import DatasetError
 
 _TAIL = 32  # bytes at the end of a picture that are looked at
 

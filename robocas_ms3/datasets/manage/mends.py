@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.checks.rigid import same
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.manage.findings import EMBEDDINGS, ESSENTIAL, Finding, Outcome
 from robocas_ms3.datasets.sources.tolerant import SPECS, EpisodeArrays, motion_arrays, planar_motion
-from robocas_ms3.words import count_of
 
 Treatment = tuple[EpisodeArrays, Outcome, str]
 """The arrays after it, what becomes of the episode, and the problem in words."""

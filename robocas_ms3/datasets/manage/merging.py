@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.assemble import Assembly, Member, OnEpisode, OnStart, Side, assemble, check_before
 from robocas_ms3.datasets.manage.parts import Part, names_of, open_part, shown
 from robocas_ms3.datasets.writing.plan import SETTINGS
-from robocas_ms3.errors import DatasetError
 
 SPLIT_RULE = "every episode keeps the side it had in the dataset it is from"
 

@@ -8,13 +8,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.episode import Overview
 from robocas_ms3.datasets.sources.provenance import ConversionRecord
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.strict import parse
 
 Sides = tuple[list[int], list[int]]
 """Training and validation episodes."""

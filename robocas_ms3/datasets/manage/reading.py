@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.content import NO_FILE, SURPLUS, read_headers
 from robocas_ms3.datasets.checks.pictures import check_camera_file, check_pictures, sizes_of
@@ -19,8 +21,6 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.files import said_of
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, completed, load_arrays
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.words import count_of
 
 FULL_SIZE = (640, 480)
 _MOST = 3  # problems named of one camera's pictures

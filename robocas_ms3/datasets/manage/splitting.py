@@ -13,15 +13,15 @@ from typing import Literal
 
 import numpy as np
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import write_json
+from robocas_ms3.core.outputs import locked_folder
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.assemble import Assembly, Member, OnEpisode, OnStart, Side, assemble, check_before
 from robocas_ms3.datasets.manage.input_check import check_numbers
 from robocas_ms3.datasets.manage.parts import Part, Sides, names_of
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.info import info_of
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import write_json
-from robocas_ms3.outputs import locked_folder
 
 By = Literal["seed", "target", "task"]
 KEEP_RULE = "every episode keeps the side it had in the dataset it is from"

@@ -8,14 +8,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.findings import Finding, Outcome
 from robocas_ms3.datasets.manage.reading import FULL_SIZE, read_episode
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.words import count_of
 
 
 @dataclass

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
+from robocas_ms3.core.documents import DocumentError, read_bytes
 from robocas_ms3.datasets.pictures.png import SIGNATURE
-from robocas_ms3.documents import DocumentError, read_bytes
 
 LARGEST = 8192
 """Pixels per side."""

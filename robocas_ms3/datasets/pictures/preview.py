@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.files import make_folder, replacing
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.drawing import Pictures, Story, draw_frame, draw_row, row_steps
 from robocas_ms3.datasets.pictures.video import SHEET, open_video, sheet_row, write_sheet
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.files import make_folder, replacing
 
 FEW = 20
 """Of so many episodes previews are made without being asked for."""

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.headers import LARGEST, read_picture_bytes
 from robocas_ms3.datasets.pictures.png import encode_png
-from robocas_ms3.errors import DatasetError
 
 _QUALITY = {
     "jpg": [cv2.IMWRITE_JPEG_QUALITY, 95],

@@ -12,6 +12,8 @@ import imageio.v2 as imageio
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import replacing
 from robocas_ms3.datasets.pictures.drawing import (
     COLUMNS,
     THUMBNAIL,
@@ -25,8 +27,6 @@ from robocas_ms3.datasets.pictures.drawing import (
 )
 from robocas_ms3.datasets.pictures.png import encode_png
 from robocas_ms3.datasets.sources.protocol import EpisodeSource, Kind, SourceEpisode, shots
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import replacing
 
 PANEL = (426, 320)
 """Width and height of one camera's picture in a video."""

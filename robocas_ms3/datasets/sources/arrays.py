@@ -1,6 +1,6 @@
 """From recorded states to the arrays of an episode: pure maths, no simulator.
 
-Which states are kept, and the motion between them: `robocas_ms3.recordings.motion`.
+Which states are kept, and the motion between them: `robocas_ms3.demos.recordings.motion`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.recordings.motion import Motion, stored_motion
-from robocas_ms3.recordings.subgoals import SubGoal
+from robocas_ms3.demos.recordings.motion import Motion, stored_motion
+from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.robots.description import RobotDescription
 
 Array = NDArray[np.float64]

@@ -15,13 +15,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import read_picture
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE, read_array, read_json, said_of
 from robocas_ms3.datasets.sources.protocol import SourceEpisode
 from robocas_ms3.datasets.sources.tolerant import completed, is_declared, load_arrays, read_arrays
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.subgoals import SubGoal, read_subgoals
+from robocas_ms3.demos.recordings.subgoals import SubGoal, read_subgoals
 
 DEFAULT_RATE = 5.0  # upstream's, Hz
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import DAMAGED, load_array, load_json
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.documents import DAMAGED, load_array, load_json
-from robocas_ms3.errors import DatasetError
 
 CAMERA_LIMIT = 2**22
 """Bytes of an array of intrinsics or poses; a pose has 128."""

@@ -15,12 +15,12 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.pictures.boxes import Box
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.seeds import one_seed
-from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
+from robocas_ms3.demos.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 
 Side = Literal["train", "val", "all"]
 """Of the split into training and validation."""

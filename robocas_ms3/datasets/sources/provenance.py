@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, NonNegativeInt, StringConstraints
 
 from robocas_ms3.datasets import schema
-from robocas_ms3.recordings.reading import Recording, TrajectoryFile
+from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
 
 
 class EntryRecord(BaseModel):

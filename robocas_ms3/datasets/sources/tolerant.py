@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import DAMAGED, open_arrays
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.arrays import wrap_angle
-from robocas_ms3.documents import DAMAGED, open_arrays
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.poses import from_xyzw
-from robocas_ms3.recordings.motion import stored_motion
+from robocas_ms3.demos.recordings.motion import stored_motion
 
 SPECS = {spec.name: spec for spec in schema.EPISODE_INFO}
 PICKLED = "pickled objects, which are never loaded"

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.facts import Facts, facts_of
 from robocas_ms3.datasets.statistics.described import counted, described, histogram, rounded
 from robocas_ms3.datasets.statistics.layout_map import LayoutMap, layout_map
 from robocas_ms3.datasets.training.sample_arrays import checked_actions
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.words import count_of
 
 STILL = (1e-3, np.deg2rad(0.5))  # m and rad a step below which the gripper counts as standing still
 

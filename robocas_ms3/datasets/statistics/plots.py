@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from robocas_ms3.core.errors import MissingExtraError
+from robocas_ms3.core.files import make_folder, replacing, write_json
+from robocas_ms3.core.words import called, count_of, printable
 from robocas_ms3.datasets.actions import ACTION_NAMES
 from robocas_ms3.datasets.statistics.collect import Stats
 from robocas_ms3.datasets.statistics.described import counted, histogram
 from robocas_ms3.datasets.statistics.layout_map import LayoutMap
-from robocas_ms3.errors import MissingExtraError
-from robocas_ms3.files import make_folder, replacing, write_json
-from robocas_ms3.words import called, count_of, printable
 
 DPI = 110
 BLUE, ORANGE, GREY = "#2f6fa8", "#e08a2e", "#9aa3ab"

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, episode_actions
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 from robocas_ms3.datasets.sources.tolerant import first_line
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.language.templates import GOAL_TYPES
+from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 
 def check_holds(source: EpisodeSource, cameras: Sequence[str], *, depth: bool, embedding: bool) -> None:

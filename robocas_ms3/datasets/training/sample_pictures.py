@@ -13,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import get_worker_info
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.sources.protocol import Kind, SourceEpisode
-from robocas_ms3.errors import DatasetError
 
 _settled = -1  # the process that was settled last
 

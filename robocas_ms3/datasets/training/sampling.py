@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.core.errors import DatasetError
 
 
 class SampleIndex:

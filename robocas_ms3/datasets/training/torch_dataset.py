@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError, EmptySplitError
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
@@ -22,8 +24,6 @@ from robocas_ms3.datasets.training.sample_arrays import check_holds, read_episod
 from robocas_ms3.datasets.training.sample_pictures import PictureStack
 from robocas_ms3.datasets.training.sampling import SampleIndex, balancing_weights
 from robocas_ms3.datasets.training.windows import Padding, Window
-from robocas_ms3.errors import DatasetError, EmptySplitError
-from robocas_ms3.words import count_of
 
 UPSTREAM_CAMERAS = ("base_camera", "gripper_camera")
 UPSTREAM_SIZE = (320, 256)

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import DatasetError
+from robocas_ms3.core.errors import DatasetError
 
 Steps = NDArray[np.int64]
 Padding = Literal["hold", "zero", "drop"]

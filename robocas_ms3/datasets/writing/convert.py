@@ -14,6 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError, IncompleteError
+from robocas_ms3.core.files import make_folder, write_json
+from robocas_ms3.core.outputs import check_there, claim_output, kept_if_begun, locked_folder, sweep, while_there
+from robocas_ms3.core.processes import Limits
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.preview import FEW, finish_previews, on_sheet
 from robocas_ms3.datasets.pictures.stored import Pictures
@@ -37,10 +41,6 @@ from robocas_ms3.datasets.writing.players import Player, RecordingPlayer, Reques
 from robocas_ms3.datasets.writing.timing import Timing
 from robocas_ms3.datasets.writing.workers import Job, write_all
 from robocas_ms3.datasets.writing.writer import WrittenEpisode
-from robocas_ms3.errors import DatasetError, IncompleteError
-from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import check_there, claim_output, kept_if_begun, locked_folder, sweep, while_there
-from robocas_ms3.processes import Limits
 
 _log = logging.getLogger(__name__)
 
@@ -229,7 +229,7 @@ def _split_before(out: Path) -> tuple[list[int], list[int]]:
 
 def embed_texts(player: Player, entries: Sequence[Mapping[str, Any]]) -> dict[str, NDArray[np.float32]]:
     """Embed every distinct text here, so that no worker has to load the model."""
-    from robocas_ms3.language.embed import TextEmbedder
+    from robocas_ms3.scenes.language.embed import TextEmbedder
 
     embedder = TextEmbedder()
     texts = list(dict.fromkeys(text for entry in entries for text in _texts(player, entry["source"])))

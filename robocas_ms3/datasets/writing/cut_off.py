@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from robocas_ms3.core.documents import DAMAGED, DocumentError, check_regular, load_array, load_json
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.files import CAMERA_LIMIT
 from robocas_ms3.datasets.sources.tolerant import read_arrays
-from robocas_ms3.documents import DAMAGED, DocumentError, check_regular, load_array, load_json
 
 _ENDS = {".png": b"\0\0\0\0IEND\xaeB\x60\x82", ".jpg": b"\xff\xd9"}
 

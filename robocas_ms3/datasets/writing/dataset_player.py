@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.documents import DAMAGED
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.pictures.stored import Pictures
@@ -18,8 +20,6 @@ from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame
 from robocas_ms3.datasets.writing.players import Played, Player, RecordingPlayer, Request
 from robocas_ms3.datasets.writing.timing import Timing
-from robocas_ms3.documents import DAMAGED
-from robocas_ms3.errors import DatasetError
 
 NEEDED = frozenset(s.name for s in schema.EPISODE_INFO if not s.embedding) - {"base_rel_pos", "base_rel_orn"}
 """Arrays that an episode must have to be converted."""

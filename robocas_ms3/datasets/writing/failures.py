@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.core.ledger import Ledger
 from robocas_ms3.datasets.sources.provenance import environment_of, task_of
 from robocas_ms3.demos.ledger import FAILURES_FILE
-from robocas_ms3.ledger import Ledger
 
 
 def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:

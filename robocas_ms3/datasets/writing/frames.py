@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.datasets.pictures.boxes import Box
 from robocas_ms3.datasets.pictures.stored import Pictures
-from robocas_ms3.recordings.environment import RecordedEnv
-from robocas_ms3.recordings.reading import Recording
+from robocas_ms3.demos.recordings.environment import RecordedEnv
+from robocas_ms3.demos.recordings.reading import Recording
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import write_json
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.sources.tolerant import first_line, read_arrays
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import write_json
-from robocas_ms3.recordings.seeds import one_seed
-from robocas_ms3.recordings.subgoals import SubGoal, subgoal_runs
+from robocas_ms3.demos.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The folder a dataset is written into, and files of others that get there; its rules: `robocas_ms3.outputs`."""
+"""The folder a dataset is written into, and files of others that get there; its rules: `robocas_ms3.core.outputs`."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3 import outputs
+from robocas_ms3.core import outputs
+from robocas_ms3.core.documents import check_regular, load_json
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import make_folder, write_json
+from robocas_ms3.core.outputs import claim_output, is_taken, kept_if_begun, locked_folder, sweep
 from robocas_ms3.datasets import schema
-from robocas_ms3.documents import check_regular, load_json
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import make_folder, write_json
-from robocas_ms3.outputs import claim_output, is_taken, kept_if_begun, locked_folder, sweep
 
 MARKS = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
 """A folder with one of these is a RoboCAS dataset, whole or not."""

@@ -11,16 +11,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from robocas_ms3.core.documents import load_json
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.outputs import check_same, is_taken
+from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.provenance import ConversionRecord
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
-from robocas_ms3.documents import load_json
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.outputs import check_same, is_taken
-from robocas_ms3.recordings.seeds import one_seed
-from robocas_ms3.recordings.versions import versions
-from robocas_ms3.strict import parse
+from robocas_ms3.demos.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.versions import versions
 
 Entries = Sequence[dict[str, Any]]
 """What is to be converted, see `players.Player.entries`."""

@@ -11,6 +11,8 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.words import count_of
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import format_of
 from robocas_ms3.datasets.pictures.stored import Pictures
@@ -19,12 +21,10 @@ from robocas_ms3.datasets.sources.episode import DEFAULT_RATE
 from robocas_ms3.datasets.sources.provenance import recording_entry, scene_record, succeeded, unread_entry
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame, FrameSource, OpenSource
 from robocas_ms3.datasets.writing.timing import Timing
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.environment import RecordedEnv
-from robocas_ms3.recordings.motion import sample_states, sample_stride
-from robocas_ms3.recordings.reading import Recording, TrajectoryFile
-from robocas_ms3.recordings.subgoals import sample_subgoals
-from robocas_ms3.words import count_of
+from robocas_ms3.demos.recordings.environment import RecordedEnv
+from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
+from robocas_ms3.demos.recordings.reading import Recording, TrajectoryFile
+from robocas_ms3.demos.recordings.subgoals import sample_subgoals
 
 _log = logging.getLogger(__name__)
 

@@ -12,9 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from robocas_ms3.errors import DatasetError, IncompleteError, MissingExtraError, RobocasError
-from robocas_ms3.processes import NO_LIMITS, Limits, Pool, SentError, Worker, use_one_torch_thread
-from robocas_ms3.words import count_of
+from robocas_ms3.core.errors import DatasetError, IncompleteError, MissingExtraError, RobocasError
+from robocas_ms3.core.processes import NO_LIMITS, Limits, Pool, SentError, Worker, use_one_torch_thread
+from robocas_ms3.core.words import count_of
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

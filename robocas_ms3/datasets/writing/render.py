@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import inverse
 from robocas_ms3.datasets.pictures.boxes import Box, box_of
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.poses import inverse
-from robocas_ms3.recordings.environment import RecordedEnv
-from robocas_ms3.recordings.reading import Recording
+from robocas_ms3.demos.recordings.environment import RecordedEnv
+from robocas_ms3.demos.recordings.reading import Recording
 
 _SAME_PLACE = 1e-3  # m
 

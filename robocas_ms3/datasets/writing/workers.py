@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.processes import Limits
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.preview import Preview
 from robocas_ms3.datasets.writing.players import RecordingPlayer, Request
 from robocas_ms3.datasets.writing.pool import do_all
 from robocas_ms3.datasets.writing.writer import WrittenEpisode, write_episode
-from robocas_ms3.processes import Limits
 
 
 @dataclass(frozen=True)

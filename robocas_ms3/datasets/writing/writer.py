@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.files import json_text, replacing_folder
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.pictures.drawing import Story
 from robocas_ms3.datasets.pictures.preview import Preview
@@ -22,8 +24,6 @@ from robocas_ms3.datasets.sources.arrays import with_embeddings
 from robocas_ms3.datasets.writing.frames import CameraModel, Frame
 from robocas_ms3.datasets.writing.players import Player
 from robocas_ms3.datasets.writing.timing import Timing
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.files import json_text, replacing_folder
 
 ENCODERS = 2  # threads; ISA-L and OpenCV work outside Python's lock
 _MAX_WAITING = 24  # pictures, which bounds memory

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.datasets.writing.render import require_renderer
-from robocas_ms3.errors import EvaluationError
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import Observations, Wants
 from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol

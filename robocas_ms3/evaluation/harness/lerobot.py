@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 from lerobot.configs import FeatureType, PolicyFeature  # pyright: ignore[reportMissingImports]
 from lerobot.envs import EnvConfig  # pyright: ignore[reportMissingImports]
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, depth_key
 from robocas_ms3.evaluation.policy import CAMERAS, Reference, Wants

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.sources.arrays import episode_arrays
-from robocas_ms3.poses import from_wxyz, inverse
-from robocas_ms3.recordings.motion import Motion, gripper_open
+from robocas_ms3.demos.recordings.motion import Motion, gripper_open
 from robocas_ms3.robots.forward import chain
 from robocas_ms3.robots.table import RobotSpec
 

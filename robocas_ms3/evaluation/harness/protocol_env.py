@@ -13,7 +13,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.outputs import locked_folder
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.driven import DrivenEpisodes
@@ -21,7 +22,6 @@ from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.run import Settings, chosen
-from robocas_ms3.outputs import locked_folder
 from robocas_ms3.robots.table import find_robot
 
 

@@ -16,12 +16,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.exits import no_exit
+from robocas_ms3.core.extensions import Table
+from robocas_ms3.core.strict import nearest
 from robocas_ms3.evaluation.policies.plain import RandomPolicy, StillPolicy
 from robocas_ms3.evaluation.policy import Policy, Wants
-from robocas_ms3.exits import no_exit
-from robocas_ms3.extensions import Table
-from robocas_ms3.strict import nearest
 
 GROUP = "robocas_ms3.policies"
 FOLDERS_GROUP = "robocas_ms3.policy_folders"

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.demos.recordings.entries import read_json, read_reset, was_taken_over
+from robocas_ms3.demos.recordings.environment import read_env
+from robocas_ms3.demos.recordings.stored import open_episode, open_trajectory, read_actions
 from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
-from robocas_ms3.recordings.entries import read_json, read_reset, was_taken_over
-from robocas_ms3.recordings.environment import read_env
-from robocas_ms3.recordings.stored import open_episode, open_trajectory, read_actions
 
 
 class ReplayPolicy:

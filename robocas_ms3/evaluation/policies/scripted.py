@@ -10,14 +10,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.benchmark import TASKS
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.demos.recordings.motion import sample_stride
 from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack, PoseTrack, Track
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
-from robocas_ms3.recordings.motion import sample_stride
 from robocas_ms3.robots.table import find_robot
+from robocas_ms3.scenes.task_specs import TASKS
 
 BESIDE = (0.01, 0.05)  # m sideways, least and most: a finger on top of what is meant, or what stands next to it
 _FREQ = 20  # Hz, at which it plans

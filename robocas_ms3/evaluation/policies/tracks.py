@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.demos.recordings.motion import Motion, sample_states
 from robocas_ms3.evaluation.policy import Observations
-from robocas_ms3.recordings.motion import Motion, sample_states
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.table import RobotSpec
 

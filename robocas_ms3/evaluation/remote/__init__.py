@@ -5,7 +5,7 @@
 docs/remote_policies.md.
 """
 
-from robocas_ms3.errors import MissingExtraError
+from robocas_ms3.core.errors import MissingExtraError
 
 try:
     import msgpack  # noqa: F401

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit, urlunsplit
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 
 SCHEMES = ("ws", "wss")
 _FLAGS = {"0": False, "1": True}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import EvaluationError, PolicyFailed, RobocasError, WireError
+from robocas_ms3.core.errors import EvaluationError, PolicyFailed, RobocasError, WireError
 from robocas_ms3.evaluation.policy import Observations, Policy, Start, policy_code
 from robocas_ms3.evaluation.remote.messages import (
     ACTIONS,

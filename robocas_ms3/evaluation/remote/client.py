@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import EvaluationError, PolicyFailed, WireError
+from robocas_ms3.core.errors import EvaluationError, PolicyFailed, WireError
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.evaluation.remote.address import Address, read_address
 from robocas_ms3.evaluation.remote.connection import open_connection, run_in_loop

@@ -13,11 +13,11 @@ from typing import Any, TypeVar
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
-from robocas_ms3.errors import EvaluationError, WireError
+from robocas_ms3.core.errors import EvaluationError, WireError
+from robocas_ms3.core.words import printable
 from robocas_ms3.evaluation.remote import keepalive
 from robocas_ms3.evaluation.remote.metadata import ServerMetadata, read_metadata
 from robocas_ms3.evaluation.remote.wire import unpack
-from robocas_ms3.words import printable
 
 MAX_REPLY = 16 * 2**20  # bytes
 _RETRY_S = 0.2  # between attempts to connect

@@ -18,15 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from robocas_ms3.errors import EvaluationError, RobocasError, WireError
+from robocas_ms3.core.errors import EvaluationError, RobocasError, WireError
+from robocas_ms3.core.strict import refusal
+from robocas_ms3.core.words import printable
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.evaluation.remote.metadata import LARGEST_BATCH
 from robocas_ms3.evaluation.remote.served import ServedFiles, name_of
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES
 from robocas_ms3.robots.table import DEFAULT
-from robocas_ms3.strict import refusal
-from robocas_ms3.words import printable
 
 ENV, RESET, START, PROMPT, ACTIONS = "env_id", "reset", "start", "prompt", "actions"
 BATCH, ERROR = "batch", "error"

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 
 WANTS, POLICY = "robocas_wants", "robocas_policy"
 MAX_BATCH, ANSWERS_PINGS = "robocas_max_batch", "robocas_answers_pings"

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.evaluation.remote.address import Address
 from robocas_ms3.evaluation.remote.connection import (

@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.paths import builtin_packs_dir, data_dir, protocols_dir
 from robocas_ms3.evaluation.policy import Start
-from robocas_ms3.paths import builtin_packs_dir, data_dir, protocols_dir
 
 _PARTS = 3  # of a file's name in messages: folder of the protocol, folder in it, file
 

@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from robocas_ms3 import __version__
-from robocas_ms3.errors import EvaluationError, RobocasError, WireError
+from robocas_ms3.core.errors import EvaluationError, RobocasError, WireError
 from robocas_ms3.evaluation.policy import Policy, describe, policy_code, said_of
 from robocas_ms3.evaluation.remote import keepalive
 from robocas_ms3.evaluation.remote.address import netloc, strip_brackets

@@ -10,7 +10,7 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import WireError
+from robocas_ms3.core.errors import WireError
 
 MAX_BYTES = 64 * 2**20  # of a message
 MAX_DEPTH = 16  # of maps and lists in each other

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from robocas_ms3.core.files import make_folder, replacing
+from robocas_ms3.core.words import printable
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.columns import has_parquet, write_parquet
 from robocas_ms3.evaluation.report.page import page
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.tables import markdown
-from robocas_ms3.files import make_folder, replacing
-from robocas_ms3.words import printable
 
 MARKDOWN, PAGE, PARQUET = "report.md", "report.html", "episodes.parquet"
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from html import escape
 from pathlib import Path
 
+from robocas_ms3.core.words import count_of
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.report.marks import section, table
 from robocas_ms3.evaluation.report.stages import failure_of
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.words import count_of
 
 VIDEOS = "videos"
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from robocas_ms3.core.words import count_of
 from robocas_ms3.evaluation.orders import orders
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import LoadedProtocol
@@ -20,7 +21,6 @@ from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Share, share, success_by
 from robocas_ms3.evaluation.tables import P_VIS_EDGES, WELDED, first_splits
 from robocas_ms3.evaluation.tables import title as title_of
-from robocas_ms3.words import count_of
 
 
 def page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | None = None) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.benchmark.spec import STAGES as ON_THE_WAY
+from robocas_ms3.scenes.task_specs import STAGES as ON_THE_WAY
+from robocas_ms3.scenes.task_specs import TASKS
 
 STAGES = {
     "furniture_opened": "furniture opened",

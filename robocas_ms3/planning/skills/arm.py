@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.decisions import ONE_BY_ONE, TRIES, Decisions, Effort
 from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory

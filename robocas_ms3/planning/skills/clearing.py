@@ -8,14 +8,14 @@ from typing import Literal
 
 import numpy as np
 
-from robocas_ms3.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.core.errors import EpisodeLost, PlanningFailed
+from robocas_ms3.core.poses import transform
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.looking import hidden_share
 from robocas_ms3.planning.skills.pushing import push_away, surface_in_base
 from robocas_ms3.planning.skills.removing import blockers, clear_grasps, remove
-from robocas_ms3.poses import transform
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_SHARE, Clutter
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 from robocas_ms3.tasks.terms import FALLEN

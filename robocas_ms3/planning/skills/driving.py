@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import from_wxyz, planar, transform
 from robocas_ms3.planning.protocol import Array, Obstacle
 from robocas_ms3.planning.scene import seen_from
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.timing import stopping
-from robocas_ms3.poses import from_wxyz, planar, transform
 from robocas_ms3.robots.description import Limits, RobotDescription
 from robocas_ms3.scenes import standing
 

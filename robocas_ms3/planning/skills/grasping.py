@@ -12,12 +12,12 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import inverse
 from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins, rank_grasps
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.skills.arm import ROOM, Arm, moved_back, raised
-from robocas_ms3.poses import inverse
 from robocas_ms3.scenes.grasping import NEIGHBOURHOOD, PREGRASP_DISTANCE, Approach, gripper_is_clear
 
 GRASPS_CHECKED = 48  # grasps of which a check of collisions says whether to try them early

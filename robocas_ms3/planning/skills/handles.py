@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.pulling import reached, track, turned_about_bar
 from robocas_ms3.planning.skills.arm import Arm, moved_back
 from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.retreating import plan_step_back
 from robocas_ms3.planning.timing import through, timed
-from robocas_ms3.poses import inverse, transform
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.scenes.grasping import HALF_TURN
 

@@ -6,10 +6,10 @@ import numpy as np
 from mani_skill.sensors.camera import CameraConfig
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.poses import from_wxyz, inverse
 from robocas_ms3.scenes.randomise import draw_camera_shift
 from robocas_ms3.scenes.visibility import PinholeCamera, Scenery, object_mesh, prepare_rays
 

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import inverse
 from robocas_ms3.planning.protocol import Array, Obstacle
 from robocas_ms3.planning.scene import SPACING, shape_of
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.poses import inverse
 from robocas_ms3.scenes.lookup import OPENED_AT_MOST
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.contacts import contact_forces

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import from_wxyz, inverse, transform
 from robocas_ms3.planning.chain import turn_between
 from robocas_ms3.planning.drops import overhangs, sample_drops
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.skills.arm import CARRYING_ROOM, Arm, moved_back, raised
 from robocas_ms3.planning.skills.retreating import plan_step_back
-from robocas_ms3.poses import from_wxyz, inverse, transform
 
 DROPS_SAMPLED, DROPS_CHECKED, DROPS_PLANNED = 192, 64, 10
 DROP_MARGIN = 0.045  # m, as far as a robot may be off by then

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.executor import CLOSED
 from robocas_ms3.planning.protocol import Array, Obstacle, Trajectory
 from robocas_ms3.planning.pushes import STAND_OFF, YAWS, Push, candidates
 from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.skills.arm import Arm, raised
-from robocas_ms3.poses import inverse, transform
 
 ABOVE = 0.08  # m above the start of the push, from where the tool comes straight down
 LIFT = 0.05  # m after the push (upstream's)

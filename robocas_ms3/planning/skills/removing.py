@@ -8,7 +8,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import transform
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.shapes import convex_hull
@@ -17,7 +18,6 @@ from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.placing import attach_held
 from robocas_ms3.planning.skills.pushing import surface_in_base
 from robocas_ms3.planning.skills.retreating import plan_step_back
-from robocas_ms3.poses import transform
 from robocas_ms3.scenes.grasping import MAX_WIDTH, directions_ok, gripper_is_clear
 
 GRID = 0.04  # m between places tried

@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from robocas_ms3.errors import PlanningFailed
+from robocas_ms3.core.errors import PlanningFailed
+from robocas_ms3.core.poses import inverse, transform
 from robocas_ms3.planning.protocol import Array, Obstacle
 from robocas_ms3.planning.scene import seen_from
 from robocas_ms3.planning.skills.arm import Arm
@@ -29,7 +30,6 @@ from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.handles import open_part, pull_share
 from robocas_ms3.planning.skills.part import Part
 from robocas_ms3.planning.skills.placing import attach_held, drop_poses
-from robocas_ms3.poses import inverse, transform
 from robocas_ms3.scenes.grasping import HALF_TURN, NEIGHBOURHOOD, PREGRASP_DISTANCE, directions_ok, gripper_is_clear
 
 KINDS = 4  # of grasps that attempts take one after the other

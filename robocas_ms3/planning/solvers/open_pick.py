@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.stance import open_from_reach
 from robocas_ms3.planning.solvers import pick
+from robocas_ms3.scenes.language.templates import subgoal
 
 
 def attempt(arm: Arm) -> None:

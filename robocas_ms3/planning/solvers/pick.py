@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from robocas_ms3.language.templates import subgoal
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
 from robocas_ms3.planning.skills.stance import drive_to_basket, grasp_from_reach
+from robocas_ms3.scenes.language.templates import subgoal
 
 
 def attempt(arm: Arm) -> None:

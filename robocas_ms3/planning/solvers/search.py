@@ -5,8 +5,7 @@ What to move, and how, is decided by trying a few ways and taking the one after 
 
 from __future__ import annotations
 
-from robocas_ms3.errors import PlanningFailed
-from robocas_ms3.language.templates import subgoal
+from robocas_ms3.core.errors import PlanningFailed
 from robocas_ms3.planning.decisions import Effort
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.skills.arm import Arm
@@ -15,6 +14,7 @@ from robocas_ms3.planning.skills.grasping import grasp
 from robocas_ms3.planning.skills.looking import FAR, NEAR, look_at, prepare_looks
 from robocas_ms3.planning.skills.placing import carry_to_basket, release_into_basket
 from robocas_ms3.planning.skills.removing import hang_clear
+from robocas_ms3.scenes.language.templates import subgoal
 
 LIFT_HEIGHT = 0.15  # m, upstream's
 AHEAD = 3  # moves that are compared

@@ -7,8 +7,8 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Protocol
 
-from robocas_ms3.errors import PlanError
-from robocas_ms3.extensions import load
+from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.extensions import load
 from robocas_ms3.plans.claims import refuse_claimed
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import CLAIMS, Outcome, Unit

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+from robocas_ms3.core.processes import uninterrupted
 from robocas_ms3.plans.engines import refuse_options
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.slot import Slot, Stages
 from robocas_ms3.plans.units import Outcome, Unit
-from robocas_ms3.processes import uninterrupted
 
 
 class LocalEngine:

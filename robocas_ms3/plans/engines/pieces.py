@@ -7,8 +7,8 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from robocas_ms3.files import flush_to_disk, make_folder
-from robocas_ms3.outputs import sweep
+from robocas_ms3.core.files import flush_to_disk, make_folder
+from robocas_ms3.core.outputs import sweep
 from robocas_ms3.plans.units import DEATHS, EPISODES, LEDGER, Outcome, ledger
 
 PIECE = 16 * 2**20

@@ -11,16 +11,16 @@ from pathlib import Path
 from queue import Empty, PriorityQueue
 from typing import Any
 
-from robocas_ms3.errors import PlanError
+from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.processes import SentError
+from robocas_ms3.core.processes.child import Stopped
+from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.plans.engines.pieces import Arriving
 from robocas_ms3.plans.engines.ray_actor import RaySlot, Terms
 from robocas_ms3.plans.engines.ray_cluster import connect, read_options, require_ray
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.slot import Stages
 from robocas_ms3.plans.units import DEATHS, LEDGER, Outcome, Unit, outcomes
-from robocas_ms3.processes import SentError
-from robocas_ms3.processes.child import Stopped
-from robocas_ms3.recordings.versions import versions
 
 TRIES = 3
 """How often a unit is begun again where it has lost its actor at the same seed, counting the first time."""

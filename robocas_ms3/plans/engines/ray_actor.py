@@ -19,15 +19,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from uuid import uuid4
 
-from robocas_ms3.errors import PlanError, RobocasError
-from robocas_ms3.files import write_json
-from robocas_ms3.outputs import check_same, locked_folder
+from robocas_ms3.core.errors import PlanError, RobocasError
+from robocas_ms3.core.files import write_json
+from robocas_ms3.core.outputs import check_same, locked_folder
+from robocas_ms3.core.processes import SentError
+from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.plans.engines.pieces import Pieces, sent
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.slot import Slot, Stages
 from robocas_ms3.plans.units import PLAN, Outcome, Unit
-from robocas_ms3.processes import SentError
-from robocas_ms3.recordings.versions import versions
 
 _LOOK = 0.5  # s between two looks at the lease
 _SEEN = 20.0  # s that a file may take until another machine sees it

@@ -12,9 +12,9 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from robocas_ms3.errors import MissingExtraError, PlanError
+from robocas_ms3.core.errors import MissingExtraError, PlanError
+from robocas_ms3.core.strict import StrictModel, parse
 from robocas_ms3.plans.engines import refuse_options
-from robocas_ms3.strict import StrictModel, parse
 
 _ANSWERING = 10.0  # s
 _log = logging.getLogger(__name__)

@@ -18,14 +18,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.errors import PlanError
+from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.processes import SentError
 from robocas_ms3.plans.driver import current_run
 from robocas_ms3.plans.engines.slurm_job import UnitsJob
 from robocas_ms3.plans.engines.slurm_options import read_options
 from robocas_ms3.plans.engines.slurm_queue import error_of, open_queue, require_slurm
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import DONE, Outcome, Unit, outcomes
-from robocas_ms3.processes import SentError
 
 _LOOK = 0.5  # s between two looks at the folders, at least
 _LOOKS = 200.0  # folders a second that are looked at, at most

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.extensions import load
+from robocas_ms3.core.extensions import load
+from robocas_ms3.core.processes import SentError
 from robocas_ms3.plans.claims import claimed
 from robocas_ms3.plans.driver import is_current
 from robocas_ms3.plans.engines.local import LocalEngine
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.plans.units import CLAIMS, Outcome, Unit
-from robocas_ms3.processes import SentError
 
 FOLDER = CLAIMS.parent.name
 """In the plan's folder: logs of the jobs, what submitit keeps, and claims."""

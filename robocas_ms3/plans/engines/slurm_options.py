@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from robocas_ms3.errors import PlanError
+from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.strict import StrictModel, parse
 from robocas_ms3.plans.claims import LEASE
 from robocas_ms3.plans.engines import refuse_options
-from robocas_ms3.strict import StrictModel, parse
 
 PASSED = (
     *("partition", "account", "qos", "constraint", "exclude", "nodelist", "gres", "gpus_per_node", "reservation"),

@@ -13,12 +13,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from robocas_ms3.errors import MissingExtraError, PlanError
-from robocas_ms3.files import make_folder
+from robocas_ms3.core.errors import MissingExtraError, PlanError
+from robocas_ms3.core.files import make_folder
+from robocas_ms3.core.processes import SentError
 from robocas_ms3.plans.engines.slurm_job import FOLDER, UnitsJob
 from robocas_ms3.plans.engines.slurm_options import SlurmOptions
 from robocas_ms3.plans.units import Unit
-from robocas_ms3.processes import SentError
 
 try:
     from submitit import LocalExecutor, SlurmExecutor  # pyright: ignore[reportMissingImports]

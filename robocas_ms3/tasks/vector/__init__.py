@@ -10,9 +10,9 @@ import gymnasium as gym
 from gymnasium.vector import VectorEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from robocas_ms3.benchmark import TASKS
-from robocas_ms3.errors import VectorEnvError
-from robocas_ms3.processes import NO_LIMITS, Limits
+from robocas_ms3.core.errors import VectorEnvError
+from robocas_ms3.core.processes import NO_LIMITS, Limits
+from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector.backend import Backend, choose_backend
 from robocas_ms3.tasks.vector.environment import NumpyVectorEnv, RoboCASVectorEnv
 from robocas_ms3.tasks.vector.processes import ProcessEnv

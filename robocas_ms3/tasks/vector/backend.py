@@ -7,7 +7,7 @@ from typing import Literal, get_args
 import torch
 from mani_skill.envs.utils.system.backend import CPU_SIM_BACKENDS
 
-from robocas_ms3.errors import VectorEnvError
+from robocas_ms3.core.errors import VectorEnvError
 
 Backend = Literal["auto", "processes", "gpu"]
 

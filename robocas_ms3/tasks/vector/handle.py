@@ -17,9 +17,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import VectorEnvError, WorkerDied
-from robocas_ms3.exits import responsive
-from robocas_ms3.processes import NO_LIMITS, is_too_large, uninterrupted
+from robocas_ms3.core.errors import VectorEnvError, WorkerDied
+from robocas_ms3.core.exits import responsive
+from robocas_ms3.core.processes import NO_LIMITS, is_too_large, uninterrupted
 
 STEP, LEAVE = b"s", b"q"  # messages; all others are pickled
 NUMBER = 8  # bytes before each message, its number, which the answer repeats

@@ -17,12 +17,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.errors import LayoutError, VectorEnvError
-from robocas_ms3.processes import SentError, leave_with, use_one_torch_thread
+from robocas_ms3.core.errors import LayoutError, VectorEnvError
+from robocas_ms3.core.processes import SentError, leave_with, use_one_torch_thread
+from robocas_ms3.core.words import escape_log_lines, escape_tracebacks
 from robocas_ms3.tasks.vector.block import Block, Field, Path, leaves, space_fields
 from robocas_ms3.tasks.vector.handle import LEAVE, NUMBER, STEP, name_envs
 from robocas_ms3.tasks.vector.messages import Call, EnvDescription, Order, Reset, Row, Share
-from robocas_ms3.words import escape_log_lines, escape_tracebacks
 
 FIRST_SEED = 2022  # of env 0's resets without a seed, as in ManiSkill; env 1 has the next
 _log = logging.getLogger(__name__)

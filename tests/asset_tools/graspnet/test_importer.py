@@ -7,7 +7,7 @@ import trimesh
 from asset_tools.graspnet.importer import graspnet_jobs, graspnet_source
 from asset_tools.graspnet.labels import view_directions
 from asset_tools.grasps import sample_grasps, surface_samples
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 BOX = (0.04, 0.10, 0.06)
 

@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from asset_tools.graspnet.labels import label_checksums, label_grasps, read_labels, tcp_poses, view_directions
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 TOP_VIEW = 299  # the last of the lattice, 4.7 deg off +z
 SIZE = (0.04, 0.10, 0.06)  # of the box, m

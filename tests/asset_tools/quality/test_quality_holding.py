@@ -3,7 +3,7 @@ import pytest
 
 from asset_tools.quality import holding
 from asset_tools.quality.holding import hold_test
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 
 def grasps(*places):

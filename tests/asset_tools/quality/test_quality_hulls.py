@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from asset_tools.quality.hulls import hull_quality, mean_thickness, volume_iou
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 
 def box(x, y, z, at=(0, 0, 0)):

@@ -7,7 +7,7 @@ from models import Gltf, box, image_file, write_obj
 
 from asset_tools.import_scans import ImportSettings, find_scans, scan_jobs
 from asset_tools.reading.model import read_model
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 
 def mug():

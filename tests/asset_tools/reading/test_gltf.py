@@ -9,7 +9,7 @@ from models import BLUE, GREEN, RED, Gltf, box, shown_colors
 from PIL import Image
 
 from asset_tools.reading.model import read_model
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 # four columns of colour
 COLUMNS = Image.fromarray(np.array([[RED, GREEN, BLUE, (250, 250, 10)]] * 4, np.uint8))

@@ -9,7 +9,7 @@ from models import GREEN, RED, Gltf, box, image_file, shown_colors, write_obj
 from PIL import Image
 
 from asset_tools.reading.model import read_model
-from robocas_ms3.errors import AssetError, RobocasError
+from robocas_ms3.core.errors import AssetError, RobocasError
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 

@@ -12,7 +12,7 @@ from asset_tools.inspection import ModelSource, inspect_models
 from asset_tools.reading.files import LARGEST_FILE, ModelFiles, read_file
 from asset_tools.reading.limits import reading_limits
 from asset_tools.reading.model import read_model
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 
 def special(kind, path):

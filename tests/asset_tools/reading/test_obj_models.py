@@ -6,7 +6,7 @@ from models import BLUE, GREEN, RED, box, image_file, obj_text, shown_colors, wr
 
 from asset_tools.reading.model import read_model
 from asset_tools.reading.obj import parse_mtl, parse_obj
-from robocas_ms3.errors import AssetError
+from robocas_ms3.core.errors import AssetError
 
 
 def warnings(model):

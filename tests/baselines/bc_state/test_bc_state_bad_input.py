@@ -9,9 +9,9 @@ from synthetic import write_trajectory
 from robocas_ms3.baselines.bc_state import BASELINE, data
 from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.bc_state.data import StateSamples
-from robocas_ms3.errors import DatasetError, EvaluationError
+from robocas_ms3.core.errors import DatasetError, EvaluationError
+from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.evaluation.policy import Observations, Start
-from robocas_ms3.recordings.environment import RecordedEnv
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.bc_state.data import StateSamples
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.session import train_run
+from robocas_ms3.core.poses import inverse, to_wxyz
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.evaluation.policy import Observations, Start
-from robocas_ms3.poses import inverse, to_wxyz
 
 SMALL = {"chunk": 4, "width": 64, "blocks": 2, "dropout": 0.0, "noise": 0.0}
 STEPS = 800

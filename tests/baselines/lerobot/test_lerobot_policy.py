@@ -9,7 +9,7 @@ import torch
 from robocas_ms3.baselines.lerobot.observations import EMBEDDING, STATE, scaled, state_of
 from robocas_ms3.baselines.lerobot.policy import LeRobotPolicy
 from robocas_ms3.baselines.lerobot.serve import main, open_checkpoint, rate_of
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import Observations, Start, describe
 
 INPUTS = {STATE: (17,), "observation.images.base_camera": (3, 2, 4), EMBEDDING: (384,)}

@@ -16,8 +16,8 @@ pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 from robocas_ms3.baselines.lerobot import prepare as module
 from robocas_ms3.baselines.lerobot.observations import EMBEDDING, STATE, STATE_NAMES
 from robocas_ms3.baselines.lerobot.prepare import main, prepare
+from robocas_ms3.core.errors import DatasetError, OutputExistsError
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-from robocas_ms3.errors import DatasetError, OutputExistsError
 
 DATA = "data/chunk-000/file-000.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"

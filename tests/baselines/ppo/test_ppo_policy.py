@@ -9,7 +9,7 @@ from robocas_ms3.baselines.ppo import BASELINE
 from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.trials import arm_action
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.policy import Observations
 from robocas_ms3.evaluation.stepping import control_mode

@@ -9,7 +9,7 @@ from safetensors.torch import load_file
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.ppo import BASELINE
 from robocas_ms3.baselines.session import Said, train_run
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
 
 STEPS = 4  # of an episode
 

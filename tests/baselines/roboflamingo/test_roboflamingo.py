@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from robocas_ms3.baselines.roboflamingo.adapter import HORIZON, RoboFlamingoPolicy, Stepwise, scale_of
+from robocas_ms3.core.errors import DatasetError, EvaluationError
 from robocas_ms3.datasets.actions import ActionScale
-from robocas_ms3.errors import DatasetError, EvaluationError
 from robocas_ms3.evaluation.policy import Observations, Start
 
 SCALE = ActionScale(np.array([-0.1, -0.2, 0.0, -0.5, -1.0, 0.2]), np.array([0.1, 0.0, 0.4, 0.5, 3.0, 0.2]))

@@ -14,9 +14,9 @@ from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.policy import scaled
 from robocas_ms3.baselines.session import train_run
+from robocas_ms3.core.errors import DatasetError, TrainingError
+from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.errors import DatasetError, TrainingError
-from robocas_ms3.strict import parse
 
 
 @pytest.fixture(scope="module")

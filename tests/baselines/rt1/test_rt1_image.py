@@ -9,7 +9,7 @@ from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.image import FiLM, ImageEncoder, SkippedBranch, TokenLearner, efficientnet
 from robocas_ms3.baselines.rt1.model import cropped
-from robocas_ms3.errors import TrainingError
+from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.evaluation.policy import describe
 
 

@@ -5,8 +5,8 @@ import torch
 
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
-from robocas_ms3.errors import TrainingError
-from robocas_ms3.strict import parse
+from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.core.strict import parse
 
 # EfficientNet-B0's table, channels by 1.2 (to eights), repeats by 1.4 (up): expansion, kernel, in, out, repeats
 B3 = [

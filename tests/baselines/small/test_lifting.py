@@ -11,7 +11,7 @@ from robocas_ms3.baselines.chunks import state_of
 from robocas_ms3.baselines.small.config import View
 from robocas_ms3.baselines.small.lifting import SAID, Lift, heights_of, tcp_of
 from robocas_ms3.baselines.small.pointing import places_of
-from robocas_ms3.poses import from_parts, inverse, transform
+from robocas_ms3.core.poses import from_parts, inverse, transform
 
 VIEW = View(rendered=(64, 48), size=(64, 48))
 DOWN = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1.0], [0, 0, 0, 1]]  # a metre above the base, looking straight down

@@ -20,11 +20,11 @@ from robocas_ms3.baselines.small.data import looked_at
 from robocas_ms3.baselines.small.model import shifted
 from robocas_ms3.baselines.small.pointing import CELL, NOWHERE, pointing_losses
 from robocas_ms3.baselines.small.standing import Standing
+from robocas_ms3.core.errors import DatasetError, TrainingError
+from robocas_ms3.core.poses import to_wxyz
+from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.errors import DatasetError, TrainingError
 from robocas_ms3.evaluation.policy import Observations, Start
-from robocas_ms3.poses import to_wxyz
-from robocas_ms3.strict import parse
 
 
 @pytest.fixture(scope="module")

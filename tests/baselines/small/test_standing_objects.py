@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from robocas_ms3.baselines.small.standing import seen_from, standing
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.poses import from_parts
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import from_parts
 
 STEPS = 5
 BASE = [2.0, 1.0, 0.5]  # of the arm in the world, turned by 90 degrees about z

@@ -8,7 +8,7 @@ import pytest
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.checks.scene_values import Scene, check_values, sound
-from robocas_ms3.recordings.seeds import one_seed
+from robocas_ms3.demos.recordings.seeds import one_seed
 
 FILE = "episode_0000001/scene.json"
 POSE = [0.5, 0.8, 0.6, 1.0, 0.0, 0.0, 0.0]

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from irregular import KINDS, replace_file
 
+from robocas_ms3.core.documents import DocumentError
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.input_check import look_at_ends
 from robocas_ms3.datasets.pictures.headers import LARGEST, read_header
@@ -16,9 +18,7 @@ from robocas_ms3.datasets.pictures.stored import Pictures, read_picture
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.cut_off import cut_off
 from robocas_ms3.datasets.writing.output import Placer
-from robocas_ms3.documents import DocumentError
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.stored import open_trajectory
+from robocas_ms3.demos.recordings.stored import open_trajectory
 from robocas_ms3.viewer.source import open_source
 
 EPISODE = "episode_0000001"

@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.cli.main import run
+from robocas_ms3.core.errors import AssetError
 from robocas_ms3.datasets.checks import replay as replay_check
 from robocas_ms3.datasets.checks.replay import replay_dataset
 from robocas_ms3.demos.open_loop import Playback
-from robocas_ms3.errors import AssetError
 
 
 class Player:

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.datasets.sources.tolerant import load_arrays
-from robocas_ms3.errors import DatasetError
 
 NPZ = "episode_0000001/episode_info.npz"
 

@@ -11,6 +11,8 @@ pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.cli import main
+from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.core.outputs import locked_folder
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
@@ -21,9 +23,7 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
 from robocas_ms3.datasets.writing.dataset_player import open_player
 from robocas_ms3.datasets.writing.players import Request
-from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.outputs import locked_folder
-from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
 
 
 def test_the_folder_of_version_0_6(lerobot):

@@ -5,11 +5,11 @@ from synthetic import RayCaster
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.depth import DEPTH_INFO, to_depth, to_levels
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.video import CODINGS, Encoder, read_frames
-from robocas_ms3.errors import DatasetError
 
 
 def test_depth_in_range_is_exact():

@@ -11,6 +11,7 @@ from synthetic import RayCaster, write_trajectory
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.manage.splitting import Share, resplit
@@ -18,7 +19,6 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.errors import DatasetError
 from robocas_ms3.viewer.source import open_source
 
 

@@ -4,6 +4,7 @@ import pytest
 
 pa = pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot.check_language import check_language
 from robocas_ms3.datasets.lerobot.language import (
     EVENTS,
@@ -17,9 +18,8 @@ from robocas_ms3.datasets.lerobot.language import (
     persistent_rows,
     read_rows_of,
 )
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.language.instructions import template_ids
-from robocas_ms3.recordings.subgoals import SubGoal
+from robocas_ms3.demos.recordings.subgoals import SubGoal
+from robocas_ms3.scenes.language.instructions import template_ids
 
 GOALS = [SubGoal("move and grasp", "grasp it", 0, 2), SubGoal("transfer object", "drop it", 3, 6)]
 CAMERA = "observation.images.base_camera"

@@ -15,6 +15,7 @@ from synthetic import RayCaster
 pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
+from robocas_ms3.core.errors import DatasetError, IncompleteError
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
@@ -23,7 +24,6 @@ from robocas_ms3.datasets.manage.importing import import_robocas
 from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.tolerant import arrays_fingerprint
-from robocas_ms3.errors import DatasetError, IncompleteError
 
 
 def test_an_episode_with_an_error_is_converted_on_resume(trajectory, lerobot, tmp_path):

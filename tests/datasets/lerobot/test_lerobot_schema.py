@@ -7,14 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.lerobot.arrays import frame_columns, robocas_arrays
 from robocas_ms3.datasets.lerobot.schema import FEATURES, features_json, whole_rate
 from robocas_ms3.datasets.lerobot.variants import VARIANTS
 from robocas_ms3.datasets.sources.arrays import episode_arrays
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.poses import from_xyzw
-from robocas_ms3.recordings.motion import Motion
-from robocas_ms3.recordings.subgoals import SubGoal
+from robocas_ms3.demos.recordings.motion import Motion
+from robocas_ms3.demos.recordings.subgoals import SubGoal
 
 
 def made_up(steps, seed):

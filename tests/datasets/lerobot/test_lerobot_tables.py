@@ -8,9 +8,9 @@ pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
 import pyarrow as pa
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot import tables
 from robocas_ms3.datasets.lerobot.tables import read_rows
-from robocas_ms3.errors import DatasetError
 
 EPISODES = [0] * 3 + [1] * 2 + [3] * 4 + [4]
 

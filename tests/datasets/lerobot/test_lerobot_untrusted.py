@@ -11,11 +11,11 @@ pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pa = pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.tables import TEXT, Column, read_objects, read_rows
-from robocas_ms3.errors import DatasetError
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,8 @@ pytest.importorskip("av", reason="needs the extra 'lerobot'")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.cli import main
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import inverse
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
@@ -20,9 +22,7 @@ from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.variants import NEWEST, VARIANTS, Version
 from robocas_ms3.datasets.pictures.boxes import box_of
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.poses import inverse
-from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.viewer.source import open_source as open_page
 
 

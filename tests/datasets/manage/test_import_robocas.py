@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.cli.import_robocas import ranges
 from robocas_ms3.cli.main import run
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.eef import eef_turn
@@ -18,7 +19,6 @@ from robocas_ms3.datasets.manage.importing import import_robocas
 from robocas_ms3.datasets.manage.survey import survey
 from robocas_ms3.datasets.pictures.video import PANEL, contact_sheet, video_frame
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.errors import DatasetError
 
 OURS = ("agv_pose", "rel_agv_pose")
 

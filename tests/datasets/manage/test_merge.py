@@ -6,6 +6,8 @@ from managing import DAMAGES, change, die, edit, files_of, make, read
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
+from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.core.outputs import locked_folder
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.parts import names_of
@@ -14,8 +16,6 @@ from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.output import Placer
-from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.outputs import locked_folder
 
 
 @pytest.fixture(scope="module")

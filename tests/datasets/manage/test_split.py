@@ -8,13 +8,13 @@ from hypothesis import strategies as st
 from managing import DAMAGES, edit, files_of, make, read
 
 from robocas_ms3.cli.main import run
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage import splitting
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.splitting import Share, cut, folder_names, groups_of, parts_by_share, resplit
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.errors import DatasetError
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.pictures.headers import read_header
 from robocas_ms3.datasets.pictures.png import encode_png
 from robocas_ms3.datasets.pictures.stored import read_picture, write_picture
-from robocas_ms3.errors import DatasetError
 
 RGB, DEPTH = (np.uint8, (3,)), (np.uint16, ())
 

@@ -4,9 +4,9 @@ import pytest
 from PIL import Image
 
 from robocas_ms3.cli.main import run
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.pictures.video import PANEL, colour_depth, contact_sheet, video_frame, write_video
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.errors import DatasetError
 
 
 def test_videos_show_every_step_in_real_time(made, tmp_path):

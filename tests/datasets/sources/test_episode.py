@@ -4,12 +4,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import from_xyzw, inverse, wxyz_to_xyzw, xyzw_to_wxyz
 from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.datasets.sources.arrays import compose, continuous_xyzw, episode_arrays, planar_base, with_embeddings
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.poses import from_xyzw, inverse, wxyz_to_xyzw, xyzw_to_wxyz
-from robocas_ms3.recordings.motion import Motion, gripper_open, relative_motion, sample_states, sample_stride
-from robocas_ms3.recordings.subgoals import SubGoal, sample_subgoals
+from robocas_ms3.demos.recordings.motion import Motion, gripper_open, relative_motion, sample_states, sample_stride
+from robocas_ms3.demos.recordings.subgoals import SubGoal, sample_subgoals
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from managing import arrays_of, change
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as laws
 from robocas_ms3.datasets.manage.mends import mend_all
 from robocas_ms3.datasets.sources.tolerant import EpisodeArrays, load_arrays, motion_arrays, read_arrays
-from robocas_ms3.errors import DatasetError
 
 FILE = "episode_0000001/episode_info.npz"
 KEYS = ("ee_pos", "ee_orn", "rel_pos", "rel_orn")

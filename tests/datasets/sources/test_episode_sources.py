@@ -12,13 +12,13 @@ pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
 
 import pyarrow.parquet as pq
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.datasets.statistics.collect import collect
 from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings import reading
+from robocas_ms3.demos.recordings import reading
 
 
 @pytest.fixture(scope="module")

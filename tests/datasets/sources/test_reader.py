@@ -2,10 +2,10 @@
 
 import pytest
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.statistics.collect import collect
-from robocas_ms3.errors import DatasetError
 
 
 class Listed(list):

@@ -10,11 +10,11 @@ from PIL import Image
 
 from robocas_ms3.cli.stats import Stats as Command
 from robocas_ms3.cli.stats import main
+from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.datasets.actions import ACTION_NAMES
 from robocas_ms3.datasets.sources.facts import Facts, Surface
 from robocas_ms3.datasets.statistics.collect import collect, described, histogram, layout_map
 from robocas_ms3.datasets.statistics.plots import PICTURES, write_stats
-from robocas_ms3.errors import DatasetError, MissingExtraError
 
 TABLE = Surface("table, top", x=0.9, y=1.0, yaw=-np.pi / 2, region=[[0.0, -0.1], [0.1, 0.1]])
 CONFIG = {

@@ -19,12 +19,12 @@ from hypothesis import strategies as st
 from PIL import Image
 from torch.utils.data import DataLoader, WeightedRandomSampler
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import RoboCASDataset
 from robocas_ms3.datasets.actions import ActionScale, episode_actions
 from robocas_ms3.datasets.training.sampling import SampleIndex, balancing_weights
 from robocas_ms3.datasets.training.windows import Window
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.motion import Motion
+from robocas_ms3.demos.recordings.motion import Motion
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.table import PANDA
 

@@ -9,11 +9,11 @@ from managing import files_of
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run as run_command
+from robocas_ms3.core.errors import AssetError, DatasetError, IncompleteError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing import convert as conversion
 from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.errors import AssetError, DatasetError, IncompleteError
 
 SEEDS = tuple(range(10, 24))
 
@@ -151,7 +151,7 @@ def test_texts_that_cannot_be_read(many, tmp_path, monkeypatch):
     del content["episodes"][3]["robocas"]["instruction"]
     trajectory.with_suffix(".json").write_text(json.dumps(content))
     embedder = type("Embedder", (), {"__call__": lambda self, texts: np.eye(384, dtype=np.float32)[: len(texts)]})
-    monkeypatch.setattr("robocas_ms3.language.embed.TextEmbedder", embedder)
+    monkeypatch.setattr("robocas_ms3.scenes.language.embed.TextEmbedder", embedder)
     with pytest.raises(IncompleteError, match="episode_0000003: .*traj_3: the JSON's entry is incomplete"):
         run(trajectory, tmp_path / "out", embeddings=True)
     assert validate(tmp_path / "out").violations == []

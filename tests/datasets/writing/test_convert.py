@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from synthetic import STEPS, RayCaster, made_up_vectors, write_trajectory
 
+from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
+from robocas_ms3.core.outputs import locked_folder
+from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.writing.convert import convert
-from robocas_ms3.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.outputs import locked_folder
-from robocas_ms3.poses import from_xyzw
-from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
 
 
 def run(trajectory, out, **kwargs):

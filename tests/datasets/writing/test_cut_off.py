@@ -6,11 +6,11 @@ import pytest
 from managing import files_of
 from synthetic import RayCaster
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.cut_off import cut_off
-from robocas_ms3.errors import DatasetError
 
 FILES = (
     "episode_info.npz",

@@ -5,10 +5,10 @@ from hypothesis import strategies as st
 from managing import change
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.writing.info import write_info
-from robocas_ms3.errors import DatasetError
 
 
 @settings(max_examples=50, deadline=None)

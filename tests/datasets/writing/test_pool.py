@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from robocas_ms3.core.errors import DatasetError, IncompleteError, MissingExtraError
 from robocas_ms3.datasets.writing.pool import do_all
-from robocas_ms3.errors import DatasetError, IncompleteError, MissingExtraError
 
 
 class Looking:

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from robocas_ms3.cli.convert import Convert, main
+from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks import depth as geometry
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.pictures.stored import Pictures
 from robocas_ms3.datasets.writing.convert import convert
 from robocas_ms3.datasets.writing.render import EnvFrames
-from robocas_ms3.errors import DatasetError
-from robocas_ms3.recordings.reading import TrajectoryFile
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
 
 ENV_ID = "robocas_ms3:RoboCASPick-v1"
 SIZE = (96, 72)

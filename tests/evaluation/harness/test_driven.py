@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from counting_env import BREAKS
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness.driven import DrivenEpisodes
 from robocas_ms3.evaluation.policies.plain import RandomPolicy

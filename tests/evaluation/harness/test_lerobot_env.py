@@ -19,8 +19,8 @@ from lerobot.envs.utils import env_to_policy_features
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_eval import rollout
 
+from robocas_ms3.core.errors import EvaluationError, VectorEnvError
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.errors import EvaluationError, VectorEnvError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness import driven
 from robocas_ms3.evaluation.harness.lerobot import RoboCASEnvConfig

@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.lerobot.schema import FEATURES
 from robocas_ms3.datasets.sources.arrays import episode_arrays
+from robocas_ms3.demos.recordings.motion import Motion, gripper_open
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, Proprioception
-from robocas_ms3.poses import from_wxyz
-from robocas_ms3.recordings.motion import Motion, gripper_open
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.table import PANDA
 

@@ -7,14 +7,14 @@ import shutil
 import numpy as np
 import pytest
 
-from robocas_ms3.errors import EvaluationError, RobocasError, VectorEnvError
+from robocas_ms3.core.errors import EvaluationError, RobocasError, VectorEnvError
+from robocas_ms3.core.outputs import locked_folder
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness import driven
 from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.run import Settings, evaluate
-from robocas_ms3.outputs import locked_folder
 
 SMOKE = load_protocol("smoke")
 WANTS = Wants(reference="tcp", rate_hz=5, cameras={"base_camera": (6, 4)}, depth=True)

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from robocas_ms3.errors import EvaluationError, WireError
+from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.evaluation.harness import driven
 from robocas_ms3.evaluation.harness.vla_eval import RoboCAS
 from robocas_ms3.evaluation.protocol import load_protocol

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.evaluation.policy import Observations, Start, Wants
 from robocas_ms3.evaluation.tracking import SUMS
-from robocas_ms3.paths import protocols_dir
 
 CAMERA = (6, 4)  # width, height
 LAYOUTS = "layouts/pick_table_scattered.npy"

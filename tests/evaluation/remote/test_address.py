@@ -3,7 +3,7 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.remote.address import Address, read_address
 

@@ -12,7 +12,7 @@ pytest.importorskip("msgpack")
 
 from remote_ends import IN_A_HURRY, StandIn, Told, a_start, serving, some_observations, talking
 
-from robocas_ms3.errors import EvaluationError, PolicyFailed
+from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import Episode
 from robocas_ms3.evaluation.remote.client import RemotePolicy

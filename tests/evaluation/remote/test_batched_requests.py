@@ -13,7 +13,7 @@ from remote_ends import IN_A_HURRY, StandIn, Told, a_start, serving, some_observ
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from robocas_ms3.errors import EvaluationError, PolicyFailed
+from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.policy import Wants
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.messages import batch_limit, message_bytes, observation_message

@@ -18,7 +18,7 @@ pytest.importorskip("msgpack")
 from remote_ends import Told, a_start, serving, some_observations
 from websockets.sync.client import connect
 
-from robocas_ms3.errors import PolicyFailed
+from robocas_ms3.core.errors import PolicyFailed
 from robocas_ms3.evaluation.remote import keepalive
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.messages import observation_message
@@ -147,7 +147,7 @@ CUT = """
 import os, subprocess, sys, threading, time
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
 from remote_ends import a_start, some_observations, talking
-from robocas_ms3.errors import PolicyFailed
+from robocas_ms3.core.errors import PolicyFailed
 from robocas_ms3.evaluation.remote import keepalive
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.wire import pack

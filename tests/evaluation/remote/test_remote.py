@@ -12,7 +12,7 @@ pytest.importorskip("msgpack")
 
 from remote_ends import CAMERA, Told, a_start, serving, some_observations, talking
 
-from robocas_ms3.errors import EvaluationError, PolicyFailed
+from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
 from robocas_ms3.evaluation.policy import Wants

@@ -18,7 +18,7 @@ pytest.importorskip("msgpack")
 from remote_ends import a_start, some_observations, talking
 from websockets.asyncio.server import serve
 
-from robocas_ms3.errors import PolicyFailed
+from robocas_ms3.core.errors import PolicyFailed
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.wire import pack, unpack
 

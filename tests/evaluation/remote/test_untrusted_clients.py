@@ -15,7 +15,7 @@ from remote_ends import Told, a_start, serving, some_observations
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from robocas_ms3.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.messages import observation_message

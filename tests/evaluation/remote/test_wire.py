@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 msgpack = pytest.importorskip("msgpack")
 
-from robocas_ms3.errors import WireError
+from robocas_ms3.core.errors import WireError
 from robocas_ms3.evaluation.remote import wire
 from robocas_ms3.evaluation.remote.wire import pack, unpack
 

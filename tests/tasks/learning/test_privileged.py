@@ -11,7 +11,7 @@ import torch
 from learning_envs import STATE_ONLY, held_still, put, reward_now, target_of
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.arrays import as_tensor
+from robocas_ms3.core.arrays import as_tensor
 from robocas_ms3.tasks import TASKS, goals, learning, open_pick, search
 from robocas_ms3.tasks import base as tasks_base
 from robocas_ms3.tasks.transfer import Moment

@@ -5,7 +5,7 @@ import pytest
 from vector_envs import STATE_ONLY, with_gpu
 
 import robocas_ms3
-from robocas_ms3.errors import VectorEnvError
+from robocas_ms3.core.errors import VectorEnvError
 from robocas_ms3.tasks.vector.backend import choose_backend
 
 

@@ -7,7 +7,7 @@ import pytest
 from vector_envs import HORIZON, doing, make
 from vector_wrappers import Narrow, Wins
 
-from robocas_ms3.errors import VectorEnvError
+from robocas_ms3.core.errors import VectorEnvError
 
 slow = pytest.mark.slow
 

@@ -14,7 +14,7 @@ import torch
 from vector_envs import doing, gone, make
 from vector_wrappers import LacksLayouts, Misbehaves, OwnError
 
-from robocas_ms3.errors import ConfigError, LayoutError, VectorEnvError, WorkerDied
+from robocas_ms3.core.errors import ConfigError, LayoutError, VectorEnvError, WorkerDied
 from robocas_ms3.tasks import RoboCASPickEnv
 
 slow = pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 import torch
 from vector_envs import HORIZON, STATE_ONLY, doing, make
 
-from robocas_ms3.errors import VectorEnvError
+from robocas_ms3.core.errors import VectorEnvError
 from robocas_ms3.tasks.vector.environment import RoboCASVectorEnv
 
 slow = pytest.mark.slow

@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from robocas_ms3.errors import WorkerDied
-from robocas_ms3.processes import Limits
+from robocas_ms3.core.errors import WorkerDied
+from robocas_ms3.core.processes import Limits
 from robocas_ms3.tasks.vector import handle
 from robocas_ms3.tasks.vector.handle import WorkerHandle
 

@@ -8,7 +8,7 @@ import time
 import gymnasium as gym
 import torch
 
-from robocas_ms3.errors import LayoutError
+from robocas_ms3.core.errors import LayoutError
 
 
 class OwnError(Exception):

@@ -1,6 +1,0 @@
-"""Task configurations: strict models of the YAML files in ``task_configs/``."""
-
-from robocas_ms3.config.load import load_config_of, load_task_config, shipped_configs
-from robocas_ms3.config.task import TaskConfig
-
-__all__ = ["TaskConfig", "load_config_of", "load_task_config", "shipped_configs"]

@@ -1,0 +1,1 @@
+"""Errors, files and output folders, validation, registries, poses, and processes that do work."""

@@ -1,0 +1,170 @@
+"""What may end the process: Ctrl-C, which may be deferred, and foreign code, which may not (`no_exit`)."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from traceback import extract_tb
+from types import FrameType
+from typing import Any
+
+from robocas_ms3.core.errors import ExtensionError
+
+Handler = Callable[[int, FrameType | None], Any]
+_SECOND = 0.5  # s from one SIGINT to the next that is a second one; sooner, it is the same key pressed, sent twice
+
+
+class _CommandInterrupt:
+    """Ctrl-C of a command: its handler is called once; the second one ends the process if it was not called by then.
+
+    Python only notes a signal, and calls the handler when native code returns or a deferral ends. A thread that learns
+    of the first SIGINT at once ignores those of the next half second, and then restores the system's default.
+    """
+
+    def __init__(self) -> None:
+        self.installed = False
+        self.holds = 0  # of `uninterrupted` and `responsive` that are under way
+        self._handler: Handler = signal.default_int_handler
+        self._handled = threading.Event()
+
+    def install(self, handler: Handler) -> None:
+        """Handle SIGINT by a command's handler."""
+        read, write = os.pipe()
+        os.set_blocking(write, False)
+        signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+        threading.Thread(target=self._watch, args=(read,), name="interrupts", daemon=True).start()
+        self._handler, self.installed = handler, True
+        signal.signal(signal.SIGINT, self.handle)
+        self.arm()
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        """Call the command's handler."""
+        self._handled.set()
+        self._handler(number, frame)
+
+    def waits(self) -> bool:
+        """Return whether the command waits for the first SIGINT, undeferred."""
+        return self.installed and signal.getsignal(signal.SIGINT) == self.handle
+
+    def arm(self) -> None:
+        """Let the system restore its default when the first SIGINT comes.
+
+        So the second one ends the process even while native code keeps the thread of `_watch` from running. Only where
+        the C library has ``sysv_signal``.
+        """
+        libc = ctypes.CDLL(None)
+        action = ctypes.create_string_buffer(1024)  # a `struct sigaction`, which begins with the handler
+        if hasattr(libc, "sysv_signal") and libc.sigaction(int(signal.SIGINT), None, action) == 0:
+            libc.sysv_signal(int(signal.SIGINT), ctypes.c_void_p.from_buffer(action))
+
+    def _watch(self, signals: int) -> None:
+        libc = ctypes.CDLL(None)  # `signal.signal` is for the main thread alone
+        while signal.SIGINT not in os.read(signals, 1):  # SIGTERM comes here too
+            pass
+        default = signal.SIG_IGN
+        while not self._handled.is_set():
+            if not self.holds:
+                libc.signal(int(signal.SIGINT), ctypes.c_void_p(int(default)))
+            default = signal.SIG_DFL
+            self._handled.wait(_SECOND)
+
+
+_command = _CommandInterrupt()
+
+
+def handle_interrupt(handler: Handler) -> None:
+    """Install a command's handler of SIGINT; a second SIGINT ends the process while Python can't run the handler."""
+    _command.install(handler)
+
+
+def was_interrupted() -> bool:
+    """Return whether a ``KeyboardInterrupt`` may come from a signal: no, as long as a command waits for the first."""
+    return not _command.waits()
+
+
+@contextmanager
+def deferred_interrupts() -> Iterator[None]:
+    """Handle a SIGINT or SIGTERM that comes inside afterwards, once; of a command, a second SIGINT ends the process.
+
+    A mask is not enough: the system gives the signal to another thread, of which Python tells the main one.
+    """
+    came: list[tuple[int, FrameType | None]] = []
+    held: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if callable(handler := signal.getsignal(number)):
+                held[number] = handler
+                signal.signal(number, lambda number, frame: came.append((number, frame)))
+    try:
+        yield
+    finally:
+        with ExitStack() as restored:  # one that comes now interrupts this, but not what is restored after it
+            for number, handler in held.items():
+                restored.callback(_restore, number, handler)
+        if came:
+            held[came[0][0]](*came[0])
+
+
+@contextmanager
+def responsive() -> Iterator[None]:
+    """Wait inside, in Python: a second SIGINT right after the first changes nothing."""
+    waits = _command.waits() and threading.current_thread() is threading.main_thread()
+    if waits:
+        _command.holds += 1
+        signal.signal(signal.SIGINT, _command.handle)
+    try:
+        yield
+    finally:
+        if waits:
+            _command.holds -= 1
+            if _command.waits():
+                _command.arm()
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C back for a moment, the second one too; processes that are started during that inherit it."""
+    with deferred_interrupts():
+        _command.holds += 1
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            _command.holds -= 1
+
+
+@contextmanager
+def no_exit(source: str) -> Iterator[None]:
+    """Turn a ``SystemExit``, or a ``KeyboardInterrupt`` without a signal, of foreign code into an error.
+
+    Args:
+        source: whose code is called, such as ``policy mine:Policy``.
+
+    Raises:
+        ExtensionError: the code called ``sys.exit``, or raised ``KeyboardInterrupt``.
+    """
+    try:
+        yield
+    except (SystemExit, KeyboardInterrupt) as error:
+        if isinstance(error, KeyboardInterrupt) and was_interrupted():
+            raise
+        raise exit_error(error, source) from error
+
+
+def exit_error(error: BaseException, source: str) -> ExtensionError:
+    """Make the error that says where foreign code tried to end the process."""
+    frames = extract_tb(error.__traceback__)
+    line = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+    fix = "Raise an Exception there instead."
+    return ExtensionError("this code tried to end the process", where=source, found=f"{error!r}{line}", fix=fix)
+
+
+def _restore(number: int, handler: Handler) -> None:
+    signal.signal(number, handler)
+    if handler == _command.handle:
+        _command.arm()

@@ -1,0 +1,139 @@
+"""Files of JSON lines that grow by a record at a time, as runs and evaluations keep what came of their parts.
+
+A run may be killed while it writes: a last line that was cut off is no line, and is written over. One with a number
+that is NaN or infinite is damaged.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, is_dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from robocas_ms3.core.documents import read_bytes
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.files import json_text, naming, open_for_append, replacing
+from robocas_ms3.core.strict import refusal, validate_json
+
+Record = TypeVar("Record")
+_Error = TypeVar("_Error", bound=RobocasError)
+_LIMIT = 2**30  # bytes of a file: a million lines have 300 MB
+
+
+@dataclass(frozen=True)
+class Line(Generic[Record]):
+    """A line of the file.
+
+    Attributes:
+        number: from 1 on.
+        record: what it says; None: it is damaged.
+        problem: pydantic's, of a damaged one.
+        cut_off: whether a kill may have cut it off: it is the last one, and has no end.
+    """
+
+    number: int
+    record: Record | None
+    problem: ValidationError | None = None
+    cut_off: bool = False
+
+
+@lru_cache
+def _form_of(record: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(record)
+
+
+class Ledger(Generic[Record]):
+    """The file.
+
+    Args:
+        path: of the file, which may not be there yet.
+        record: what a line is: a dataclass, or a type of JSON. Types are checked; keys it does not know are left out.
+    """
+
+    def __init__(self, path: Path, record: Any) -> None:
+        self.path = path
+        self._form: TypeAdapter[Record] = _form_of(record)
+
+    def lines(self) -> list[Line[Record]]:
+        """All lines but empty ones, the damaged ones too; none where there is no file.
+
+        Raises:
+            OSError: the file cannot be read.
+            DocumentError: the path leads to a pipe or a device, or the file is too large.
+        """
+        try:
+            pieces = read_bytes(self.path, _LIMIT).split(b"\n")
+        except FileNotFoundError:
+            return []
+        return [self._read(number, piece, len(pieces)) for number, piece in enumerate(pieces, 1) if piece.strip()]
+
+    def read(self) -> list[Record]:
+        """What the lines say; damaged ones are left out."""
+        return [line.record for line in self.lines() if line.record is not None]
+
+    def append(self, records: Iterable[Record], *, sync: bool = False) -> None:
+        """Add lines.
+
+        Args:
+            records: what they say, in finite numbers; if there are none, the file is not touched.
+            sync: whether they are on the disk when this returns.
+
+        Raises:
+            RobocasError: a record has no place in JSON, or the file is a symbolic link.
+        """
+        text = _text(records, self.path)
+        if not text:
+            return
+        with naming(self.path), open_for_append(self.path) as file:
+            self._end(file)
+            file.write(text)
+            file.flush()
+            if sync:
+                os.fsync(file.fileno())
+
+    def rewrite(self, records: Iterable[Record]) -> None:
+        """Write the file anew, whole or not at all."""
+        with replacing(self.path) as tmp:
+            tmp.write_bytes(_text(records, self.path))
+
+    def refusal(self, line: Line[Record], error: type[_Error], about: str) -> _Error:
+        """What is wrong with a damaged line, as an error of ours.
+
+        Args:
+            line: of this file.
+            error: to be made.
+            about: what the line isn't, such as "no outcome of an episode".
+        """
+        assert line.problem is not None
+        return refusal(line.problem, self._form, error, where=f"{self.path}:{line.number}", about=about)
+
+    def _read(self, number: int, text: bytes, last: int) -> Line[Record]:
+        try:
+            return Line(number, validate_json(self._form, text))
+        except ValidationError as problem:
+            return Line(number, None, problem, cut_off=number == last)
+
+    def _end(self, file: Any) -> None:
+        """See that the last line has an end: one that was cut off goes."""
+        if not file.seek(0, os.SEEK_END):
+            return
+        file.seek(-1, os.SEEK_END)
+        if file.read(1) == b"\n":
+            return
+        file.seek(0)
+        content = file.read()
+        rest = content[content.rfind(b"\n") + 1 :]
+        if rest and self._read(1, rest, 1).record is None:
+            file.truncate(len(content) - len(rest))
+        elif rest:
+            file.write(b"\n")
+
+
+def _text(records: Iterable[Any], path: Path) -> bytes:
+    plain = (asdict(record) if is_dataclass(record) and not isinstance(record, type) else record for record in records)
+    return "".join(json_text(record, path, ascii_only=True) + "\n" for record in plain).encode()

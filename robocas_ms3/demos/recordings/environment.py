@@ -1,0 +1,202 @@
+"""The environment that a file says an episode was recorded in: read strictly, and made.
+
+A file is somebody's data. It names a registered task, a shipped configuration or the whole of one, and installed packs;
+never a module, a file or a folder.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, PositiveInt, ValidationError
+
+from robocas_ms3.assets.pack import pack_folders
+from robocas_ms3.core.errors import DatasetError, ExtensionError
+from robocas_ms3.core.strict import StrictModel, mistakes
+from robocas_ms3.robots.table import RobotSpec, find_robot
+from robocas_ms3.scenes.config.load import shipped_configs
+
+_PREFIX = "robocas_ms3:"  # lets gymnasium import this package by itself: ManiSkill's own tools then work
+_DEEP = 3  # dicts in dicts that settings of simulation and cameras may have
+
+_NAME = re.compile(r"\w[\w.+-]*")
+_Name = Annotated[str, Field(pattern=f"^{_NAME.pattern}$")]
+_Settings = dict[str, Any]
+
+
+class _Kwargs(StrictModel):
+    """Arguments of ``gym.make`` that a file may have; those that aren't the scene's are the reader's to choose."""
+
+    model_config = ConfigDict(strict=True)
+
+    config: _Name | dict[str, Any] | None = None
+    pack: _Name = "builtin"
+    furniture_pack: _Name = "builtin"
+    visual_level: _Name = "fast"
+    robot_uids: _Name | None = None
+    sim_config: _Settings = {}
+    sensor_configs: _Settings = {}
+    control_mode: _Name | None = None
+    obs_mode: str | None = None
+    reward_mode: _Name | None = None
+    num_envs: PositiveInt = 1
+    seeds: list[int] | None = None
+    reconfiguration_freq: int | None = None
+    max_episode_steps: PositiveInt | None = None
+    enable_shadow: bool = False
+    enhanced_determinism: bool = False
+    parallel_in_single_scene: bool = False
+    render_mode: _Name | None = None
+    sim_backend: str | None = None
+    render_backend: str | None = None
+    shader_dir: str | None = None
+    human_render_camera_configs: _Settings = {}
+    viewer_camera_configs: _Settings = {}
+    layouts: Any = None
+
+
+_SCENE = ("config", "pack", "furniture_pack", "visual_level", "robot_uids", "sim_config", "sensor_configs")
+
+
+class _Info(BaseModel):
+    model_config = ConfigDict(extra="allow", strict=True)
+
+    env_id: str
+    env_kwargs: _Kwargs
+
+
+@dataclass(frozen=True)
+class RecordedEnv:
+    """An environment as a file tells of it.
+
+    Attributes:
+        env_id: gymnasium's, of a registered task.
+        control_mode: of the actions; None: not said.
+        kwargs: for ``gym.make``, what makes the scene: ``_SCENE``. Where layouts were kept is not followed: they
+            follow from the seed.
+    """
+
+    env_id: str
+    control_mode: str | None
+    kwargs: dict[str, Any]
+
+    def with_pack(self, pack: str | Path | None) -> RecordedEnv:
+        """The same with the objects of another pack, by name or folder, where one is given."""
+        if pack is None:
+            return self
+        named = str(pack) if str(pack) in pack_folders() else str(Path(pack).absolute())
+        return replace(self, kwargs={**self.kwargs, "pack": named})
+
+    def robot(self, where: object = "robot_uids") -> RobotSpec:
+        """The robot that it was.
+
+        Raises:
+            DatasetError: none of its name is installed.
+        """
+        try:
+            return find_robot(self.kwargs.get("robot_uids"), where=where)
+        except ExtensionError as error:
+            fix = error.fix or "Install the package that has it."
+            raise DatasetError(error.what, where=where, expected=error.expected, found=error.found, fix=fix) from error
+
+    def make(self, **kwargs: Any) -> Any:
+        """Make it.
+
+        Args:
+            kwargs: further ones of ``gym.make``, which win over its own.
+
+        Raises:
+            DatasetError: no such task is registered, configuration shipped, or robot or pack installed; what lies in
+                the folder where we run is none, whatever its name.
+        """
+        import gymnasium as gym
+
+        from robocas_ms3.tasks import TASKS
+
+        known = sorted(spec.env_id for spec in TASKS.values())
+        if self.env_id not in known:
+            raise DatasetError("no such task", where="env_id", expected=f"one of {known}", found=self.env_id)
+        self.robot()
+        config = self.kwargs.get("config")
+        if isinstance(config, str) and config not in shipped_configs():
+            raise DatasetError("no such configuration", where="config", expected="a shipped one", found=config)
+        for key in ("pack", "furniture_pack"):
+            name = self.kwargs.get(key, "builtin")
+            if not Path(name).is_absolute() and name not in pack_folders():
+                expected = f"one of {', '.join(pack_folders())}"
+                fix = "Install it, or pass its folder with --pack." if key == "pack" else "Install it."
+                raise DatasetError("no such pack is installed", where=key, expected=expected, found=name, fix=fix)
+        return gym.make(self.env_id, **{**self.kwargs, **kwargs})
+
+
+def read_env(info: Any, where: object, *, pack: str | Path | None = None) -> RecordedEnv:
+    """Read ``env_info`` of a file.
+
+    Args:
+        info: ``{"env_id": ..., "env_kwargs": {...}}``.
+        where: it stands, for messages.
+        pack: name or folder, instead of what the file names.
+
+    Raises:
+        DatasetError: it says something else, or more than a file may choose.
+    """
+    if pack is not None and isinstance(info, Mapping) and isinstance(info.get("env_kwargs"), Mapping):
+        info = {**info, "env_kwargs": {**info["env_kwargs"], "pack": "builtin"}}
+    try:
+        found = _Info.model_validate(info)
+    except ValidationError as error:
+        raise _refusal(error, where) from error
+    env_id = found.env_id.removeprefix(_PREFIX)
+    if not re.fullmatch(r"\w+-v\d+", env_id):
+        raise DatasetError(
+            "a file can't choose this", where=f"{where}, env_id", expected="id of a task", found=found.env_id
+        )
+    kwargs = found.env_kwargs.model_dump(exclude_unset=True)
+    for name in ("sim_config", "sensor_configs"):
+        _check_settings(kwargs.get(name, {}), f"{where}, env_kwargs.{name}", _DEEP)
+    kept = {name: value for name, value in kwargs.items() if name in _SCENE}
+    return RecordedEnv(env_id, found.env_kwargs.control_mode, kept).with_pack(pack)
+
+
+def recorded_id(env_id: str) -> str:
+    """A registered id as files have it."""
+    return f"{_PREFIX}{env_id}"
+
+
+def _refusal(error: ValidationError, where: object) -> DatasetError:
+    first = mistakes(error, _Info)[0]
+    name, fix, expected = first.key.rpartition(".")[2], first.fix, first.expected
+    if first.kind == "string_pattern_mismatch":
+        expected = "a name, no path"
+        if name in ("pack", "furniture_pack"):
+            fix = "Pass the pack with --pack, if you trust it." if name == "pack" else "Install that pack by name."
+    what = first.what if first.kind == "value_error" else "the recorded environment can't be read"
+    where = f"{where}, {first.key}" if first.key else where
+    return DatasetError(what, where=where, expected=expected, found=first.found, fix=fix)
+
+
+def _check_settings(settings: Any, where: str, deep: int) -> None:
+    """Settings are numbers, words, and few levels of them.
+
+    Raises:
+        DatasetError: they are something else.
+    """
+    if isinstance(settings, dict) and deep:
+        for key, value in settings.items():
+            _check_settings(value, f"{where}.{key}", deep - 1)
+    elif isinstance(settings, list) and len(settings) <= 16 and deep:
+        for value in settings:
+            _check_settings(value, where, 0)
+    elif not _is_setting(settings):
+        raise DatasetError("no such setting", where=where, expected="a number or a name", found=str(settings)[:80])
+
+
+def _is_setting(value: Any) -> bool:
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return value is None or isinstance(value, int) or (isinstance(value, str) and bool(_NAME.fullmatch(value)))

@@ -1,0 +1,191 @@
+"""Reads a ManiSkill trajectory, ``F.h5`` with ``F.json`` beside it, as the generator writes it."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.demos.recordings.entries import Entry, read_entry, read_json
+from robocas_ms3.demos.recordings.environment import read_env
+from robocas_ms3.demos.recordings.motion import Motion, gripper_commands
+from robocas_ms3.demos.recordings.stored import (
+    open_episode,
+    open_trajectory,
+    read_actions,
+    read_bodies,
+    readable,
+)
+from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.table import RobotSpec
+
+_STATE_DIM = 13 + 2 * RobotDescription.finger_slice.stop
+
+
+@dataclass(frozen=True)
+class Recording(Entry):
+    """One recorded episode.
+
+    Attributes:
+        actions: (S, A).
+        states: ``{"actors": {name: (S+1, 13)}, "articulations": {name: (S+1, 13 + 2 joints)}}``.
+        robot: whose it is.
+    """
+
+    actions: NDArray[np.float32]
+    states: dict[str, dict[str, NDArray[np.float32]]]
+    robot: RobotSpec
+
+    def motion(self, samples: NDArray[np.int64]) -> Motion:
+        """What the robot did, at some of the states, in order."""
+        commands = gripper_commands(self.actions, self.control_mode)
+        return Motion.of(self.robot, self.states["articulations"][self.robot.description.uid], commands, samples)
+
+    def state(self, index: int) -> dict[str, dict[str, NDArray[np.float32]]]:
+        """One state as ``set_state_dict`` takes it, each array (1, D)."""
+        return {kind: {n: a[index : index + 1] for n, a in arrays.items()} for kind, arrays in self.states.items()}
+
+
+class TrajectoryFile:
+    """An open trajectory; use it in a ``with`` statement.
+
+    Args:
+        path: the HDF5 file.
+        pack: name or folder of the objects' pack, instead of what the file names.
+
+    Attributes:
+        path: the HDF5 file.
+        env_info: ``env_id``, ``env_kwargs``, ... of the JSON.
+        env: what it was recorded in.
+        robot: whose motion it is.
+        control_freq: Hz.
+        versions: what it was made with.
+        episodes: the JSON's entries.
+    """
+
+    def __init__(self, path: str | Path, *, pack: str | Path | None = None) -> None:
+        """Open both files and check that they belong together.
+
+        Raises:
+            DatasetError: a file is missing, damaged, or they do not match; or it chooses what no file may.
+        """
+        self.path = Path(path)
+        metadata_path = self.path.with_suffix(".json")
+        if self.path.is_dir():
+            inside = self.path / "trajectory.h5"
+            fix = f"Did you mean {inside}?" if inside.is_file() else "Give the .h5 file that robocas generate made."
+            raise DatasetError("this is a folder, not a trajectory file", where=self.path, fix=fix)
+        if not self.path.is_file():
+            raise DatasetError("no such trajectory file", where=self.path, fix="Make one with robocas generate.")
+        metadata = read_json(self.path)
+        self.env_info: dict[str, Any] = metadata["env_info"]
+        self.episodes: list[dict[str, Any]] = metadata["episodes"]
+        self.env = read_env(self.env_info, metadata_path, pack=pack)
+        self.robot = self.env.robot(f"{metadata_path}, env_info.env_kwargs.robot_uids")
+        if "robocas" not in metadata:
+            raise DatasetError(
+                "the JSON lacks the instructions and sub-goals",
+                where=metadata_path,
+                expected="key 'robocas'",
+                fix="Convert the file written by robocas generate; replays of it drop them.",
+            )
+        self.control_freq = _frequency(metadata["robocas"], metadata_path)
+        self.versions: dict[str, Any] = metadata["robocas"].get("versions", {})
+        self._file = open_trajectory(self.path)
+        listed = {f"traj_{episode['episode_id']}" for episode in self.episodes}
+        with readable(self.path, "this file is damaged"):
+            stored = set(self._file)
+        if listed != stored:
+            self.close()
+            raise DatasetError(
+                "HDF5 and JSON do not list the same episodes",
+                where=self.path,
+                expected=f"{len(listed)} of the JSON",
+                found=f"{len(stored)}, {len(listed ^ stored)} of them differ",
+            )
+
+    def __enter__(self) -> TrajectoryFile:
+        """Give itself: the file is open already."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the file."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def reopened(self) -> TrajectoryFile:
+        """The same file, open again, by the JSON as it was read.
+
+        Raises:
+            DatasetError: the HDF5 file is missing or damaged.
+        """
+        file = copy(self)
+        file._file = open_trajectory(self.path)
+        return file
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the open file behind, which no other process and no copy can have."""
+        return {**self.__dict__, "_file": None}
+
+    def entry(self, index: int) -> Entry:
+        """What the JSON says of an episode.
+
+        Args:
+            index: position in ``episodes``.
+
+        Raises:
+            DatasetError: it says something else, or more than a file may choose.
+        """
+        return read_entry(self.episodes[index], self._where(index))
+
+    def recording(self, index: int, *, bodies: bool = True) -> Recording:
+        """Read an episode.
+
+        Args:
+            index: position in ``episodes``.
+            bodies: whether to read the states of all, not only of the robot.
+
+        Raises:
+            DatasetError: it is damaged, or contradicts the JSON.
+        """
+        where, uid = self._where(index), self.robot.description.uid
+        group = open_episode(self._file, self.episodes[index]["episode_id"])
+        states, actions = read_bodies(group, only=None if bodies else uid), read_actions(group)
+        entry = self.entry(index)
+        lengths = {len(array) for arrays in states.values() for array in arrays.values()}
+        if lengths != {len(actions) + 1} or entry.control_steps != len(actions):
+            raise DatasetError(
+                "actions, states and JSON differ in length",
+                where=where,
+                expected=f"{entry.control_steps} actions, one state more",
+                found=f"{len(actions)} actions, {sorted(lengths)} states",
+            )
+        robot = states.get("articulations", {}).get(uid)
+        width = _STATE_DIM
+        if robot is None or robot.shape[1] != width:
+            raise DatasetError(
+                "states of another robot",
+                where=where,
+                expected=f"{uid} of {width} numbers",
+                found=sorted(states.get("articulations", {})) if robot is None else robot.shape[1],
+            )
+        return Recording(**vars(entry), actions=actions, states=states, robot=self.robot)
+
+    def _where(self, index: int) -> str:
+        return f"{self.path}, traj_{self.episodes[index]['episode_id']}"
+
+
+def _frequency(said: Any, path: Path) -> float:
+    freq = said.get("control_freq", 20) if isinstance(said, dict) else None
+    if not isinstance(freq, int | float) or isinstance(freq, bool) or not 0 < freq < np.inf:
+        where = f"{path}, robocas.control_freq"
+        raise DatasetError("no such frequency", where=where, expected="a number > 0", found=freq)
+    return float(freq)

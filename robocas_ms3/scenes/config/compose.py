@@ -1,0 +1,140 @@
+"""Composition of configurations: one mapping is merged into another, and the source of each key is kept.
+
+The rules are those of docs/configuration.md: mappings are merged key by key, other values are replaced, a block whose
+``kind`` changes is replaced as a whole, and ``null`` removes a key where it is not a value of that key.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, Literal
+
+from robocas_ms3.core.documents import YAML_DEPTH
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.core.strict import nearest
+from robocas_ms3.scenes.config.task import TaskConfig
+
+EXTENDS = "extends"
+"""The key of a file that names its base; no mapping inside another file may have it."""
+_KIND = "kind"
+
+
+class Composition:
+    """A configuration under construction.
+
+    Attributes:
+        values: the mapping, as YAML has it.
+        sources: dotted key -> file or command line option that set it last.
+    """
+
+    def __init__(self) -> None:
+        self.values: dict[str, Any] = {}
+        self.sources: dict[str, str] = {}
+
+    def merge(self, changes: Mapping[Any, Any], source: str, *, removes: bool = True) -> None:
+        """Merge a mapping over the present values.
+
+        Args:
+            changes: mapping of the configuration's form; it may be incomplete.
+            source: file or option that it comes from, for messages.
+            removes: whether ``null`` removes a key, see above.
+
+        Raises:
+            ConfigError: it removes a name that is not there, or names a base.
+        """
+        if EXTENDS in changes:
+            raise ConfigError(
+                f"{EXTENDS!r} is a key of YAML files only",
+                where=source,
+                expected="the keys of the configuration",
+                found=repr(changes[EXTENDS])[:80],
+                fix="Load the base by its name or path, and change its keys.",
+            )
+        self._merge(self.values, changes, (), source, removes)
+
+    def source_of(self, key: str, default: str) -> str:
+        """Return the source of a dotted key, or of the block that it is in; ``default`` if several or none set it."""
+        names = key.split(".") if key else []
+        for end in range(len(names), 0, -1):
+            place = ".".join(names[:end])
+            if source := self.sources.get(place):
+                return source
+            inside = {source for name, source in self.sources.items() if source and name.startswith(f"{place}.")}
+            if inside:
+                return inside.pop() if len(inside) == 1 else default
+        return default
+
+    def _merge(
+        self, values: dict[Any, Any], changes: Mapping[Any, Any], path: tuple[str, ...], source: str, removes: bool
+    ) -> None:
+        if len(path) > YAML_DEPTH:  # a mapping that contains itself, by a YAML alias
+            what = "a value here has no place in this file"
+            raise ConfigError(what, where=source, found=f"mappings nested more than {YAML_DEPTH} deep")
+        replaced = False
+        for key, new in changes.items():
+            place, old = (*path, " ".join(str(key).split())), values.get(key)
+            if new is None and removes and (declared := _declaration(place)) in {"key", "name"}:
+                if declared == "name" and key not in values:
+                    expected, fix = f"one of {sorted(map(str, values))}", nearest(str(key), map(str, values))
+                    what = f"there is no {'.'.join(place)!r} to remove"
+                    raise ConfigError(what, where=source, expected=expected, found=repr(str(key)), fix=fix)
+                values.pop(key, None)
+                replaced = replaced or declared == "name"
+                self._set_source(place, source, old)
+            elif isinstance(new, Mapping) and new:
+                inner = old
+                if not isinstance(inner, dict) or new.get(_KIND, inner.get(_KIND)) != inner.get(_KIND):
+                    inner = values[key] = {}
+                    self._set_source(place, "", old)
+                self._merge(inner, new, place, source, removes)
+            elif not (isinstance(new, Mapping) and isinstance(old, dict)):
+                values[key] = copy.deepcopy(new)
+                self._set_source(place, source, old)
+        if replaced:  # furniture is built in this order: a piece takes the place of the one that it replaces
+            first = {key: values[key] for key in changes if key in values}
+            ordered = first | {key: value for key, value in values.items() if key not in first}
+            values.clear()
+            values.update(ordered)
+
+    def _set_source(self, place: tuple[str, ...], source: str, old: Any) -> None:
+        """Set the source of a key, and forget those of the keys inside its old value."""
+        key = ".".join(place)
+        if isinstance(old, dict):  # only then: a file may have very many keys
+            for inside in [name for name in self.sources if name.startswith(f"{key}.")]:
+                del self.sources[inside]
+        self.sources[key] = source
+
+
+def _declaration(place: Sequence[str]) -> Literal["nullable", "key", "name", "unknown"]:
+    """Return how the configuration declares a key: with null as a value, without, as a free name, or not at all."""
+    nodes, found = [_schema()], "unknown"
+    for name in place:
+        found, inner = "unknown", []
+        for node in (alternative for outer in nodes for alternative in _alternatives(outer)):
+            if name in node.get("properties", {}):
+                found = "key"
+                inner.append(node["properties"][name])
+            elif isinstance(node.get("additionalProperties"), dict):
+                found = "name"
+                inner.append(node["additionalProperties"])
+        nodes = inner
+    takes_null = any(one.get("type") == "null" for node in nodes for one in _alternatives(node))
+    return "nullable" if takes_null else found
+
+
+def _alternatives(node: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the schemas that a value may be of, references resolved."""
+    if "$ref" in node:
+        node = _schema()["$defs"][node["$ref"].rsplit("/", 1)[-1]]
+    choices = (*node.get("anyOf", ()), *node.get("oneOf", ()))
+    if not choices:
+        yield node
+    for choice in choices:
+        yield from _alternatives(choice)
+
+
+@lru_cache(maxsize=1)
+def _schema() -> dict[str, Any]:
+    return TaskConfig.model_json_schema()

@@ -1,0 +1,198 @@
+"""Load task configurations. Each mistake is one error that names file, key, expected and found value."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.core.documents import YAML_LIMIT, DocumentError, load_yaml, read_text
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.core.paths import task_configs_dir
+from robocas_ms3.core.strict import nearest, parse
+from robocas_ms3.scenes.config.compose import EXTENDS, Composition
+from robocas_ms3.scenes.config.overrides import parse_override
+from robocas_ms3.scenes.config.supports import SUPPORTS
+from robocas_ms3.scenes.config.task import TaskConfig
+from robocas_ms3.scenes.task_specs import TaskSpec
+
+CHAIN_LIMIT = 8
+"""Files that a configuration and its bases may be."""
+_SUFFIXES = (".yaml", ".yml")
+_log = logging.getLogger(__name__)
+
+
+def shipped_configs() -> dict[str, Path]:
+    """Return name -> file of the configurations that are part of the package."""
+    return {path.stem: path for path in sorted(task_configs_dir().glob("*.yaml"))}
+
+
+def load_config_of(spec: TaskSpec, config: str | Path | dict | TaskConfig | None = None) -> TaskConfig:
+    """Load a configuration of a task.
+
+    Args:
+        spec: of the task.
+        config: see `load_task_config`; None: the task's default.
+
+    Raises:
+        ConfigError: the configuration is wrong, or another task's.
+    """
+    loaded = load_task_config(spec.default_config if config is None else config)
+    if loaded.task != spec.name:
+        name = f" {config}" if isinstance(config, str) else ""
+        raise ConfigError(
+            f"{spec.env_id} can't run the configuration{name}",
+            expected=f"task: {spec.name}",
+            found=f"task: {loaded.task}",
+        )
+    return loaded
+
+
+def load_task_config(
+    config: str | Path | dict | TaskConfig, changes: Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
+) -> TaskConfig:
+    """Load a task configuration. A file whose ``support`` is not one of ``SUPPORTS`` gets a warning.
+
+    Args:
+        config: name of a shipped configuration (``pick_table_scattered``), path of a YAML file, a mapping of the same
+            form, or a loaded configuration. Only files may have the key ``extends``.
+        changes: mapping that is merged over it.
+        overrides: ``KEY=VALUE`` each, such as ``objects.count=12``; they are merged last.
+
+    Raises:
+        ConfigError: no such file, not YAML, a chain of bases that does not end, an unknown key, a wrong type or value.
+    """
+    if isinstance(config, TaskConfig):
+        if not changes and not overrides:
+            return config
+        config = config.model_dump(mode="json")
+    composition = Composition()
+    if isinstance(config, dict):
+        label = "config"
+        composition.merge(config, label, removes=False)
+    else:
+        label = _merge_file(composition, config)
+    if changes:
+        composition.merge(changes, "changes")
+    for text in overrides:
+        nested = parse_override(text, ConfigError, "objects.count=12")
+        composition.merge(nested, f"--set {text}")
+    changed_by = [*(["changes"] if changes else []), *(f"--set {text}" for text in overrides)]
+    everything = f"{label} with {', '.join(changed_by)}" if changed_by else label
+    where = partial(composition.source_of, default=everything)
+    parsed = parse(TaskConfig, composition.values, ConfigError, where=where)
+    if parsed.support not in SUPPORTS and not isinstance(config, dict):
+        _log.warning(
+            "%s: texts know no support %r: they say 'on the %s' and no synonyms; known are %s",
+            *(composition.source_of("support", label), parsed.support, parsed.support, ", ".join(SUPPORTS)),
+        )
+    return parsed
+
+
+def check_no_base(path: Path) -> None:
+    """Check that a file has no base, as a file in a frozen protocol: it must neither depend on nor read other files.
+
+    A file whose text has no such key is not parsed, to save time.
+
+    Raises:
+        ConfigError: the file has a base, or cannot be read.
+    """
+    try:
+        text = read_text(path, YAML_LIMIT)
+    except (OSError, DocumentError) as error:
+        raise ConfigError("can't read this file", where=path, found=error) from error
+    if EXTENDS not in text and "\\" not in text:  # the key may be written with escapes
+        return
+    data = _read(path)
+    if EXTENDS in data:
+        raise ConfigError(
+            f"{EXTENDS!r} is not allowed in a protocol",
+            where=path,
+            expected="a whole configuration",
+            found=f"{EXTENDS}: {data[EXTENDS]}"[:80],
+            fix="robocas eval freeze writes whole configurations.",
+        )
+
+
+def _merge_file(composition: Composition, config: str | Path) -> str:
+    """Merge a file over its bases; returns what messages call it."""
+    chain = _chain(_find(config))
+    first = str(chain[0][0])
+    for number, (path, data) in reversed(list(enumerate(chain))):
+        source = f"{path} (extended by {chain[number - 1][0]})" if number else first
+        composition.merge(data, source, removes=path != chain[-1][0])
+    bases = ", ".join(str(path) for path, _ in chain[1:])
+    return f"{first} (extends {bases})" if bases else first
+
+
+def _chain(path: Path) -> list[tuple[Path, dict[Any, Any]]]:
+    """Read a file and its bases, the file first; without their keys ``extends``."""
+    chain: list[tuple[Path, dict[Any, Any]]] = []
+    found: Path | None = path
+    while found is not None:
+        path, data = found, _read(found)
+        files = [*(str(before) for before, _ in chain), str(path)]
+        where = f"{path}, {EXTENDS}"
+        if any(before.resolve() == path.resolve() for before, _ in chain):
+            where = f"{chain[-1][0]}, {EXTENDS}"
+            raise ConfigError(
+                "these configurations extend each other", where=where, expected="no cycle", found=" -> ".join(files)
+            )
+        if len(chain) == CHAIN_LIMIT:
+            expected = f"at most {CHAIN_LIMIT} files"
+            raise ConfigError("too many base configurations", where=where, expected=expected, found=files[0])
+        found = _base(data.pop(EXTENDS), path, where) if EXTENDS in data else None
+        chain.append((path, data))
+    return chain
+
+
+def _base(named: Any, path: Path, where: str) -> Path:
+    """Return the file that another one names as its base."""
+    if not isinstance(named, str) or not named:
+        expected = "a shipped name or a YAML file"
+        raise ConfigError(f"wrong value for {EXTENDS!r}", where=where, expected=expected, found=repr(named)[:80])
+    return _find(named, path.parent, where)
+
+
+def _read(path: Path) -> dict[Any, Any]:
+    try:
+        data = load_yaml(path)
+    except DocumentError as error:
+        raise ConfigError("this is not valid YAML", where=path, found=error) from error
+    except OSError as error:
+        raise ConfigError("can't read this file", where=path, found=error.strerror) from error
+    if not isinstance(data, dict):
+        raise ConfigError("a task configuration is a mapping", where=path, found=type(data).__name__)
+    for key in data:
+        if key != EXTENDS and key not in TaskConfig.model_fields and (likely := nearest(str(key), [EXTENDS])):
+            expected = f"one of {[EXTENDS, *sorted(TaskConfig.model_fields)]}"
+            raise ConfigError(f"unknown key {key!r}", where=path, expected=expected, found=repr(key), fix=likely)
+    return data
+
+
+def _find(config: str | Path, folder: Path | None = None, where: str = "") -> Path:
+    """Return the file of a name or path, which is relative to a folder where one is given."""
+    shipped, name = shipped_configs(), str(config)
+    if name in shipped:
+        return shipped[name]
+    path = Path(config) if folder is None else folder / config
+    is_yaml = path.suffix in _SUFFIXES
+    with suppress(OSError, ValueError):  # such as a name that is too long
+        if is_yaml and path.is_file():
+            return path
+    likely = nearest(path.stem if is_yaml else name, shipped)
+    what, expected = "no such task configuration", "a YAML file (.yaml, .yml) or a shipped name"
+    if folder is not None:
+        files = [str(path.relative_to(folder)) for end in _SUFFIXES for path in sorted(folder.glob(f"*{end}"))]
+        what, expected = "no such base", f"a shipped name or a YAML file (.yaml, .yml) relative to {folder}"
+        likely = nearest(name, [*shipped, *files]) or nearest(f"{name}.yaml", files) or likely
+    raise ConfigError(
+        what,
+        where=where or name,
+        expected=expected + ("" if likely else f": {', '.join(sorted(shipped))}"),
+        found=repr(name) if where else "",
+        fix=f"{likely} `robocas list` has all names." if likely else "",
+    )

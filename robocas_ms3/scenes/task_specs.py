@@ -1,0 +1,116 @@
+"""The tasks: one frozen row each, which everything that differs from task to task is read from.
+
+Other packages add rows by entry points ``robocas_ms3.tasks``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from robocas_ms3.core.extensions import Table
+
+SIM_FREQ = 100  # Hz, of physics
+STANDARD_FREQ = 20  # Hz, of control; gymnasium's horizon is for it
+STAGES = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_target", "target_grasped", "target_lifted")
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """A task. What it is made of is named by import path, ``package.module:name``, and loaded where it is used.
+
+    Attributes:
+        name: short name, as in ``robocas generate pick``.
+        env_id: gymnasium id.
+        env: its class, a `tasks.scene.SceneEnv` whose ``SPEC`` is this.
+        default_config: task configuration used when none is given: name of a shipped one, or path of a YAML file.
+        target: how its target is chosen, a `scenes.targets.TargetRule`.
+        solver: its scripted policy, a function of an `Arm` that tries once.
+        seconds: horizon; upstream allows 200 steps of 5 Hz.
+        training_seconds: horizon to train with where the base stands still (`rl_kwargs`).
+        summary: one line for people.
+        slots: what its instructions have besides object and support: ``relation``, which may be left out, ``part``.
+        checks: what its configurations have to be besides well-formed: functions that raise ValueError.
+        instructions: its templates by split, ``upstream``, ``train`` and ``held_out``; default: those of
+            ``language/instructions.yaml``.
+        stages: those of its environment that an episode comes through, in order; an evaluation names the one that it
+            did not come to. Default: the benchmark's, of which an environment may lack some.
+    """
+
+    name: str
+    env_id: str
+    env: str
+    default_config: str
+    target: str
+    solver: str
+    seconds: int
+    training_seconds: int
+    summary: str
+    slots: tuple[str, ...] = ()
+    checks: tuple[str, ...] = ()
+    instructions: Mapping[str, Sequence[str]] = field(default_factory=dict, hash=False)
+    stages: tuple[str, ...] = STAGES
+
+    def steps(self, control_freq: int) -> int:
+        """The horizon in control steps at a rate, Hz."""
+        return self.seconds * control_freq
+
+    @property
+    def max_episode_steps(self) -> int:
+        """The horizon at the standard rate, which gymnasium is told, whatever the rate."""
+        return self.steps(STANDARD_FREQ)
+
+
+HAS_BASKET = "robocas_ms3.scenes.config.checks:has_basket"
+
+PICK = TaskSpec(
+    name="pick",
+    env_id="RoboCASPick-v1",
+    env="robocas_ms3.tasks.pick:RoboCASPickEnv",
+    default_config="pick_table_scattered",
+    target="robocas_ms3.scenes.targets:BY_NAME",
+    solver="robocas_ms3.planning.solvers.pick:attempt",
+    seconds=40,
+    training_seconds=20,
+    summary="grasp the named object among scattered ones and drop it into the basket",
+    checks=(HAS_BASKET,),
+)
+SELECT = TaskSpec(
+    name="select",
+    env_id="RoboCASSelect-v1",
+    env="robocas_ms3.tasks.select:RoboCASSelectEnv",
+    default_config="select_table_orderly",
+    target="robocas_ms3.scenes.targets:BY_RELATION",
+    solver="robocas_ms3.planning.solvers.pick:attempt",
+    seconds=40,
+    training_seconds=20,
+    summary="grasp the one of several identical objects that the instruction names by where it stands",
+    slots=("relation",),
+    checks=(HAS_BASKET, "robocas_ms3.scenes.config.checks:has_copies"),
+)
+SEARCH = TaskSpec(
+    name="search",
+    env_id="RoboCASSearch-v1",
+    env="robocas_ms3.tasks.search:RoboCASSearchEnv",
+    default_config="search_table_stacked",
+    target="robocas_ms3.scenes.targets:BY_VISIBILITY",
+    solver="robocas_ms3.planning.solvers.search:attempt",
+    seconds=120,
+    training_seconds=90,
+    summary="find the named object in a heap, clear what covers it, and drop it into the basket",
+    checks=(HAS_BASKET,),
+)
+OPEN_PICK = TaskSpec(
+    name="open_pick",
+    env_id="RoboCASOpenPick-v1",
+    env="robocas_ms3.tasks.open_pick:RoboCASOpenPickEnv",
+    default_config="open_pick_container",
+    target="robocas_ms3.scenes.targets:BY_NAME",
+    solver="robocas_ms3.planning.solvers.open_pick:attempt",
+    seconds=100,
+    training_seconds=40,
+    summary="open a door or drawer, take the named object out and drop it into the basket",
+    slots=("part",),
+    checks=(HAS_BASKET,),
+)
+TASKS = Table("task", "robocas_ms3.tasks", TaskSpec, {spec.name: spec for spec in (PICK, SELECT, SEARCH, OPEN_PICK)})

@@ -1,0 +1,154 @@
+"""Files of others are bounded before anything is built of them."""
+
+import json
+import os
+import re
+import time
+
+import pytest
+
+from robocas_ms3.core import documents
+from robocas_ms3.core.documents import (
+    JSON_DEPTH,
+    YAML_DEPTH,
+    DocumentError,
+    json_values,
+    load_array,
+    load_json,
+    load_yaml,
+    open_arrays,
+    read_bytes,
+    read_text,
+)
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(text):
+        path = tmp_path / "file"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write
+
+
+def laughs(levels: int, merged: bool = False) -> str:
+    first = "a0: &a0 {k: ha}" if merged else "a0: &a0 [ha, ha, ha, ha, ha, ha, ha, ha, ha]"
+    rows = [first]
+    for level in range(1, levels):
+        nine = ", ".join([f"*a{level - 1}"] * 9)
+        rows.append(f"a{level}: &a{level} " + (f"{{<<: [{nine}]}}" if merged else f"[{nine}]"))
+    return "\n".join(rows)
+
+
+@pytest.mark.parametrize("merged", [False, True])
+def test_yaml_whose_aliases_stand_for_a_billion(file, merged):
+    begun = time.perf_counter()
+    with pytest.raises(DocumentError, match="more than 500000 values, with those that aliases stand for"):
+        load_yaml(file(laughs(9, merged)))
+    assert time.perf_counter() - begun < 2
+    few = load_yaml(file(laughs(3, merged)))
+    assert few["a2"] == ({"k": "ha"} if merged else [[["ha"] * 9] * 9] * 9)
+
+
+def test_what_aliases_stand_for_is_counted_each_time(file, monkeypatch):
+    text = "a: &a [1, 2]\nb: [*a, *a]"  # 1 mapping, 2 keys, 3 values in a; list of b, and 3 values twice
+    monkeypatch.setattr(documents, "YAML_NODES", 13)
+    assert load_yaml(file(text)) == {"a": [1, 2], "b": [[1, 2], [1, 2]]}
+    monkeypatch.setattr(documents, "YAML_NODES", 12)
+    with pytest.raises(DocumentError, match="more than 12 values"):
+        load_yaml(file(text))
+
+
+def test_yaml_may_be_nested_so_deep_and_no_deeper(file):
+    load_yaml(file("[" * YAML_DEPTH + "]" * YAML_DEPTH))
+    for depth in (YAML_DEPTH + 1, 100_000):
+        with pytest.raises(DocumentError, match=f"nested more than {YAML_DEPTH} deep"):
+            load_yaml(file("[" * depth + "]" * depth))
+
+
+@pytest.mark.parametrize("before", ["", '[1, {"a": []}, '])
+@pytest.mark.parametrize("depth", [JSON_DEPTH + 1, 500, 100_000])
+def test_json_nested_too_deeply(file, before, depth):
+    with pytest.raises(DocumentError):
+        load_json(file(before + "[" * depth + "]" * depth + "]" * bool(before)))
+    load_json(file("[" * JSON_DEPTH + "]" * JSON_DEPTH))
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999", "-2.5E+400", "9" * 400 + ".0"])
+def test_json_knows_finite_numbers_only(file, number):
+    with pytest.raises(DocumentError, match=f"^{re.escape(number[:40])} is no number of JSON$"):
+        load_json(file(f'{{"a": [1, {number}]}}'))
+    assert load_json(file(f'["{number}", 1e300]')) == [number, 1e300]
+
+
+@pytest.mark.parametrize("load", [load_json, load_yaml])
+@pytest.mark.parametrize("number", [2**63, -(2**63), 10**400, int("9" * 4300)])
+def test_integers_have_64_bits(file, load, number):
+    with pytest.raises(DocumentError):
+        load(file(f'{{"a": [1, {number}]}}'))
+    assert load(file(f"[{2**63 - 1}]")) == [2**63 - 1]
+
+
+@pytest.mark.parametrize("number", ["1:" * 200_000 + "1", "1:" * 300 + "1.5", "0x" + "f" * 4000, "9" * 5000])
+def test_long_yaml_numbers_are_refused_at_once(file, number):
+    with pytest.raises(DocumentError):
+        load_yaml(file(f"a: {number}"))
+    assert load_yaml(file("a: [1:30, 0x10, 1:30.5, .inf]")) == {"a": [90, 16, 90.5, float("inf")]}
+
+
+@pytest.mark.parametrize("text", ['["\\ud800"]', '{"\\udfff": 1}', '"\\uD83Dx"', b'"\xed\xa0\x80"'])
+def test_lone_surrogates_of_json_are_refused(file, text):
+    with pytest.raises(DocumentError):
+        load_json(file(text))
+    with pytest.raises(DocumentError):
+        json_values(text)
+    assert load_json(file('"\\ud83d\\ude00"')) == "\U0001f600"
+
+
+@pytest.mark.parametrize(
+    "load",
+    [load_json, load_yaml, open_arrays, load_array, lambda path: read_bytes(path, 9), lambda path: read_text(path, 9)],
+)
+def test_only_regular_files_are_read(tmp_path, load):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    for name in ("pipe", "zero"):
+        with pytest.raises(DocumentError):
+            load(tmp_path / name)
+
+
+@pytest.mark.parametrize(("load", "limit"), [(load_json, "JSON_LIMIT"), (load_yaml, "YAML_LIMIT")])
+def test_a_file_that_is_too_large_is_not_read_whole(file, monkeypatch, load, limit):
+    monkeypatch.setattr(documents, limit, 2**20)
+    assert load(file('"' + "a" * (2**20 - 2) + '"')) == "a" * (2**20 - 2)
+    with pytest.raises(DocumentError, match="more than 1 MB"):
+        load(file('"' + "a" * (2**20 - 1) + '"'))
+
+
+@pytest.mark.parametrize("load", [load_json, load_yaml])
+@pytest.mark.parametrize("text", [b"\xff\xfe{}", '{"a": ', "\x00"])
+def test_what_is_not_of_its_language_is_one_line(file, load, text):
+    with pytest.raises(DocumentError) as error:
+        load(file(text))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [("a: 1\na: 2", "'a' is given twice"), ("? [1]\n: 2", "unhashable key"), ("d: 2020-02-30", "day is out of range")],
+)
+def test_yaml_that_can_be_built_in_no_way(file, text, match):
+    with pytest.raises(DocumentError, match=match):
+        load_yaml(file(text))
+
+
+def test_what_is_merged_into_a_mapping_is_not_given_twice(file):
+    text = "z: &z {k: 0}\na: &a {<<: *z, k: 1}\nb: {<<: *a, k: 2}"
+    assert load_yaml(file(text)) == {"z": {"k": 0}, "a": {"k": 1}, "b": {"k": 2}}
+
+
+def test_what_is_there_is_read(file):
+    data = {"a": [1, 2.5, None, True], "b": {"c": "ä"}}
+    assert load_json(file(json.dumps(data))) == data
+    assert load_yaml(file("a: [1, 2.5, null, true]\nb: {c: ä}")) == data

@@ -1,0 +1,159 @@
+"""Code of others can't end a command without an error, and the second Ctrl-C ends a long native call."""
+
+import os
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from robocas_ms3.core.errors import ExtensionError
+from robocas_ms3.core.exits import no_exit
+from robocas_ms3.core.extensions import Table, load
+from robocas_ms3.core.processes import Calls, Pool
+
+ROOT = Path(__file__).resolve().parents[2]
+PYTHONS_OWN = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+NATIVE = """
+import hashlib
+from contextlib import nullcontext
+from robocas_ms3.cli.interrupts import heed_ctrl_c
+from robocas_ms3.core.exits import deferred_interrupts, uninterrupted
+heed_ctrl_c()
+with uninterrupted():
+    pass
+with {around}:
+    print("ready", flush=True)
+    while True:
+        {call}
+"""
+LONG_CALLS = {
+    "with Python's lock": ("nullcontext()", "sum(range(2**62))"),
+    "without it": ("nullcontext()", HASHING := "hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)"),
+    "deferred": ("deferred_interrupts()", HASHING),
+}
+STEP = """
+import hashlib
+from robocas_ms3.cli.interrupts import heed_ctrl_c
+from robocas_ms3.core.exits import deferred_interrupts
+heed_ctrl_c()
+try:
+    with deferred_interrupts():
+        print("ready", flush=True)
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 500_000)
+        print("step done", flush=True)
+except KeyboardInterrupt:
+    print("handled", flush=True)
+"""
+WAITING = """
+import os, signal, time
+from robocas_ms3.cli.interrupts import heed_ctrl_c
+from robocas_ms3.core.exits import responsive
+heed_ctrl_c()
+try:
+    with responsive():
+        print("ready", flush=True)
+        time.sleep(100)
+except KeyboardInterrupt:
+    print("handled", flush=True)
+os._exit(0)
+"""
+UNSIGNALLED = """
+from robocas_ms3.cli.interrupts import heed_ctrl_c
+from robocas_ms3.core.errors import ExtensionError
+from robocas_ms3.core.exits import no_exit
+heed_ctrl_c()
+try:
+    with no_exit("policy mine:Policy"):
+        raise KeyboardInterrupt
+except ExtensionError as error:
+    print(error.where)
+"""
+
+
+def python(program: str) -> subprocess.Popen:
+    """A process that runs a program, with Python's own handling of Ctrl-C."""
+    return subprocess.Popen(
+        [sys.executable, "-c", PYTHONS_OWN + program],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize(("around", "call"), LONG_CALLS.values(), ids=LONG_CALLS)
+def test_the_second_ctrl_c_ends_a_long_native_call(around, call):
+    with python(NATIVE.format(around=around, call=call)) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == "ready\n"
+            while process.poll() is None:  # how long the system takes to deliver the first one is not known
+                process.send_signal(signal.SIGINT)
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(0.2)
+            assert process.returncode == -signal.SIGINT
+        finally:
+            process.kill()
+
+
+def test_a_step_is_finished_although_ctrl_c_came_twice_at_once():
+    with python(STEP) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        for _ in range(5):
+            process.send_signal(signal.SIGINT)
+        assert (process.communicate()[0], process.returncode) == ("step done\nhandled\n", 0)
+
+
+def test_the_first_of_two_at_once_is_handled_while_a_command_waits():
+    with python(WAITING) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        for _ in range(2):
+            process.send_signal(signal.SIGINT)
+        assert (process.communicate()[0], process.returncode) == ("handled\n", 0)
+
+
+def test_an_interrupt_that_no_signal_caused_is_an_error_of_its_source():
+    with python(UNSIGNALLED) as process:
+        assert process.communicate()[0] == "policy mine:Policy\n"
+
+
+def test_an_exit_is_an_error_of_its_source():
+    with pytest.raises(ExtensionError) as caught, no_exit("policy mine:Policy"):
+        sys.exit(0)
+    assert caught.value.where == "policy mine:Policy"
+    assert __file__ in str(caught.value.found)
+    with pytest.raises(KeyboardInterrupt), no_exit("a library has no handler of its own"):
+        raise KeyboardInterrupt
+
+
+@pytest.fixture
+def leaving(tmp_path, monkeypatch):
+    """A package whose import calls `sys.exit`."""
+    info = tmp_path / "leaving-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: leaving\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[a.group]\nbad = leaving_module:BAD\n")
+    (tmp_path / "leaving_module.py").write_text("import sys\nsys.exit(0)\n")
+    monkeypatch.delitem(sys.modules, "leaving_module", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def test_the_import_of_an_extension_can_not_end_the_process(leaving):
+    numbers = Table("number", "a.group", int, {"one": 1})
+    assert dict(numbers) == {"one": 1}
+    with pytest.raises(ExtensionError):
+        numbers.find("bad")
+    with pytest.raises(ExtensionError):
+        load("leaving_module:BAD")
+
+
+def leave(how: BaseException) -> None:
+    raise how
+
+
+@pytest.mark.parametrize("how", [SystemExit(0), KeyboardInterrupt()])
+def test_code_in_a_worker_can_not_end_the_program(how):
+    with Pool(partial(Calls, leave), 2) as pool, pytest.raises(ExtensionError):
+        list(pool.do([how]))

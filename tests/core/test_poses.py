@@ -1,0 +1,59 @@
+"""Rigid transforms: by hand, back again, and one as it is among others."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.core import poses
+
+
+@st.composite
+def transforms(draw):
+    """(N, 2, 4, 4)"""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    count = draw(st.integers(1, 9))
+    turns = Rotation.random(2 * count, random_state=rng).as_matrix().reshape(count, 2, 3, 3)
+    return poses.from_parts(rng.uniform(-2, 2, (count, 2, 3)), turns)
+
+
+def test_by_hand():
+    # a quarter turn about z, at (1, 2, 3): the frame's x points along the world's y
+    pose = poses.from_wxyz(np.array([1, 2, 3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]))
+    np.testing.assert_allclose(pose, [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(poses.planar(1, 2, 3, np.pi / 2), pose, atol=1e-12)
+    np.testing.assert_allclose(poses.transform(pose, np.array([[1.0, 0, 0]])), [[1, 3, 3]], atol=1e-12)
+    np.testing.assert_allclose(poses.inverse(pose)[:3, 3], [-2, 1, -3], atol=1e-12)
+
+
+@settings(max_examples=50, deadline=None)
+@given(transforms())
+def test_what_is_undone_is_as_before(some):
+    np.testing.assert_allclose(poses.inverse(some) @ some, np.broadcast_to(np.eye(4), some.shape), atol=1e-12)
+    np.testing.assert_allclose(poses.from_wxyz(poses.to_wxyz(some)), some, atol=1e-12)
+    seven = poses.to_wxyz(some)
+    again = poses.from_xyzw(seven[..., :3], poses.wxyz_to_xyzw(seven[..., 3:]))
+    np.testing.assert_array_equal(again, poses.from_wxyz(seven))
+
+
+@settings(max_examples=50, deadline=None)
+@given(transforms())
+def test_one_is_as_it_is_among_others_to_the_bit(some):
+    seven = poses.to_wxyz(some)
+    for index in np.ndindex(*some.shape[:-2]):
+        np.testing.assert_array_equal(poses.from_wxyz(seven[index]), poses.from_wxyz(seven)[index])
+        np.testing.assert_array_equal(poses.inverse(some[index]), poses.inverse(some)[index])
+
+
+def test_tensors_are_read():
+    pose = torch.tensor([1.0, 2, 3, 1, 0, 0, 0])
+    np.testing.assert_array_equal(poses.from_wxyz(pose)[:3, 3], [1, 2, 3])
+
+
+@pytest.mark.parametrize("order", ["xyzw_to_wxyz", "wxyz_to_xyzw"])
+def test_orders_of_quaternions(order):
+    wxyz, xyzw = np.array([1, 2, 3, 4]), np.array([2, 3, 4, 1])
+    before, after = (xyzw, wxyz) if order == "xyzw_to_wxyz" else (wxyz, xyzw)
+    np.testing.assert_array_equal(getattr(poses, order)(before), after)

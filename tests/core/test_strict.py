@@ -1,0 +1,109 @@
+"""What is said of mistakes in data of others, whatever its form: one line, in our words."""
+
+from typing import Annotated, Literal
+
+import pytest
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
+
+from robocas_ms3.core.errors import AssetError, ConfigError
+from robocas_ms3.core.strict import StrictModel, mistakes, nearest, parse, parse_json, refusal
+
+
+def _even(number: int) -> int:
+    if number % 2:
+        raise ValueError("an even number")
+    return number
+
+
+class Ball(StrictModel):
+    kind: Literal["ball"] = "ball"
+    radius: Annotated[float, Field(gt=0)]
+
+
+class Crate(StrictModel):
+    kind: Literal["crate"] = "crate"
+    size: tuple[float, float]
+
+
+class Shelf(StrictModel):
+    name: Annotated[str, Field(pattern="^[a-z]+$")]
+    things: list[Annotated[Ball | Crate, Field(discriminator="kind")]] = []
+    names: dict[Annotated[str, Field(pattern="^[a-z]+$")], int] = {}
+    boards: Annotated[int, AfterValidator(_even)] = 2
+
+
+def said(**changes) -> str:
+    with pytest.raises(ConfigError) as caught:
+        parse(Shelf, {"name": "a", **changes}, ConfigError, where="shelf.yaml", about="no shelf")
+    assert "\n" not in str(caught.value)
+    return str(caught.value).removeprefix("shelf.yaml: no shelf: ")
+
+
+def test_what_fits_is_read_as_yaml_has_it():
+    shelf = parse(Shelf, {"name": "a", "things": [{"kind": "crate", "size": [1, 2]}]}, ConfigError, where="")
+    assert shelf.things == [Crate(size=(1.0, 2.0))]
+    with pytest.raises(ValidationError):
+        shelf.name = "b"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"name": "A"}, "wrong value for 'name' (expected a string like ^[a-z]+$, found 'A')"),
+        ({"name": 1, "boards": "2"}, "wrong value for 'name' (expected a string, found 1). 1 more after this one."),
+        ({"boards": 3}, "boards: an even number (found 3)"),
+        (
+            {"boards": 3, "bords": 2},
+            "unknown key 'bords' (expected one of ['boards', 'name', 'names', 'things'], found 'bords'). "
+            "Did you mean boards? 1 more after this one.",
+        ),
+        ({"names": {"x y": 1}}, "wrong value for 'names.x y' (expected a string like ^[a-z]+$, found 'x y')"),
+        (
+            {"names": {"two\nlines": 1}},
+            "wrong value for 'names.two lines' (expected a string like ^[a-z]+$, found 'two\\nlines')",
+        ),
+        (
+            {"things": [{"kind": "ball", "radius": 0}]},
+            "wrong value for 'things.0.radius' (expected greater than 0, found 0)",
+        ),
+        (
+            {"things": [{"kind": "ball", "radius": float("inf")}]},
+            "wrong value for 'things.0.radius' (expected a finite number, found inf)",
+        ),
+        (
+            {"things": [{"kind": "bal"}]},
+            "wrong value for 'things.0.kind' (expected one of ['ball', 'crate'], found 'bal'). Did you mean ball?",
+        ),
+    ],
+)
+def test_mistakes(changes, message):
+    assert said(**changes) == message
+
+
+def test_what_json_has_no_word_for_is_a_mistake_at_its_key():
+    assert said(boards={1, 2}) == "wrong value for 'boards' (expected a whole number, found {'set': '{1, 2}'})"
+    assert "has no place in this file" in said(names={(1, 2): 3})
+
+
+def test_json_itself():
+    with pytest.raises(AssetError, match=r"^f: this is not valid JSON .found EOF while parsing"):
+        parse_json(Shelf, '{"name": ', AssetError, where="f")
+    assert parse_json(Shelf, b'{"name": "a"}', AssetError, where="f").boards == 2
+
+
+def test_other_words_and_other_forms():
+    form = TypeAdapter(dict[str, Ball])
+    with pytest.raises(ValidationError) as caught:
+        form.validate_json('{"a": {"radius": "x"}, "b": 3}', strict=True)
+    first, second = mistakes(caught.value, form, {"float_type": "metres"})
+    assert (first.key, first.expected, first.found, first.value) == ("a.radius", "metres", "'x'", "x")
+    assert (second.key, second.kind) == ("b", "model_type")
+    made = refusal(caught.value, form, AssetError, where="f", fix="Make it again.")
+    assert str(made) == (
+        "f: wrong value for 'a.radius' (expected a number, found 'x'). 1 more after this one. Make it again."
+    )
+
+
+def test_the_nearest_words():
+    assert nearest("shelv", ["table", "shelf"]) == "Did you mean shelf?"
+    assert nearest("sofa", ["table", "shelf"]) == ""

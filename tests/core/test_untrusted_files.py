@@ -1,0 +1,222 @@
+"""Files of unknown origin are read whole, or refused by one typed error of one line, whatever values they hold."""
+
+import json
+import shutil
+from pathlib import Path
+
+import made_up_results
+import pytest
+import yaml
+from fuzzing import VALUES, changed
+from synthetic import write_trajectory
+
+from robocas_ms3.core.documents import DocumentError
+from robocas_ms3.core.errors import RobocasError, TrainingError
+from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry
+from robocas_ms3.datasets.sources.trajectory import TrajectorySource
+from robocas_ms3.datasets.statistics.collect import collect
+from robocas_ms3.datasets.writing.plan import resumed_plan
+from robocas_ms3.demos.checks import check_same_run
+from robocas_ms3.demos.ledger import Ledger, count_by_stage
+from robocas_ms3.demos.recordings.reading import TrajectoryFile
+from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.comparison import comparison
+from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+from robocas_ms3.evaluation.report.page import page
+from robocas_ms3.evaluation.tables import markdown
+from robocas_ms3.plans import units
+from robocas_ms3.plans.begun import check_plan_of, content_of, read_plan
+from robocas_ms3.plans.driver import RUN as DRIVER_RUN
+from robocas_ms3.plans.driver import current_run, wait_for_killed
+from robocas_ms3.plans.plan import load_plan, shipped_plans
+from robocas_ms3.plans.status import status
+from robocas_ms3.plans.tally import Tally, tally_path
+
+MOST = 40  # changes of a file that are tried: the same ones each time
+
+
+def refused(read, path, whole, *, line=False, most=MOST):
+    """Read a file with every change, and return the places whose change was refused."""
+    before = path.read_text() if path.exists() else ""
+    rest = before.splitlines(keepends=True)[1:] if line else []
+    places = set()
+    for place, value, data in [*changed(whole, most), *(((), value, value) for value in VALUES[::5])]:
+        path.write_text("".join([json.dumps(data), "\n" * line, *rest]))
+        try:
+            read()
+        except (RobocasError, DocumentError) as error:
+            assert "\n" not in str(error)
+            places.add(place)
+        except Exception as error:
+            raise AssertionError(f"{place}: {str(value)[:40]}") from error
+    path.write_text(before)
+    return places
+
+
+ORDER = {
+    "moved": [{"object": "mug", "step": 3, "needed": True, "in_order": True}],
+    "needed": ["mug"],
+    "left": 0,
+    "score": 1.0,
+}
+
+
+@pytest.mark.parametrize("name", [results.RUN, results.OUTCOMES])
+def test_results_of_an_evaluation(tmp_path, name):
+    root = tmp_path / "result"
+    played = [made_up_results.outcome(i, came_to=7 - i, retrieval=ORDER, p_vis=0.5) for i in range(2)]
+    run = made_up_results.write(root, played).run
+
+    def read():
+        found = results.read(root)
+        assert markdown(found)
+        assert page(found)
+        assert comparison([found, found])
+        assert results.begin(root, run, resume=True)
+
+    read()
+    whole = json.loads((root / name).read_text().splitlines()[0])
+    assert refused(read, root / name, whole, line=name == results.OUTCOMES, most=25)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("steps", -1), ("seconds", 1e308), ("p_vis", -1.5), ("episode", 2**62), ("retrieval", {}), ("seed", True)],
+)
+def test_absurd_values_of_an_outcome(tmp_path, key, value):
+    made_up_results.write(tmp_path / "result", [made_up_results.outcome(0)])
+    path = tmp_path / "result" / results.OUTCOMES
+    path.write_text(json.dumps({**json.loads(path.read_text()), key: value}) + "\n")
+    with pytest.raises(RobocasError) as error:
+        results.read(tmp_path / "result")
+    assert error.value.where == f"{path}:1"
+
+
+@pytest.mark.parametrize("name", ["protocol.yaml", "episodes.jsonl"])
+def test_protocols(tmp_path, name):
+    root = shutil.copytree(Path(shipped_protocols()["ms3-v1"]), tmp_path / "protocol")
+    episodes = (root / "episodes.jsonl").read_text().splitlines(keepends=True)[:2]
+    (root / "episodes.jsonl").write_text("".join(episodes))
+
+    def read():
+        rules = load_protocol(root).rules
+        for task in ("pick", "search"):
+            rules.steps(task, rules.rate(Wants("robocas", reference="tcp")))
+
+    read()
+    line = name == "episodes.jsonl"
+    whole = json.loads(episodes[0]) if line else yaml.safe_load((root / name).read_text())
+    assert refused(read, root / name, whole, line=line)
+
+
+def test_a_protocol_s_numbers_are_bounded(tmp_path):
+    root = shutil.copytree(Path(shipped_protocols()["ms3-v1"]), tmp_path / "protocol")
+    whole = yaml.safe_load((root / "protocol.yaml").read_text())
+    for changes in ({"max_steps": 2**62}, {"max_seconds": {**whole["max_seconds"], "pick": 1e308}}, {"max_steps": -1}):
+        (root / "protocol.yaml").write_text(json.dumps({**whole, **changes}))
+        with pytest.raises(RobocasError):
+            load_protocol(root)
+
+
+def test_files_of_a_plan(tmp_path):
+    plan, out = load_plan(next(iter(shipped_plans()))), tmp_path / "plan"
+    unit = units.Unit(0, 0)
+    folder = unit.folder(plan, out)
+    folder.mkdir(parents=True)
+    outcomes = [units.Outcome(seed, True, 10, ["a: b"], 1.0, 1.0, 5, 1e9) for seed in unit.seeds(plan)]
+    (out / units.PLAN).write_text(json.dumps(content_of(plan)))
+    units.ledger(folder).append(outcomes)
+    units.deaths(folder).append([units.Death(1, "a", "b")])
+    (folder / units.DONE).write_text("{}")
+    tally = Tally()
+    tally.add(0, outcomes)
+    tally.write(tally_path(out, plan.parts[0].name))
+    (out / DRIVER_RUN).write_text(json.dumps({"run": "abc", "lingers": 0.0}))
+
+    def read():
+        assert status(out).as_json()
+        unit.is_done(plan, out)
+        units.deaths(folder).read()
+        check_plan_of(out, read_plan(out))
+        current_run(out)
+        wait_for_killed(out)
+
+    read()
+    assert refused(read, out / units.PLAN, content_of(plan), most=25)
+    for path in (folder / units.LEDGER, folder / units.DEATHS):  # damaged lines are left out
+        refused(read, path, json.loads(path.read_text().splitlines()[0]), line=True, most=20)
+    for path in (tally_path(out, plan.parts[0].name), out / DRIVER_RUN):  # what is damaged is counted again
+        refused(read, path, json.loads(path.read_text()), most=20)
+
+
+def test_files_of_a_generation(tmp_path):
+    run = {"env_id": "x", "settings": {"task": "pick", "control_freq": 20}, "versions": {"a": "1"}, "seed": 0}
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps(run))
+    assert refused(lambda: check_same_run(path, run), path, run)
+    ledger = Ledger(tmp_path / "failures.jsonl")
+    failure = {"seed": 1, "attempt": 0, "stage": "a", "reason": "b", "seconds": 1.0}
+    ledger.path.write_text(json.dumps(failure) + "\n")
+    refused(lambda: (ledger.by_seed(), count_by_stage(ledger.read())), ledger.path, failure, line=True)
+    for changes in ({"attempt": -2}, {"seed": 2**62}, {"seconds": 1e308}, {"seconds": True}):
+        ledger.path.write_text(json.dumps({**failure, **changes}) + "\n")
+        assert ledger.read() == []
+
+
+def test_the_json_of_a_trajectory(tmp_path):
+    path = write_trajectory(tmp_path / "trajectory.h5", seeds=(3, 4))
+
+    def read():
+        source = TrajectorySource(path)
+        for number in source.numbers:
+            episode = source.episode(number)
+            assert episode.arrays
+            _ = episode.goals, episode.scene, episode.layout, source.entry(number)
+        collect(path)
+        with TrajectoryFile(path) as file:
+            for index in range(len(file.episodes)):
+                assert recording_entry(file, index)
+                assert recorded_scene(file, index)
+
+    read()
+    whole = json.loads(path.with_suffix(".json").read_text())
+    assert refused(read, path.with_suffix(".json"), whole, most=25)
+
+
+def test_the_settings_of_a_conversion_that_is_resumed(tmp_path):
+    entry = {"trajectory": "F.h5", "trajectory_episode": 0, "seed": 3, "success": True, "recording": "ab", "source": 0}
+    settings = dict.fromkeys(("rate_hz", "cameras", "image_size", "image_format", "depth", "embeddings"))
+    (tmp_path / "conversion.json").write_text("{}")
+    whole = {"schema_version": 2, "made_with": {}, **settings, "episodes": {"0": entry}}
+    assert refused(lambda: resumed_plan(tmp_path, [entry], settings), tmp_path / "conversion.json", whole)
+
+
+torch = pytest.importorskip("torch", reason="needs torch")
+
+
+def test_a_training_run_and_its_checkpoint(tmp_path):
+    from robocas_ms3.baselines import checkpoints
+    from robocas_ms3.baselines.policy import RunPolicy
+    from robocas_ms3.baselines.runs import SHIPPED, read_run
+
+    root = shutil.copytree(SHIPPED / "small", tmp_path / "run")
+    whole = json.loads((root / "run.json").read_text())
+    assert refused(lambda: read_run(root), root / "run.json", whole)
+    facts = whole["facts"]
+    for changes in ({"chunk": {**facts["chunk"], "mean": "x"}}, {"heights": []}, {"pictures": {"base_camera": [1]}}):
+        (root / "run.json").write_text(json.dumps({**whole, "facts": {**facts, **changes}}))
+        with pytest.raises(TrainingError):
+            RunPolicy(root, "cpu")
+    (root / "run.json").write_text(json.dumps(whole))
+    tensors, about = checkpoints.load(root / "weights.safetensors", {})
+    checkpoints.save(root / "weights.safetensors", tensors, {**about, "step": "nan"})
+    with pytest.raises(TrainingError):
+        RunPolicy(root, "cpu")
+    for step in ("", "x", "-1", "nan", "1e308", "9" * 5000):
+        with pytest.raises(TrainingError) as error:
+            checkpoints.step_of({"step": step}, root)
+        assert len(str(error.value)) < 500
+    with pytest.raises(TrainingError):
+        checkpoints.step_of({}, root)
+    assert checkpoints.step_of({"step": "12"}, root) == 12

@@ -1,0 +1,121 @@
+"""A file chooses no code and no path."""
+
+import shutil
+import sys
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from synthetic import write_trajectory
+
+from robocas_ms3.assets.pack import MANIFEST
+from robocas_ms3.cli.main import run
+from robocas_ms3.core.errors import ConfigError, DatasetError
+from robocas_ms3.core.paths import builtin_packs_dir, task_configs_dir
+from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env, recorded_id
+
+ID = "robocas_ms3:RoboCASPick-v1"
+
+
+def test_what_makes_the_scene_is_kept_and_the_rest_is_the_readers():
+    kwargs = {
+        "config": "pick_table_scattered",
+        "pack": "builtin",
+        "layouts": "/tmp/somewhere",
+        "num_envs": 4,
+        "obs_mode": "none",
+        "render_backend": "none",
+        "control_mode": "pd_joint_pos",
+        "sim_config": {"control_freq": 20, "scene_config": {"contact_offset": 0.01}},
+        "sensor_configs": {"width": 64, "base_camera": {"fov": 1.2, "shader_pack": "default"}},
+    }
+    env = read_env({"env_id": ID, "env_kwargs": kwargs, "max_episode_steps": 800}, "F.json")
+    assert (env.env_id, env.control_mode) == ("RoboCASPick-v1", "pd_joint_pos")
+    kept = ("config", "pack", "sim_config", "sensor_configs")
+    assert env.kwargs == {name: kwargs[name] for name in kept}
+    assert read_env({"env_id": "RoboCASPick-v1", "env_kwargs": {}}, "F.json") == RecordedEnv("RoboCASPick-v1", None, {})
+    assert recorded_id("RoboCASPick-v1") == ID
+
+
+@pytest.mark.parametrize(
+    ("info", "message"),
+    [
+        ({"env_id": "evilmod:RoboCASPick-v1"}, "F.json, env_id: a file can't choose this"),
+        ({"env_id": "robocas_ms3:evilmod:RoboCASPick-v1"}, "a file can't choose this"),
+        ({"env_id": 3}, "env_id: .*expected a string, found 3"),
+        ({"env_kwargs": 3}, "env_kwargs: "),
+        ({"env_kwargs": {"pack": "../packs/mine"}}, "pack: .*expected a name, no path.*Pass the pack with --pack"),
+        ({"env_kwargs": {"furniture_pack": "/mine"}}, "furniture_pack: .*expected a name, no path"),
+        ({"env_kwargs": {"config": "mine/pick.yaml"}}, "config: .*expected a name, no path"),
+        ({"env_kwargs": {"wrappers": ["evilmod:W"]}}, "wrappers: .*expected one of .'config', 'control_mode'"),
+        ({"env_kwargs": {"num_envs": "4"}}, "num_envs: "),
+        ({"env_kwargs": {"sim_config": {"control_freq": float("nan")}}}, "control_freq: no such setting"),
+        ({"env_kwargs": {"sensor_configs": {"shader_pack": "../evil"}}}, "shader_pack: no such setting"),
+        ({"env_kwargs": {"sim_config": {"a": {"b": {"c": {"d": 1}}}}}}, "no such setting"),
+    ],
+)
+def test_what_a_file_may_not_choose(info, message):
+    with pytest.raises(DatasetError, match=message):
+        read_env({"env_id": ID, "env_kwargs": {}, **info}, "F.json")
+
+
+def test_the_user_may_choose_a_pack(tmp_path):
+    info = {"env_id": ID, "env_kwargs": {"pack": "../mine", "config": "pick_table_scattered"}}
+    assert read_env(info, "F.json", pack=tmp_path).kwargs["pack"] == str(tmp_path)
+
+
+def test_only_registered_tasks_are_made():
+    with pytest.raises(DatasetError, match=r"no such task .expected one of .*RoboCASPick-v1.*found CartPole-v1"):
+        read_env({"env_id": "CartPole-v1", "env_kwargs": {}}, "F.json").make()
+
+
+@pytest.mark.parametrize(("key", "name"), [("pack", "mine"), ("furniture_pack", "mine"), ("config", "mine.yaml")])
+def test_what_lies_in_the_folder_where_we_run_is_not_taken_for_what_is_installed(tmp_path, monkeypatch, key, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").mkdir()
+    shutil.copyfile(builtin_packs_dir() / "builtin" / MANIFEST, tmp_path / "mine" / MANIFEST)
+    shutil.copyfile(task_configs_dir() / "pick_table_scattered.yaml", tmp_path / "mine.yaml")
+    env = read_env({"env_id": ID, "env_kwargs": {key: name}}, "F.json")
+    with pytest.raises(DatasetError, match=f"{key}: no such .*found {name}"):
+        env.make(obs_mode="none", render_backend="none")
+    trusted = env.with_pack("mine").kwargs["pack"]  # by the user
+    assert trusted == str(tmp_path / "mine")
+    assert env.with_pack("builtin").kwargs["pack"] == "builtin"
+
+
+def test_a_recorded_configuration_can_not_extend_a_file(tmp_path):
+    (tmp_path / "base.yaml").write_text("extends: pick_table_scattered\n")
+    config = {"extends": str(tmp_path / "base.yaml")}
+    env = read_env({"env_id": ID, "env_kwargs": {"config": config}}, "F.json")
+    with pytest.raises(ConfigError, match="'extends' is a key of YAML files only"):
+        env.make(obs_mode="none", render_backend="none")
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(json_values | st.fixed_dictionaries({"env_id": json_values, "env_kwargs": json_values}))
+def test_whatever_it_says_it_is_read_or_refused(info):
+    try:
+        assert isinstance(read_env(info, "F.json"), RecordedEnv)
+    except DatasetError as error:
+        assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize("command", [("convert",), ("replay",)])
+def test_no_module_of_a_file_is_imported(tmp_path, monkeypatch, command, capsys):
+    path = write_trajectory(tmp_path / "F.h5", seeds=(3,))
+    text = path.with_suffix(".json").read_text().replace("robocas_ms3:RoboCASPick", "evilmod:RoboCASPick")
+    path.with_suffix(".json").write_text(text)
+    (tmp_path / "evilmod.py").write_text("raise SystemExit(f'imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    out = ["--out", str(tmp_path / "out")] if command == ("convert",) else []
+    assert run([*command, str(path), *out]) != 0
+    assert "a file can't choose this" in capsys.readouterr().err
+    assert "evilmod" not in sys.modules
+    assert not (tmp_path / "out").exists()

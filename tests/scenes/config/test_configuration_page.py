@@ -1,0 +1,58 @@
+"""The examples of docs/configuration.md do what the page says."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.evaluation.freeze import read_plan
+from robocas_ms3.scenes.config import load_task_config
+
+ROOT = Path(__file__).resolve().parents[3]
+PAGE = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str, heading: str) -> list[str]:
+    section = PAGE.split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    return re.findall(rf"^```{language}\n(.*?)^```$", section, re.DOTALL | re.MULTILINE)
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for text in blocks("yaml", "Extending a configuration"):
+        name = text.splitlines()[0].removeprefix("# ")
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def test_the_files_load(files):
+    mine, shelf = load_task_config("mine.yaml"), load_task_config("on_the_shelf.yaml")
+    assert (mine.objects.count, mine.layout.kind, mine.task) == (6, "orderly", "pick")
+    assert list(shelf.furniture) == ["shelf", "side_table"]
+    assert (shelf.objects.count, shelf.target.approach) == (6, "front")
+    assert load_task_config("mine.yaml", changes={"objects": {"count": 8}}).objects.count == 8
+
+
+def test_the_commands_set_keys_that_there_are(files):
+    (text,) = blocks("", "Changing keys on the command line")
+    for line in text.splitlines():
+        words = shlex.split(line)[1:]
+        overrides = [words[number + 1] for number, word in enumerate(words) if word == "--set"]
+        assert overrides
+        if words[0] == "eval":
+            plan = read_plan(ROOT / words[2])
+            assert {scene.changed(overrides).language.split for scene in plan.parts} == {"held_out"}
+        else:
+            name = words[words.index("--config") + 1] if "--config" in words else words[words.index("--set") - 1]
+            name = words[2] if words[0] == "layouts" else name
+            assert load_task_config(name, overrides=overrides) != load_task_config(name)
+
+
+def test_the_message_is_the_one_of_the_page(capsys):
+    (text,) = blocks("console", "Changing keys on the command line")
+    command, said = text.splitlines()
+    assert run(shlex.split(command)[2:]) == 1
+    assert capsys.readouterr().err == f"{said}\n"

@@ -1,0 +1,186 @@
+"""``extends``: which file a base is, how values are merged, and which errors name which file."""
+
+import os
+
+import pytest
+import yaml
+
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.scenes.config import load_task_config, shipped_configs
+from robocas_ms3.scenes.config.load import CHAIN_LIMIT, check_no_base
+
+
+def write(folder, **files):
+    for name, values in files.items():
+        text = values if isinstance(values, str) else yaml.safe_dump(values, sort_keys=False)
+        (folder / f"{name}.yaml").write_text(text)
+    return folder / f"{next(iter(files))}.yaml"
+
+
+def error_of(path, **kwargs) -> ConfigError:
+    with pytest.raises(ConfigError) as caught:
+        load_task_config(path, **kwargs)
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+def test_keys_of_a_shipped_base_are_changed(tmp_path):
+    path = write(tmp_path, mine={"extends": "pick_table_scattered", "objects": {"count": 6}, "support": "plate"})
+    base, mine = load_task_config("pick_table_scattered"), load_task_config(path)
+    assert (mine.objects.count, mine.support) == (6, "plate")
+    assert mine.model_copy(update={"objects": base.objects, "support": base.support}) == base
+
+
+def test_a_path_is_relative_to_the_extending_file(tmp_path, monkeypatch):
+    (tmp_path / "near").mkdir()
+    write(tmp_path / "near", mine={"extends": "../base.yaml", "objects": {"count": 3}})
+    write(tmp_path, base={"extends": "pick_table_scattered", "support": "plate"})
+    monkeypatch.chdir("/")
+    config = load_task_config(tmp_path / "near" / "mine.yaml")
+    assert (config.objects.count, config.support) == (3, "plate")
+
+
+def test_a_base_may_be_incomplete(tmp_path):
+    data = load_task_config("pick_table_scattered").model_dump(mode="json")
+    base = {"room": data.pop("room"), "layout": data.pop("layout")}
+    path = write(tmp_path, mine={"extends": "base.yaml", **data}, base=base)
+    assert load_task_config(path) == load_task_config("pick_table_scattered")
+    assert error_of(tmp_path / "base.yaml").found == "nothing"
+
+
+def test_mappings_are_merged_and_other_values_replaced(tmp_path):
+    target = {"relations": ["nearest"], "max_distance": 0.5}
+    path = write(
+        tmp_path,
+        mine={"extends": "base.yaml", "target": {"relations": ["leftmost"]}, "objects": {"ids": [12, 13]}},
+        base={"extends": "pick_table_scattered", "target": target, "objects": {"ids": [14], "count": 2}},
+    )
+    config = load_task_config(path)
+    assert (config.target.relations, config.target.max_distance) == (["leftmost"], 0.5)
+    assert (config.objects.ids, config.objects.count) == ([12, 13], 2)
+
+
+def test_a_layout_of_another_kind_replaces_the_base_layout(tmp_path):
+    path = write(tmp_path, mine={"extends": "pick_table_scattered", "layout": {"kind": "orderly", "copies": 1}})
+    assert load_task_config(path).layout.copies == 1
+    path = write(tmp_path, mine={"extends": "pick_table_scattered", "layout": {"kind": "scattered"}})
+    assert load_task_config(path).layout == load_task_config("pick_table_scattered").layout
+
+
+def test_null_removes_a_key_or_is_its_value(tmp_path):
+    base = {"extends": "search_table_stacked", "lights": {"ambient": 1.0}, "randomisation": {"robot": {"yaw_deg": 9}}}
+    nulls = {"lights": {"ambient": None}, "randomisation": {"robot": None}, "target": {"max_visible_share": None}}
+    config = load_task_config(write(tmp_path, mine={"extends": "base.yaml", **nulls}, base=base))
+    assert config.lights.ambient == 0.4  # the default
+    assert config.randomisation.robot is None
+    assert config.target.max_visible_share is None
+
+
+def test_null_removes_furniture_and_the_next_name_takes_its_place(tmp_path):
+    table = load_task_config("pick_table_scattered").model_dump(mode="json")["furniture"]["table"]
+    furniture = {"shelf": None, "desk": table}
+    path = write(
+        tmp_path,
+        mine={"extends": "pick_shelf_scattered", "furniture": furniture, "surface": {"furniture": "desk"}},
+    )
+    assert list(load_task_config(path).furniture) == ["desk", "side_table"]
+    path = write(tmp_path, mine={"extends": "pick_shelf_scattered", "furniture": {"side_tabel": None}})
+    error = error_of(path)
+    assert error.where == str(path)
+    assert error.fix == "Did you mean side_table?"
+
+
+def test_a_wrong_key_names_the_file_of_the_chain_that_it_is_in(tmp_path):
+    files = {
+        "mine": {"extends": "middle.yaml", "objects": {"count": 3}},
+        "middle": {"extends": "base.yaml", "layout": {"min_gapp": 0.1}},
+        "base": {"extends": "pick_table_scattered", "objects": {"count": "ten", "repeats": True}},
+    }
+    path = write(tmp_path, **files)
+    error = error_of(path)  # `count` is right in the extending file
+    assert error.where == f"{tmp_path / 'middle.yaml'} (extended by {path})"
+    assert error.fix == "Did you mean min_gap?"
+    path = write(tmp_path, **{**files, "middle": {"extends": "base.yaml", "objects": {"ids": ["apple", 1.5]}}})
+    error = error_of(path)
+    assert "'objects.ids.1'" in error.what
+    assert str(error.where).startswith(str(tmp_path / "middle.yaml"))
+    path = write(tmp_path, mine={"extends": "pick_table_scattered", "layout": {"kind": "stackd"}})
+    assert error_of(path).where == str(path)
+
+
+def test_a_mistake_of_several_files_names_all_of_them(tmp_path):
+    path = write(tmp_path, mine={"extends": "pick_table_scattered", "surface": {"min_xy": [0.4, 0.0]}})
+    assert error_of(path).where == f"{path} (extends {shipped_configs()['pick_table_scattered']})"
+
+
+@pytest.mark.parametrize("value", [["pick_heap"], 3, None, "", {"a": 1}])
+def test_a_base_is_a_name_or_a_path(tmp_path, value):
+    path = write(tmp_path, mine={"extends": value})
+    error = error_of(path)
+    assert error.where == f"{path}, extends"
+    assert error.found == repr(value)
+
+
+@pytest.mark.parametrize(
+    ("named", "likely"),
+    [("pick_table_scatered", "pick_table_scattered"), ("bsae.yaml", "base.yaml"), ("base", "base.yaml")],
+)
+def test_a_base_that_is_missing_gets_the_nearest_names(tmp_path, named, likely):
+    path = write(tmp_path, mine={"extends": named}, base={})
+    error = error_of(path)
+    assert error.where == f"{path}, extends"
+    assert error.found == repr(named)
+    assert likely in error.fix
+
+
+@pytest.mark.parametrize("named", ["x" * 5000 + ".yaml", "a\0b.yaml", "folder.yaml", "pipe.yaml"])
+def test_a_base_that_is_no_file_is_an_error(tmp_path, named):
+    (tmp_path / "folder.yaml").mkdir()
+    os.mkfifo(tmp_path / "pipe.yaml")
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump({"extends": named}))
+    assert error_of(path).where == f"{path}, extends"
+
+
+def test_a_cycle_is_an_error(tmp_path):
+    path = write(tmp_path, mine={"extends": "other.yaml"}, other={"extends": "mine.yaml"})
+    error = error_of(path)
+    assert error.where == f"{tmp_path / 'other.yaml'}, extends"
+    assert str(error.found).count(" -> ") == 2
+    assert "no cycle" in str(error_of(write(tmp_path, self={"extends": "self.yaml"})))
+
+
+def test_a_chain_has_a_limit(tmp_path):
+    names = [f"base_{number}.yaml" for number in range(CHAIN_LIMIT)]
+    for name, base in zip(names, [*names[1:], "pick_table_scattered"], strict=True):
+        (tmp_path / name).write_text(f"extends: {base}\n")
+    assert load_task_config(tmp_path / names[1]) == load_task_config("pick_table_scattered")
+    assert error_of(tmp_path / names[0]).expected == f"at most {CHAIN_LIMIT} files"
+
+
+@pytest.mark.parametrize("text", ["- a", "a: [", "a: 1\na: 2", ""])
+def test_a_broken_base_is_named(tmp_path, text):
+    path = write(tmp_path, mine={"extends": "base.yaml"}, base=text)
+    assert error_of(path).where == tmp_path / "base.yaml"
+
+
+def test_a_misspelt_extends_gets_the_right_word(tmp_path):
+    assert error_of(write(tmp_path, mine={"extend": "pick_heap"})).fix == "Did you mean extends?"
+
+
+def test_a_mapping_inside_itself_is_an_error(tmp_path):
+    error_of(write(tmp_path, mine="extends: pick_table_scattered\nlights: &a {ambient: *a}\n"))
+
+
+@pytest.mark.parametrize("where", ["config", "changes"])
+def test_mappings_can_not_extend(tmp_path, where):
+    data = {"extends": str(write(tmp_path, base={"task": "pick"}))}
+    error = error_of(data) if where == "config" else error_of("pick_table_scattered", changes=data)
+    assert error.where == where
+    assert "extends" in error.what
+
+
+def test_files_of_protocols_can_not_extend(tmp_path):
+    check_no_base(shipped_configs()["pick_table_scattered"])
+    with pytest.raises(ConfigError, match="not allowed in a protocol"):
+        check_no_base(shipped_configs()["pick_shelf_scattered"])

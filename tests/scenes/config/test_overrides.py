@@ -1,0 +1,162 @@
+"""Overrides of keys, as ``--set`` has them, and what the commands do with them."""
+
+import json
+
+import pytest
+import yaml
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.evaluation.freeze import Plan
+from robocas_ms3.scenes.config import load_task_config
+from robocas_ms3.scenes.config.overrides import parse_override
+
+NAME = "pick_table_scattered"
+FILE_CHANGED = {"extends": NAME, "objects": {"count": 5, "repeats": True}}
+
+
+@pytest.mark.parametrize(
+    ("text", "nested"),
+    [
+        ("objects.count=12", {"objects": {"count": 12}}),
+        ("support=a=b", {"support": "a=b"}),
+        ("target.max_distance=3e-1", {"target": {"max_distance": 0.3}}),
+        ("surface.min_xy=[1e-1, -2.5E+0]", {"surface": {"min_xy": [0.1, -2.5]}}),
+        ('support="12"', {"support": "12"}),
+        ("support='1e5'", {"support": "1e5"}),
+        ("support=nan", {"support": "nan"}),
+        ("support=1e5x", {"support": "1e5x"}),
+        ("support=''", {"support": ""}),
+        ("opening=~", {"opening": None}),
+        ("surface.min_xy=[0.0, -0.3]", {"surface": {"min_xy": [0.0, -0.3]}}),
+        ("opening=null", {"opening": None}),
+    ],
+)
+def test_values_are_yaml_and_dots_separate_keys(text, nested):
+    assert parse_override(text, ConfigError, "a=1") == nested
+
+
+@pytest.mark.parametrize(
+    "text", ["objects.count", "=3", "objects.=3", ".count=3", "a=[1", " a=1", "", "a=", "a=  ", "a=#3", "a=---"]
+)
+def test_an_invalid_override_is_an_error(text):
+    with pytest.raises(ConfigError) as caught:
+        parse_override(text, ConfigError, "a=1")
+    assert (caught.value.where, caught.value.found) == ("--set", text)
+
+
+def test_an_empty_value_is_no_null():
+    with pytest.raises(ConfigError) as caught:
+        load_task_config(NAME, overrides=["objects.count="])
+    assert "objects.count=null" in caught.value.fix
+    assert load_task_config(NAME, overrides=["objects.count=3", "objects.count=null"]).objects.count == 10
+
+
+def test_they_are_merged_over_a_file_in_their_order(tmp_path):
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(FILE_CHANGED))
+    overrides = ("objects.count=6", "objects.count=7", "layout.kind=stacked")
+    config = load_task_config(tmp_path / "mine.yaml", overrides=overrides)
+    assert (config.objects.count, config.objects.repeats, config.layout.kind) == (7, True, "stacked")
+    loaded = load_task_config(NAME)
+    assert load_task_config(loaded, overrides=["objects.count=3"]).objects.count == 3
+    assert loaded.objects.count == 10
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("objects.cout=3", ["'objects.cout'", "'count'", "Did you mean count?"]),
+        ("objcts.count=3", ["'objcts'", "Did you mean objects?"]),
+        ("objects.count=ten", ["'objects.count'", "a whole number", "'ten'"]),
+        ('objects.count="12"', ["'objects.count'", "a whole number", "'12'"]),
+        ("target.max_distance=nan", ["'target.max_distance'", "'nan'"]),
+        ("objects.count=0", ["greater than or equal to 1"]),
+        ("objects=3", ["'objects'", "a mapping"]),
+        ("robot_start=retst", ["'robot_start'", "'rest'"]),
+        ("room=null", ["'room'", "this key"]),
+        ("layout.kind=stackd", ["'layout.kind'", "Did you mean stacked?"]),
+        ("furniture.tabel=null", ["furniture.tabel", "Did you mean table?"]),
+        ("extends=pick_heap", ["extends", "YAML files"]),
+    ],
+)
+def test_a_mistake_names_the_option(text, words):
+    with pytest.raises(ConfigError) as caught:
+        load_task_config(NAME, overrides=["objects.repeats=true", text])
+    assert caught.value.where == f"--set {text}"
+    assert [word for word in words if word not in str(caught.value)] == []
+
+
+def test_a_mistake_between_keys_names_file_and_options():
+    with pytest.raises(ConfigError) as caught:
+        load_task_config(NAME, overrides=["surface.furniture=desk"])
+    assert str(caught.value.where).endswith(f"{NAME}.yaml with --set surface.furniture=desk")
+
+
+def test_show_prints_a_resolved_configuration_that_loads_again(tmp_path, capsys):
+    words = ["show", "select_shelf_orderly", "--set", "objects.count=12", "--set", "layout.copies=4", "--print-config"]
+    assert run([*words, "--out", str(tmp_path / "out")]) == 0
+    (tmp_path / "printed.yaml").write_text(capsys.readouterr().out)
+    printed = load_task_config(tmp_path / "printed.yaml")
+    overrides = ("objects.count=12", "layout.copies=4")
+    assert printed == load_task_config("select_shelf_orderly", overrides=overrides)
+    assert "extends" not in yaml.safe_load((tmp_path / "printed.yaml").read_text())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["show", NAME],
+        ["generate", "pick", "--out", "out"],
+        ["layouts", "build", NAME, "--out", "out"],
+        ["eval", "freeze", "plan.yaml", "--out", "out"],
+    ],
+)
+def test_commands_refuse_a_wrong_key_and_write_nothing(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    part = {"config": NAME, "count": 1, "first_seed": 0}
+    plan = {"rules": {"name": "a", "description": "b", "max_seconds": {"pick": 5}}, "parts": [part]}
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(plan))
+    assert run([*words, "--set", "objects.cout=3"]) == 1
+    assert capsys.readouterr().err.startswith("error: --set objects.cout=3: unknown key 'objects.cout'")
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.yaml"]
+
+
+def test_a_frozen_protocol_takes_no_overrides(capsys):
+    assert run(["eval", "pick", "--protocol", "smoke", "--set", "objects.count=3"]) == 1
+    assert "error: --set: a protocol's configurations are frozen" in capsys.readouterr().err
+
+
+def test_freeze_sets_them_after_the_changes_of_the_plan():
+    part = {"config": NAME, "count": 1, "first_seed": 0, "change": {"objects": {"count": 3, "repeats": True}}}
+    plan = Plan.model_validate({"rules": {}, "parts": [part]})
+    config = plan.parts[0].changed(["objects.count=4"])
+    assert (config.objects.count, config.objects.repeats) == (4, True)
+
+
+@pytest.mark.slow
+def test_layouts_are_those_of_the_resolved_configuration(tmp_path, capsys):
+    build = ["layouts", "build", NAME, "--seeds", "0:1", "--jobs", "1", "--out", str(tmp_path)]
+    assert run(build) == 0
+    assert run([*build, "--set", "objects.count=4"]) == 0
+    assert run([*build, "--set", "objects.count=10"]) == 0  # as the file has it: the same cache
+    found = [json.loads(path.read_text()) for path in tmp_path.glob("*/*.json")]
+    assert sorted(about["config"]["objects"]["count"] for about in found) == [4, 10]
+
+
+@pytest.mark.slow
+def test_a_recording_has_the_resolved_configuration_and_resumes_with_no_other(tmp_path, capsys):
+    out = tmp_path / "out"
+    words = ["generate", "pick", "-n", "1", "--out", str(out), "--replay-rate", "0", "--set"]
+    assert run([*words, "objects.count=3"]) == 0
+    expected = load_task_config(NAME, overrides=["objects.count=3"]).model_dump(mode="json")
+    assert json.loads((out / "run.json").read_text())["settings"]["config"] == expected
+    recorded = json.loads((out / "trajectory.json").read_text())["env_info"]["env_kwargs"]["config"]
+    assert recorded == expected
+    before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    capsys.readouterr()
+    assert run([*words, "objects.count=4", "--resume"]) == 1
+    said = capsys.readouterr().err
+    assert [words for words in ("settings.config.objects.count", "expected 3", "found 4") if words not in said] == []
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
+    assert run([*words, "objects.count=3", "--resume"]) == 0

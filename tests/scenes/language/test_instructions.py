@@ -1,0 +1,214 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.core.errors import AssetError, RobocasError
+from robocas_ms3.scenes.config import load_task_config
+from robocas_ms3.scenes.config.load import shipped_configs
+from robocas_ms3.scenes.language.instructions import (
+    SPLITS,
+    Instruction,
+    choose_instruction,
+    could_mean,
+    instruction,
+    is_plural,
+    part_name,
+    template_ids,
+)
+from robocas_ms3.scenes.language.texts import Split, instruction_texts, synonym_texts
+from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.task_specs import TASKS
+
+EXTRA = {"pick": {}, "search": {}, "select": {"relation": "nearest"}, "open_pick": {"part": "left door"}}
+
+
+def choose(
+    seed: int,
+    task: str = "pick",
+    split: Split = "train",
+    object: str = "apple",
+    support: str = "table",
+    **more: Any,
+) -> Instruction:
+    rng = np.random.default_rng(seed)
+    return choose_instruction(rng, task, split, object=object, support=support, **{**EXTRA[task], **more})
+
+
+@pytest.mark.parametrize(
+    ("task", "text"),
+    [
+        ("pick", "grasp the scissors on the table and move it to the basket"),
+        ("select", "grasp the nearest scissors on the table and move it to the basket"),
+        ("search", "search the scissors from the objects on the table and transfer it to the basket"),
+        ("open_pick", "open the left door of the table, grasp the scissors and move them to the basket"),
+    ],
+)
+def test_defaults_are_upstreams_word_for_word(task, text):
+    found = instruction(task, object="scissors", support="table", **EXTRA[task])
+    assert found.text == text
+    assert (found.template_id, found.split, found.object_word) == (f"{task}/upstream/00", "upstream", "scissors")
+    assert choose(5, task, "upstream", "scissors") == found
+
+
+@pytest.mark.parametrize(
+    ("task", "text"),
+    [
+        ("pick", "pick up the toothpaste from the table and place it in the basket"),
+        ("select", "pick up the nearest toothpaste from the table and place it in the basket"),
+        ("search", "search out the toothpaste from the heap on the table"),
+    ],
+)
+def test_the_papers_own_sentences(task, text):
+    found = instruction(task, object="toothpaste", support="table", template_id=f"{task}/train/00", **EXTRA[task])
+    assert found.text == text
+    assert found.split == "train"
+
+
+@pytest.mark.parametrize(
+    ("relation", "phrase"),
+    [
+        ("nearest", "nearest mug"),
+        ("second_nearest", "second nearest mug"),
+        ("farthest", "farthest mug"),
+        ("leftmost", "leftmost mug"),
+        ("second_from_left", "second mug from the left"),
+        ("middle", "middle mug"),
+        ("second_from_right", "second mug from the right"),
+        ("rightmost", "rightmost mug"),
+    ],
+)
+def test_relations(relation, phrase):
+    found = instruction("select", object="mug", support="shelf", relation=relation)
+    assert found.text == f"grasp the {phrase} on the shelf and move it to the basket"
+    assert found.relation_phrase == phrase.replace("mug", "{object}")
+
+
+def test_number_and_preposition():
+    def pick(object, support):
+        return instruction("pick", object=object, support=support, template_id="pick/train/05").text
+
+    assert pick("scissors", "cabinet") == "grab the scissors in the cabinet and put them in the basket"
+    assert pick("pair of scissors", "shelf") == "grab the pair of scissors on the shelf and put it in the basket"
+    assert is_plural("red scissors")
+    assert not is_plural("scissors box")
+
+
+def test_a_synonym_of_a_support_keeps_its_preposition():
+    found = {choose(seed, support="cabinet", object="lemon").text for seed in range(300)}
+    assert any("in the cupboard" in text for text in found)
+    assert not any("on the c" in text for text in found)
+
+
+@pytest.mark.parametrize("name", sorted(shipped_configs()))
+def test_goods_are_in_what_has_something_above_them_and_on_what_has_not(name):
+    config = load_task_config(name)
+    try:
+        model = SceneModel.load(config, load_pack("builtin"), load_pack("builtin"))
+    except AssetError:  # of a pack that is made from the user's own files
+        return
+    shelf = "shelf" in config.support
+    wanted = "in" if np.isfinite(model.headroom) and not shelf else "on"
+    texts = {choose(seed, support=config.support, object="lemon", synonyms=False).text for seed in range(60)}
+    other = "on" if wanted == "in" else "in"
+    assert any(f" {wanted} the {config.support}" in text for text in texts)
+    assert not any(f" {other} the {config.support}" in text for text in texts)
+
+
+def test_draws_are_repeatable_and_reach_everything():
+    found = [choose(seed) for seed in range(400)]
+    assert found == [choose(seed) for seed in range(400)]
+    assert {item.template_id for item in found} == set(template_ids("pick", "train"))
+    assert {item.object_word for item in found} == {"apple", *synonym_texts().objects["apple"].train}
+    assert {item.support_word for item in found} == {"table", *synonym_texts().supports["table"].train}
+    phrases = {choose(seed, "select", "held_out").relation_phrase for seed in range(100)}
+    nearest = instruction_texts().relations["nearest"]
+    assert phrases == {nearest.plain, *nearest.held_out}
+
+
+def test_every_draw_moves_the_generator_by_the_same_amount():
+    states = set()
+    for task in TASKS:
+        for split in SPLITS:
+            for synonyms in (True, False):
+                rng = np.random.default_rng(1)
+                choose_instruction(rng, task, split, object="mug", support="table", synonyms=synonyms, **EXTRA[task])
+                states.add(rng.random())
+    assert len(states) == 1
+
+
+def test_held_out_shares_only_plain_words_with_train():
+    for task in TASKS:
+        train, held_out = ([choose(seed, task, split) for seed in range(200)] for split in ("train", "held_out"))
+        for attribute in ("text", "template_id"):
+            assert not {getattr(i, attribute) for i in train} & {getattr(i, attribute) for i in held_out}
+        assert {i.object_word for i in train} & {i.object_word for i in held_out} == {"apple"}
+
+
+def test_synonyms_can_be_left_out():
+    found = [choose(seed, "select", "held_out", synonyms=False) for seed in range(100)]
+    assert {(i.object_word, i.support_word, i.relation_phrase) for i in found} == {
+        ("apple", "table", "nearest {object}")
+    }
+    assert len({i.template_id for i in found}) == 7
+
+
+def test_no_synonym_that_could_mean_another_object_of_the_scene():
+    def words(*others):
+        return {choose(seed, object="mug", others=others).object_word for seed in range(100)}
+
+    assert words("mug", "apple") == {"mug", "cup", "coffee mug"}
+    assert words("paper cup") == {"mug", "coffee mug"}
+    assert could_mean("shampoo bottle", "white shampoo bottle")
+    assert not could_mean("white shampoo bottle", "shampoo bottle")
+
+
+def test_unknown_objects_and_supports_go_by_their_own_names():
+    found = {choose(seed, object="gizmo {0}", support="lectern").object_word for seed in range(20)}
+    assert found == {"gizmo {0}"}
+    assert "on the lectern" in instruction("pick", object="gizmo {0}", support="lectern").text
+
+
+@pytest.mark.parametrize(
+    ("link", "name"),
+    [
+        ("door", "door"),
+        ("door_left", "left door"),
+        ("drawer_right", "right drawer"),
+        ("freezer_door", "freezer door"),
+        ("glass_door_left", "left glass door"),
+        ("left", "left"),
+    ],
+)
+def test_part_names(link, name):
+    assert part_name(link) == name
+
+
+@pytest.mark.parametrize(
+    ("task", "more", "match"),
+    [
+        ("pick", {"relation": "nearest"}, r"pick: the task select, and no other, .* \(found 'nearest {object}'\)"),
+        ("open_pick", {"part": ""}, "open_pick, and no other, needs a part"),
+        ("search", {"part": "door"}, "open_pick, and no other, needs a part"),
+    ],
+)
+def test_relation_and_part_where_they_belong(task, more, match):
+    with pytest.raises(RobocasError, match=match):
+        choose(0, task, **more)
+    with pytest.raises(RobocasError, match=match):
+        instruction(task, object="apple", support="table", **{**EXTRA[task], **more})
+
+
+def test_select_without_a_relation_is_upstreams_word_for_word():
+    found = instruction("select", object="mug", support="table")
+    assert found.text == "grasp the mug on the table and move it to the basket"
+    assert found.relation_phrase == ""
+    assert choose(5, "select", "upstream", "mug", relation=None) == found
+    assert "mug" in choose(5, "select", "train", "mug", relation=None, synonyms=False).text
+
+
+@pytest.mark.parametrize("template_id", ["pick/train/21", "pick/train/-1", "search/train/00", "pick/train", "7"])
+def test_unknown_templates(template_id):
+    with pytest.raises(RobocasError, match=f"{template_id}: no such template"):
+        instruction("pick", object="apple", support="table", template_id=template_id)

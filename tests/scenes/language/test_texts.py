@@ -1,0 +1,170 @@
+import json
+import re
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.core.paths import builtin_packs_dir
+from robocas_ms3.scenes.config.relations import RELATIONS
+from robocas_ms3.scenes.language.instructions import (
+    SPLITS,
+    choose_instruction,
+    could_mean,
+    instruction,
+    template_ids,
+)
+from robocas_ms3.scenes.language.templates import SUBGOALS
+from robocas_ms3.scenes.language.texts import (
+    INSTRUCTIONS_FILE,
+    SYNONYMS_FILE,
+    InstructionTexts,
+    SynonymTexts,
+    instruction_texts,
+    read_texts,
+    synonym_texts,
+)
+from robocas_ms3.scenes.task_specs import TASKS
+
+ROOT = Path(__file__).resolve().parents[3]
+TEXTS, WORDS = instruction_texts(), synonym_texts()
+NAMES = sorted(
+    asset["name"]
+    for asset in json.loads((builtin_packs_dir() / "builtin" / "manifest.json").read_text())["assets"]
+    if asset["kind"] == "object"
+)
+
+
+def test_every_task_has_its_paraphrases():
+    assert set(TEXTS.tasks) == set(TASKS)
+    for templates in TEXTS.tasks.values():
+        assert len(templates.upstream) == 1
+        assert len(templates.train) + len(templates.held_out) >= 20
+        assert 0.7 < len(templates.train) / (len(templates.train) + len(templates.held_out)) < 0.8
+
+
+def test_no_template_twice_and_none_on_both_sides():
+    for templates in TEXTS.tasks.values():
+        texts = [normal(t) for split in SPLITS for t in templates.of(split)]
+        assert len(set(texts)) == len(texts)
+    # nor does one task's held-out part teach another task's
+    train, held_out = ({normal(t) for task in TEXTS.tasks.values() for t in task.of(s)} for s in ("train", "held_out"))
+    assert not train & held_out
+
+
+def normal(template):
+    return re.sub(r"[^a-z{} ]", "", template.lower().replace("into", "in").replace("please ", ""))
+
+
+def test_templates_read_alike():
+    for templates in TEXTS.tasks.values():
+        for template in (t for split in SPLITS for t in templates.of(split)):
+            assert template[0].islower() or template[0] == "{", template
+            assert template[-1].isalpha() or template[-1] == "}", template
+            assert not re.search(r"\ban? ", template), template
+            if template not in templates.upstream:  # elsewhere the words follow object and support
+                assert not re.search(r"(?<!\{)\b(it|them)\b|\b(on|in) the \{support\}", template), template
+            assert "basket" in template or template == TEXTS.tasks["search"].train[0], template
+            assert "the {object}" in template
+
+
+def test_every_template_renders_for_every_builtin_object():
+    seen = set()
+    for name in NAMES:
+        for word in (name, *WORDS.objects[name].train, *WORDS.objects[name].held_out):
+            for task in TASKS:
+                for template_id in (i for split in SPLITS for i in template_ids(task, split)):
+                    for relation in RELATIONS if task == "select" else (None,):
+                        part = "left door" if task == "open_pick" else ""
+                        text = instruction(
+                            task, object=word, support="cabinet", relation=relation, part=part, template_id=template_id
+                        ).text
+                        assert word in text
+                        seen.add(text)
+    joined = "\n".join(seen)
+    assert not re.search(r"[{}]|  |^ | $|,,| ,|\ban? |\bthe the\b|\bNone\b", joined, re.MULTILINE)
+
+
+def test_relations_are_all_there_and_say_different_things():
+    assert tuple(TEXTS.relations) == RELATIONS
+    phrases = [p for r in TEXTS.relations.values() for p in (r.plain, *r.train, *r.held_out)]
+    assert len(set(phrases)) == len(phrases)
+    assert all(r.train and r.held_out for r in TEXTS.relations.values())
+
+
+def test_every_builtin_object_has_synonyms_on_both_sides():
+    assert len(NAMES) == 46
+    assert sorted(WORDS.objects) == NAMES
+    for name, words in WORDS.objects.items():
+        both = (*words.train, *words.held_out)
+        assert words.train and words.held_out and len(both) <= 4
+        assert len({name, *both}) == len(both) + 1
+
+
+def test_no_word_could_mean_another_builtin_object():
+    for (a, of_a), (b, of_b) in combinations(WORDS.objects.items(), 2):
+        for x in (a, *of_a.train, *of_a.held_out):
+            for y in (b, *of_b.train, *of_b.held_out):
+                assert not could_mean(x, y) and not could_mean(y, x), f"{x!r} of {a}, {y!r} of {b}"
+
+
+@pytest.mark.parametrize("path", [INSTRUCTIONS_FILE, SYNONYMS_FILE])
+def test_no_key_twice(path):
+    def check(node):
+        if isinstance(node, yaml.MappingNode):
+            keys = [key.value for key, _ in node.value]
+            assert len(set(keys)) == len(keys), keys
+            for _, value in node.value:
+                check(value)
+
+    check(yaml.compose(path.read_text()))
+
+
+@pytest.mark.parametrize(
+    ("task", "template", "match"),
+    [
+        ("pick", "put the thing in the basket", "object"),
+        ("pick", "put the {object} on the {object}", "object"),
+        ("pick", "open the {part} for the {object}", "part"),
+        ("open_pick", "take the {object} out of the {support}", "part"),
+        ("select", "take the {relation} {object}", "relation"),
+    ],
+)
+def test_wrong_fields_are_refused(tmp_path, task, template, match):
+    data = yaml.safe_load(INSTRUCTIONS_FILE.read_text())
+    data["tasks"][task]["train"].append(template)
+    path = tmp_path / "instructions.yaml"
+    path.write_text(yaml.safe_dump(data))
+    with pytest.raises(ConfigError, match=rf"{path}: .*fields \['{match}'\]") as caught:
+        read_texts(path, InstructionTexts)
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_keys_are_refused(tmp_path):
+    path = tmp_path / "synonyms.yaml"
+    path.write_text("plurals: []\nobjects: {mug: {test: [cup]}}\nsupports: {}\n")
+    with pytest.raises(ConfigError, match=r"unknown key 'objects\.mug\.test' .*'held_out', 'train'"):
+        read_texts(path, SynonymTexts)
+
+
+def test_counts_in_the_docs():
+    docs = (ROOT / "docs" / "language.md").read_text()
+    for task, templates in TEXTS.tasks.items():
+        assert f"| {task} | {' | '.join(str(len(templates.of(s))) for s in SPLITS)} |" in docs
+    for what, groups in (("relations", TEXTS.relations), ("objects", WORDS.objects), ("supports", WORDS.supports)):
+        train, held_out = (sum(len(words.of(split)) for words in groups.values()) for split in ("train", "held_out"))
+        assert f"| {what} | {len(groups)} | {train} | {held_out} |" in docs
+    for relation in RELATIONS:
+        assert f"`{relation}`" in docs
+    for goal_type, text in SUBGOALS.items():
+        assert f"| {goal_type} | {text} |" in docs
+
+
+def test_the_example_in_the_docs():
+    docs = (ROOT / "docs" / "language.md").read_text()
+    rng = np.random.default_rng(1)
+    found = choose_instruction(rng, "select", "train", object="mug", support="shelf", relation="nearest")
+    assert repr(found) in docs.replace("\n#   ", " ")

@@ -1,0 +1,36 @@
+"""What holds of every task's row."""
+
+import inspect
+
+import pytest
+
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.core.extensions import load
+from robocas_ms3.scenes.config import load_config_of
+from robocas_ms3.scenes.language.texts import Templates
+from robocas_ms3.scenes.targets import TargetRule
+from robocas_ms3.scenes.task_specs import TASKS
+
+
+@pytest.mark.parametrize("spec", TASKS.values(), ids=list(TASKS))
+def test_what_a_row_names_is_there(spec):
+    assert TASKS[spec.name] is spec
+    assert load_config_of(spec).task == spec.name
+    assert isinstance(load(spec.target), TargetRule)
+    assert load(spec.env).SPEC is spec
+    assert list(inspect.signature(load(spec.solver)).parameters) == ["arm"]
+    for check in spec.checks:
+        load(check)(load_config_of(spec))
+    assert Templates.for_task(spec).upstream
+
+
+@pytest.mark.parametrize(
+    ("name", "standard", "slow"), [("pick", 800, 200), ("search", 2400, 600), ("open_pick", 2000, 500)]
+)
+def test_a_horizon_is_as_many_seconds_at_any_rate(name, standard, slow):
+    assert (TASKS[name].max_episode_steps, TASKS[name].steps(5)) == (standard, slow)
+
+
+def test_a_configuration_of_another_task_is_refused():
+    with pytest.raises(ConfigError, match=r"RoboCASPick-v1 can't run .*select_table_orderly .expected task: pick"):
+        load_config_of(TASKS["pick"], "select_table_orderly")
