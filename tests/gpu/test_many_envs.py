@@ -24,6 +24,7 @@ pytestmark = [
 
 ENVS = emulated_envs() or 16
 SOME = [1, 3]  # envs of a partial reset
+MODES = ["pd_joint_pos", "pd_ee_delta_pose"]
 STILL = 0.003  # m in a second, of what a layout calls at rest
 only_gpu = pytest.mark.skipif(emulated_envs() > 0, reason="the emulation has no limits of memory")
 only_emulated = pytest.mark.skipif(
@@ -120,17 +121,19 @@ def test_a_partial_reset_leaves_the_other_envs_unchanged(many):
 
 
 @only_emulated
-def test_a_partial_reset_changes_no_bit_of_the_other_envs(many):
-    set_control_mode([many], "pd_joint_pos")
-    check_partial_reset(many, SOME, "pd_joint_pos")
+@pytest.mark.parametrize("mode", MODES)
+def test_a_partial_reset_changes_no_bit_of_the_other_envs(many, mode):
+    set_control_mode([many], mode)
+    check_partial_reset(many, SOME, mode)
 
 
-def test_a_state_that_is_set_is_the_one_that_was_read(many):
-    set_control_mode([many], "pd_joint_pos")
-    check_state_round_trip(many, SOME, "pd_joint_pos")
+@pytest.mark.parametrize("mode", MODES)
+def test_a_state_that_is_set_is_the_one_that_was_read(many, mode):
+    set_control_mode([many], mode)
+    check_state_round_trip(many, SOME, mode)
 
 
-@pytest.mark.parametrize("mode", ["pd_joint_pos", "pd_ee_delta_pose"])
+@pytest.mark.parametrize("mode", MODES)
 def test_the_same_actions_from_a_state_that_is_set_again_lead_to_the_same_configuration(mode):
     env = gym.make("RoboCASPick-v1", num_envs=ENVS, obs_mode="none", control_mode=mode, render_backend="none")
     base: Any = env.unwrapped
