@@ -1,7 +1,7 @@
 """The methods of ManiSkill's motion-planning solvers on top of this package's planners.
 
-``mani_skill.examples.motionplanning`` has the original, which needs mplib. Scripts written for it run with this class
-after a change of the import and of the constructor's arguments; docs/motion_planning.md lists the differences.
+``mani_skill.examples.motionplanning`` has the original, which needs mplib. Solutions written for it run with this class
+after a change of the import, unless they continue after a failed plan; docs/motion_planning.md lists the differences.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ class PandaArmMotionPlanningSolver:
         vis: whether to show every step in ManiSkill's viewer, which needs a display.
         joint_vel_limits: velocity limit of every arm joint, rad/s.
         joint_acc_limits: acceleration limit of every arm joint, rad/s^2.
+        debug, visualize_target_grasp_pose, print_env_info: arguments of ManiSkill's solver, without effect here.
         backend: name of the motion planner.
 
     Attributes:
@@ -58,8 +59,8 @@ class PandaArmMotionPlanningSolver:
         gripper_state: gripper command that motions hold, 1 open to -1 closed.
 
     Raises:
-        RobocasError: the environment has several envs, another control mode or another robot, or the base's pose has a
-            NaN or infinite number.
+        RobocasError: the environment has several envs, another control mode or another robot, the base's pose has a NaN
+            or infinite number, or a limit is not a positive number.
         ExtensionError: no motion planner has this name.
     """
 
@@ -69,8 +70,11 @@ class PandaArmMotionPlanningSolver:
         self,
         env: gym.Env,
         *,
-        base_pose: sapien.Pose | Pose | None = None,
+        debug: bool = False,
         vis: bool = False,
+        base_pose: sapien.Pose | Pose | None = None,
+        visualize_target_grasp_pose: bool = False,
+        print_env_info: bool = False,
         joint_vel_limits: float = 0.9,
         joint_acc_limits: float = 0.9,
         backend: str = backends.DEFAULT,
@@ -93,6 +97,8 @@ class PandaArmMotionPlanningSolver:
                 found=self.control_mode,
                 fix="Make the environment with control_mode='pd_joint_pos'.",
             )
+        _require_positive(joint_vel_limits, "joint_vel_limits", "rad/s")
+        _require_positive(joint_acc_limits, "joint_acc_limits", "rad/s^2")
         spec = _robot_spec(cast("BaseAgent", self.base_env.agent))
         self.robot = self.base_env.agent.robot
         self.description = replace(
@@ -296,6 +302,12 @@ def _require_count(count: int, where: str, least: int) -> None:
     if not count >= least:
         fix = f"Pass {least} or more."
         raise RobocasError("number too small", where=where, expected=f"at least {least}", found=count, fix=fix)
+
+
+def _require_positive(limit: float, where: str, unit: str) -> None:
+    if not 0 < limit < np.inf:
+        expected, fix = f"a positive number in {unit}", "Leave it out for 0.9."
+        raise RobocasError("invalid limit", where=where, expected=expected, found=limit, fix=fix)
 
 
 def _robot_spec(agent: BaseAgent) -> RobotSpec:

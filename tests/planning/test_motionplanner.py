@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
+import sys
+from importlib import resources
 from itertools import product
 from types import SimpleNamespace
 
@@ -13,6 +16,7 @@ import sapien
 
 import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
 from robocas_ms3.core.errors import ExtensionError, PlanningFailed, RobocasError
+from robocas_ms3.planning import motionplanner
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import Trajectory
 
@@ -182,6 +186,31 @@ def test_invalid_arguments_raise_at_the_call(joint_env, method, arguments, where
     assert str(caught.value.found)
     assert caught.value.fix
     assert (solver.gripper_state, steps(joint_env)) == (gripper, before)
+
+
+@pytest.mark.parametrize("name", ["joint_vel_limits", "joint_acc_limits"])
+@pytest.mark.parametrize("limit", [0.0, -0.9, np.nan, np.inf])
+def test_limits_that_are_not_positive_raise(joint_env, name, limit):
+    with pytest.raises(RobocasError) as caught:
+        PandaArmMotionPlanningSolver(joint_env, **{name: limit})
+    assert caught.value.where == name
+
+
+def test_a_solution_of_maniskill_solves_its_task(monkeypatch):
+    """The original file, loaded by its path: its package imports all solutions, some of which need mplib."""
+    package = "mani_skill.examples.motionplanning.panda"
+    monkeypatch.setitem(sys.modules, "mplib", None)
+    monkeypatch.setitem(sys.modules, f"{package}.motionplanner", motionplanner)
+    path = resources.files(package) / "solutions" / "pick_cube.py"
+    spec = importlib.util.spec_from_file_location("pick_cube_of_maniskill", str(path))
+    solution = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(solution)
+    assert solution.PandaArmMotionPlanningSolver is PandaArmMotionPlanningSolver
+    env = gym.make("PickCube-v1", obs_mode="state", control_mode="pd_joint_pos", render_backend="none")
+    for seed in range(3):
+        *_, info = solution.solve(env, seed=seed)
+        assert info["success"].item(), seed
+    env.close()
 
 
 def test_a_base_pose_with_nan_raises(joint_env):
