@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from batches import check_equals_singles, check_partial_reset, make_batch, make_singles
+from batches import check_equals_singles, check_partial_reset, make_batch, make_singles, set_control_mode
 from gpu_emulation import emulated_envs
 from mani_skill.agents.controllers.base_controller import CombinedController
 from mani_skill.envs.scene import ManiSkillScene
@@ -54,6 +54,17 @@ def test_a_missing_apply(batch, singles, monkeypatch, name):
     monkeypatch.setattr(type(batch.unwrapped.scene.px), f"gpu_apply_{name}", lambda self: None)
     with pytest.raises(AssertionError):
         check(batch, singles)
+
+
+def test_a_missing_apply_of_target_velocities(batch, singles, monkeypatch):
+    """Only end-effector modes set them."""
+    mode = "pd_ee_delta_pose"
+    set_control_mode([batch, *singles], mode)
+    check_equals_singles(batch, singles, mode, steps=5, heap=False)
+    monkeypatch.setattr(type(batch.unwrapped.scene.px), "gpu_apply_articulation_target_velocity", lambda self: None)
+    with pytest.raises(AssertionError, match="qpos"):
+        check_equals_singles(batch, singles, mode, steps=5, heap=False)
+    set_control_mode(singles, MODE)
 
 
 def test_a_missing_fetch(batch, singles, monkeypatch):
