@@ -26,13 +26,13 @@ from robocas_ms3.baselines.table import find_baseline, need_extra
 from robocas_ms3.core.errors import EmptySplitError, OutputExistsError, TrainingError
 from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.files import make_folder
+from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.core.outputs import (
     check_one_way,
     check_overwrite,
     check_run,
     claim_output,
     is_taken,
-    locked_folder,
     sweep,
     while_there,
 )

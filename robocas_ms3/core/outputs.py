@@ -1,45 +1,293 @@
-"""Folders that runs write into: whose they may be, what becomes of what is there, and who else may write there.
+"""Output folders: what may be written into, continued or replaced, and what a killed run leaves.
 
-A run that writes one episode after the other takes these steps, all under `locked_folder`: `claim_output` refuses what
-is there unless the user said what to do with it; `check_overwrite` keeps what is none of ours from being deleted, and
-`check_run` what is another command's; `sweep` removes what a killed run left half written; `kept_if_begun` leaves no
-folder behind of which nothing came.
+The commands that write a folder step by step use `OutputFolder`. Commands that write a file or folder in one go use
+`check_replaceable` and `files.replacing` or `files.replacing_folder`.
 """
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import glob
-import logging
+import json
 import os
 import shutil
 import tempfile
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import IO, Any
+from types import TracebackType
+from typing import Any
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import OutputExistsError, RobocasError
-from robocas_ms3.core.files import empty_folder, is_fixed, make_folder, open_for_append, remove
+from robocas_ms3.core.files import empty_folder, is_fixed, json_text, make_folder, remove, write_json
+from robocas_ms3.core.locks import LOCK, locked_folder
 
-# What the system says where there are none: of some network file systems, or of a lock server that is gone
-_NO_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS})
-_log = logging.getLogger(__name__)
-_DYING = 0.5  # s that a killed process may hold a lock for: one that it was just starting has it too
-_INSIDE = ".lock"  # of a folder that can't have it beside it
-# What a plan's run has in its folder before it says what it is: one that was killed then leaves nothing else
-_BEFORE = (_INSIDE, ".driver.*", ".plan.*.tmp.json")
+_LEFTOVERS = (".*.tmp*", ".*.old")  # of `files.replacing` and `files.replacing_folder` in a process that was killed
+# Files that do not count as content; a plan's run writes its own before it writes the record
+_HIDDEN = (LOCK, ".driver.*", *_LEFTOVERS)
+_SHOWN_CHANGES = 8
+_SHOWN_VALUE = 60  # characters
+
+
+@dataclass(frozen=True)
+class FolderKind:
+    """What tells the output folders of a command from other folders.
+
+    Attributes:
+        command: which writes them, such as ``robocas generate``.
+        records: paths inside of the JSON file with the settings. `OutputFolder.start` writes the first; the folder
+            of a finished run may have another.
+        key: a key that this command's record has, and the record of no other command.
+        marks: other paths inside by which such a folder is known. Without a record it can't be continued, but it may
+            be overwritten.
+        upgrade: returns a record of an older version with the keys of today.
+    """
+
+    command: str
+    records: tuple[str, ...]
+    key: str
+    marks: tuple[str, ...] = ()
+    upgrade: Callable[[dict[str, Any]], dict[str, Any]] = dict
+
+
+class OutputFolder:
+    """A folder that a run writes into, is locked by, and continues if its recorded settings match.
+
+    Entering locks and checks the folder, and changes nothing in it. `start` comes before the first file. Leaving by an
+    error removes a started folder that holds no result yet::
+
+        with OutputFolder(out, KIND, settings, overwrite=overwrite) as output:
+            output.start(record)
+            ...
+
+    Args:
+        path: of the folder; missing and empty folders are fine.
+        kind: of the command.
+        settings: what has to match to continue: JSON values, by keys of the record. None: see `check_settings`.
+        overwrite: whether to start again.
+
+    Attributes:
+        path: of the folder.
+        recorded: content of the record, upgraded; None: the run starts from nothing.
+        has_lock: whether the folder is locked: False on a file system without locks.
+
+    Raises:
+        OutputExistsError: on entering: the folder was not written by the command, or with other settings.
+        RobocasError: on entering: another process writes there. On leaving: somebody removed the folder.
+    """
+
+    def __init__(
+        self, path: Path | str, kind: FolderKind, settings: Mapping[str, Any] | None = None, *, overwrite: bool = False
+    ) -> None:
+        self.path = Path(path)
+        self.recorded: dict[str, Any] | None = None
+        self.has_lock = False
+        self._kind, self._settings, self._overwrite = kind, settings, overwrite
+        self._started = False
+        self._stack = ExitStack()
+
+    def __enter__(self) -> OutputFolder:
+        with ExitStack() as stack:
+            self.has_lock = stack.enter_context(locked_folder(self.path))
+            self.recorded = self._read()
+            if self._settings is not None:
+                self.check_settings(self._settings)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._stack:
+            if error is None or not self._started:
+                return
+            if isinstance(error, FileNotFoundError):
+                try:
+                    self.check_exists()
+                except RobocasError as removed:
+                    raise removed from error
+            with suppress(OSError, RobocasError):
+                if not self._has_results():
+                    _delete(self.path)
+
+    def check_settings(self, settings: Mapping[str, Any]) -> None:
+        """Check that recorded settings match; not those of a folder that is to be overwritten.
+
+        Raises:
+            OutputExistsError: some differ.
+        """
+        if self.recorded is None:
+            return
+        now = json.loads(json_text(settings, self.path))
+        changes = [change for key, value in now.items() for change in _changes(self.recorded.get(key), value, key)]
+        if changes:
+            more = len(changes) - _SHOWN_CHANGES
+            found = "; ".join(changes[:_SHOWN_CHANGES]) + (f"; {more} more" if more > 0 else "")
+            fix = "Continue with the recorded settings and versions, choose another folder, or pass --overwrite."
+            raise OutputExistsError("written with other settings", where=self._record_path(), found=found, fix=fix)
+
+    def start(self, record: Mapping[str, Any]) -> None:
+        """Make the folder, delete content that is overwritten and leftovers of a killed run, and write the record.
+
+        Args:
+            record: holds the settings.
+
+        Raises:
+            RobocasError: the folder can't be made or replaced, or the record is no JSON.
+        """
+        if not self._started:
+            _finish_deletion(self.path)
+            if self._overwrite:
+                _delete(self.path)
+        self._started = True
+        make_folder(self.path)
+        sweep(self.path)
+        write_json(self._record_path(), record, sync=True)
+
+    def check_exists(self) -> None:
+        """Check that nobody removed the folder: writers make missing folders, and would begin another one.
+
+        Raises:
+            RobocasError: the record is gone.
+        """
+        if not self._record_path().is_file():
+            what, fix = "the output folder was removed or emptied during the run", "Start again."
+            raise RobocasError(what, where=self.path, expected=self._record_path().name, fix=fix)
+
+    def _record_path(self) -> Path:
+        """Return the path of the record, or of the one that will be written."""
+        paths = [self.path / record for record in self._kind.records]
+        return next((path for path in paths if path.is_file()), paths[0])
+
+    def _read(self) -> dict[str, Any] | None:
+        """Return the record; None if there is nothing to continue."""
+        if is_empty(self.path):
+            return None
+        record = self._load()
+        if record is None:
+            if not any((self.path / mark).exists() for mark in self._kind.marks):
+                what, expected = f"this folder is not of `{self._kind.command}`", " or ".join(self._known_by())
+                raise OutputExistsError(what, where=self.path, expected=expected, fix="Choose another.")
+            if not self._overwrite and self._has_results():
+                what, fix = "there are no recorded settings to continue with", "Pass --overwrite to start again."
+                raise OutputExistsError(what, where=self._record_path(), fix=fix)
+        return None if record is None or self._overwrite or not self._has_results() else self._kind.upgrade(record)
+
+    def _load(self) -> dict[str, Any] | None:
+        try:
+            record = load_json(self._record_path())
+        except (OSError, ValueError):
+            return None
+        return record if isinstance(record, dict) and self._kind.key in record else None
+
+    def _known_by(self) -> list[str]:
+        return [f"{self._kind.records[0]} with {self._kind.key!r}", *self._kind.marks]
+
+    def _has_results(self) -> bool:
+        """Return whether a file besides the record has content."""
+        records = {self.path / record for record in self._kind.records}
+        return any(path not in records and path.lstat().st_size for path in _content(self.path))
+
+
+def _content(folder: Path) -> Iterator[Path]:
+    """Yield the files in a folder and below it that are not hidden."""
+    for entry in folder.iterdir() if folder.is_dir() else ():
+        if any(fnmatchcase(entry.name, pattern) for pattern in _HIDDEN):
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            yield from _content(entry)
+        else:
+            yield entry
+
+
+def is_empty(path: Path) -> bool:
+    """Return whether nothing exists there but an empty folder, or one with a lock and leftovers of a killed run."""
+    if not path.is_dir():
+        return not path.exists()
+    return all(any(fnmatchcase(entry.name, pattern) for pattern in _HIDDEN) for entry in path.iterdir())
+
+
+def check_replaceable(path: Path | str, *, overwrite: bool | None = None, marks: Sequence[str] = ()) -> None:
+    """Check that an output that is written in one go does not exist, or may be replaced.
+
+    Args:
+        path: a file or folder.
+        overwrite: the command's flag; None: it has none.
+        marks: paths inside, one of which a folder must have to be replaced.
+
+    Raises:
+        OutputExistsError: the output exists, and the flag is not set, or it was written by something else.
+    """
+    path = Path(path)
+    if is_empty(path):
+        return
+    if not overwrite:
+        fix = "Choose another." if overwrite is None else "Pass --overwrite to replace it, or choose another."
+        raise OutputExistsError("the output exists already", where=path, fix=fix)
+    if marks and not any((path / mark).exists() for mark in marks):
+        what = "refusing to replace what this command has not written"
+        raise OutputExistsError(what, where=path, expected=" or ".join(marks), fix="Choose another.")
+
+
+def _delete(path: Path) -> None:
+    """Delete a file or folder; a folder disappears at once under this name."""
+    if not path.is_dir():
+        path.unlink(missing_ok=True)
+        return
+    if is_fixed(path):
+        empty_folder(path, but=path / LOCK)
+        return
+    target = path.resolve()  # a symbolic link stays, and leads to an empty folder
+    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=make_folder(target.parent)))
+    try:
+        os.replace(target, old)
+    except OSError as error:
+        old.rmdir()
+        what = "can't replace this folder"
+        raise RobocasError(what, where=path, found=error.strerror, fix="Choose another.") from error
+    if path.is_symlink():
+        target.mkdir()
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _finish_deletion(path: Path) -> None:
+    """Delete what an overwriting run that was killed has only renamed."""
+    for old in path.parent.glob(f".{glob.escape(path.name)}.*.old"):
+        if not (old / "old").exists():  # else `files.replacing_folder` may put it back
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def sweep(folder: Path) -> None:
+    """Remove temporary files and folders that a killed run left; the folder has to be locked."""
+    for pattern in _LEFTOVERS:
+        for leftover in folder.glob(pattern):
+            remove(leftover)
+
+
+def _changes(before: Any, now: Any, path: str) -> list[str]:
+    """Return ``path: before -> now`` for each value that differs."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        keys = dict.fromkeys([*before, *now])
+        return [change for key in keys for change in _changes(before.get(key), now.get(key), f"{path}.{key}")]
+    if isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
+        pairs = enumerate(zip(before, now, strict=True))
+        return [change for index, (old, new) in pairs for change in _changes(old, new, f"{path}.{index}")]
+    return [] if before == now else [f"{path}: {_shortened(before)} -> {_shortened(now)}"]
+
+
+def _shortened(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= _SHOWN_VALUE else f"{text[: _SHOWN_VALUE - 3]}..."
+
+
+# Until the last caller uses `OutputFolder`
 
 
 def is_taken(path: Path) -> bool:
-    """Whether there is something: a file, or a folder that holds more than what says who is at it."""
-    if not path.is_dir():
-        return path.exists()
-    return any(not any(fnmatchcase(entry.name, name) for name in _BEFORE) for entry in path.iterdir())
+    """Return whether an output exists."""
+    return not is_empty(path)
 
 
 def check_one_way(where: str, *, resume: bool, overwrite: bool, error: type[RobocasError] = RobocasError) -> None:
@@ -77,32 +325,9 @@ def claim_output(path: Path | str, *, overwrite: bool = False, resume: bool | No
     if taken and not (overwrite or resume):
         ways = ("" if resume is None else "--resume to go on, ") + "--overwrite to replace it"
         raise OutputExistsError("the output exists already", where=path, fix=f"Pass {ways}.")
-    for old in path.parent.glob(f".{glob.escape(path.name)}.*.old"):
-        if not (old / "old").exists():  # that of a folder being replaced, which may have to come back
-            shutil.rmtree(old, ignore_errors=True)
+    _finish_deletion(path)
     if taken and overwrite:
-        _remove(path)
-
-
-def _remove(path: Path) -> None:
-    """Delete a file or a folder, which is renamed first where it can be."""
-    if not path.is_dir():
-        path.unlink()
-        return
-    if is_fixed(path):
-        empty_folder(path, but=path / _INSIDE)
-        return
-    target = path.resolve()  # a link to a folder goes on leading to one
-    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=make_folder(target.parent)))
-    try:
-        os.replace(target, old)
-    except OSError as error:
-        old.rmdir()
-        what = "can't replace this folder"
-        raise RobocasError(what, where=path, found=error.strerror, fix="Choose another.") from error
-    if path.is_symlink():
-        target.mkdir()
-    shutil.rmtree(old, ignore_errors=True)
+        _delete(path)
 
 
 def check_absent(out: Path, error: type[RobocasError] = OutputExistsError) -> None:
@@ -205,102 +430,6 @@ def check_run(path: Path, key: str, command: str, error: type[RobocasError] = Ou
         found = ", ".join(run) if isinstance(run, dict) else ""
         what, fix = f"refusing to write over what `robocas {command}` has not made", "Choose another --out."
         raise error(what, where=path, expected=key, found=found or "nothing of the kind", fix=fix)
-
-
-@contextmanager
-def locked_folder(path: Path | str) -> Iterator[bool]:
-    """Hold a lock on a folder that may not exist yet; it ends with the process, however that ends.
-
-    If the folder is not there in the end, the parents made for the lock go too.
-
-    Yields:
-        Whether it is held: False on a file system that has no locks.
-
-    Raises:
-        RobocasError: another process holds it, or nothing can be written there.
-    """
-    path = Path(path)
-    new = [folder for folder in path.parents if not folder.exists()]
-    lock = _lock_of(path)
-    try:
-        file, held = _locked(lock, path)
-        with file:
-            try:
-                yield held
-            finally:
-                lock.unlink(missing_ok=True)
-    finally:
-        if not path.exists():
-            with suppress(OSError):  # nothing came of it; another run may be in them
-                for folder in new:
-                    folder.rmdir()
-
-
-def _lock_of(path: Path) -> Path:
-    """One file whatever links lead to the folder; beside it, since it may be replaced, or else inside."""
-    if is_fixed(path):
-        return path / _INSIDE
-    path = path.resolve()
-    return path.parent / f".{path.name}.lock"
-
-
-def _locked(lock: Path, path: Path) -> tuple[IO[bytes], bool]:
-    """Open and lock a file that whoever held it before may just have removed; and whether there are locks."""
-    while True:
-        make_folder(lock.parent)
-        try:
-            file = open_for_append(lock)
-        except OSError as error:  # it says that it is writable, as those of /proc do
-            what = "can't write into this folder"
-            raise RobocasError(what, where=lock.parent, found=error.strerror, fix="Choose another.") from error
-        try:
-            held = lock_file(file, path, wait=False)
-        except BaseException:
-            file.close()
-            raise
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file.fileno()), lock.lstat()):
-                return file, held
-        file.close()
-
-
-def lock_file(file: IO[Any], path: Path, *, wait: bool) -> bool:
-    """Hold a lock on an open file until it is closed; on a file system that has none go on without, and say so.
-
-    Args:
-        file: open for writing.
-        path: what the lock is for.
-        wait: until nobody else holds it; else half a second, since one that was killed may take a moment to be gone.
-
-    Returns:
-        Whether it is held.
-
-    Raises:
-        RobocasError: somebody else holds it; or it can't be had for a reason of the system's.
-    """
-    until = time.monotonic() + _DYING
-    try:
-        while True:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-                break
-            except BlockingIOError as error:
-                if time.monotonic() > until:
-                    what, fix = "another process is writing here", "Wait until it is done."
-                    raise RobocasError(what, where=path, fix=fix) from error
-                time.sleep(0.02)
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            raise RobocasError("can't lock this folder", where=path, found=error.strerror) from error
-        _log.warning("%s: its file system has no locks (%s): see that no other run writes there", path, error.strerror)
-        return False
-    return True
-
-
-def sweep(folder: Path) -> None:
-    """Remove what a killed run left half written; nobody else may write here, so lock the folder before."""
-    for leftover in [*folder.glob(".*.tmp*"), *folder.glob(".*.old")]:
-        remove(leftover)
 
 
 @contextmanager

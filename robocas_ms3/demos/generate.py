@@ -13,15 +13,8 @@ import numpy as np
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
-from robocas_ms3.core.outputs import (
-    check_one_way,
-    check_overwrite,
-    check_run,
-    check_there,
-    claim_output,
-    locked_folder,
-    while_there,
-)
+from robocas_ms3.core.locks import locked_folder
+from robocas_ms3.core.outputs import check_one_way, check_overwrite, check_run, check_there, claim_output, while_there
 from robocas_ms3.core.processes import Limits, Worker
 from robocas_ms3.demos.checks import WEIGHTS, check_arguments, check_same_run
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings

@@ -17,6 +17,7 @@ from typing import Any
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.exits import responsive
 from robocas_ms3.core.files import make_folder, write_json
+from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.core.outputs import (
     check_one_way,
     check_overwrite,
@@ -24,7 +25,6 @@ from robocas_ms3.core.outputs import (
     check_there,
     claim_output,
     is_taken,
-    locked_folder,
     sweep,
     while_there,
 )

@@ -19,7 +19,7 @@ from robocas_ms3.assets.pack import MANIFEST, LoadedFurniture, sha256
 from robocas_ms3.core.documents import DAMAGED, open_arrays
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.files import make_folder, open_for_append, replacing, write_json
-from robocas_ms3.core.outputs import lock_file
+from robocas_ms3.core.locks import lock_file
 from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.scenes.frozen import FrozenLayouts
 from robocas_ms3.scenes.layout import Layout

@@ -1,158 +1,181 @@
-"""Whose an output folder is: what is refused, overwritten, locked, swept, and left behind."""
+"""Output folders: which are continued, refused, overwritten, and what is left behind."""
 
 import errno
-import fcntl
+import json
 import os
-import threading
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.core.files import make_folder, replacing_folder
-from robocas_ms3.core.outputs import check_overwrite, claim_output, kept_if_begun, locked_folder, sweep, while_there
+from robocas_ms3.core.errors import OutputExistsError, RobocasError
+from robocas_ms3.core.files import replacing_folder
+from robocas_ms3.core.locks import locked_folder
+from robocas_ms3.core.outputs import FolderKind, OutputFolder, check_replaceable, sweep
+
+KIND = FolderKind("robocas test", ("run.json",), "rate", marks=("old_format",))
+SETTINGS = {"rate": 5, "camera": {"size": [640, 480], "depth": True}}
 
 
-def test_existing_output_needs_a_flag(tmp_path):
-    (tmp_path / "out").mkdir()
-    claim_output(tmp_path / "out")  # empty: fine
-    (tmp_path / "out" / "file").write_text("")
-    with pytest.raises(OutputExistsError, match="--resume.*--overwrite"):
-        claim_output(tmp_path / "out")
-    with pytest.raises(OutputExistsError, match=r"exists already\. Pass --overwrite to replace it\.$"):
-        claim_output(tmp_path / "out", resume=None)  # it can't be gone on with
-    claim_output(tmp_path / "out", resume=True)
-    assert (tmp_path / "out" / "file").exists()
-    claim_output(tmp_path / "out", overwrite=True)
-    assert list(tmp_path.iterdir()) == []
+def write_run(path, settings=SETTINGS, *, episodes=1, overwrite=False):
+    with OutputFolder(path, KIND, settings, overwrite=overwrite) as output:
+        output.start(settings)
+        for number in range(episodes):
+            (path / f"episode_{number}").write_text("written")
 
 
-def test_what_is_overwritten_disappears_at_once(tmp_path, monkeypatch):
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_run_with_the_recorded_settings_continues(tmp_path):
+    out = tmp_path / "a" / "out"
+    write_run(out)
+    (out / ".episode_1.tmp").mkdir()
+    with OutputFolder(out, KIND, SETTINGS) as output:
+        assert output.recorded == SETTINGS
+        output.start({**SETTINGS, "episodes": 2})
+        assert names(out) == ["episode_0", "run.json"]  # what a killed run left half written is gone
+    assert json.loads((out / "run.json").read_text()) == {**SETTINGS, "episodes": 2}
+    assert names(out.parent) == ["out"]
+
+
+def test_other_settings_are_refused_with_all_changes(tmp_path):
+    write_run(tmp_path / "out")
+    other = {"rate": 10, "camera": {"size": [640, 360]}, "codec": "h264"}
+    with pytest.raises(OutputExistsError) as error:
+        write_run(tmp_path / "out", other)
+    assert error.value.where == tmp_path / "out" / "run.json"
+    changes = ["rate: 5 -> 10", "camera.size.1: 480 -> 360", "camera.depth: true -> null", 'codec: null -> "h264"']
+    assert error.value.found.split("; ") == changes
+    with OutputFolder(tmp_path / "out", KIND) as output, pytest.raises(OutputExistsError):
+        output.check_settings(other)
+    write_run(tmp_path / "out", other, episodes=2, overwrite=True)
+    assert names(tmp_path / "out") == ["episode_0", "episode_1", "run.json"]
+
+
+def test_settings_of_an_older_version_are_upgraded(tmp_path):
+    write_run(tmp_path, {"rate": 5})
+    kind = FolderKind("robocas test", ("run.json",), "rate", upgrade=lambda record: {"codec": "h264", **record})
+    with OutputFolder(tmp_path, kind, {"rate": 5, "codec": "h264"}) as output:
+        assert output.recorded == {"rate": 5, "codec": "h264"}
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("record", [None, "[]", "{", '{"protocol": "of another command"}'])
+def test_folder_of_something_else_is_left_alone(tmp_path, record, overwrite):
+    (tmp_path / "thesis").touch()
+    if record is not None:
+        (tmp_path / "run.json").write_text(record)
+    before = names(tmp_path)
+    for path in (tmp_path, tmp_path / "thesis"):
+        with pytest.raises(OutputExistsError) as error:
+            write_run(path, overwrite=overwrite)
+        assert error.value.where == path
+    assert names(tmp_path) == before
+
+
+def test_known_folder_without_settings_can_only_be_overwritten(tmp_path):
+    (tmp_path / "old_format").write_text("some")
+    with pytest.raises(OutputExistsError):
+        write_run(tmp_path)
+    write_run(tmp_path, overwrite=True)
+    assert names(tmp_path) == ["episode_0", "run.json"]
+
+
+@pytest.mark.parametrize("episodes", [0, 1])
+def test_run_that_fails_keeps_a_folder_with_results_only(tmp_path, episodes):
+    with pytest.raises(KeyboardInterrupt), OutputFolder(tmp_path / "a" / "out", KIND, SETTINGS) as output:
+        output.start(SETTINGS)
+        (output.path / "empty").mkdir()
+        for number in range(episodes):
+            (output.path / f"episode_{number}").write_text("written")
+        raise KeyboardInterrupt
+    assert (tmp_path / "a").exists() is bool(episodes)
+
+
+def test_folder_without_results_is_started_with_any_settings(tmp_path):
+    write_run(tmp_path, episodes=0)  # as if killed there
+    (tmp_path / "parts").mkdir()
+    write_run(tmp_path, {"rate": 10})
+
+
+def test_overwritten_folder_stays_until_the_start(tmp_path):
+    write_run(tmp_path / "out")
+    with pytest.raises(ZeroDivisionError), OutputFolder(tmp_path / "out", KIND, SETTINGS, overwrite=True):
+        _ = 1 / 0
+    assert names(tmp_path / "out") == ["episode_0", "run.json"]
+
+
+def test_overwritten_folder_disappears_at_once(tmp_path, monkeypatch):
     out = tmp_path / "out"
-    out.mkdir()
-    (out / "file").write_text("")
+    write_run(out)
     with monkeypatch.context() as patch:
         patch.setattr("shutil.rmtree", lambda *_, **__: None)  # as if killed there
-        claim_output(out, overwrite=True)
-    assert not out.exists()
-    (left,) = tmp_path.iterdir()
-    assert left.name.startswith(".out.")
-    assert left.name.endswith(".old")
-    claim_output(out)
-    assert list(tmp_path.iterdir()) == []
+        write_run(out, episodes=0, overwrite=True)
+    assert names(out) == ["run.json"]
+    assert len(names(tmp_path)) == 2
+    write_run(out)
+    assert names(tmp_path) == ["out"]
 
 
-def test_a_link_to_a_folder_goes_on_leading_to_one(tmp_path):
-    (tmp_path / "disk" / "data").mkdir(parents=True)
-    (tmp_path / "disk" / "data" / "file").write_text("")
+def test_link_to_an_overwritten_folder_stays(tmp_path):
+    write_run(tmp_path / "disk" / "data")
     (tmp_path / "out").symlink_to(tmp_path / "disk" / "data")
-    claim_output(tmp_path / "out", overwrite=True)
+    write_run(tmp_path / "out", episodes=0, overwrite=True)
     assert (tmp_path / "out").is_symlink()
-    assert [*(tmp_path / "disk").iterdir(), *(tmp_path / "out").iterdir()] == [tmp_path / "disk" / "data"]
+    assert names(tmp_path / "disk") == ["data"]
+    assert names(tmp_path / "disk" / "data") == ["run.json"]
 
 
-def test_a_lock_leaves_no_parents_of_a_folder_that_never_was(tmp_path):
-    with pytest.raises(ZeroDivisionError), locked_folder(tmp_path / "a" / "b" / "out"):
-        _ = 1 / 0
-    assert list(tmp_path.iterdir()) == []
-    with locked_folder(tmp_path / "a" / "out"):
-        make_folder(tmp_path / "a" / "out")
-    assert [p.name for p in (tmp_path / "a").iterdir()] == ["out"]
+def test_folder_removed_during_the_run(tmp_path):
+    with pytest.raises(FileNotFoundError), OutputFolder(tmp_path / "out", KIND, SETTINGS) as output:
+        output.start(SETTINGS)
+        (output.path / "none").read_text()  # another missing file is a mistake in the code
+    with pytest.raises(RobocasError) as error, OutputFolder(tmp_path / "out", KIND, SETTINGS) as output:
+        output.start(SETTINGS)
+        output.check_exists()
+        (output.path / "run.json").unlink()
+        with pytest.raises(RobocasError):
+            output.check_exists()
+        (output.path / "run.json").read_text()
+    assert error.value.where == tmp_path / "out"
 
 
-def test_a_lock_that_was_removed_meanwhile_is_none(tmp_path, monkeypatch):
-    """The one who held it removes it between another's opening and locking."""
-    lock, whole, calls = tmp_path / ".out.lock", fcntl.flock, []
-
-    def flock(*args):
-        calls.append(args)
-        if len(calls) == 1:
-            lock.unlink()
-        whole(*args)
-
-    monkeypatch.setattr("fcntl.flock", flock)
-    with locked_folder(tmp_path / "out"):
-        assert len(calls) == 2
-        with pytest.raises(RobocasError, match="another process"), locked_folder(tmp_path / "out"):
-            pass
+def test_two_runs_in_one_folder(tmp_path):
+    with OutputFolder(tmp_path / "out", KIND, SETTINGS) as output:
+        assert output.has_lock
+        with pytest.raises(RobocasError):
+            write_run(tmp_path / "out")
 
 
-def test_a_lock_that_is_a_link_is_refused_and_leads_nowhere(tmp_path):
-    (tmp_path / "target").write_text("kept")
-    (tmp_path / ".out.lock").symlink_to(tmp_path / "target")
-    with pytest.raises(RobocasError) as error, locked_folder(tmp_path / "out"):
-        pass
-    assert error.value.where == tmp_path / ".out.lock"
-    assert (tmp_path / "target").read_text() == "kept"
-    os.unlink(tmp_path / ".out.lock")
-    os.link(tmp_path / "target", tmp_path / ".out.lock")
-    with locked_folder(tmp_path / "out"):
-        assert (tmp_path / "target").read_text() == "kept"  # of another name of the file, too
+def test_output_written_in_one_go(tmp_path):
+    out = tmp_path / "out"
+    check_replaceable(out)
+    out.mkdir()
+    check_replaceable(out)
+    (out / "index.js").touch()
+    for overwrite in (None, False):
+        with pytest.raises(OutputExistsError):
+            check_replaceable(out, overwrite=overwrite)
+    check_replaceable(out, overwrite=True, marks=("index.html", "index.js"))
+    with pytest.raises(OutputExistsError):
+        check_replaceable(out, overwrite=True, marks=("pack.json",))
 
 
-@pytest.mark.skipif(not os.access("/proc", os.W_OK), reason="here it says that it is not writable")
-def test_a_lock_in_a_folder_that_only_says_it_is_writable():
-    with pytest.raises(RobocasError, match="/proc: can't write into this folder") as error, locked_folder("/proc/out"):
-        pass
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("error", [OutputExistsError, DatasetError])
-def test_only_what_is_ours_is_overwritten(tmp_path, error):
-    check_overwrite(tmp_path / "none", ("run.json",), "a run", error)
-    check_overwrite(tmp_path, ("run.json",), "a run", error)  # empty
-    (tmp_path / "thesis").write_text("")
-    for path in (tmp_path, tmp_path / "thesis"):
-        with pytest.raises(error, match=r"refusing to overwrite what is not a run .expected run\.json or parts"):
-            check_overwrite(path, ("run.json", "parts"), "a run", error)
-    (tmp_path / "parts").mkdir()
-    check_overwrite(tmp_path, ("run.json", "parts"), "a run", error)
-
-
-def test_what_was_left_half_written_is_swept(tmp_path):
+def test_leftovers_are_removed_and_links_are_not_followed(tmp_path):
     for name in (".a.1.tmp.png", ".b.tmp", "kept.tmp", ".c.old"):
         (tmp_path / name).mkdir() if name == ".b.tmp" else (tmp_path / name).touch()
     (tmp_path / "disk").mkdir()
     (tmp_path / "disk" / "file").touch()
     (tmp_path / ".link.tmp").symlink_to(tmp_path / "disk")
     sweep(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "kept.tmp"]
-    assert (tmp_path / "disk" / "file").exists()  # of a link, the link alone goes
-
-
-@pytest.mark.parametrize("begun", [False, True])
-def test_a_folder_of_which_nothing_came_goes(tmp_path, begun):
-    parts = make_folder(tmp_path / "out" / "parts")
-    with pytest.raises(KeyboardInterrupt), kept_if_begun(tmp_path / "out", parts, "part_*"):
-        if begun:
-            (parts / "part_0").touch()
-        raise KeyboardInterrupt
-    assert (tmp_path / "out").exists() is begun
-
-
-def test_one_lock_whatever_links_lead_to_a_folder(tmp_path):
-    (tmp_path / "disk").mkdir()
-    (tmp_path / "link").symlink_to(tmp_path / "disk")
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "above").symlink_to(tmp_path)
-    for other in (tmp_path / "link", tmp_path / "other" / "above" / "disk"):
-        refused = pytest.raises(RobocasError, match="another process is writing here")
-        with locked_folder(tmp_path / "disk"), refused, locked_folder(other):
-            pass
-
-
-def test_a_lock_that_is_about_to_go_is_waited_for(tmp_path):
-    holding = ExitStack()
-    holding.enter_context(locked_folder(tmp_path / "out"))
-    threading.Timer(0.15, holding.close).start()
-    with locked_folder(tmp_path / "out") as held:
-        assert held
+    assert names(tmp_path) == ["disk", "kept.tmp"]
+    assert (tmp_path / "disk" / "file").exists()
 
 
 @pytest.fixture
-def fixed(tmp_path, monkeypatch):
-    """A folder that can be written into but neither renamed nor have anything beside it, as a container mounts it."""
+def mounted(tmp_path, monkeypatch):
+    """A folder that can be written into, but neither renamed nor have anything next to it, like a container's mount."""
     out = tmp_path / "out"
     out.mkdir()
     whole, access = os.replace, os.access
@@ -167,61 +190,20 @@ def fixed(tmp_path, monkeypatch):
     return out
 
 
-def test_a_folder_with_nothing_beside_it_is_locked_and_emptied_where_it_is(fixed):
-    (fixed / "episode_0").mkdir()
-    (fixed / "run.json").touch()
-    with locked_folder(fixed):
-        with pytest.raises(RobocasError, match="another process"), locked_folder(fixed):
-            pass
-        with pytest.raises(OutputExistsError):
-            claim_output(fixed)
-        claim_output(fixed, overwrite=True)
-        claim_output(fixed)  # its lock is no content
-    assert list(fixed.iterdir()) == []
+def test_mounted_folder_is_locked_and_emptied_in_place(mounted):
+    write_run(mounted)
+    with locked_folder(mounted), pytest.raises(RobocasError):
+        write_run(mounted)
+    write_run(mounted, episodes=0, overwrite=True)
+    assert names(mounted) == ["run.json"]
 
 
-def test_a_folder_with_nothing_beside_it_is_replaced_from_within(fixed):
-    (fixed / "old").touch()
-    with pytest.raises(ZeroDivisionError), replacing_folder(fixed) as folder:
+def test_mounted_folder_is_replaced_from_within(mounted):
+    (mounted / "old").touch()
+    with pytest.raises(ZeroDivisionError), replacing_folder(mounted) as folder:
         (folder / "new").touch()
         _ = 1 / 0
-    assert [path.name for path in fixed.iterdir()] == ["old"]
-    with replacing_folder(fixed) as folder:
+    assert names(mounted) == ["old"]
+    with replacing_folder(mounted) as folder:
         (folder / "new").mkdir()
-    assert [path.name for path in fixed.iterdir()] == ["new"]
-
-
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
-def test_a_file_system_without_locks_is_said_and_gone_on_without(tmp_path, monkeypatch, caplog, number):
-    def flock(*_):
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr("fcntl.flock", flock)
-    with locked_folder(tmp_path / "out") as held:
-        assert held is False
-        (tmp_path / "out").mkdir()
-    (said,) = caplog.messages
-    assert f"{tmp_path}/out: its file system has no locks ({os.strerror(number)})" in said
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-def test_a_lock_that_fails_otherwise_blames_no_other_run(tmp_path, monkeypatch):
-    def flock(*_):
-        raise OSError(errno.EIO, "Input/output error")
-
-    monkeypatch.setattr("fcntl.flock", flock)
-    with pytest.raises(RobocasError, match=r"out: can't lock this folder \(found Input/output error\)"):  # noqa: SIM117
-        with locked_folder(tmp_path / "out"):
-            pass
-
-
-def test_a_file_that_is_missed_is_the_fault_of_who_removed_the_folder(tmp_path):
-    mark = tmp_path / "out" / "run.json"
-    make_folder(mark.parent)
-    mark.touch()
-    with pytest.raises(FileNotFoundError), while_there(mark, DatasetError):  # a mistake of ours remains one
-        (mark.parent / "none").read_text()
-    mark.unlink()
-    said = r"out: the output folder is gone, or emptied.*\(expected run.json\)"
-    with pytest.raises(DatasetError, match=said), while_there(mark, DatasetError):
-        mark.read_text()
+    assert names(mounted) == ["new"]

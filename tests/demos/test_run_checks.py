@@ -9,7 +9,7 @@ from synthetic import write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.core.outputs import locked_folder
+from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.demos import generate as module
 from robocas_ms3.demos.checks import SIM_FREQ, WEIGHTS, check_same_run
 from robocas_ms3.demos.convert_actions import CONVERTIBLE

@@ -10,7 +10,7 @@ from counting import Dying
 
 from robocas_ms3.cli.main import run as cli
 from robocas_ms3.core.errors import DatasetError, EvaluationError, RobocasError, WorkerDied
-from robocas_ms3.core.outputs import locked_folder
+from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.evaluation import results, run
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import Wants

@@ -15,7 +15,7 @@ import numpy as np
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import write_json
-from robocas_ms3.core.outputs import locked_folder
+from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.manage.assemble import Assembly, Member, OnEpisode, OnStart, Side, assemble, check_before
 from robocas_ms3.datasets.manage.input_check import check_numbers

@@ -16,7 +16,8 @@ from robocas_ms3.core import outputs
 from robocas_ms3.core.documents import check_regular, load_json
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import make_folder, write_json
-from robocas_ms3.core.outputs import claim_output, is_taken, kept_if_begun, locked_folder, sweep
+from robocas_ms3.core.locks import locked_folder
+from robocas_ms3.core.outputs import claim_output, is_taken, kept_if_begun, sweep
 from robocas_ms3.datasets import schema
 
 MARKS = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.outputs import locked_folder
+from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.driven import DrivenEpisodes

@@ -21,7 +21,8 @@ from uuid import uuid4
 
 from robocas_ms3.core.errors import PlanError, RobocasError
 from robocas_ms3.core.files import write_json
-from robocas_ms3.core.outputs import check_same, locked_folder
+from robocas_ms3.core.locks import locked_folder
+from robocas_ms3.core.outputs import check_same
 from robocas_ms3.core.processes import SentError
 from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.plans.engines.pieces import Pieces, sent

@@ -12,7 +12,7 @@ pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.cli import main
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.core.outputs import locked_folder
+from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot

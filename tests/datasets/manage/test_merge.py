@@ -7,7 +7,7 @@ from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.core.outputs import locked_folder
+from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.merging import merge
 from robocas_ms3.datasets.manage.parts import names_of

@@ -13,7 +13,7 @@ import pytest
 from synthetic import STEPS, RayCaster, made_up_vectors, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.core.outputs import locked_folder
+from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate

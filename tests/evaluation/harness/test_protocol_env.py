@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.core.errors import EvaluationError, RobocasError, VectorEnvError
-from robocas_ms3.core.outputs import locked_folder
+from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness import driven
 from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv

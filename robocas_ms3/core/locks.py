@@ -1,0 +1,112 @@
+"""Locks on folders and files, which end with the process that holds them."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import logging
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.files import is_fixed, make_folder, open_for_append
+
+LOCK = ".lock"
+"""Name of the lock file inside a folder that can't have it next to it, such as a mount point."""
+# Raised by network file systems that have no locks, or whose lock server is down
+_NO_LOCKS = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS})
+_DYING = 0.5  # s that a killed process, or a child that it was starting, may still hold a lock
+_log = logging.getLogger(__name__)
+
+
+@contextmanager
+def locked_folder(path: Path | str) -> Iterator[bool]:
+    """Hold a lock on a folder, which may not exist yet.
+
+    Parent folders that were made for the lock are removed if the folder does not exist in the end.
+
+    Yields:
+        Whether the lock is held: False on a file system without locks.
+
+    Raises:
+        RobocasError: another process holds the lock, or the folder is not writable.
+    """
+    path = Path(path)
+    new = [folder for folder in path.parents if not folder.exists()]
+    lock = _lock_path(path)
+    try:
+        file, held = _open_locked(lock, path)
+        with file:
+            try:
+                yield held
+            finally:
+                lock.unlink(missing_ok=True)
+    finally:
+        if not path.exists():
+            with suppress(OSError):  # another run may write into a parent
+                for folder in new:
+                    folder.rmdir()
+
+
+def lock_file(file: IO[Any], path: Path, *, wait: bool) -> bool:
+    """Lock an open file until it is closed; a file system without locks gives a warning.
+
+    Args:
+        file: open for writing.
+        path: the folder or file that the lock protects, for messages.
+        wait: whether to wait until no other process holds the lock.
+
+    Returns:
+        Whether the lock is held.
+
+    Raises:
+        RobocasError: another process holds the lock, or locking failed.
+    """
+    until = time.monotonic() + _DYING
+    try:
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+                return True
+            except BlockingIOError as error:
+                if time.monotonic() > until:
+                    what, fix = "another process is writing here", "Wait until it is done."
+                    raise RobocasError(what, where=path, fix=fix) from error
+                time.sleep(0.02)
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise RobocasError("can't lock this folder", where=path, found=error.strerror) from error
+        _log.warning("%s: its file system has no locks (%s): see that no other run writes there", path, error.strerror)
+        return False
+
+
+def _lock_path(path: Path) -> Path:
+    """Return the lock file: the same one through any symbolic link, and outside of a folder that may be replaced."""
+    if is_fixed(path):
+        return path / LOCK
+    path = path.resolve()
+    return path.parent / f".{path.name}.lock"
+
+
+def _open_locked(lock: Path, path: Path) -> tuple[IO[bytes], bool]:
+    """Open and lock a file; again if the process that held the lock has removed the file in between."""
+    while True:
+        make_folder(lock.parent)
+        try:
+            file = open_for_append(lock)
+        except OSError as error:  # folders of /proc look writable
+            what = "can't write into this folder"
+            raise RobocasError(what, where=lock.parent, found=error.strerror, fix="Choose another.") from error
+        try:
+            held = lock_file(file, path, wait=False)
+        except BaseException:
+            file.close()
+            raise
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), lock.lstat()):
+                return file, held
+        file.close()
