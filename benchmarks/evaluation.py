@@ -22,7 +22,7 @@ import tyro
 from numpy.typing import NDArray
 
 import robocas_ms3
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.stage import make_env, start_of
@@ -50,12 +50,12 @@ class Args:
 class Waving:
     """Joints that go to and fro about where they are, gripper open."""
 
-    wants = Wants("joint_positions", rate_hz=RATE, language="none")
+    spec = PolicySpec("joint_positions", rate_hz=RATE, language="none")
 
     def __init__(self) -> None:
         self._step, self._from = 0, np.zeros((0, 7))
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Begin anew, all envs at once."""
         self._step = 0
 
@@ -94,7 +94,7 @@ def main(args: Args) -> None:
             sim_config={"control_freq": RATE},
             max_episode_steps=10**9,
         )
-        ours = make_env(protocol, Waving.wants, episodes[0], args.envs, backend="processes")
+        ours = make_env(protocol, Waving.spec, episodes[0], args.envs, backend="processes")
         spent: dict[str, list[float]] = {"bare": [], "evaluation": []}
         for _ in range(args.turns):
             spent["bare"].append(alone(bare, [one.seed for one in episodes], args.steps))
@@ -121,7 +121,7 @@ def alone(env: Any, seeds: list[int], steps: int) -> float:
     return cpu(env) - before
 
 
-def evaluated(env: Any, starts: list[Start], steps: int) -> float:
+def evaluated(env: Any, starts: list[EpisodeSpec], steps: int) -> float:
     """CPU seconds of the evaluation's loop from the first step on."""
     policy = Counting(env)
     ended = list(Rollouts(env, policy, Rules(steps, ends_on=()), 1 / RATE, refill=True).play(starts))
@@ -136,7 +136,7 @@ class Counting(Waving):
         super().__init__()
         self.before, self._env = 0.0, env
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Begin anew, all envs at once."""
         super().reset(starts)
         self.before = cpu(self._env)

@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 from websockets.asyncio.server import ServerConnection, serve
 
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.server import PolicyServer
 from robocas_ms3.evaluation.remote.wire import pack
@@ -53,10 +53,10 @@ class Args:
 class SlowPolicy:
     """Take a fixed time per call."""
 
-    def __init__(self, seconds: float, wants: Wants) -> None:
-        self.seconds, self.wants = seconds, wants
+    def __init__(self, seconds: float, spec: PolicySpec) -> None:
+        self.seconds, self.spec = seconds, spec
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Keep no state."""
 
     def act(self, observations: Observations) -> np.ndarray:
@@ -67,27 +67,27 @@ class SlowPolicy:
 
 def main(args: Args) -> None:
     """Run all servers with all numbers of envs."""
-    wants = Wants(cameras=dict.fromkeys(CAMERAS, (args.images, args.images)) if args.images else {})
+    spec = PolicySpec(cameras=dict.fromkeys(CAMERAS, (args.images, args.images)) if args.images else {})
     report: dict[str, Any] = {"inference_ms": args.inference_ms, "images": args.images, "rounds": args.rounds}
     for server in args.servers:
         report[server] = {}
         for envs in args.envs:
-            report[server][envs] = measure(server, envs, wants, args)
+            report[server][envs] = measure(server, envs, spec, args)
             print(server, envs, report[server][envs], file=sys.stderr)
     print(json.dumps(report, indent=2))
 
 
-def measure(server: str, envs: int, wants: Wants, args: Args) -> dict[str, float]:
+def measure(server: str, envs: int, spec: PolicySpec, args: Args) -> dict[str, float]:
     """Return the observations per second of one server, and the median time of a call of `act` in ms."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=serve_slowly, args=(server, args, wants, theirs), daemon=True)
+    process = context.Process(target=serve_slowly, args=(server, args, spec, theirs), daemon=True)
     process.start()
     try:
-        options = [] if server == "batched" else [*plain_options(wants), *["max_in_flight=1"] * args.in_turn]
+        options = [] if server == "batched" else [*plain_options(spec), *["max_in_flight=1"] * args.in_turn]
         policy = RemotePolicy(f"{ours.recv()}?{'&'.join(options)}")
-        policy.reset([Start(env, env, "pick", "", "", "", env, "take the apple") for env in range(envs)])
-        observations, times = synthetic(envs, wants), []
+        policy.reset([EpisodeSpec(env, env, "pick", "", "", "", env, "take the apple") for env in range(envs)])
+        observations, times = synthetic(envs, spec), []
         for _ in range(WARM_UP + args.rounds):
             start = time.perf_counter()
             policy.act(observations)
@@ -101,26 +101,26 @@ def measure(server: str, envs: int, wants: Wants, args: Args) -> dict[str, float
     return {"obs_per_s": round(per_second, 1), "act_ms": round(1000 * float(np.median(measured)), 2)}
 
 
-def synthetic(envs: int, wants: Wants) -> Observations:
+def synthetic(envs: int, spec: PolicySpec) -> Observations:
     """Return observations of seeded noise."""
     rng = np.random.default_rng(0)
-    shapes = {name: (envs, height, width, 3) for name, (width, height) in wants.cameras.items()}
+    shapes = {name: (envs, height, width, 3) for name, (width, height) in spec.cameras.items()}
     images = {name: rng.integers(0, 256, shape, np.uint8) for name, shape in shapes.items()}
     robot = {name: rng.normal(size=(envs, size)).astype(np.float32) for name, size in SIZES.items()}
     return Observations(np.arange(envs), ["take the apple"] * envs, None, images, {}, **robot, state=None)
 
 
-def plain_options(wants: Wants) -> list[str]:
+def plain_options(spec: PolicySpec) -> list[str]:
     """Return the options of an address that a plain openpi server needs."""
-    cameras = ",".join(f"{name}:{width}x{height}" for name, (width, height) in wants.cameras.items())
+    cameras = ",".join(f"{name}:{width}x{height}" for name, (width, height) in spec.cameras.items())
     return [f"cameras={cameras}"] if cameras else []
 
 
-def serve_slowly(server: str, args: Args, wants: Wants, pipe: Connection) -> None:
+def serve_slowly(server: str, args: Args, spec: PolicySpec, pipe: Connection) -> None:
     """Serve until the process is terminated."""
     seconds = args.inference_ms / 1000
     if server == "batched":
-        PolicyServer(SlowPolicy(seconds, wants), port=0, **({"max_batch": 1} if args.in_turn else {})).run(pipe.send)
+        PolicyServer(SlowPolicy(seconds, spec), port=0, **({"max_batch": 1} if args.in_turn else {})).run(pipe.send)
     else:
         asyncio.run(serve_openpi(seconds, pipe, parallel=server == "parallel"))
 

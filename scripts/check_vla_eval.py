@@ -40,7 +40,7 @@ from vla_eval.specs import (
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness.vla_eval import state_of
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
-from robocas_ms3.evaluation.policy import Observations, Start
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.run import Settings, evaluate
 
@@ -58,10 +58,10 @@ class Remembering(ScriptedPolicy):
     def __init__(self) -> None:
         super().__init__("robocas")
         cameras = {name: (width, height) for name, (width, height) in CAMERAS.items()}
-        self.wants = dataclasses.replace(self.wants, cameras=cameras, language="text")
+        self.spec = dataclasses.replace(self.spec, cameras=cameras, language="text")
         self.kept: dict[int, list[dict[str, np.ndarray]]] = {}
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Plan the episode."""
         super().reset(starts)
         self.now = self.kept[starts[0].episode] = []

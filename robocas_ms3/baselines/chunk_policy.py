@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.chunks import decode
 from robocas_ms3.core.poses import Array, from_wxyz
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 _EMPTY = 0.004
 """m; between fingers that hold nothing."""
@@ -32,7 +32,7 @@ class ChunkPolicy:
     Whoever missed looks like one who pushes with a closed hand, and would wait for ever.
 
     Args:
-        wants: what it is to be shown; of pictures those that a new chunk begins with.
+        spec: what it is to be shown; of pictures those that a new chunk begins with.
         predict: (K, 10) chunk of what one env shows, of observations and its row, see `chunks`.
         play: steps of a chunk before the next one, up to K.
         fade: how fast older predictions lose weight, a step.
@@ -41,9 +41,9 @@ class ChunkPolicy:
     """
 
     def __init__(
-        self, wants: Wants, predict: Predict, play: int, fade: float, about: dict[str, Any], reopen: float = 0.0
+        self, spec: PolicySpec, predict: Predict, play: int, fade: float, about: dict[str, Any], reopen: float = 0.0
     ) -> None:
-        self.wants, self._predict, self._about = replace(wants, look_every=play), predict, about
+        self.spec, self._predict, self._about = replace(spec, look_every=play), predict, about
         self._play, self._fade, self._reopen = play, fade, reopen
         self._plans: dict[int, list[_Plan]] = {}  # by env, newest first
         self._looked_from: dict[int, Array] = {}  # by env, (3,) where the TCP was in the arm's base
@@ -52,7 +52,7 @@ class ChunkPolicy:
         """What a result says of it besides."""
         return self._about
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Forget what was planned in these envs."""
         for start in starts:
             self._plans[start.env] = []

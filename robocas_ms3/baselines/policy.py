@@ -9,7 +9,7 @@ from robocas_ms3.baselines.runs import RUN, SHIPPED, WEIGHTS, RunRecord, hash_of
 from robocas_ms3.baselines.table import find_baseline
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict import parse
-from robocas_ms3.evaluation.policy import Observations, Policy, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec
 
 
 def shipped_small() -> RunPolicy:
@@ -57,16 +57,16 @@ class RunPolicy:
         self._about = {**_about(record, step), "weights": hash_of_weights(folder)}
 
     @property
-    def wants(self) -> Wants:
+    def spec(self) -> PolicySpec:
         """What it declares of itself."""
-        return self._policy.wants
+        return self._policy.spec
 
     def describe(self) -> dict[str, Any]:
         """What a result says of it: what was trained, on what, how long."""
         more = getattr(self._policy, "describe", dict)
         return {**self._about, **more()}
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Begin episodes."""
         self._policy.reset(starts)
 

@@ -23,7 +23,7 @@ from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.takeover import Takeover
 from robocas_ms3.evaluation.policies import open_policy
-from robocas_ms3.evaluation.policy import Policy, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Policy, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 from robocas_ms3.evaluation.stage import looks
@@ -49,8 +49,8 @@ def check_acting(settings: EpisodeSettings) -> str:
         RobocasError: there is no such policy, it speaks another way, or wants to see where nothing can be rendered.
     """
     with open_policy(settings.after_policy) as policy:
-        load_protocol(PROTOCOL).rules.refuse(policy.wants)
-        if policy.wants.cameras:
+        load_protocol(PROTOCOL).rules.refuse(policy.spec)
+        if policy.spec.cameras:
             require_renderer()
         return str(getattr(policy, "describe", dict)().get("weights", ""))
 
@@ -82,7 +82,7 @@ class Player:
     def __init__(self, settings: EpisodeSettings) -> None:
         self._settings, self._open = settings, ExitStack()
         self._policy: Policy = self._open.enter_context(open_policy(settings.after_policy))
-        self._env = _make_env(settings, self._policy.wants)
+        self._env = _make_env(settings, self._policy.spec)
         self._base: Any = self._env.unwrapped
         vector = RoboCASVectorEnv(self._env, auto_reset=False, ignore_terminations=True, record_metrics=False)
         self._vector = NumpyVectorEnv(vector)
@@ -110,10 +110,10 @@ class Player:
         self._env.close()
         self._open.close()
 
-    def _start(self, seed: int) -> Start:
+    def _start(self, seed: int) -> EpisodeSpec:
         settings = self._settings
         words = self._base.instruction().text
-        return Start(
+        return EpisodeSpec(
             -1, 0, settings.task, self._config, settings.layouts, settings.pack, seed, words, robot=settings.robot
         )
 
@@ -125,7 +125,7 @@ class Player:
         return str(path)
 
 
-def _make_env(settings: EpisodeSettings, wants: Wants) -> PolicyStepping:
+def _make_env(settings: EpisodeSettings, spec: PolicySpec) -> PolicyStepping:
     """One env in this process, as `stage.make_env` makes many in others."""
     env = gym.make(
         TASKS[settings.task].env_id,
@@ -133,14 +133,14 @@ def _make_env(settings: EpisodeSettings, wants: Wants) -> PolicyStepping:
         layouts=settings.layouts,
         pack=settings.pack,
         robot_uids=settings.robot,
-        control_mode=control_mode(wants.convention),
+        control_mode=control_mode(spec.convention),
         reward_mode="none",
         sim_backend="physx_cpu",
         sim_config={"control_freq": UPSTREAM_HZ},
         max_episode_steps=10**9,
-        **looks(wants),
+        **looks(spec),
     )
-    return PolicyStepping(env, wants.convention, wants.reference, "upstream", look_every=wants.look_every)
+    return PolicyStepping(env, spec.convention, spec.reference, "upstream", look_every=spec.look_every)
 
 
 def _over(at_end: dict[str, bool]) -> str:

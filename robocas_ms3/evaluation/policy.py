@@ -23,7 +23,7 @@ CAMERAS = ("base_camera", "gripper_camera", "static_camera")
 
 
 @dataclass(frozen=True)
-class Wants:
+class PolicySpec:
     """What a policy declares of itself; a mismatch with the protocol is refused before the first step.
 
     Attributes:
@@ -66,7 +66,7 @@ class Wants:
 
 
 @dataclass(frozen=True)
-class Start:
+class EpisodeSpec:
     """An episode as a policy is told of it.
 
     Attributes:
@@ -128,11 +128,11 @@ class Policy(Protocol):
     """A policy. It is made once for a run, and plays several episodes at a time."""
 
     @property
-    def wants(self) -> Wants:
+    def spec(self) -> PolicySpec:
         """What it declares of itself."""
         ...
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Begin episodes in some envs; what was kept of these envs is over."""
         ...
 
@@ -141,9 +141,9 @@ class Policy(Protocol):
         ...
 
 
-def said_of(wants: Wants) -> dict[str, Any]:
+def policy_spec_values(spec: PolicySpec) -> dict[str, Any]:
     """JSON values of what is declared; of looks only if there are fewer than steps, as who reads it may be older."""
-    said = {**vars(wants), "cameras": {name: list(size) for name, size in wants.cameras.items()}}
+    said = {**vars(spec), "cameras": {name: list(size) for name, size in spec.cameras.items()}}
     return {key: value for key, value in said.items() if key != "look_every" or value != 1}
 
 
@@ -155,10 +155,10 @@ def describe(policy: Policy) -> dict[str, Any]:
     """
     where = f"policy {_class_of(policy)}, describe()"
     with policy_code(policy):
-        wants, added = said_of(policy.wants), getattr(policy, "describe", dict)()
+        spec, added = policy_spec_values(policy.spec), getattr(policy, "describe", dict)()
     if not isinstance(added, dict):
         raise EvaluationError("invalid policy description", where=where, expected="a dict", found=type(added).__name__)
-    said = {"class": _class_of(policy), "wants": wants, **added}
+    said = {"class": _class_of(policy), "wants": spec, **added}
     return json.loads(json_text(said, where, error=EvaluationError))
 
 

@@ -29,7 +29,7 @@ from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.core.strict import StrictModel, nearest, parse, parse_json
 from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
 from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.robots.table import DEFAULT as DEFAULT_ROBOT
 from robocas_ms3.scenes.config.load import check_no_base
 from robocas_ms3.scenes.task_specs import TASKS
@@ -88,15 +88,15 @@ class Protocol(StrictModel):
         ends = [self.max_steps, None if seconds is None else round(seconds * rate)]
         return min((steps for steps in ends if steps is not None), default=None)
 
-    def refuse(self, wants: Wants) -> None:
+    def refuse(self, spec: PolicySpec) -> None:
         """See that a policy can be evaluated by this.
 
         Raises:
             EvaluationError: its actions or its rate are others.
         """
         for what, found, allowed in (
-            ("convention", wants.convention, self.conventions),
-            ("reference", wants.reference, self.references),
+            ("convention", spec.convention, self.conventions),
+            ("reference", spec.reference, self.references),
         ):
             if found not in allowed:
                 raise EvaluationError(
@@ -105,21 +105,21 @@ class Protocol(StrictModel):
                     expected=" or ".join(allowed),
                     found=found,
                 )
-        if self.rate_hz is not None and wants.rate_hz not in (None, self.rate_hz):
+        if self.rate_hz is not None and spec.rate_hz not in (None, self.rate_hz):
             raise EvaluationError(
                 "the policy acts at another rate",
                 where=self.name,
                 expected=f"{self.rate_hz} Hz",
-                found=f"{wants.rate_hz:g} Hz",
+                found=f"{spec.rate_hz:g} Hz",
             )
 
-    def rate(self, wants: Wants) -> int:
+    def rate(self, spec: PolicySpec) -> int:
         """Actions a second.
 
         Raises:
             EvaluationError: physics at 100 Hz can't be stopped at that rate.
         """
-        rate = self.rate_hz or wants.rate_hz or DEFAULT_HZ
+        rate = self.rate_hz or spec.rate_hz or DEFAULT_HZ
         if rate < 1 or rate != int(rate) or 100 % int(rate):
             raise EvaluationError("no such rate", where="rate_hz", expected="a divisor of 100", found=f"{rate:g}")
         return int(rate)

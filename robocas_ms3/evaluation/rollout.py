@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.policy import Observations, Policy, Start, Wants, policy_code, privileged
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec, policy_code, privileged
 from robocas_ms3.evaluation.tracking import MEASURES, summed
 from robocas_ms3.scenes.language.embed import TextEmbedder
 
@@ -37,7 +37,7 @@ class Rollout:
         error: why it was broken off, as by a policy that failed; empty: it was not.
     """
 
-    start: Start
+    start: EpisodeSpec
     steps: int = 0
     seconds: float = 0.0
     flags: dict[str, int | None] = field(default_factory=dict)
@@ -72,7 +72,7 @@ class EpisodeBatch:
     Args:
         env: vector environment (`make_vec`, NumPy arrays, no automatic resets) whose envs take actions of the policy's
             convention (`stepping.PolicyStepping`).
-        wants: what the policy sees, and what its actions mean.
+        spec: what the policy sees, and what its actions mean.
         rules: when an episode ends.
         control_dt: simulated time of a control step, s.
         refill: whether an env can be reset while others run. In a GPU's batch all envs are reset together.
@@ -83,18 +83,18 @@ class EpisodeBatch:
         size: numbers of an action.
     """
 
-    def __init__(self, env: Any, wants: Wants, rules: Rules, control_dt: float, *, refill: bool) -> None:
-        self._env, self._wants, self._rules, self._dt, self.refill = env, wants, rules, control_dt, refill
-        self.size = CONVENTIONS[wants.convention].size
+    def __init__(self, env: Any, spec: PolicySpec, rules: Rules, control_dt: float, *, refill: bool) -> None:
+        self._env, self._spec, self._rules, self._dt, self.refill = env, spec, rules, control_dt, refill
+        self.size = CONVENTIONS[spec.convention].size
         self.num_envs: int = env.num_envs
         self.running: dict[int, Rollout] = {}
         self.obs: Any = None
         self._info: dict[str, Any] = {}
         self._flags: list[str] = []  # names of an info's flags
         self._held = np.zeros((0, self.num_envs), dtype=bool)  # by flag and env, whether it has held in its episode
-        self._embed = TextEmbedder() if wants.language == "embedding" else None
+        self._embed = TextEmbedder() if spec.language == "embedding" else None
 
-    def start(self, pairs: list[tuple[int, Start]]) -> list[Start]:
+    def start(self, pairs: list[tuple[int, EpisodeSpec]]) -> list[EpisodeSpec]:
         """Reset envs to the first state of episodes.
 
         Args:
@@ -122,20 +122,20 @@ class EpisodeBatch:
 
     def observe(self, envs: list[int]) -> Observations:
         """Return what the policy sees of some running envs."""
-        obs, wants, index = self.obs, self._wants, np.array(envs)
+        obs, spec, index = self.obs, self._spec, np.array(envs)
         agent, cameras = obs["agent"], obs.get("sensor_data", {})
         starts = [self.running[env].start for env in envs]
-        texts = [start.instruction if wants.language != "none" else "" for start in starts]
+        texts = [start.instruction if spec.language != "none" else "" for start in starts]
         return Observations(
             envs=index,
             instructions=texts,
             embeddings=self._embed(texts) if self._embed else None,
-            images={name: cameras[name]["rgb"][index] for name in wants.cameras},
-            depths={name: cameras[name]["depth"][index] for name in wants.cameras} if wants.depth else {},
+            images={name: cameras[name]["rgb"][index] for name in spec.cameras},
+            depths={name: cameras[name]["depth"][index] for name in spec.cameras} if spec.depth else {},
             qpos=agent["qpos"][index],
             tcp_in_base=agent["tcp_in_arm_base"][index],
             gripper_width=agent["gripper_width"][index],
-            state=privileged(obs["extra"])[index] if wants.state else None,
+            state=privileged(obs["extra"])[index] if spec.state else None,
         )
 
     def step(self, actions: NDArray[np.float32]) -> Iterator[Rollout]:
@@ -213,12 +213,12 @@ class Rollouts:
     """
 
     def __init__(self, env: Any, policy: Policy, rules: Rules, control_dt: float, *, refill: bool) -> None:
-        self._batch = EpisodeBatch(env, policy.wants, rules, control_dt, refill=refill)
+        self._batch = EpisodeBatch(env, policy.spec, rules, control_dt, refill=refill)
         self._policy = policy
         self._chunks: dict[int, list[NDArray[np.floating]]] = {}
         self.lost = self._batch.lost
 
-    def play(self, episodes: Sequence[Start]) -> Iterator[Rollout]:
+    def play(self, episodes: Sequence[EpisodeSpec]) -> Iterator[Rollout]:
         """Play episodes; each is given as it ends, in any order. Their ``env`` is set here."""
         waiting, batch = list(reversed(episodes)), self._batch
         while waiting or batch.running:
@@ -256,7 +256,7 @@ class Rollouts:
             actions = np.asarray(acted, np.float32)
         spent = (time.perf_counter() - begun) / len(envs)
         chunks = as_chunks(actions, len(envs), self._batch.size, where=type(self._policy).__name__)
-        every = self._policy.wants.look_every
+        every = self._policy.spec.look_every
         if chunks.shape[1] > 1 and chunks.shape[1] % every:
             what = "it would be asked for chunks without a look at pictures"
             raise EvaluationError(

@@ -91,15 +91,15 @@ def evaluate(
             another run.
         RobocasError: another process writes there.
     """
-    protocol.rules.refuse(policy.wants)
-    rate_of(protocol, policy.wants)
+    protocol.rules.refuse(policy.spec)
+    rate_of(protocol, policy.spec)
     if settings.weld:
         refuse(protocol.rules.stepping, choose_backend(settings.backend))
     wanted = chosen(protocol.episodes, settings)
     if not wanted:
         number, of = settings.shard
         raise EvaluationError("no episodes in this part", where=protocol.rules.name, found=f"shard {number}/{of}")
-    if policy.wants.cameras:
+    if policy.spec.cameras:
         require_renderer()
     with locked_folder(folder):
         done = results.begin(folder, about(protocol, policy, name, settings), resume=resume, again=again)
@@ -167,7 +167,7 @@ def about(protocol: LoadedProtocol, policy: Policy, name: str, settings: Setting
 
 def _play(protocol: LoadedProtocol, policy: Policy, episodes: list[Episode], settings: Settings) -> Iterator[Outcome]:
     rules, first = protocol.rules, episodes[0]
-    rate, gpu = rate_of(protocol, policy.wants), choose_backend(settings.backend) == "gpu"
+    rate, gpu = rate_of(protocol, policy.spec), choose_backend(settings.backend) == "gpu"
     count = min(settings.num_envs, len(episodes))
     runs = {name: getattr(settings, name) for name in ("backend", "workers", "weld", "limits")}
     steps = rules.steps(first.task, rate)
@@ -181,7 +181,7 @@ def _play(protocol: LoadedProtocol, policy: Policy, episodes: list[Episode], set
         return Outcome.of(played, one, object_ids(protocol, one))
 
     while left:
-        env = make_env(protocol, policy.wants, first, min(count, len(left)), **runs)
+        env = make_env(protocol, policy.spec, first, min(count, len(left)), **runs)
         rollouts = Rollouts(env, policy, ends, 1 / rate, refill=not gpu)
         try:
             yield from map(came_of, rollouts.play([start_of(protocol, one) for one in left.values()]))

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Any
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.evaluation.policy import CAMERAS, Start, Wants
+from robocas_ms3.evaluation.policy import CAMERAS, EpisodeSpec, PolicySpec
 from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
 from robocas_ms3.evaluation.stepping import UPSTREAM_HZ, PolicyStepping, control_mode
 from robocas_ms3.scenes.frozen import FrozenLayouts
@@ -16,19 +16,19 @@ from robocas_ms3.tasks.vector import make_vec
 _UNSEEN = 8  # pixels a side of cameras that nobody asked for, which are rendered all the same
 
 
-def rate_of(protocol: LoadedProtocol, wants: Wants) -> int:
+def rate_of(protocol: LoadedProtocol, spec: PolicySpec) -> int:
     """Control steps a second."""
-    return UPSTREAM_HZ if protocol.rules.stepping == "upstream" else protocol.rules.rate(wants)
+    return UPSTREAM_HZ if protocol.rules.stepping == "upstream" else protocol.rules.rate(spec)
 
 
 def make_env(
-    protocol: LoadedProtocol, wants: Wants, episode: Episode, num_envs: int, *, weld: bool = False, **kwargs: Any
+    protocol: LoadedProtocol, spec: PolicySpec, episode: Episode, num_envs: int, *, weld: bool = False, **kwargs: Any
 ) -> Any:
     """Make envs for a configuration's episodes.
 
     Args:
         protocol: whose rules they follow.
-        wants: what the policy wants to see, and speaks.
+        spec: what the policy wants to see, and speaks.
         episode: any of that configuration.
         num_envs: how many.
         weld: whether what is lifted is welded to the hand (`weld`).
@@ -36,10 +36,10 @@ def make_env(
     """
     stepped = partial(
         PolicyStepping,
-        convention=wants.convention,
-        reference=wants.reference,
+        convention=spec.convention,
+        reference=spec.reference,
         stepping=protocol.rules.stepping,
-        look_every=wants.look_every,
+        look_every=spec.look_every,
         weld=weld,
     )
     return make_vec(
@@ -54,11 +54,11 @@ def make_env(
         layouts=str(protocol.layouts_file(episode.config)),
         pack=protocol.rules.pack,
         robot_uids=protocol.rules.robot,
-        control_mode=control_mode(wants.convention),
+        control_mode=control_mode(spec.convention),
         reward_mode="none",
-        sim_config={"control_freq": rate_of(protocol, wants)},
+        sim_config={"control_freq": rate_of(protocol, spec)},
         max_episode_steps=10**9,  # the protocol's rules end episodes
-        **{**looks(wants, renders="render_mode" in kwargs), **kwargs},
+        **{**looks(spec, renders="render_mode" in kwargs), **kwargs},
     )
 
 
@@ -68,9 +68,9 @@ def object_ids(protocol: LoadedProtocol, episode: Episode) -> tuple[str, ...]:
     return layouts(episode.seed, episode.seed).object_ids
 
 
-def start_of(protocol: LoadedProtocol, episode: Episode) -> Start:
+def start_of(protocol: LoadedProtocol, episode: Episode) -> EpisodeSpec:
     """An episode as a policy is told of it; its env is not known yet."""
-    return Start(
+    return EpisodeSpec(
         env=-1,
         episode=episode.episode,
         task=episode.task,
@@ -83,12 +83,12 @@ def start_of(protocol: LoadedProtocol, episode: Episode) -> Start:
     )
 
 
-def looks(wants: Wants, *, renders: bool = False) -> dict[str, Any]:
+def looks(spec: PolicySpec, *, renders: bool = False) -> dict[str, Any]:
     """Arguments of an environment that shows what a policy wants to see, and perhaps renders for others."""
-    if not wants.cameras:
+    if not spec.cameras:
         return {"obs_mode": "state_dict", **({} if renders else {"render_backend": "none"})}
-    modes = ["rgb", *(["depth"] if wants.depth else []), *(["state_dict"] if wants.state else [])]
-    sizes = {name: wants.cameras.get(name, (_UNSEEN, _UNSEEN)) for name in CAMERAS}
+    modes = ["rgb", *(["depth"] if spec.depth else []), *(["state_dict"] if spec.state else [])]
+    sizes = {name: spec.cameras.get(name, (_UNSEEN, _UNSEEN)) for name in CAMERAS}
     return {
         "obs_mode": "+".join(modes),
         "sensor_configs": {name: dict(width=width, height=height) for name, (width, height) in sizes.items()},

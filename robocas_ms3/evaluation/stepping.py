@@ -36,7 +36,7 @@ class PolicyStepping(gym.Wrapper):
         reference: what motions are relative to.
         stepping: ``timed``: a step is one control step. ``upstream``: a step moves the gripper until it stands, then
             the TCP, on a straight line, until it is there or 0.4 s are over. Envs of a batch that are there wait.
-        look_every: policy steps from one look at pictures to the next (`policy.Wants`); others are black.
+        look_every: policy steps from one look at pictures to the next (`policy.PolicySpec`); others are black.
         weld: whether what is lifted is welded to the hand (`weld`); one env on a CPU.
     """
 

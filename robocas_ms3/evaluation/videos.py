@@ -64,7 +64,7 @@ def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Seq
             expected=result.run["protocol_hash"],
             found=protocol.hash,
         )
-    protocol.rules.refuse(policy.wants)
+    protocol.rules.refuse(policy.spec)
     if result.run["weld"]:
         refuse(protocol.rules.stepping, "processes")
     require_renderer()
@@ -76,10 +76,10 @@ def film(result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Seq
 
 def _film(result: Result, protocol: LoadedProtocol, policy: Policy, numbers: list[int]) -> Iterator[FailureVideo]:
     rules, first = protocol.rules, protocol.episodes[numbers[0]]
-    rate = rate_of(protocol, policy.wants)
+    rate = rate_of(protocol, policy.spec)
     size = {"width": SIZE[0], "height": SIZE[1]}
     watched = {"render_mode": "rgb_array", "human_render_camera_configs": size, "weld": result.run["weld"]}
-    made = make_env(protocol, policy.wants, first, 1, backend="processes", **watched)
+    made = make_env(protocol, policy.spec, first, 1, backend="processes", **watched)
     env = _FilmedEnv(made, max(1, round(rate / _FRAMES)))
     try:
         for number in numbers:

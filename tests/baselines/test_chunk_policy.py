@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.baselines.chunk_policy import ChunkPolicy
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 STAY = [0, 0, 0, 1, 0, 0, 0, 1, 0, 1.0]
 
@@ -25,12 +25,12 @@ def seen(tcps, envs=(0,), width=0.0):
 
 
 def start(env):
-    return Start(env, 0, "pick", "", "", "builtin", 0, "")
+    return EpisodeSpec(env, 0, "pick", "", "", "builtin", 0, "")
 
 
 def policy(chunks, fade=0.0):
     said = (chunk for asked in chunks for chunk in asked)
-    made = ChunkPolicy(Wants(), lambda observations, place: np.array(next(said), float), 1, fade, {})
+    made = ChunkPolicy(PolicySpec(), lambda observations, place: np.array(next(said), float), 1, fade, {})
     made.reset([start(0), start(1)])
     return made
 
@@ -72,7 +72,7 @@ def test_newer_predictions_weigh_more():
 def test_a_chunk_is_followed_before_the_next():
     """For two of three steps; then the mean of what it said of the third one, and what the next says of it."""
     asked = iter([[[row(0.1), row(0.2), row(0.3)]], [[row(0.5), row(), row()]]])
-    acting = ChunkPolicy(Wants(), lambda observations, place: np.array(next(asked), float)[place], 2, 0.0, {})
+    acting = ChunkPolicy(PolicySpec(), lambda observations, place: np.array(next(asked), float)[place], 2, 0.0, {})
     acting.reset([start(0)])
     assert [acting.act(seen([HERE]))[0, 0] for _ in range(3)] == pytest.approx([0.1, 0.2, 0.4])
 
@@ -84,7 +84,7 @@ def test_envs_are_asked_when_they_are_due():
         asked.append(int(observations.envs[place]))
         return np.array([row(0.1), row(0.2)])
 
-    acting = ChunkPolicy(Wants(), predict, 2, 0.0, {})
+    acting = ChunkPolicy(PolicySpec(), predict, 2, 0.0, {})
     acting.reset([start(0), start(1)])
     moved = [acting.act(seen([HERE] * 2, (0, 1)))[:, 0].tolist() for _ in range(2)]
     acting.reset([start(1)])
@@ -117,7 +117,7 @@ CLOSED = [[row(0.0, 0.0), row(0.0, 0.0)]]
 def test_an_empty_fist_that_waits_opens(reopen, width, moved, opened):
     """At the look after the one that closed it, which was a step before; where to go is as predicted."""
     asked = iter(CLOSED * 2)
-    acting = ChunkPolicy(Wants(), lambda observations, place: np.array(next(asked)), 1, 2.0, {}, reopen)
+    acting = ChunkPolicy(PolicySpec(), lambda observations, place: np.array(next(asked)), 1, 2.0, {}, reopen)
     acting.reset([start(0)])
     assert acting.act(seen([HERE], width=width))[0, 6] == 0.0
     there = [HERE[0] + moved, *HERE[1:]]
@@ -127,7 +127,7 @@ def test_an_empty_fist_that_waits_opens(reopen, width, moved, opened):
 def test_older_plans_do_not_keep_it_closed():
     """All predictions weigh alike, and five of six want it closed."""
     asked = iter([[row(0.0, 0.0)] * 8] * 6)
-    acting = ChunkPolicy(Wants(), lambda observations, place: np.array(next(asked)), 1, 0.0, {}, 0.02)
+    acting = ChunkPolicy(PolicySpec(), lambda observations, place: np.array(next(asked)), 1, 0.0, {}, 0.02)
     acting.reset([start(0)])
     away = [[HERE[0] + 0.1 * place, *HERE[1:]] for place in range(5)]  # it moves, then stays
     assert [acting.act(seen([here]))[0, 6] for here in [*away, away[-1]]] == [0, 0, 0, 0, 0, 1]
@@ -135,7 +135,7 @@ def test_older_plans_do_not_keep_it_closed():
 
 def test_where_another_episode_ended_is_forgotten():
     asked = iter(CLOSED * 2)
-    acting = ChunkPolicy(Wants(), lambda observations, place: np.array(next(asked)), 1, 2.0, {}, 0.02)
+    acting = ChunkPolicy(PolicySpec(), lambda observations, place: np.array(next(asked)), 1, 2.0, {}, 0.02)
     for _ in range(2):
         acting.reset([start(0)])
         assert acting.act(seen([HERE]))[0, 6] == 0.0

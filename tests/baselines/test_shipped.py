@@ -24,7 +24,7 @@ def test_they_are_small_and_of_this_version():
 def test_they_are_a_policy_by_name():
     policy = make_policy("small")
     assert isinstance(policy, RunPolicy)
-    assert (policy.wants.convention, policy.wants.rate_hz, policy.wants.language) == ("robocas", 5.0, "embedding")
+    assert (policy.spec.convention, policy.spec.rate_hz, policy.spec.language) == ("robocas", 5.0, "embedding")
     assert policy.describe()["steps"] > 0
 
 

@@ -13,10 +13,10 @@ pytest.importorskip("msgpack")
 
 ROOT = Path(__file__).resolve().parents[2]
 POLICY = """
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 
 class Up:
-    wants = Wants(convention="delta_quaternion", rate_hz=10)
+    spec = PolicySpec(convention="delta_quaternion", rate_hz=10)
     def reset(self, starts): ...
     def act(self, observations): return np.ones((len(observations.envs), 8))
     def close(self): print("closed")
@@ -40,13 +40,13 @@ def serving(policy, folder, *options):
 
 
 def test_a_policy_of_ones_own_is_served_until_ctrl_c(tmp_path):
-    from robocas_ms3.evaluation.policy import said_of
+    from robocas_ms3.evaluation.policy import policy_spec_values
     from robocas_ms3.evaluation.remote.client import RemotePolicy
 
     (tmp_path / "mine.py").write_text(POLICY)
     with serving("mine:Up", tmp_path) as (served, url):
         remote = RemotePolicy(url)
-        assert said_of(remote.wants)["convention"] == "delta_quaternion"
+        assert policy_spec_values(remote.spec)["convention"] == "delta_quaternion"
         remote.close()
         served.send_signal(signal.SIGINT)
         out, err = served.communicate(timeout=20)
@@ -55,10 +55,10 @@ def test_a_policy_of_ones_own_is_served_until_ctrl_c(tmp_path):
 
 SLOW = """
 import time
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 
 class Slow:
-    wants = Wants()
+    spec = PolicySpec()
     def reset(self, starts): ...
     def act(self, observations):
         print("acts", flush=True)

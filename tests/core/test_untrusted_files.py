@@ -21,7 +21,7 @@ from robocas_ms3.demos.ledger import Ledger, count_by_stage
 from robocas_ms3.demos.recordings.reading import TrajectoryFile
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.comparison import comparison
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 from robocas_ms3.evaluation.report.page import page
 from robocas_ms3.evaluation.tables import markdown
@@ -102,7 +102,7 @@ def test_protocols(tmp_path, name):
     def read():
         rules = load_protocol(root).rules
         for task in ("pick", "search"):
-            rules.steps(task, rules.rate(Wants("robocas", reference="tcp")))
+            rules.steps(task, rules.rate(PolicySpec("robocas", reference="tcp")))
 
     read()
     line = name == "episodes.jsonl"

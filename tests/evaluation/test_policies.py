@@ -10,22 +10,22 @@ from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.evaluation.policies import make_policy, open_policy
 from robocas_ms3.evaluation.policies.plain import StillPolicy
 from robocas_ms3.evaluation.policies.scripted import BESIDE, beside
-from robocas_ms3.evaluation.policy import Start, Wants, describe, said_of
+from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe, policy_spec_values
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 
 GOOD = """
 import numpy as np
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 class Mine:
-    wants = Wants()
+    spec = PolicySpec()
     def reset(self, starts): ...
     def act(self, observations): return np.ones((len(observations.envs), 7))
 class Picky(Mine):
     def __init__(self, folder): ...
 class Wishless(Mine):
-    wants = {"convention": "robocas"}
+    spec = {"convention": "robocas"}
 class Idle:
-    wants = Wants()
+    spec = PolicySpec()
     def reset(self, starts): ...
 class Broken(Mine):
     def __init__(self): len(3)
@@ -33,7 +33,7 @@ class LeavesMade(Mine):
     def __init__(self): raise SystemExit(0)
 class LeavesWanting(Mine):
     @property
-    def wants(self): raise SystemExit(0)
+    def spec(self): raise SystemExit(0)
 class LeavesReset(Mine):
     def reset(self, starts): raise SystemExit(0)
 class LeavesActing(Mine):
@@ -45,10 +45,10 @@ class LeavesClosed(Mine):
 class LeavesWantingLater(Mine):
     asked = 0
     @property
-    def wants(self):
+    def spec(self):
         self.asked += 1
         if self.asked > 2: raise SystemExit(0)
-        return Mine.wants
+        return Mine.spec
 class LeavesConverted(Mine):
     def act(self, observations): return self
     def __array__(self, *_, **__): raise SystemExit(0)
@@ -75,10 +75,10 @@ def here(tmp_path, monkeypatch):
 
 
 def test_looks_are_told_where_they_are_not_every_steps():
-    assert "look_every" not in said_of(Wants())
-    assert said_of(Wants(look_every=7))["look_every"] == 7
+    assert "look_every" not in policy_spec_values(PolicySpec())
+    assert policy_spec_values(PolicySpec(look_every=7))["look_every"] == 7
     with pytest.raises(EvaluationError, match="look_every"):
-        Wants(look_every=0)
+        PolicySpec(look_every=0)
 
 
 def test_a_module_in_the_folder_of_the_command(here):
@@ -98,7 +98,7 @@ def test_a_module_in_the_folder_of_the_command(here):
         ("own_spoilt:Mine", "own_spoilt: this policy's module can't be imported .*SyntaxError"),
         ("own_importing:Mine", "own_importing: this policy's module can't be imported .*not_there_at_all"),
         ("own_policy:Picky", "this policy can't be made .*takes no arguments"),
-        ("own_policy:Wishless", "a policy without wants"),
+        ("own_policy:Wishless", "a policy without spec"),
         ("own_policy:Idle", "a policy without act"),
     ],
 )
@@ -124,7 +124,11 @@ def test_an_error_of_the_policys_own_is_its_own(here):
 def test_a_policy_can_not_end_the_process(here, name):
     with pytest.raises(ExtensionError) as caught, open_policy(name) as policy:
         describe(policy)
-        list(Rollouts(Counting(1), policy, Rules(3), 0.05, refill=True).play([Start(-1, 0, "pick", "", "", "", 2, "")]))
+        list(
+            Rollouts(Counting(1), policy, Rules(3), 0.05, refill=True).play(
+                [EpisodeSpec(-1, 0, "pick", "", "", "", 2, "")]
+            )
+        )
     assert str(caught.value.where).startswith("policy own_")
     assert str(here) in str(caught.value.found)
 

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from robocas_ms3.core.errors import ConfigError, EvaluationError
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import EPISODES, RULES, files_of, load_protocol, shipped_protocols
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
@@ -131,14 +131,14 @@ def test_an_episode_ends_by_actions_or_by_seconds_whichever_comes_first():
 
 def test_policies_that_do_not_fit_are_refused():
     rules = load_protocol("smoke").rules.model_copy(update={"rate_hz": 20, "conventions": ["robocas"]})
-    rules.refuse(Wants(rate_hz=20))
-    for wants, said in ((Wants(rate_hz=10), "another rate"), (Wants(convention="delta_euler"), "convention")):
+    rules.refuse(PolicySpec(rate_hz=20))
+    for spec, said in ((PolicySpec(rate_hz=10), "another rate"), (PolicySpec(convention="delta_euler"), "convention")):
         with pytest.raises(EvaluationError, match=said):
-            rules.refuse(wants)
+            rules.refuse(spec)
 
 
 def test_rates_are_those_that_physics_can_be_stopped_at():
     rules = load_protocol("smoke").rules
-    assert [rules.rate(Wants()), rules.rate(Wants(rate_hz=10))] == [20, 10]
+    assert [rules.rate(PolicySpec()), rules.rate(PolicySpec(rate_hz=10))] == [20, 10]
     with pytest.raises(EvaluationError, match="divisor of 100"):
-        rules.rate(Wants(rate_hz=30))
+        rules.rate(PolicySpec(rate_hz=30))

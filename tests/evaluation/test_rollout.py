@@ -7,19 +7,19 @@ import pytest
 from counting import Counting
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.rollout import Rollouts, Rules
 
 
 class Obedient:
     """Does as many as its instruction says, in chunks; keeps what it was told."""
 
-    wants = Wants(state=True)
+    spec = PolicySpec(state=True)
 
     def __init__(self, chunk: int = 1) -> None:
         self.chunk, self.asked, self.begun = chunk, [], []
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         self.begun += [(start.env, start.episode) for start in starts]
 
     def act(self, observations: Observations) -> np.ndarray:
@@ -32,8 +32,8 @@ class Obedient:
         return actions[:, 0] if self.chunk == 1 else actions
 
 
-def starts(seeds: list[int]) -> list[Start]:
-    return [Start(-1, i, "pick", "", "", "", seed, f"count to {seed}") for i, seed in enumerate(seeds)]
+def starts(seeds: list[int]) -> list[EpisodeSpec]:
+    return [EpisodeSpec(-1, i, "pick", "", "", "", seed, f"count to {seed}") for i, seed in enumerate(seeds)]
 
 
 SEEDS = [3, 9, 2, 5, 4, 1]
@@ -69,7 +69,7 @@ def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
 def test_chunks_begin_with_a_look(chunk, looks, fits):
     """Whoever acts step by step sees to that himself."""
     policy = Obedient(chunk)
-    policy.wants = Wants(state=True, look_every=looks)
+    policy.spec = PolicySpec(state=True, look_every=looks)
     episodes = Rollouts(Counting(1), policy, Rules(7), 0.05, refill=True).play(starts([4]))
     if fits:
         assert [one.steps for one in episodes] == [4]

@@ -13,7 +13,7 @@ from robocas_ms3.core.errors import DatasetError, EvaluationError, RobocasError,
 from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.evaluation import results, run
 from robocas_ms3.evaluation.policies import make_policy
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.run import Settings, chosen, evaluate
 from robocas_ms3.evaluation.verify import problems
@@ -109,7 +109,7 @@ def test_a_policy_that_does_not_fit_is_refused_before_anything_is_written(tmp_pa
     assert not (tmp_path / "out").exists()
     rules = load_protocol("paper-v1").rules
     with pytest.raises(EvaluationError, match=r"another rate \(expected 5 Hz, found 10 Hz\)"):
-        rules.refuse(Wants(reference="tcp", rate_hz=10))
+        rules.refuse(PolicySpec(reference="tcp", rate_hz=10))
     with pytest.raises(
         EvaluationError, match=r"no such task \(expected pick, select, search, open_pick, found nothing"
     ):
@@ -126,7 +126,7 @@ def test_who_wants_to_see_needs_a_renderer(tmp_path, monkeypatch):
 
     monkeypatch.setattr(run, "require_renderer", none)
     policy = make_policy("random")
-    policy.wants = Wants(reference="tcp", cameras={"base_camera": (8, 8)})
+    policy.spec = PolicySpec(reference="tcp", cameras={"base_camera": (8, 8)})
     with pytest.raises(DatasetError, match="no render device"):
         next(evaluate(load_protocol("smoke"), policy, "random", tmp_path / "out", Settings(backend="processes")))
     assert not (tmp_path / "out").exists()
@@ -138,7 +138,7 @@ def test_an_episode_that_ends_its_process_is_played_again_and_then_counts_as_fai
 ):
     protocol, made, deaths = load_protocol(short), [], [times]
 
-    def make_env(protocol, wants, first, count, **_):
+    def make_env(protocol, spec, first, count, **_):
         made.append(Dying(count, protocol.episodes[1].seed, deaths))
         return made[-1]
 
@@ -161,7 +161,7 @@ def test_an_episode_that_ends_its_process_is_played_again_and_then_counts_as_fai
 
 
 def test_a_process_that_dies_at_no_episode_ends_the_run(short, tmp_path, monkeypatch):
-    def make_env(protocol, wants, first, count, **_):
+    def make_env(protocol, spec, first, count, **_):
         raise WorkerDied("its process died", where="env 0", found="SIGSEGV")
 
     monkeypatch.setattr(run, "make_env", make_env)
@@ -182,7 +182,7 @@ def test_an_interrupted_run_says_how_it_goes_on(tmp_path, monkeypatch, capsys):
 def test_what_a_policy_can_not_want():
     for wrong in ({"convention": "words"}, {"language": "loud"}, {"cameras": {"eye": (8, 8)}}, {"reference": "me"}):
         with pytest.raises(EvaluationError, match=f"{next(iter(wrong))}: a policy can't want that"):
-            Wants(**wrong)
+            PolicySpec(**wrong)
 
 
 def test_episodes_are_chosen_by_task_count_and_shard():
@@ -199,7 +199,7 @@ def test_policies_by_name():
     for name in ("nobody", "replay:", "no_such_module:Policy", "json:Nothing"):
         with pytest.raises(EvaluationError, match="no such policy"):
             make_policy(name)
-    assert make_policy("robocas_ms3.evaluation.policies.plain:StillPolicy").wants.convention == "robocas"
+    assert make_policy("robocas_ms3.evaluation.policies.plain:StillPolicy").spec.convention == "robocas"
 
 
 def test_two_runs_into_one_folder_are_refused(tmp_path):

@@ -8,7 +8,7 @@ import torch
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import stage
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 
 
@@ -24,7 +24,7 @@ def test_who_makes_the_envs_keeps_them(monkeypatch):
     asked = []
     monkeypatch.setattr(stage, "make_vec", lambda *args, **kwargs: asked.append(args))
     protocol = load_protocol("smoke")
-    stage.make_env(protocol, Wants(), protocol.episodes[0], 2)
+    stage.make_env(protocol, PolicySpec(), protocol.episodes[0], 2)
     assert asked == [("RoboCASPick-v1", 2)]
     assert torch.get_num_threads() == 2
 

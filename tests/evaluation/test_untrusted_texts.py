@@ -11,7 +11,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.comparison import comparison
 from robocas_ms3.evaluation.outcomes import Outcome
-from robocas_ms3.evaluation.policy import Start, Wants, describe
+from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe
 from robocas_ms3.evaluation.remote.server import PolicyServer
 from robocas_ms3.evaluation.report import write_report
 from robocas_ms3.evaluation.rollout import Rollout
@@ -23,7 +23,7 @@ HOSTILE = "\x1b]0;t\x07\x9b\u202e<script>alert(1)</script>|`a`\n[b](http://c)"
 class Policy:
     """Its description is what it was made with."""
 
-    wants = Wants(rate_hz=5.0)
+    spec = PolicySpec(rate_hz=5.0)
 
     def __init__(self, description):
         self.describe = lambda: description
@@ -50,7 +50,7 @@ def test_a_description_that_no_result_can_hold_is_refused(description, key):
 
 def test_wants_of_a_policy_are_part_of_its_description():
     policy = Policy({})
-    policy.wants = Wants(rate_hz=float("nan"))
+    policy.spec = PolicySpec(rate_hz=float("nan"))
     with pytest.raises(EvaluationError) as error:
         describe(policy)
     assert error.value.where.endswith("wants.rate_hz")
@@ -70,7 +70,7 @@ def test_what_a_description_says_is_read_back_and_does_not_rename_the_policy(tmp
 
 
 def test_an_error_text_of_a_policy_is_read_back(tmp_path):
-    start = Start(0, 0, "pick", "table", "", "builtin", 0, "")
+    start = EpisodeSpec(0, 0, "pick", "table", "", "builtin", 0, "")
     episode = SimpleNamespace(episode=0, task="pick", config="table", seed=0, split="test", p_vis=None)
     made = Outcome.of(Rollout(start, error=f"{HOSTILE}\udcff"), episode, [])
     assert made.error.isprintable()

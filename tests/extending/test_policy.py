@@ -74,7 +74,7 @@ def test_it_is_found_and_listed_by_its_name(site):
         ("", "it = nowhere_at_all:It", "it = .*: this policy can't be loaded .*No module named 'nowhere_at_all'"),
         ("It = 7", "it = spoilt_policies:It", "it = .*: no policy .*found int"),
         ("def It(size): ...", "it = spoilt_policies:It", "it: this policy can't be made .*takes no arguments"),
-        ("It = object", "it = spoilt_policies:It", "it: a policy without wants"),
+        ("It = object", "it = spoilt_policies:It", "it: a policy without spec"),
     ],
 )
 def test_a_broken_one_is_one_line_and_only_when_it_is_chosen(site, module, entry, message):

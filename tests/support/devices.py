@@ -8,7 +8,7 @@ from rt1_sizes import SIZES
 
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.session import Said, train_run
-from robocas_ms3.evaluation.policy import Observations, Start
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 
 VIEW = {"rendered": [64, 48], "size": [64, 48]}
 CHANGES = {
@@ -38,8 +38,10 @@ def check(dataset, tmp_path, name, precision, device):
         [step, split] for step, split in (("2", "train"), ("3", "val"), ("4", "train"), ("6", "train"), ("6", "val"))
     ]
     policy = RunPolicy(out, device)
-    policy.reset([Start(0, 0, "pick", "", "", "builtin", 0, ""), Start(1, 0, "pick", "", "", "builtin", 0, "")])
-    sizes = {camera: size for camera, size in policy.wants.cameras.items()}
+    policy.reset(
+        [EpisodeSpec(0, 0, "pick", "", "", "builtin", 0, ""), EpisodeSpec(1, 0, "pick", "", "", "builtin", 0, "")]
+    )
+    sizes = {camera: size for camera, size in policy.spec.cameras.items()}
     nothing = np.zeros((2, 12), np.float32)
     here = np.tile(np.array([0.5, 0, 0.3, 1, 0, 0, 0], np.float32), (2, 1))
     seen = Observations(

@@ -14,7 +14,7 @@ from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
 from robocas_ms3.baselines.session import Said, train_run
 from robocas_ms3.baselines.table import BASELINES
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 
 
 class MadeUpConfig(BaselineConfig):
@@ -66,7 +66,7 @@ class MadeUpModel(torch.nn.Module):
 
 
 class MadeUpPolicy:
-    wants = Wants(language="none")
+    spec = PolicySpec(language="none")
 
     def __init__(self, model):
         self.model = model

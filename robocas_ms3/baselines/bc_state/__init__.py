@@ -16,7 +16,7 @@ from robocas_ms3.baselines.bc_state.model import BcStateModel
 from robocas_ms3.baselines.chunk_policy import ChunkPolicy
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.poses import from_wxyz
-from robocas_ms3.evaluation.policy import Observations, Wants
+from robocas_ms3.evaluation.policy import Observations, PolicySpec
 
 
 class BcState:
@@ -48,8 +48,8 @@ class BcState:
             with torch.inference_mode():
                 return model.act(torch.from_numpy(told).to(device))[0].cpu().numpy()
 
-        wants = Wants("robocas", reference="tcp", rate_hz=facts["rate_hz"], state=True, language="none")
-        return ChunkPolicy(wants, predict, min(config.play, config.chunk), config.fade, {})
+        spec = PolicySpec("robocas", reference="tcp", rate_hz=facts["rate_hz"], state=True, language="none")
+        return ChunkPolicy(spec, predict, min(config.play, config.chunk), config.fade, {})
 
 
 BASELINE = BcState()

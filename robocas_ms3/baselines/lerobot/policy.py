@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.baselines.lerobot.observations import DIMENSIONS, EMBEDDING, STATE, STATE_NAMES, scaled, state_of
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.policy import CAMERAS, Observations, Start, Wants
+from robocas_ms3.evaluation.policy import CAMERAS, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.description import RobotDescription
 
 _IMAGES = "observation.images."
@@ -56,7 +56,7 @@ class LeRobotPolicy:
             elif {STATE: (len(STATE_NAMES),), EMBEDDING: (DIMENSIONS,)}.get(key) != tuple(shape):
                 fix = "Train on a dataset that robocas_ms3.baselines.lerobot.prepare made."
                 raise EvaluationError("a policy of another dataset", where=key, found=list(shape), fix=fix)
-        self.wants = Wants(
+        self.spec = PolicySpec(
             convention="robocas",
             reference="tcp",
             rate_hz=rate_hz,
@@ -70,7 +70,7 @@ class LeRobotPolicy:
         """What a result says of it besides."""
         return self._about
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Begin episodes: queues are emptied, noise begins with the episode's seed."""
         for start in starts:
             self._models[start.env] = _copied(self._model)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.trials import arm_action, seen
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.ee_deltas import POSITION_SCALE, ROTATION_SCALE
 
 _SCALE = np.array([POSITION_SCALE] * 3 + [ROTATION_SCALE] * 3 + [1.0])
@@ -27,12 +27,12 @@ class PpoPolicy:
 
     def __init__(self, facts: dict[str, Any], agent: Agent) -> None:
         # it turns about one axis alone, about which Euler angles and rotation vectors are the same
-        self.wants = Wants(
+        self.spec = PolicySpec(
             "delta_axis_angle", reference="target", rate_hz=facts["rate_hz"], state=True, language="none"
         )
         self._agent, self._size = agent, facts["observed"]
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Nothing is kept of an episode."""
 
     def act(self, observations: Observations) -> NDArray[np.floating]:

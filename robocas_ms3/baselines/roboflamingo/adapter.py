@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.datasets.actions import ActionScale
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 HORIZON = 11  # frames: the paper's appendix, RoboFlamingo
 PICTURES = (320, 256)  # width, height: the paper trains it on the pictures of its RT-1
@@ -107,7 +107,7 @@ class RoboFlamingoPolicy:
     ) -> None:
         self._model, self._scale, self._pictures = model, scale, pictures
         cameras = {_BASE: stored, _GRIPPER: stored}
-        self.wants = Wants(convention="robocas", reference="tcp", rate_hz=rate_hz, cameras=cameras)
+        self.spec = PolicySpec(convention="robocas", reference="tcp", rate_hz=rate_hz, cameras=cameras)
         self._frames: dict[int, deque[tuple[NDArray[np.uint8], NDArray[np.uint8]]]] = {}
 
     def describe(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ class RoboFlamingoPolicy:
         ranges = {"low": self._scale.low.tolist(), "high": self._scale.high.tolist()}
         return {"model": type(self._model).__qualname__, "horizon": HORIZON, "ranges": ranges}
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Begin episodes; the frames of these envs are forgotten, those of others are not."""
         for start in starts:
             self._frames[start.env] = deque(maxlen=HORIZON)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.model import RT1Model
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 
 class RT1Policy:
@@ -34,7 +34,7 @@ class RT1Policy:
         self._config, self._model = config, model.eval()
         self._frames: dict[int, deque[torch.Tensor]] = {}  # by env, tokens (images, width), the oldest first
         self._held: dict[int, NDArray[np.float32]] = {}  # by env that has ended, the action that holds still
-        self.wants = Wants(
+        self.spec = PolicySpec(
             convention="robocas",
             reference="tcp",
             rate_hz=facts["rate_hz"],
@@ -48,7 +48,7 @@ class RT1Policy:
         begun = path.name if path is not None and bool(self._model.from_imagenet) else "from scratch"
         return {"image_weights": begun}
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Forget what these envs showed."""
         for start in starts:
             self._frames.pop(start.env, None)

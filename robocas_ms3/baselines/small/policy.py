@@ -14,7 +14,7 @@ from robocas_ms3.baselines.small.config import SmallConfig
 from robocas_ms3.baselines.small.data import looked_at
 from robocas_ms3.baselines.small.model import SmallModel
 from robocas_ms3.core.poses import from_wxyz
-from robocas_ms3.evaluation.policy import Observations, Wants
+from robocas_ms3.evaluation.policy import Observations, PolicySpec
 
 
 def make_policy(config: SmallConfig, facts: dict[str, Any], model: SmallModel) -> ChunkPolicy:
@@ -30,7 +30,7 @@ def make_policy(config: SmallConfig, facts: dict[str, Any], model: SmallModel) -
             chunks = model.act({name: torch.from_numpy(value)[None].to(device) for name, value in batch.items()})
         return chunks[0].cpu().numpy()
 
-    wants = Wants(
+    spec = PolicySpec(
         convention="robocas",
         reference="tcp",
         rate_hz=facts["rate_hz"],
@@ -38,4 +38,4 @@ def make_policy(config: SmallConfig, facts: dict[str, Any], model: SmallModel) -
         language="embedding" if config.language else "none",
     )
     about = {"reopen": config.reopen}  # runs of before know nothing of it
-    return ChunkPolicy(wants, predict, min(config.play, config.chunk), config.fade, about, config.reopen)
+    return ChunkPolicy(spec, predict, min(config.play, config.chunk), config.fade, about, config.reopen)

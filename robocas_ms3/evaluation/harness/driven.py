@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.datasets.writing.render import require_renderer
 from robocas_ms3.evaluation.outcomes import Outcome
-from robocas_ms3.evaluation.policy import Observations, Wants
+from robocas_ms3.evaluation.policy import Observations, PolicySpec
 from robocas_ms3.evaluation.protocol import Episode, LoadedProtocol
 from robocas_ms3.evaluation.rollout import NOT_FINITE, EpisodeBatch, Rules, as_chunks
 from robocas_ms3.evaluation.run import Settings, about
@@ -28,10 +28,10 @@ class ExternalPolicy:
     """The policy of an external loop, as far as results describe it.
 
     Attributes:
-        wants: what it sees, and what its actions mean.
+        spec: what it sees, and what its actions mean.
     """
 
-    wants: Wants
+    spec: PolicySpec
 
 
 class DrivenEpisodes:
@@ -42,7 +42,7 @@ class DrivenEpisodes:
 
     Args:
         protocol: whose episodes.
-        wants: what the policy sees, and what its actions mean.
+        spec: what the policy sees, and what its actions mean.
         settings: number of envs, and where they run.
         name: of the policy, for `about`.
 
@@ -55,13 +55,15 @@ class DrivenEpisodes:
         DatasetError: the policy uses cameras, and there is no render device.
     """
 
-    def __init__(self, protocol: LoadedProtocol, wants: Wants, settings: Settings = ONE_ENV, name: str = "") -> None:
-        protocol.rules.refuse(wants)
-        if wants.cameras:
+    def __init__(
+        self, protocol: LoadedProtocol, spec: PolicySpec, settings: Settings = ONE_ENV, name: str = ""
+    ) -> None:
+        protocol.rules.refuse(spec)
+        if spec.cameras:
             require_renderer()
-        self.protocol, self.wants, self.settings = protocol, wants, settings
-        self.rate = rate_of(protocol, wants)
-        policy: Any = ExternalPolicy(wants)
+        self.protocol, self.spec, self.settings = protocol, spec, settings
+        self.rate = rate_of(protocol, spec)
+        policy: Any = ExternalPolicy(spec)
         self.about: dict[str, Any] = about(protocol, policy, name, settings)
         self.outcomes: dict[int, Outcome] = {}
         self._episodes: list[Episode] = []
@@ -173,9 +175,9 @@ class DrivenEpisodes:
         self.close()
         settings, rules = self.settings, self.protocol.rules
         runs = {name: getattr(settings, name) for name in ("backend", "workers", "weld", "limits")}
-        self._env = make_env(self.protocol, self.wants, episode, settings.num_envs, **runs)
+        self._env = make_env(self.protocol, self.spec, episode, settings.num_envs, **runs)
         ends = Rules(self.max_steps(episode.task), tuple(rules.ends_on), rules.max_v0_steps)
         refill = choose_backend(settings.backend) != "gpu"
-        self._batch = EpisodeBatch(self._env, self.wants, ends, 1 / self.rate, refill=refill)
+        self._batch = EpisodeBatch(self._env, self.spec, ends, 1 / self.rate, refill=refill)
         self._config = episode.config
         return self._batch

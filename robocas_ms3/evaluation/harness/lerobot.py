@@ -13,7 +13,7 @@ from lerobot.envs import EnvConfig  # pyright: ignore[reportMissingImports]
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, depth_key
-from robocas_ms3.evaluation.policy import CAMERAS, Reference, Wants
+from robocas_ms3.evaluation.policy import CAMERAS, PolicySpec, Reference
 from robocas_ms3.evaluation.protocol import load_protocol
 
 if TYPE_CHECKING:
@@ -56,11 +56,11 @@ class RoboCASEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        wants = self.wants  # checks convention, reference and cameras
+        spec = self.spec  # checks convention, reference and cameras
         height, width = self.observation_height, self.observation_width
         visual, state = FeatureType.VISUAL, FeatureType.STATE
-        images = [f"observation.images.{camera}" for camera in wants.cameras]
-        depths = [depth_key(camera) for camera in wants.cameras] if self.depth else []
+        images = [f"observation.images.{camera}" for camera in spec.cameras]
+        depths = [depth_key(camera) for camera in spec.cameras] if self.depth else []
         self.features = {
             "action": PolicyFeature(FeatureType.ACTION, (CONVENTIONS[self.convention].size,)),
             **{name: PolicyFeature(state, (size,)) for name, size in WIDTHS.items()},
@@ -74,7 +74,7 @@ class RoboCASEnvConfig(EnvConfig):
         }
 
     @property
-    def wants(self) -> Wants:
+    def spec(self) -> PolicySpec:
         """What the policy sees, and what its actions mean.
 
         Raises:
@@ -82,7 +82,7 @@ class RoboCASEnvConfig(EnvConfig):
         """
         size = (self.observation_width, self.observation_height)
         cameras = dict.fromkeys(_names(self.cameras, "env.cameras"), size)
-        return Wants(self.convention, cast(Reference, self.reference), self.fps, cameras, depth=self.depth)
+        return PolicySpec(self.convention, cast(Reference, self.reference), self.fps, cameras, depth=self.depth)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -113,7 +113,7 @@ class RoboCASEnvConfig(EnvConfig):
         for task in tasks:
             settings = Settings(n_envs, cast("Backend", self.backend), tasks=(task,), split=self.split)
             folder = None if self.results is None else Path(self.results).absolute() / task
-            made = ProtocolVectorEnv(protocol, self.wants, settings, folder=folder, name=self.policy_name)
+            made = ProtocolVectorEnv(protocol, self.spec, settings, folder=folder, name=self.policy_name)
             envs[task] = {0: made}
         return envs
 

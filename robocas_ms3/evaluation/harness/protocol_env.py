@@ -19,7 +19,7 @@ from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.actions import CONVENTIONS
 from robocas_ms3.evaluation.harness.driven import DrivenEpisodes
 from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception, depth_key
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.run import Settings, chosen
 from robocas_ms3.robots.table import find_robot
@@ -39,7 +39,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
 
     Args:
         protocol: whose episodes.
-        wants: cameras, action convention and rate.
+        spec: cameras, action convention and rate.
         settings: ``tasks`` names the task; number of envs, where they run, split.
         folder: for a result that ``robocas eval report`` reads; None: none is written.
         name: of the policy, in the result.
@@ -54,7 +54,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     def __init__(
         self,
         protocol: LoadedProtocol,
-        wants: Wants,
+        spec: PolicySpec,
         settings: Settings,
         *,
         folder: Path | None = None,
@@ -69,7 +69,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
             raise EvaluationError(
                 "several configurations in one batch", where=where, expected="one", found=", ".join(configs), fix=fix
             )
-        self._driven = DrivenEpisodes(protocol, wants, settings, name)
+        self._driven = DrivenEpisodes(protocol, spec, settings, name)
         self._task = self._episodes[0].task
         self._max_steps = self._driven.max_steps(self._task)
         self._lock = ExitStack()
@@ -81,14 +81,14 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
                     raise EvaluationError("there is a result already", where=folder, fix="Choose another folder.")
                 results.begin(folder, self._driven.about, resume=False)
                 self._lock = lock.pop_all()  # held until `close`
-        self._convention = CONVENTIONS[wants.convention]
+        self._convention = CONVENTIONS[spec.convention]
         self._proprioception = Proprioception()
-        self._wants, self._next = wants, 0
+        self._spec, self._next = spec, 0
         count = self.num_envs = settings.num_envs
         self.render_mode = "rgb_array"
         rate = self._driven.rate
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": rate, "autoreset_mode": AutoresetMode.DISABLED}
-        self.single_observation_space = _space(wants)
+        self.single_observation_space = _space(spec)
         self.single_action_space = gym.spaces.Box(-np.inf, np.inf, (self._convention.size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, count)
         self.action_space = batch_space(self.single_action_space, count)
@@ -129,10 +129,10 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
             self._proprioception.reset(env, obs, robot)
         for flags in (self._ended, self._success, self._truncated):
             flags[:] = False
-        self._obs = {name: np.zeros((self.num_envs, *shape), np.float32) for name, shape in _shapes(self._wants)}
+        self._obs = {name: np.zeros((self.num_envs, *shape), np.float32) for name, shape in _shapes(self._spec)}
         self._pixels = {
             name: np.zeros((self.num_envs, height, width, 3), np.uint8)
-            for name, (width, height) in self._wants.cameras.items()
+            for name, (width, height) in self._spec.cameras.items()
         }
         self._read(list(range(self.num_envs)))
         return self._shown(), self._info()
@@ -217,7 +217,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         for camera, pixels in self._pixels.items():
             images = obs["sensor_data"][camera]
             pixels[envs] = images["rgb"][envs]
-            if self._wants.depth:
+            if self._spec.depth:
                 self._obs[depth_key(camera)][envs] = images["depth"][envs].transpose(0, 3, 1, 2)
 
     def _shown(self) -> dict[str, Any]:
@@ -233,17 +233,17 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         return info
 
 
-def _shapes(wants: Wants) -> list[tuple[str, tuple[int, ...]]]:
+def _shapes(spec: PolicySpec) -> list[tuple[str, tuple[int, ...]]]:
     """Names and shapes of the float32 entries of one env's observation."""
-    depths = [(depth_key(name), (1, h, w)) for name, (w, h) in wants.cameras.items()] if wants.depth else []
+    depths = [(depth_key(name), (1, h, w)) for name, (w, h) in spec.cameras.items()] if spec.depth else []
     return [*((name, (width,)) for name, width in WIDTHS.items()), *depths]
 
 
-def _space(wants: Wants) -> gym.spaces.Dict:
+def _space(spec: PolicySpec) -> gym.spaces.Dict:
     numbers: dict[str, gym.Space[Any]] = {
-        name: gym.spaces.Box(-np.inf, np.inf, shape, np.float32) for name, shape in _shapes(wants)
+        name: gym.spaces.Box(-np.inf, np.inf, shape, np.float32) for name, shape in _shapes(spec)
     }
     pixels: dict[str, gym.Space[Any]] = {
-        name: gym.spaces.Box(0, 255, (h, w, 3), np.uint8) for name, (w, h) in wants.cameras.items()
+        name: gym.spaces.Box(0, 255, (h, w, 3), np.uint8) for name, (w, h) in spec.cameras.items()
     }
     return gym.spaces.Dict({"pixels": gym.spaces.Dict(pixels), **numbers})

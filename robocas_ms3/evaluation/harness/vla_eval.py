@@ -19,7 +19,7 @@ from robocas_ms3.evaluation.harness.driven import DrivenEpisodes
 from robocas_ms3.evaluation.outcomes import STAGES
 from robocas_ms3.evaluation.policy import Observations
 from robocas_ms3.evaluation.protocol import Episode, load_protocol
-from robocas_ms3.evaluation.remote.messages import actions_of, wants_of
+from robocas_ms3.evaluation.remote.messages import actions_of, read_policy_spec
 from robocas_ms3.evaluation.tracking import MEASURES
 from robocas_ms3.robots.description import RobotDescription
 
@@ -57,8 +57,8 @@ class RoboCAS:
         rate_hz: float | None = None,
     ) -> None:
         said = {"cameras": dict(cameras or {}), "convention": convention, "reference": reference, "rate_hz": rate_hz}
-        self._wants = wants_of(said, "params")
-        self._driven = DrivenEpisodes(load_protocol(protocol), self._wants)
+        self._spec = read_policy_spec(said, "params")
+        self._driven = DrivenEpisodes(load_protocol(protocol), self._spec)
         self._of_config: dict[str, list[Episode]] = {}
         for episode in self._driven.protocol.episodes:
             self._of_config.setdefault(episode.config, []).append(episode)
@@ -93,7 +93,7 @@ class RoboCAS:
         """What actions mean, in vla-eval's words."""
         from vla_eval.specs import DimSpec  # pyright: ignore[reportMissingImports]
 
-        convention = self._wants.convention
+        convention = self._spec.convention
         if convention not in _ROTATIONS:
             return {"joints": DimSpec("joints", 7, "absolute_joint_positions"), "gripper": _gripper(DimSpec)}
         size, turn = _ROTATIONS[convention]
@@ -108,7 +108,7 @@ class RoboCAS:
         """What is seen, in vla-eval's words."""
         from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec  # pyright: ignore[reportMissingImports]
 
-        images = dict.fromkeys(["image", *self._wants.cameras] if self._wants.cameras else [], IMAGE_RGB)
+        images = dict.fromkeys(["image", *self._spec.cameras] if self._spec.cameras else [], IMAGE_RGB)
         return {**images, "state": DimSpec("state", _STATE, "robocas"), "language": LANGUAGE}
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
@@ -148,7 +148,7 @@ class RoboCAS:
         Raises:
             WireError: it is none of the convention.
         """
-        actions = actions_of({"actions": action.get("actions", action.get("action"))}, self._wants.convention)
+        actions = actions_of({"actions": action.get("actions", action.get("action"))}, self._spec.convention)
         self._seen = self._driven.step(actions[None])
         self._record()
 

@@ -21,7 +21,7 @@ from robocas_ms3.core.exits import no_exit
 from robocas_ms3.core.extensions import Table
 from robocas_ms3.core.strict import nearest
 from robocas_ms3.evaluation.policies.plain import RandomPolicy, StillPolicy
-from robocas_ms3.evaluation.policy import Policy, Wants
+from robocas_ms3.evaluation.policy import Policy, PolicySpec
 
 GROUP = "robocas_ms3.policies"
 FOLDERS_GROUP = "robocas_ms3.policy_folders"
@@ -76,12 +76,12 @@ def _check(policy: Any, name: str) -> None:
         EvaluationError: it hasn't.
     """
     for what, fits in (
-        ("wants", isinstance(getattr(policy, "wants", None), Wants)),
+        ("spec", isinstance(getattr(policy, "spec", None), PolicySpec)),
         ("reset", callable(getattr(policy, "reset", None))),
         ("act", callable(getattr(policy, "act", None))),
     ):
         if not fits:
-            expected = "wants (robocas_ms3.evaluation.policy.Wants), reset(starts) and act(observations)"
+            expected = "spec (robocas_ms3.evaluation.policy.PolicySpec), reset(starts) and act(observations)"
             raise EvaluationError(f"a policy without {what}", where=name, expected=expected)
 
 

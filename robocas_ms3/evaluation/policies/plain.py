@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 _REACH, _TURN = 0.05, 0.2  # m and rad an action of a random policy goes at most
 _CHANGE = 0.1  # probability that it opens or shuts the gripper
@@ -14,9 +14,9 @@ _CHANGE = 0.1  # probability that it opens or shuts the gripper
 class StillPolicy:
     """Stays where it is, gripper open."""
 
-    wants = Wants(reference="tcp", language="none")
+    spec = PolicySpec(reference="tcp", language="none")
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Nothing to begin."""
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
@@ -27,13 +27,13 @@ class StillPolicy:
 class RandomPolicy:
     """Goes anywhere; each episode from its own seed, whatever is played beside it."""
 
-    wants = Wants(reference="tcp", language="none")
+    spec = PolicySpec(reference="tcp", language="none")
 
     def __init__(self) -> None:
         self._draws: dict[int, np.random.Generator] = {}
         self._open: dict[int, bool] = {}
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Begin anew with the episodes' seeds."""
         for start in starts:
             self._draws[start.env], self._open[start.env] = np.random.default_rng([start.seed, start.episode]), True

@@ -13,7 +13,7 @@ from robocas_ms3.demos.recordings.entries import read_json, read_reset, was_take
 from robocas_ms3.demos.recordings.environment import read_env
 from robocas_ms3.demos.recordings.stored import open_episode, open_trajectory, read_actions
 from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 
 class ReplayPolicy:
@@ -42,7 +42,7 @@ class ReplayPolicy:
         self._episodes = {
             read_reset(one, f"{trajectory}, traj_{one['episode_id']}")[0]: one["episode_id"] for one in data["episodes"]
         }
-        self.wants = Wants(
+        self.spec = PolicySpec(
             convention="joint_positions",
             rate_hz=env.kwargs.get("sim_config", {}).get("control_freq", 20),
             language="none",
@@ -53,7 +53,7 @@ class ReplayPolicy:
         """What a result says of it."""
         return {"trajectory": self._trajectory.name, "episodes": len(self._episodes)}
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Look up the episodes by their seeds."""
         for start in starts:
             self._followers.begin(start.env, JointTrack(self._actions(start.seed)))

@@ -15,7 +15,7 @@ from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.recordings.motion import sample_stride
 from robocas_ms3.evaluation.policies.tracks import Followers, JointTrack, PoseTrack, Track
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -40,11 +40,13 @@ class ScriptedPolicy:
         self, speaks: Literal["joint_positions", "robocas"] = "joint_positions", *, beside: bool = False
     ) -> None:
         self._beside = beside
-        self.wants = Wants(speaks, reference="tcp", rate_hz=20 if speaks == "joint_positions" else 5, language="none")
+        self.spec = PolicySpec(
+            speaks, reference="tcp", rate_hz=20 if speaks == "joint_positions" else 5, language="none"
+        )
         self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # the one used last is the last
         self._followers = Followers()
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Plan the episodes; seconds each."""
         for start in starts:
             self._followers.begin(start.env, self._plan(start))
@@ -53,7 +55,7 @@ class ScriptedPolicy:
         """(E, A) actions of what it speaks."""
         return self._followers.act(observations)
 
-    def _plan(self, start: Start) -> Track:
+    def _plan(self, start: EpisodeSpec) -> Track:
         generator = self._generator_of(start)
         actions, states = np.zeros((0, 8)), np.zeros((1, 37))
         with tempfile.TemporaryDirectory() as folder:
@@ -62,7 +64,7 @@ class ScriptedPolicy:
                     group: Any = file["traj_0"]
                     actions = np.array(group["actions"])[:, :8]
                     states = np.array(group["env_states"]["articulations"][start.robot])
-        if self.wants.convention == "joint_positions":
+        if self.spec.convention == "joint_positions":
             return JointTrack(actions)
         if not len(actions):
             return PoseTrack(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
@@ -71,7 +73,7 @@ class ScriptedPolicy:
             track.poses[:, :2, 3] += beside(start.seed)
         return track
 
-    def _generator_of(self, start: Start) -> EpisodeGenerator:
+    def _generator_of(self, start: EpisodeSpec) -> EpisodeGenerator:
         """Return the generator of a start's scenes; of several the one used longest ago is closed.
 
         Raises:

@@ -22,7 +22,7 @@ class Address:
 
     Attributes:
         url: without options.
-        wants: what the policy wants, as its metadata would say; empty: its metadata do.
+        spec: what the policy wants, as its metadata would say; empty: its metadata do.
         rename: other keys of an observation, by name: of a camera, ``qpos``, ``prompt``, ...
         play: of a chunk, how many actions are played before the server is asked again; None: all.
         max_in_flight: number of requests without an answer, for servers without batches; None: one per env.
@@ -31,7 +31,7 @@ class Address:
     """
 
     url: str
-    wants: dict[str, Any] = field(default_factory=dict)
+    spec: dict[str, Any] = field(default_factory=dict)
     rename: dict[str, str] = field(default_factory=dict)
     play: int | None = None
     max_in_flight: int | None = None
@@ -57,17 +57,17 @@ def read_address(text: str) -> Address:
         raise EvaluationError("no address of a policy", where=text, expected=_FORM, found=error) from error
     if not valid:
         raise EvaluationError("no address of a policy", where=text, expected=_FORM)
-    wants: dict[str, Any] = {}
+    spec: dict[str, Any] = {}
     options: dict[str, Any] = {}
     for name, value in parse_qsl(parts.query, keep_blank_values=True):
         if name in ("convention", "reference", "language"):
-            wants[name] = value
+            spec[name] = value
         elif name == "rate_hz":
-            wants[name] = _number(name, value)
+            spec[name] = _number(name, value)
         elif name in ("depth", "state") and value in _FLAGS:
-            wants[name] = _FLAGS[value]
+            spec[name] = _FLAGS[value]
         elif name == "cameras":
-            wants[name] = {camera: _size(name, size) for camera, size in _pairs(name, value).items()}
+            spec[name] = {camera: _size(name, size) for camera, size in _pairs(name, value).items()}
         elif name == "rename":
             options[name] = _pairs(name, value)
         elif name in ("play", "max_in_flight") and _COUNT.fullmatch(value):
@@ -76,7 +76,7 @@ def read_address(text: str) -> Address:
             options[name] = _number(name, value)
         else:
             raise EvaluationError("no such option of an address", where=f"{name}={value}", fix=_HELP)
-    return Address(urlunsplit((parts.scheme, parts.netloc, parts.path, "", "")), wants, **options)
+    return Address(urlunsplit((parts.scheme, parts.netloc, parts.path, "", "")), spec, **options)
 
 
 def strip_brackets(host: str) -> str:

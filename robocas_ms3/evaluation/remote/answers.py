@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed, RobocasError, WireError
-from robocas_ms3.evaluation.policy import Observations, Policy, Start, policy_code
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, policy_code
 from robocas_ms3.evaluation.remote.messages import (
     ACTIONS,
     BATCH,
@@ -49,7 +49,7 @@ class Answers:
     def __init__(self, policy: Policy, files: ServedFiles, max_bytes: int, max_batch: int) -> None:
         self._policy, self._files, self._max_bytes, self._max_batch = policy, files, max_bytes, max_batch
         with policy_code(policy):
-            self._wants = policy.wants
+            self._spec = policy.spec
         self._used: set[int] = set()  # envs of the policy
 
     def answer(self, data: str | bytes, envs: dict[int, int]) -> dict[str, Any]:
@@ -79,7 +79,7 @@ class Answers:
         """Make the envs of a closed connection available."""
         self._used -= set(envs.values())
 
-    def _read(self, messages: Sequence[dict[str, Any]], envs: dict[int, int]) -> tuple[Observations, list[Start]]:
+    def _read(self, messages: Sequence[dict[str, Any]], envs: dict[int, int]) -> tuple[Observations, list[EpisodeSpec]]:
         """Return the observations of some messages, and the episodes that start."""
         numbers, starts = [], []
         for message in messages:
@@ -89,7 +89,7 @@ class Answers:
                 starts.append(start_of(message, number, self._files))
         if len(set(numbers)) < len(numbers):
             raise WireError("invalid batch", where=ENV, expected="each env once", found=sorted(numbers))
-        read = [observations_of(message, env, self._wants) for message, env in zip(messages, numbers, strict=True)]
+        read = [observations_of(message, env, self._spec) for message, env in zip(messages, numbers, strict=True)]
         return stack_observations(read), starts
 
     def _env(self, message: dict[str, Any], envs: dict[int, int]) -> tuple[int, bool]:
@@ -108,14 +108,14 @@ class Answers:
         self._used.add(envs[said])
         return envs[said], True
 
-    def _act(self, observations: Observations, starts: list[Start]) -> NDArray[Any]:
+    def _act(self, observations: Observations, starts: list[EpisodeSpec]) -> NDArray[Any]:
         """Return the policy's (E, H, A) actions."""
         with policy_code(self._policy):
             if starts:
                 self._policy.reset(starts)
             return _chunks(self._policy.act(observations), len(observations.envs))
 
-    def _act_or_explain(self, observations: Observations, starts: list[Start]) -> tuple[Any, dict[int, str]]:
+    def _act_or_explain(self, observations: Observations, starts: list[EpisodeSpec]) -> tuple[Any, dict[int, str]]:
         """Return the policy's (E, H, A) actions, and by env why it has none; an error without an env is that of all."""
         try:
             try:

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed, WireError
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.address import Address, read_address
 from robocas_ms3.evaluation.remote.connection import open_connection, run_in_loop
 from robocas_ms3.evaluation.remote.messages import actions_of
-from robocas_ms3.evaluation.remote.requests import RequestSender, policy_wants
+from robocas_ms3.evaluation.remote.requests import RequestSender, policy_spec
 
 _LOG = logging.getLogger(__name__)
 
@@ -42,15 +42,15 @@ class RemotePolicy:
         self._address: Address = read_address(address)
         connection = run_in_loop(open_connection(self._address.url, self._address.connect_s))
         try:
-            wants = policy_wants(connection.metadata, self._address)
+            spec = policy_spec(connection.metadata, self._address)
         except EvaluationError:
             run_in_loop(connection.close())
             raise
         # With `play` the server is asked before a chunk ends, so each observation needs images.
-        self.wants: Wants = replace(wants, look_every=1) if self._address.play else wants
+        self.spec: PolicySpec = replace(spec, look_every=1) if self._address.play else spec
         self._description = connection.metadata.policy
         self._sender = RequestSender(self._address, connection)
-        self._starts: dict[int, Start] = {}  # of episodes that the server does not know yet
+        self._starts: dict[int, EpisodeSpec] = {}  # of episodes that the server does not know yet
         self._chunk_length: int | None = None
 
     def describe(self) -> dict[str, Any]:
@@ -58,7 +58,7 @@ class RemotePolicy:
         rename = {"rename": self._address.rename} if self._address.rename else {}
         return {"server": self._description, "play": self._address.play, **rename}
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         """Start episodes; the server learns of them with their first observation."""
         self._starts |= {start.env: start for start in starts}
 
@@ -96,7 +96,7 @@ class RemotePolicy:
         """Return the (H, A) actions of an answer; raise where it is an error."""
         if isinstance(answer, EvaluationError):
             raise answer
-        chunk = actions_of(answer, self.wants.convention)[: self._address.play]
+        chunk = actions_of(answer, self.spec.convention)[: self._address.play]
         self._chunk_length = self._chunk_length or len(chunk)
         if len(chunk) != self._chunk_length:
             raise WireError("chunks differ in length", expected=self._chunk_length, found=len(chunk))

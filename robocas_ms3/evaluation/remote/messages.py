@@ -22,7 +22,7 @@ from robocas_ms3.core.errors import EvaluationError, RobocasError, WireError
 from robocas_ms3.core.strict import refusal
 from robocas_ms3.core.words import printable
 from robocas_ms3.evaluation.actions import CONVENTIONS
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.metadata import LARGEST_BATCH
 from robocas_ms3.evaluation.remote.served import ServedFiles, name_of
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES
@@ -38,31 +38,37 @@ _MAX_TEXT = 10_000  # characters
 _LARGEST_NUMBER = 2**32 - 1  # of episodes and seeds
 _LONGEST_LINE = 300  # characters
 _OTHER_BYTES = 8 * 2**20  # of a request, besides images
-_WANTS = TypeAdapter(Wants)
+_POLICY_SPEC = TypeAdapter(PolicySpec)
 
 
-def wants_of(message: Any, where: object) -> Wants:
-    """The way back; what is not said is as `Wants` has it.
+def read_policy_spec(message: Any, where: object) -> PolicySpec:
+    """The way back; what is not said is as `PolicySpec` has it.
 
     Raises:
         EvaluationError: there is no such thing to want.
     """
-    known = [field.name for field in fields(Wants)]
+    known = [field.name for field in fields(PolicySpec)]
     if not isinstance(message, dict) or not set(message) <= set(known):
-        raise EvaluationError("no wants of a policy", where=where, expected=f"some of {known}", found=_line(message))
+        raise EvaluationError(
+            "invalid policy specification", where=where, expected=f"some of {known}", found=_line(message)
+        )
     try:
-        wants = _WANTS.validate_json(json.dumps(message), strict=True)
+        spec = _POLICY_SPEC.validate_json(json.dumps(message), strict=True)
     except ValidationError as error:
-        raise refusal(error, _WANTS, EvaluationError, where=where, about="no wants of a policy") from error
+        raise refusal(
+            error, _POLICY_SPEC, EvaluationError, where=where, about="invalid policy specification"
+        ) from error
     except (TypeError, ValueError) as error:
-        raise EvaluationError("no wants of a policy", where=where, found=_line(error)) from error
-    sides = [side for size in wants.cameras.values() for side in size]
-    if not all(1 <= side <= _MAX_PIXELS for side in sides) or not 0 < (wants.rate_hz or 1) < math.inf:
-        raise EvaluationError("no wants of a policy", where=where, found=_line(message))
-    return wants
+        raise EvaluationError("invalid policy specification", where=where, found=_line(error)) from error
+    sides = [side for size in spec.cameras.values() for side in size]
+    if not all(1 <= side <= _MAX_PIXELS for side in sides) or not 0 < (spec.rate_hz or 1) < math.inf:
+        raise EvaluationError("invalid policy specification", where=where, found=_line(message))
+    return spec
 
 
-def observation_message(observations: Observations, row: int, start: Start | None, *, reset: bool) -> dict[str, Any]:
+def observation_message(
+    observations: Observations, row: int, start: EpisodeSpec | None, *, reset: bool
+) -> dict[str, Any]:
     """What one env shows.
 
     Args:
@@ -87,7 +93,7 @@ def observation_message(observations: Observations, row: int, start: Start | Non
     return message
 
 
-def observations_of(message: Mapping[str, Any], env: int, wants: Wants) -> Observations:
+def observations_of(message: Mapping[str, Any], env: int, spec: PolicySpec) -> Observations:
     """The way back, a batch of one env.
 
     Raises:
@@ -110,17 +116,17 @@ def observations_of(message: Mapping[str, Any], env: int, wants: Wants) -> Obser
     if not isinstance(prompt, str):
         raise WireError("an instruction is no text", where=PROMPT, found=type(prompt).__name__)
     _check_length(PROMPT, prompt)
-    sizes = {name: (height, width) for name, (width, height) in wants.cameras.items()}
+    sizes = {name: (height, width) for name, (width, height) in spec.cameras.items()}
     return Observations(
         envs=np.array([env]),
-        instructions=[prompt if wants.language != "none" else ""],
-        embeddings=array("embedding", "float32", None) if wants.language == "embedding" else None,
+        instructions=[prompt if spec.language != "none" else ""],
+        embeddings=array("embedding", "float32", None) if spec.language == "embedding" else None,
         images={name: array(name, "uint8", *size, 3) for name, size in sizes.items()},
-        depths={name: array(f"{name}_depth", "int16", *size, 1) for name, size in sizes.items()} if wants.depth else {},
+        depths={name: array(f"{name}_depth", "int16", *size, 1) for name, size in sizes.items()} if spec.depth else {},
         qpos=array("qpos", "float32", ROBOT["qpos"]),
         tcp_in_base=array("tcp_in_base", "float32", ROBOT["tcp_in_base"]),
         gripper_width=array("gripper_width", "float32", ROBOT["gripper_width"]),
-        state=array("simulator_state", "float32", None) if wants.state else None,
+        state=array("simulator_state", "float32", None) if spec.state else None,
     )
 
 
@@ -156,7 +162,7 @@ def stack_observations(observations: Sequence[Observations]) -> Observations:
     )
 
 
-def start_of(message: Mapping[str, Any], env: int, files: ServedFiles) -> Start:
+def start_of(message: Mapping[str, Any], env: int, files: ServedFiles) -> EpisodeSpec:
     """Return the episode that starts; of a client that does not say more, the instruction alone.
 
     Args:
@@ -167,7 +173,7 @@ def start_of(message: Mapping[str, Any], env: int, files: ServedFiles) -> Start:
     Raises:
         WireError: it is no start of an episode.
     """
-    blank = Start(env, 0, "", "", "", "", 0, message.get(PROMPT, ""))
+    blank = EpisodeSpec(env, 0, "", "", "", "", 0, message.get(PROMPT, ""))
     said = message.get(START, {})
     if not isinstance(said, dict) or not said.keys() <= vars(blank).keys() - {"env"}:
         raise WireError("no start of an episode", where=START, found=_line(said))
@@ -179,7 +185,7 @@ def start_of(message: Mapping[str, Any], env: int, files: ServedFiles) -> Start:
             raise WireError("number out of range", where=f"{START}.{name}", expected=expected, found=value)
         if isinstance(value, str):
             _check_length(f"{START}.{name}", value)
-    return files.resolved(Start(**{**vars(blank), **said}))
+    return files.resolved(EpisodeSpec(**{**vars(blank), **said}))
 
 
 def actions_of(reply: Any, convention: str) -> NDArray[np.float32]:
@@ -231,20 +237,20 @@ def one_line(error: BaseException) -> str:
     return printable(" ".join(said.split())[:_LONGEST_LINE])
 
 
-def message_bytes(wants: Wants, max_batch: int = 1) -> int:
+def message_bytes(spec: PolicySpec, max_batch: int = 1) -> int:
     """Return the size limit of a request: 8 MiB, and the images of all envs or four times those of one."""
-    return min(MAX_BYTES, _OTHER_BYTES + max(4, max_batch) * _image_bytes(wants))
+    return min(MAX_BYTES, _OTHER_BYTES + max(4, max_batch) * _image_bytes(spec))
 
 
-def batch_limit(wants: Wants, envs: int) -> int:
+def batch_limit(spec: PolicySpec, envs: int) -> int:
     """Return how many of these envs fit in one request of `MAX_BYTES`, at least 1."""
-    return max(1, min(envs, LARGEST_BATCH, (MAX_BYTES - _OTHER_BYTES) // max(1, _image_bytes(wants))))
+    return max(1, min(envs, LARGEST_BATCH, (MAX_BYTES - _OTHER_BYTES) // max(1, _image_bytes(spec))))
 
 
-def _image_bytes(wants: Wants) -> int:
+def _image_bytes(spec: PolicySpec) -> int:
     """Size of the images of one env."""
-    pixels = sum(width * height for width, height in wants.cameras.values())
-    return pixels * (5 if wants.depth else 3)
+    pixels = sum(width * height for width, height in spec.cameras.values())
+    return pixels * (5 if spec.depth else 3)
 
 
 def _check_length(where: str, text: str) -> None:

@@ -19,13 +19,13 @@ class ServerMetadata:
     """The metadata of a server. A plain openpi server announces none of them.
 
     Attributes:
-        wants: what the policy declares, as a message has it; None: not announced.
+        spec: what the policy declares, as a message has it; None: not announced.
         policy: description of the policy, JSON values.
         max_batch: number of envs that a batched request may have; None: no batched requests.
         answers_pings: whether the server answers websocket pings during inference.
     """
 
-    wants: Any = None
+    spec: Any = None
     policy: Any = None
     max_batch: int | None = None
     answers_pings: bool = False
@@ -33,7 +33,7 @@ class ServerMetadata:
     def message(self) -> dict[str, Any]:
         """Return the message; `read_metadata` reads it."""
         return {
-            WANTS: self.wants,
+            WANTS: self.spec,
             POLICY: self.policy,
             MAX_BATCH: self.max_batch,
             ANSWERS_PINGS: self.answers_pings,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.address import Address
 from robocas_ms3.evaluation.remote.connection import (
     AnswerTimer,
@@ -18,7 +18,7 @@ from robocas_ms3.evaluation.remote.connection import (
     open_connection,
     run_in_loop,
 )
-from robocas_ms3.evaluation.remote.messages import BATCH, ERROR, PREFIX, batch_of, observation_message, wants_of
+from robocas_ms3.evaluation.remote.messages import BATCH, ERROR, PREFIX, batch_of, observation_message, read_policy_spec
 from robocas_ms3.evaluation.remote.metadata import ServerMetadata
 from robocas_ms3.evaluation.remote.wire import pack
 
@@ -36,7 +36,7 @@ class Round:
     """
 
     observations: Observations
-    starts: Mapping[int, Start]
+    starts: Mapping[int, EpisodeSpec]
     answers: dict[int, Any] = field(default_factory=dict)
 
     def env(self, row: int) -> int:
@@ -78,7 +78,7 @@ class RequestSender:
         self._connections: dict[int, Connection] = {}
         self._timer = AnswerTimer(address.timeout_s)
 
-    def send(self, observations: Observations, starts: Mapping[int, Start]) -> list[Any]:
+    def send(self, observations: Observations, starts: Mapping[int, EpisodeSpec]) -> list[Any]:
         """Send observations and wait for all answers.
 
         Args:
@@ -167,7 +167,7 @@ class RequestSender:
 
     def _message(self, row: int, asked: Round) -> dict[str, Any]:
         start = asked.starts.get(asked.env(row))
-        shown = start if self._metadata.wants is not None else None  # a plain openpi server does not expect the key
+        shown = start if self._metadata.spec is not None else None  # a plain openpi server does not expect the key
         message = observation_message(asked.observations, row, shown, reset=start is not None)
         rename = self._address.rename
         return {rename.get(key.removeprefix(PREFIX), key): value for key, value in message.items()}
@@ -198,22 +198,24 @@ class RequestSender:
             await connection.close()
 
 
-def policy_wants(metadata: ServerMetadata, address: Address) -> Wants:
+def policy_spec(metadata: ServerMetadata, address: Address) -> PolicySpec:
     """Return what a policy declares, as its server announces it or the address says.
 
     Raises:
         EvaluationError: it is invalid, or both say it.
     """
-    if metadata.wants is not None and address.wants:
+    if metadata.spec is not None and address.spec:
         fix = "Leave these out of the address."
-        found = sorted(address.wants)
-        raise EvaluationError("the server says itself what it wants", where=address.url, found=found, fix=fix)
-    return wants_of(address.wants if metadata.wants is None else metadata.wants, address.url)
+        found = sorted(address.spec)
+        raise EvaluationError(
+            "the server announces its policy specification itself", where=address.url, found=found, fix=fix
+        )
+    return read_policy_spec(address.spec if metadata.spec is None else metadata.spec, address.url)
 
 
-def _terms(metadata: ServerMetadata, address: Address) -> tuple[Wants, int | None]:
+def _terms(metadata: ServerMetadata, address: Address) -> tuple[PolicySpec, int | None]:
     """What has to stay as it is over all connections."""
-    return policy_wants(metadata, address), metadata.max_batch
+    return policy_spec(metadata, address), metadata.max_batch
 
 
 def _without_error(answer: dict[str, Any]) -> Any:

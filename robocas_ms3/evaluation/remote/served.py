@@ -11,7 +11,7 @@ from pathlib import Path
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir, protocols_dir
-from robocas_ms3.evaluation.policy import Start
+from robocas_ms3.evaluation.policy import EpisodeSpec
 
 _PARTS = 3  # of a file's name in messages: folder of the protocol, folder in it, file
 
@@ -51,7 +51,7 @@ class ServedFiles:
         configs, layouts = ("configs/*.yaml", "layouts/*.npy")
         return cls(_named(folders.values(), configs), _named(folders.values(), layouts), frozenset({*names, *packs}))
 
-    def resolved(self, start: Start) -> Start:
+    def resolved(self, start: EpisodeSpec) -> EpisodeSpec:
         """Return a client's start with paths of this machine; empty: files and packs that are not served."""
         return replace(
             start,

@@ -16,7 +16,7 @@ from websockets.http11 import Request, Response
 
 from robocas_ms3 import __version__
 from robocas_ms3.core.errors import EvaluationError, RobocasError, WireError
-from robocas_ms3.evaluation.policy import Policy, describe, policy_code, said_of
+from robocas_ms3.evaluation.policy import Policy, describe, policy_code, policy_spec_values
 from robocas_ms3.evaluation.remote import keepalive
 from robocas_ms3.evaluation.remote.address import netloc, strip_brackets
 from robocas_ms3.evaluation.remote.answers import Answers
@@ -57,11 +57,11 @@ class PolicyServer:
     ) -> None:
         self._host, self._port = strip_brackets(host), port
         with policy_code(policy):
-            wants = policy.wants
-        max_batch = batch_limit(wants, max_batch)
-        self._max_bytes = message_bytes(wants, max_batch)
+            spec = policy.spec
+        max_batch = batch_limit(spec, max_batch)
+        self._max_bytes = message_bytes(spec, max_batch)
         about = json.loads(json.dumps({**describe(policy), "robocas_ms3": __version__}, default=str))
-        self._metadata = pack(ServerMetadata(said_of(wants), about, max_batch, answers_pings=True).message())
+        self._metadata = pack(ServerMetadata(policy_spec_values(spec), about, max_batch, answers_pings=True).message())
         self._answers = Answers(policy, files or ServedFiles.of(), self._max_bytes, max_batch)
         self._executor = CallerThreadExecutor()
         self._connections = 0

@@ -11,7 +11,7 @@ from robocas_ms3.baselines.bc_state.config import BcStateConfig
 from robocas_ms3.baselines.bc_state.data import StateSamples
 from robocas_ms3.core.errors import DatasetError, EvaluationError
 from robocas_ms3.demos.recordings.environment import RecordedEnv
-from robocas_ms3.evaluation.policy import Observations, Start
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def test_other_scenes_in_play():
     }
     config = BcStateConfig(width=8, blocks=1)
     policy = BASELINE.policy(config, facts, BASELINE.model(config, facts).eval())
-    policy.reset([Start(0, 0, "pick", "", "", "builtin", 0, "")])
+    policy.reset([EpisodeSpec(0, 0, "pick", "", "", "builtin", 0, "")])
     seen = Observations(
         envs=np.array([0]),
         instructions=[""],

@@ -12,7 +12,7 @@ from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.session import train_run
 from robocas_ms3.core.poses import inverse, to_wxyz
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.evaluation.policy import Observations, Start
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 
 SMALL = {"chunk": 4, "width": 64, "blocks": 2, "dropout": 0.0, "noise": 0.0}
 STEPS = 800
@@ -88,7 +88,7 @@ def test_five_episodes_are_learned(path, run):
     for number in split_by_seed(dict(enumerate(range(6))))[0]:
         rows = slice(number * LENGTH, (number + 1) * LENGTH)
         told, poses, opened, widths = (recorded[name][rows] for name in ("told", "poses", "opened", "widths"))
-        policy.reset([Start(0, 0, "pick", "", "", "builtin", 0, "")])
+        policy.reset([EpisodeSpec(0, 0, "pick", "", "", "builtin", 0, "")])
         for step in range(LENGTH - 1):
             action = policy.act(shown(told[step], poses[step], widths[step]))[0]
             wanted = (inverse(poses[step]) @ poses[step + 1])[:3, 3]

@@ -10,7 +10,7 @@ from robocas_ms3.baselines.lerobot.observations import EMBEDDING, STATE, scaled,
 from robocas_ms3.baselines.lerobot.policy import LeRobotPolicy
 from robocas_ms3.baselines.lerobot.serve import main, open_checkpoint, rate_of
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.policy import Observations, Start, describe
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, describe
 
 INPUTS = {STATE: (17,), "observation.images.base_camera": (3, 2, 4), EMBEDDING: (384,)}
 HALF = float(np.sqrt(0.5))
@@ -55,7 +55,7 @@ def made(model=None, inputs=None):
 
 
 def a_start(env, seed=0):
-    return Start(env, 0, "pick", "a.yaml", "a.npy", "builtin", seed, "take it")
+    return EpisodeSpec(env, 0, "pick", "a.yaml", "a.npy", "builtin", seed, "take it")
 
 
 def shown(widths):
@@ -78,10 +78,10 @@ def shown(widths):
 
 
 def test_what_it_wants_follows_from_the_checkpoint():
-    wants = made().wants
-    assert (wants.convention, wants.reference, wants.rate_hz, wants.language) == ("robocas", "tcp", 5.0, "embedding")
-    assert wants.cameras == {"base_camera": (4, 2)}
-    assert made(inputs={STATE: (17,)}).wants.language == "text"
+    spec = made().spec
+    assert (spec.convention, spec.reference, spec.rate_hz, spec.language) == ("robocas", "tcp", 5.0, "embedding")
+    assert spec.cameras == {"base_camera": (4, 2)}
+    assert made(inputs={STATE: (17,)}).spec.language == "text"
     policy = LeRobotPolicy(Chunks(), before, before, INPUTS, 5.0, {"weights": "abc"})
     assert describe(policy)["weights"] == "abc"
 

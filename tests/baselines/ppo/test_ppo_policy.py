@@ -58,8 +58,8 @@ def test_motions_are_metres_and_radians():
 
 def test_the_evaluation_does_what_the_training_did():
     policy = policy_that_says([0.5, -1.0, 0.3, 0.4, -0.2])
-    assert control_mode(policy.wants.convention) == "pd_ee_delta_pose"
-    motion = CONVENTIONS[policy.wants.convention].read(policy.act(observations(1)))
+    assert control_mode(policy.spec.convention) == "pd_ee_delta_pose"
+    motion = CONVENTIONS[policy.spec.convention].read(policy.act(observations(1)))
     assert isinstance(motion.rotation, Rotation)
     assert motion.open.tolist() == [False]
     again = to_ee_delta_action(motion.translation, motion.rotation)
@@ -68,9 +68,9 @@ def test_the_evaluation_does_what_the_training_did():
 
 
 def test_it_says_what_it_wants():
-    wants = policy_that_says([0.0] * 5).wants
-    assert (wants.reference, wants.rate_hz, wants.state, wants.language) == ("target", 5, True, "none")
-    assert not wants.cameras
+    spec = policy_that_says([0.0] * 5).spec
+    assert (spec.reference, spec.rate_hz, spec.state, spec.language) == ("target", 5, True, "none")
+    assert not spec.cameras
 
 
 def test_other_scenes_are_refused():

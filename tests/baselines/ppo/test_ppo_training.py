@@ -176,4 +176,4 @@ def test_a_short_run_in_the_simulator(tmp_path):
     rows = lines(run)
     assert [row["step"] for row in rows] == ["64", "128"]
     assert 0 < float(rows[-1]["return"]) < 20
-    assert RunPolicy(run).wants.state
+    assert RunPolicy(run).spec.state

@@ -10,7 +10,7 @@ import pytest
 from robocas_ms3.baselines.roboflamingo.adapter import HORIZON, RoboFlamingoPolicy, Stepwise, scale_of
 from robocas_ms3.core.errors import DatasetError, EvaluationError
 from robocas_ms3.datasets.actions import ActionScale
-from robocas_ms3.evaluation.policy import Observations, Start
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 
 SCALE = ActionScale(np.array([-0.1, -0.2, 0.0, -0.5, -1.0, 0.2]), np.array([0.1, 0.0, 0.4, 0.5, 3.0, 0.2]))
 WIDTH, HEIGHT = 4, 2
@@ -43,7 +43,7 @@ class Steps:
 
 
 def a_start(env):
-    return Start(env, 0, "pick", "a.yaml", "a.npy", "builtin", 0, "take it")
+    return EpisodeSpec(env, 0, "pick", "a.yaml", "a.npy", "builtin", 0, "take it")
 
 
 def shown(frames, texts=None):
@@ -73,9 +73,9 @@ def numbers(window):
 
 
 def test_what_it_wants():
-    wants = RoboFlamingoPolicy(Windows(), SCALE).wants
-    assert (wants.convention, wants.reference, wants.rate_hz, wants.language) == ("robocas", "tcp", 5, "text")
-    assert wants.cameras == {"base_camera": (640, 480), "gripper_camera": (640, 480)}
+    spec = RoboFlamingoPolicy(Windows(), SCALE).spec
+    assert (spec.convention, spec.reference, spec.rate_hz, spec.language) == ("robocas", "tcp", 5, "text")
+    assert spec.cameras == {"base_camera": (640, 480), "gripper_camera": (640, 480)}
 
 
 def test_pictures_are_squeezed_whole():

@@ -7,7 +7,7 @@ from rt1_sizes import SIZES
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.evaluation.policy import Observations, Start
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 
 SMALL = {
     **SIZES,
@@ -54,7 +54,7 @@ def played(policy, folder, place):
     number = source.split("train")[place]
     episode = source.episode(number)
     arrays = episode.read(["rel_pos", "gripper_status", "language_embedding"])
-    policy.reset([Start(3, 0, "pick", "", "", "builtin", 0, "")])
+    policy.reset([EpisodeSpec(3, 0, "pick", "", "", "builtin", 0, "")])
     given = []
     for step in range(source.lengths[number] - 1):
         nothing = np.zeros((1, 12), np.float32)
@@ -62,7 +62,7 @@ def played(policy, folder, place):
             envs=np.array([3]),
             instructions=[""],
             embeddings=arrays["language_embedding"][None],
-            images={name: episode.rgb(name, step)[None] for name in policy.wants.cameras},
+            images={name: episode.rgb(name, step)[None] for name in policy.spec.cameras},
             depths={},
             qpos=nothing,
             tcp_in_base=nothing[:, :7],

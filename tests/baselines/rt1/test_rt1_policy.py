@@ -6,13 +6,13 @@ import torch
 
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.model import chosen
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 CAMERAS = ("base_camera", "gripper_camera")
 
 
 def begin(*envs):
-    return [Start(env, 0, "pick", "", "", "builtin", env, "grasp it") for env in envs]
+    return [EpisodeSpec(env, 0, "pick", "", "", "builtin", env, "grasp it") for env in envs]
 
 
 def observations(envs, shots, words):
@@ -49,7 +49,7 @@ def seen():
 
 
 def test_what_it_wants(policy):
-    assert policy.wants == Wants(
+    assert policy.spec == PolicySpec(
         convention="robocas",
         reference="tcp",
         rate_hz=5.0,
@@ -62,7 +62,7 @@ def test_it_wants_pictures_as_the_dataset_stores_them(config, facts, model):
     """And scales them: rendered at 64 x 48 they would show another field of view."""
     stored = {**facts, "cameras": {"base_camera": [96, 64], "gripper_camera": [128, 96]}}
     policy = BASELINE.policy(config, stored, model)
-    assert policy.wants.cameras == {"base_camera": (96, 64), "gripper_camera": (128, 96)}
+    assert policy.spec.cameras == {"base_camera": (96, 64), "gripper_camera": (128, 96)}
     policy.reset(begin(0))
     shown = observations([0], np.zeros((1, 2, 48, 64, 3), np.uint8), np.ones((1, 384), np.float32))
     shown.images.update(

@@ -24,7 +24,7 @@ from robocas_ms3.core.errors import DatasetError, TrainingError
 from robocas_ms3.core.poses import to_wxyz
 from robocas_ms3.core.strict import parse
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.evaluation.policy import Observations, Start
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations
 
 
 @pytest.fixture(scope="module")
@@ -83,13 +83,13 @@ def test_every_weight_is_learned(samples):
 
 def test_a_policy_goes_where_it_was_shown(learned, samples, folder):
     policy = BASELINE.policy(learned.config, samples.facts, learned)
-    assert (policy.wants.rate_hz, policy.wants.reference) == (5.0, "tcp")
-    assert policy.wants.cameras == {"base_camera": (64, 48), "gripper_camera": (64, 48)}
+    assert (policy.spec.rate_hz, policy.spec.reference) == (5.0, "tcp")
+    assert policy.spec.cameras == {"base_camera": (64, 48), "gripper_camera": (64, 48)}
     source = open_source(folder)
     number = source.split("train")[0]
     episode, arrays = source.episode(number), source.episode(number).arrays
     poses = np.concatenate([arrays["ee_pos"], np.roll(arrays["ee_orn"], 1, axis=1)], axis=1)
-    policy.reset([Start(0, 0, "pick", "", "", "builtin", 0, "")])
+    policy.reset([EpisodeSpec(0, 0, "pick", "", "", "builtin", 0, "")])
     for step in range(3):
         action = policy.act(observed(episode, arrays, poses, step))[0]
         assert np.abs(action[:3] - arrays["rel_pos"][step]).max() < 0.008
@@ -161,7 +161,7 @@ def test_without_language_words_say_nothing(folder):
     config = SmallConfig(**TINY, language=False)
     samples = BASELINE.data(config, folder, "val", lambda done, of: None)
     assert not samples.__getitems__([0])["words"].any()
-    assert BASELINE.policy(config, samples.facts, BASELINE.model(config, samples.facts)).wants.language == "none"
+    assert BASELINE.policy(config, samples.facts, BASELINE.model(config, samples.facts)).spec.language == "none"
 
 
 def test_a_part_is_cut_and_scaled():
@@ -187,7 +187,7 @@ def test_it_is_shown_pictures_of_the_size_it_learned_by(folder):
     config = SmallConfig(**{**TINY, "views": {"base_camera": half, "gripper_camera": half}})
     samples = BASELINE.data(config, folder, "val", lambda done, of: None)
     policy = BASELINE.policy(config, samples.facts, BASELINE.model(config, samples.facts))
-    assert policy.wants.cameras == {"base_camera": (64, 48), "gripper_camera": (64, 48)}
+    assert policy.spec.cameras == {"base_camera": (64, 48), "gripper_camera": (64, 48)}
 
 
 @pytest.mark.parametrize(("chunk", "play", "looks"), [(8, 3, 3), (4, 7, 4)])
@@ -196,12 +196,12 @@ def test_it_looks_when_it_predicts(folder, monkeypatch, chunk, play, looks):
     config = SmallConfig(**{**TINY, "chunk": chunk, "play": play})
     facts = BASELINE.data(config, folder, "val", lambda done, of: None).facts
     policy = BASELINE.policy(config, facts, BASELINE.model(config, facts))
-    assert policy.wants.look_every == looks
+    assert policy.spec.look_every == looks
     episode = open_source(folder).episode(open_source(folder).split("train")[0])
     poses = np.concatenate([episode.arrays["ee_pos"], np.roll(episode.arrays["ee_orn"], 1, axis=1)], axis=1)
     predicted, predict = [], policy._predict
     monkeypatch.setattr(policy, "_predict", lambda *seen: (predicted.append(1), predict(*seen))[1])
-    policy.reset([Start(0, 0, "pick", "", "", "builtin", 0, "")])
+    policy.reset([EpisodeSpec(0, 0, "pick", "", "", "builtin", 0, "")])
     for step in range(7):
         predicted.clear()
         policy.act(observed(episode, episode.arrays, poses, step))
@@ -260,7 +260,7 @@ def test_a_camera_may_be_left_out(folder):
     samples = BASELINE.data(config, folder, "val", lambda done, of: None)
     model = BASELINE.model(config, samples.facts)
     assert torch.isfinite(model(samples.__getitems__([0, 1]))["loss"])
-    assert BASELINE.policy(config, samples.facts, model).wants.cameras == {"base_camera": (64, 48)}
+    assert BASELINE.policy(config, samples.facts, model).spec.cameras == {"base_camera": (64, 48)}
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ def made(monkeypatch) -> list[CountingEnv]:
     """Environments without physics; those that were made, in order."""
     envs: list[CountingEnv] = []
 
-    def make_env(protocol, wants, episode, num_envs, *, backend, **others):
+    def make_env(protocol, spec, episode, num_envs, *, backend, **others):
         assert backend in ("processes", "auto")
         envs.append(CountingEnv(episode.config, num_envs))
         return envs[-1]

@@ -10,7 +10,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness.driven import DrivenEpisodes
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
-from robocas_ms3.evaluation.policy import Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.run import Settings, evaluate
 
@@ -21,7 +21,7 @@ def ones(count: int = 1, value: float = 1.0) -> np.ndarray:
 
 @pytest.fixture
 def driven():
-    made = DrivenEpisodes(load_protocol("smoke"), Wants(rate_hz=5))
+    made = DrivenEpisodes(load_protocol("smoke"), PolicySpec(rate_hz=5))
     yield made
     made.close()
 
@@ -97,7 +97,7 @@ def test_actions_of_another_shape_are_refused_and_the_episode_continues(made, dr
 
 
 def test_each_env_of_a_batch_ends_by_itself(made):
-    driven = DrivenEpisodes(load_protocol("smoke"), Wants(rate_hz=5), Settings(3, "processes"))
+    driven = DrivenEpisodes(load_protocol("smoke"), PolicySpec(rate_hz=5), Settings(3, "processes"))
     seen = driven.reset([4, 5, 4])
     assert seen.envs.tolist() == [0, 1, 2] and seen.instructions[0] == seen.instructions[2] != seen.instructions[1]
     actions = np.zeros((3, 7))
@@ -127,21 +127,21 @@ def test_an_episode_that_the_protocol_lacks(made, driven, number):
 
 def test_what_does_not_fit_the_protocol_is_refused():
     with pytest.raises(EvaluationError, match="convention is none of this protocol's"):
-        DrivenEpisodes(load_protocol("paper-v1"), Wants(convention="joint_positions"))
+        DrivenEpisodes(load_protocol("paper-v1"), PolicySpec(convention="joint_positions"))
 
 
 @pytest.mark.slow
 def test_real_episodes_come_out_as_in_an_evaluation(tmp_path):
     class Brief(RandomPolicy):
-        wants = Wants(reference="tcp", language="none", rate_hz=5)
+        spec = PolicySpec(reference="tcp", language="none", rate_hz=5)
 
     protocol = load_protocol("smoke")
     settings = Settings(1, "processes", tasks=("pick",), episodes=1)
     list(evaluate(protocol, Brief(), "random", tmp_path, settings))
-    driven, policy = DrivenEpisodes(protocol, Brief.wants), RandomPolicy()
+    driven, policy = DrivenEpisodes(protocol, Brief.spec), RandomPolicy()
     for number, outcome in results.read(tmp_path).outcomes.items():
         seed = protocol.episodes[number].seed
-        policy.reset([Start(0, number, "", "", "", "", seed, "")])
+        policy.reset([EpisodeSpec(0, number, "", "", "", "", seed, "")])
         seen = driven.reset([number])
         while seen is not None:
             seen = driven.step(policy.act(seen))

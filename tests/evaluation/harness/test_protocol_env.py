@@ -12,12 +12,12 @@ from robocas_ms3.core.locks import locked_folder
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness import driven
 from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.run import Settings, evaluate
 
 SMOKE = load_protocol("smoke")
-WANTS = Wants(reference="tcp", rate_hz=5, cameras={"base_camera": (6, 4)}, depth=True)
+WANTS = PolicySpec(reference="tcp", rate_hz=5, cameras={"base_camera": (6, 4)}, depth=True)
 
 
 @pytest.fixture
@@ -26,9 +26,9 @@ def make(made, monkeypatch):
     monkeypatch.setattr(driven, "require_renderer", lambda: None)
     opened = []
 
-    def make(num_envs=2, task="pick", wants=WANTS, protocol=SMOKE, **kwargs):
+    def make(num_envs=2, task="pick", spec=WANTS, protocol=SMOKE, **kwargs):
         settings = Settings(num_envs, "processes", tasks=(task,), split=kwargs.pop("split", ""))
-        opened.append(ProtocolVectorEnv(protocol, wants, settings, **kwargs))
+        opened.append(ProtocolVectorEnv(protocol, spec, settings, **kwargs))
         return opened[-1]
 
     yield make
@@ -158,11 +158,11 @@ def test_the_folder_of_a_result_is_locked_until_the_environment_is_closed(make, 
         (dict(task="juggle"), EvaluationError, "no such task"),
         (dict(split="nowhere"), EvaluationError, "no such split"),
         (
-            dict(protocol=load_protocol("paper-v1"), wants=Wants(reference="tcp", rate_hz=10)),
+            dict(protocol=load_protocol("paper-v1"), spec=PolicySpec(reference="tcp", rate_hz=10)),
             EvaluationError,
             "another rate",
         ),
-        (dict(wants=Wants(rate_hz=7)), EvaluationError, "divisor of 100"),
+        (dict(spec=PolicySpec(rate_hz=7)), EvaluationError, "divisor of 100"),
         (dict(protocol=load_protocol("objects-v1")), EvaluationError, "one of the splits"),
     ],
 )
@@ -173,17 +173,17 @@ def test_settings_that_do_not_fit_the_protocol_are_refused(make, kwargs, error, 
 
 def test_an_unknown_backend_is_refused(monkeypatch):
     with pytest.raises(VectorEnvError, match="no such backend"):
-        ProtocolVectorEnv(SMOKE, Wants(rate_hz=5), Settings(1, "threads", tasks=("pick",)))  # pyright: ignore[reportArgumentType]
+        ProtocolVectorEnv(SMOKE, PolicySpec(rate_hz=5), Settings(1, "threads", tasks=("pick",)))  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.slow
 def test_real_episodes_have_the_outcomes_and_images_of_robocas_eval(needs_renderer, tmp_path):
     size, down = (48, 36), np.array([0, 0, 0.02, 0, 0, 0.1, 0.0], np.float32)
-    wants = Wants(reference="tcp", rate_hz=5, cameras={"gripper_camera": size})
+    spec = PolicySpec(reference="tcp", rate_hz=5, cameras={"gripper_camera": size})
 
     class Down:
         def __init__(self) -> None:
-            self.wants, self.seen = wants, []
+            self.spec, self.seen = spec, []
 
         def reset(self, starts) -> None:
             pass
@@ -198,7 +198,7 @@ def test_real_episodes_have_the_outcomes_and_images_of_robocas_eval(needs_render
     protocol, policy = load_protocol(tmp_path / "short"), Down()
     settings = Settings(2, "processes", workers=1, tasks=("search",))
     list(evaluate(protocol, policy, "down", tmp_path / "ours", settings))
-    env = ProtocolVectorEnv(protocol, wants, settings, folder=tmp_path / "theirs")
+    env = ProtocolVectorEnv(protocol, spec, settings, folder=tmp_path / "theirs")
     obs, _ = env.reset(seed=2000)
     seen, done = [], np.zeros(2, bool)
     while not done.all():

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.paths import protocols_dir
-from robocas_ms3.evaluation.policy import Observations, Start, Wants
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.tracking import SUMS
 
 CAMERA = (6, 4)  # width, height
 LAYOUTS = "layouts/pick_table_scattered.npy"
 
 
-def a_start(env: int = 0, episode: int = 3, seed: int = 7) -> Start:
+def a_start(env: int = 0, episode: int = 3, seed: int = 7) -> EpisodeSpec:
     smoke = protocols_dir() / "smoke"
     config, layouts = (str(smoke / name) for name in ("configs/pick_table_scattered.yaml", LAYOUTS))
-    return Start(env, episode, "pick", config, layouts, "builtin", seed, "take the apple")
+    return EpisodeSpec(env, episode, "pick", config, layouts, "builtin", seed, "take the apple")
 
 
 def some_observations(*envs: int, seed: int = 0, cameras: bool = False) -> Observations:
@@ -43,13 +43,13 @@ def some_observations(*envs: int, seed: int = 0, cameras: bool = False) -> Obser
 class Told:
     """A policy that keeps what it is told, and acts by what it sees."""
 
-    def __init__(self, wants: Wants | None = None, chunk: int = 3) -> None:
-        self.wants = wants or Wants()
+    def __init__(self, spec: PolicySpec | None = None, chunk: int = 3) -> None:
+        self.spec = spec or PolicySpec()
         self.chunk = chunk
-        self.starts: list[Start] = []
+        self.starts: list[EpisodeSpec] = []
         self.seen: list[Observations] = []
 
-    def reset(self, starts: list[Start]) -> None:
+    def reset(self, starts: list[EpisodeSpec]) -> None:
         self.starts += starts
 
     def act(self, observations: Observations) -> np.ndarray:

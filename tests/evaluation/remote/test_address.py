@@ -18,7 +18,7 @@ def test_options():
     text += "&max_in_flight=2&timeout_s=9"
     assert read_address(text) == Address(
         "ws://host:1",
-        wants={"cameras": {"base_camera": [320, 240], "gripper_camera": [64, 64]}, "depth": True, "rate_hz": 5.0},
+        spec={"cameras": {"base_camera": [320, 240], "gripper_camera": [64, 64]}, "depth": True, "rate_hz": 5.0},
         rename={"qpos": "state"},
         play=5,
         max_in_flight=2,

@@ -143,11 +143,11 @@ def test_the_next_episode_finds_a_server_that_came_back():
 
 
 def test_another_policy_in_its_place_is_noticed():
-    from robocas_ms3.evaluation.policy import Wants
+    from robocas_ms3.evaluation.policy import PolicySpec
 
     with serving(Told()) as url:
         remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
-    with serving(Told(Wants(convention="delta_euler")), int(url.rpartition(":")[2])):
+    with serving(Told(PolicySpec(convention="delta_euler")), int(url.rpartition(":")[2])):
         remote.reset([a_start(0)])
         with pytest.raises(PolicyFailed, match="another policy"):
             remote.act(some_observations(0))

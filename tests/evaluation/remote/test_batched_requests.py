@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.messages import batch_limit, message_bytes, observation_message
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES, pack
@@ -91,11 +91,11 @@ def test_more_envs_than_a_batch_may_have_are_asked_in_several():
 
 def test_a_batch_of_the_announced_size_fits_in_a_message():
     for camera in ((8, 8), (224, 224), (640, 480), (4096, 4096)):
-        wants = Wants(cameras=dict.fromkeys(("base_camera", "gripper_camera", "static_camera"), camera), depth=True)
-        envs = batch_limit(wants, 256)
+        spec = PolicySpec(cameras=dict.fromkeys(("base_camera", "gripper_camera", "static_camera"), camera), depth=True)
+        envs = batch_limit(spec, 256)
         images = 3 * camera[0] * camera[1] * 5
-        assert envs == 1 or envs * images + 4 * 2**20 <= message_bytes(wants, envs) <= MAX_BYTES
-        assert batch_limit(wants, 1) == 1
+        assert envs == 1 or envs * images + 4 * 2**20 <= message_bytes(spec, envs) <= MAX_BYTES
+        assert batch_limit(spec, 1) == 1
 
 
 class FailingIn(Told):
@@ -241,7 +241,7 @@ def test_a_bad_batch_is_one_line_to_its_client(batch):
 
 
 def test_embeddings_of_a_batch_have_one_length():
-    policy = Told(Wants(language="embedding"))
+    policy = Told(PolicySpec(language="embedding"))
     embedded = [message(env, **{"observation/embedding": np.zeros(384 - env, np.float32)}) for env in range(2)]
     with serving(policy) as url, connect(url, proxy=None, compression=None) as client:
         client.recv()

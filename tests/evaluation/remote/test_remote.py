@@ -15,20 +15,20 @@ from remote_ends import CAMERA, Told, a_start, serving, some_observations, talki
 from robocas_ms3.core.errors import EvaluationError, PolicyFailed
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
-from robocas_ms3.evaluation.policy import Wants
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.messages import observation_message, start_of
 from robocas_ms3.evaluation.remote.served import ServedFiles
 from robocas_ms3.evaluation.remote.wire import pack, unpack
 
-ALL = Wants(cameras={"base_camera": CAMERA}, depth=True, state=True, rate_hz=10, reference="tcp")
+ALL = PolicySpec(cameras={"base_camera": CAMERA}, depth=True, state=True, rate_hz=10, reference="tcp")
 
 
 def test_a_served_policy_sees_and_says_the_same():
     policy = Told(ALL)
     with serving(policy) as url:
         remote = RemotePolicy(url)
-        assert remote.wants == ALL
+        assert remote.spec == ALL
         assert remote.describe()["server"]["class"].endswith(":Told")
         remote.reset([a_start()])
         seen = some_observations(0, cameras=True)
@@ -43,10 +43,10 @@ def test_a_served_policy_sees_and_says_the_same():
 
 
 def test_who_is_asked_more_often_than_it_would_looks_more_often():
-    with serving(Told(Wants(look_every=3))) as url:
+    with serving(Told(PolicySpec(look_every=3))) as url:
         for address, looks in ((url, 3), (f"{url}?play=2", 1)):
             remote = RemotePolicy(address)
-            assert remote.wants.look_every == looks
+            assert remote.spec.look_every == looks
             remote.close()
 
 
@@ -156,7 +156,7 @@ def test_our_client_asks_a_plain_openpi_server():
     with openpi_server(np.ones((10, 8), np.float32) / 10, {"reset_pose": np.zeros(3)}, seen) as url:
         options = "convention=joint_positions&cameras=base_camera:6x4&play=4&language=text"
         remote = RemotePolicy(f"{url}?{options}&rename=base_camera:observation/image,prompt:text")
-        assert remote.wants == Wants(convention="joint_positions", cameras={"base_camera": (6, 4)})
+        assert remote.spec == PolicySpec(convention="joint_positions", cameras={"base_camera": (6, 4)})
         remote.reset([a_start(1)])
         assert remote.act(some_observations(1, cameras=True)).shape == (1, 4, 8)
         remote.act(some_observations(1, cameras=True))
@@ -167,7 +167,7 @@ def test_our_client_asks_a_plain_openpi_server():
 
 
 def test_a_server_that_says_what_it_wants_is_not_told():
-    with serving(Told()) as url, pytest.raises(EvaluationError, match="says itself what it wants"):
+    with serving(Told()) as url, pytest.raises(EvaluationError, match="announces its policy specification"):
         RemotePolicy(f"{url}?convention=delta_euler")
 
 

@@ -156,7 +156,7 @@ def test_the_server_of_the_documentation():
     try:
         assert served.stdout is not None
         remote = started(f"ws://127.0.0.1:{int(served.stdout.readline())}")
-        assert dict(remote.wants.cameras) == {"base_camera": (224, 224)}
+        assert dict(remote.spec.cameras) == {"base_camera": (224, 224)}
         seen = some_observations(*range(ENVS))
         seen.images["base_camera"] = np.zeros((ENVS, 224, 224, 3), np.uint8)
         assert remote.act(seen).shape == (ENVS, 5, 7)
