@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from robocas_ms3.core.errors import MissingExtraError, TrainingError
 from robocas_ms3.core.exits import no_exit
-from robocas_ms3.core.extensions import Table
+from robocas_ms3.core.extensions import Registry
 from robocas_ms3.core.strict import nearest
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class Builtin:
         return import_module(f"robocas_ms3.baselines.{self.folder}").BASELINE
 
 
-BASELINES: Table[Callable[[], Baseline]] = Table(
+BASELINES: Registry[Callable[[], Baseline]] = Registry(
     "baseline",
     GROUP,
     Callable,

@@ -101,7 +101,7 @@ def videos(folder: Path, protocol: str | None, policy: str, count: int) -> int:
     result = read(folder)
     loaded = protocol_of(result, protocol)
     name = str(result.run["policy"]["name"])
-    if name not in {*POLICIES.builtin, *POLICIES.points} and policy != name:
+    if name not in {*POLICIES.builtin, *POLICIES.entry_points} and policy != name:
         fix = f"Name it yourself, if you trust it: --policy {name}"
         raise EvaluationError("this result is of a policy of somebody's own", where=folder, found=name, fix=fix)
     from robocas_ms3.core.processes import use_one_torch_thread

@@ -62,13 +62,13 @@ def collect() -> dict[str, list[dict[str, Any]]]:
         configs.append({"name": name, "task": config.task, "scene": scene, "description": config.description})
     robots = [{"name": name, "agent": robot.agent} for name, robot in ROBOTS.items()]
     policies = [{"name": name, "package": "robocas_ms3", "of": "builtin"} for name in POLICIES.builtin]
-    for points in POLICIES.points.values():
+    for points in POLICIES.entry_points.values():
         policies += [{"name": point.name, "package": package_of(point), "of": point.value} for point in points]
     baselines = [
         {"name": name, "package": "robocas_ms3", "about": getattr(row, "about", "")}
         for name, row in BASELINES.builtin.items()
     ]
-    for points in BASELINES.points.values():
+    for points in BASELINES.entry_points.values():
         baselines += [{"name": point.name, "package": package_of(point), "about": ""} for point in points]
     packs = []
     for name, folder in pack_folders().items():

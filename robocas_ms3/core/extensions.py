@@ -1,4 +1,4 @@
-"""Tables of rows by name: the builtin ones, and those that installed packages bring by their entry points."""
+"""Registries of objects by name: the builtin ones, and those of installed packages (entry points)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
-from robocas_ms3.core.after_import import half_imported
 from robocas_ms3.core.errors import ExtensionError
 from robocas_ms3.core.exits import no_exit
 
@@ -18,59 +17,50 @@ _log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
-class Table(Mapping[str, T]):
-    """Rows by name. What other packages bring is looked for when it is asked for, and loaded row by row.
+class Registry(Mapping[str, T]):
+    """Objects by name. Entry points of other packages are loaded one by one, when they are asked for.
 
-    A row that can't be loaded, or that several packages have, is an error for who asks for it; who asks for all gets
-    the others, and one warning. One whose module is just being imported is not there yet (`unfinished`).
+    Loading an entry point that fails raises an error; iterating leaves it out and logs one warning.
 
     Args:
-        kind: what a row is, for messages.
-        group: of the entry points, ``robocas_ms3.tasks``; each has the row's name, and names the object.
-        row: type of a row.
-        builtin: those of this package; no other package can replace them.
+        kind: what the objects are, for messages.
+        group: of the entry points, such as ``robocas_ms3.tasks``. The name of an entry point is that of its object.
+        type_: type of the objects.
+        builtin: the objects of this package, which no other package can replace.
     """
 
-    def __init__(self, kind: str, group: str, row: Any, builtin: Mapping[str, T]) -> None:
-        self.kind, self.group, self.row, self.builtin = kind, group, row, dict(builtin)
+    def __init__(self, kind: str, group: str, type_: Any, builtin: Mapping[str, T]) -> None:
+        self.kind, self.group, self.type, self.builtin = kind, group, type_, dict(builtin)
         self._loaded: dict[str, T] = {}
-        self._broken: dict[str, ExtensionError] = {}
+        self._warned: set[str] = set()
 
     def __getitem__(self, name: str) -> T:
         if name in self.builtin:
             return self.builtin[name]
-        points = self.points[name]
-        if name in self._broken:
-            raise self._broken[name].with_traceback(None)
         if name not in self._loaded:
-            if half_imported(points[0].module):
-                raise KeyError(name)
-            try:
-                self._loaded[name] = self._load(points)
-            except ExtensionError as error:
-                self._broken[name] = error
-                raise
+            self._loaded[name] = self._load(self.entry_points[name])
         return self._loaded[name]
 
     def __iter__(self) -> Iterator[str]:
         yield from self.builtin
-        for name in self.points:
-            known = name in self._broken
+        for name in self.entry_points:
             try:
-                if name in self:
-                    yield name
+                self[name]
             except ExtensionError as error:
-                if not known:
+                if name not in self._warned:
+                    self._warned.add(name)
                     _log.warning("%s", error)
+            else:
+                yield name
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
     def find(self, name: str, *, where: object = "") -> T:
-        """The row of a name.
+        """Return the object of a name.
 
         Raises:
-            ExtensionError: there is none, or it can't be loaded.
+            ExtensionError: the name is unknown, or its entry point can't be loaded.
         """
         if name in self:
             return self[name]
@@ -80,8 +70,8 @@ class Table(Mapping[str, T]):
         raise ExtensionError(f"no such {self.kind}", where=where, expected=f"one of {known}", found=repr(name), fix=fix)
 
     @cached_property
-    def points(self) -> dict[str, list[EntryPoint]]:
-        """By name, the entry points of other packages, of which nothing is loaded; one each, if all is well."""
+    def entry_points(self) -> dict[str, list[EntryPoint]]:
+        """The entry points of other packages by name, not loaded; more than one where packages conflict."""
         found: dict[str, list[EntryPoint]] = {}
         for point in sorted(entry_points(group=self.group), key=lambda point: (point.name, package_of(point))):
             if point.name in self.builtin:
@@ -90,42 +80,37 @@ class Table(Mapping[str, T]):
                 found[point.name].append(point)
         return found
 
-    def unfinished(self) -> list[str]:
-        """Modules of rows that are not there yet, as their import has not ended."""
-        modules = [points[0].module for name, points in self.points.items() if name not in self._loaded]
-        return [module for module in dict.fromkeys(modules) if half_imported(module)]
-
     def _load(self, points: list[EntryPoint]) -> T:
-        point = points[0]
+        point, where = points[0], f"{points[0].name} = {points[0].value}"
         if len(points) > 1:
             what, packages = f"several packages have a {self.kind} of this name", ", ".join(map(package_of, points))
             raise ExtensionError(what, where=point.name, found=packages, fix="Uninstall all but one.")
-        fix = f"Mend or uninstall {package_of(point)}."
+        fix = f"Repair or uninstall {package_of(point)}."
         try:
-            with no_exit(f"{self.kind} {point.name} = {point.value}"):
-                row = point.load()
+            with no_exit(f"{self.kind} {where}"):
+                found = point.load()
         except ExtensionError:
             raise
-        except Exception as error:  # whatever another package's module meets
-            what, found = f"this {self.kind} can't be loaded", " ".join(f"{type(error).__name__}: {error}".split())
-            raise ExtensionError(what, where=f"{point.name} = {point.value}", found=found, fix=fix) from error
-        if not isinstance(row, self.row):
-            expected = f"a {self.row.__name__}"
-            where = f"{point.name} = {point.value}"
-            raise ExtensionError(f"no {self.kind}", where=where, expected=expected, found=type(row).__name__, fix=fix)
-        return row
+        except Exception as error:  # code of another package may raise anything
+            message = " ".join(f"{type(error).__name__}: {error}".split())
+            raise ExtensionError(f"this {self.kind} can't be loaded", where=where, found=message, fix=fix) from error
+        if not isinstance(found, self.type):
+            expected = f"a {self.type.__name__}"
+            what = f"not a {self.kind}"
+            raise ExtensionError(what, where=where, expected=expected, found=type(found).__name__, fix=fix)
+        return found
 
 
 def package_of(point: EntryPoint) -> str:
-    """Name of the package that has an entry point."""
+    """Return the name of the package that declares an entry point."""
     return point.dist.name if point.dist else point.module.partition(".")[0]
 
 
 def load(path: str) -> Any:
-    """The object of an import path, ``package.module:name``.
+    """Return the object of an import path, ``package.module:name``.
 
     Raises:
-        ExtensionError: there is none.
+        ExtensionError: there is no such module or name.
     """
     module, _, name = path.partition(":")
     try:

@@ -15,7 +15,7 @@ from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.exits import no_exit
-from robocas_ms3.core.extensions import Table
+from robocas_ms3.core.extensions import Registry
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.protocol import EpisodeSource
 
@@ -100,7 +100,7 @@ _BUILTIN = (
 )
 
 
-FORMATS: Table[Format] = Table("dataset format", GROUP, Format, {one.name: one for one in _BUILTIN})
+FORMATS: Registry[Format] = Registry("dataset format", GROUP, Format, {one.name: one for one in _BUILTIN})
 """All of them by name."""
 
 

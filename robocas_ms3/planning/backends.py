@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from robocas_ms3.core.extensions import Table
+from robocas_ms3.core.extensions import Registry
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.table import RobotSpec
 
 DEFAULT = "rrt_connect"
-BACKENDS: Table[Callable[..., Planner]] = Table(
+BACKENDS: Registry[Callable[..., Planner]] = Registry(
     "planner", "robocas_ms3.planners", Callable, {DEFAULT: RRTConnectPlanner}
 )
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from robocas_ms3.core.errors import ExtensionError
-from robocas_ms3.core.extensions import Table
+from robocas_ms3.core.extensions import Registry
 from robocas_ms3.robots.description import MOBILE_PANDA, RobotDescription
 from robocas_ms3.robots.urdf import RobotFiles, robot_files
 
@@ -34,7 +34,9 @@ STOCK_FINGERS = RobotSpec(
     "robocas_ms3.robots.mobile_panda:RoboCASMobilePandaStockFingers",
 )
 DEFAULT = MOBILE_PANDA.uid
-ROBOTS = Table("robot", "robocas_ms3.robots", RobotSpec, {row.description.uid: row for row in (PANDA, STOCK_FINGERS)})
+ROBOTS = Registry(
+    "robot", "robocas_ms3.robots", RobotSpec, {row.description.uid: row for row in (PANDA, STOCK_FINGERS)}
+)
 
 
 def find_robot(name: str | None, *, where: object = "robot") -> RobotSpec:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from robocas_ms3.core.extensions import Table
+from robocas_ms3.core.extensions import Registry
 
 SIM_FREQ = 100  # Hz, of physics
 STANDARD_FREQ = 20  # Hz, of control; gymnasium's horizon is for it
@@ -113,4 +113,4 @@ OPEN_PICK = TaskSpec(
     slots=("part",),
     checks=(HAS_BASKET,),
 )
-TASKS = Table("task", "robocas_ms3.tasks", TaskSpec, {spec.name: spec for spec in (PICK, SELECT, SEARCH, OPEN_PICK)})
+TASKS = Registry("task", "robocas_ms3.tasks", TaskSpec, {spec.name: spec for spec in (PICK, SELECT, SEARCH, OPEN_PICK)})

@@ -1,18 +1,32 @@
-"""The benchmark's tasks: importing this package loads the environments and our robots."""
+"""The benchmark's tasks: importing this package registers environments and robots with ManiSkill."""
 
 import logging
+from typing import Any
+
+from mani_skill.utils.registration import REGISTERED_ENVS, register
 
 from robocas_ms3.core.extensions import load
-from robocas_ms3.registration import register
 from robocas_ms3.robots.table import ROBOTS
 from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 from robocas_ms3.tasks.open_pick import RoboCASOpenPickEnv
 from robocas_ms3.tasks.pick import RoboCASPickEnv
-from robocas_ms3.tasks.registry import env_class
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 from robocas_ms3.tasks.select import RoboCASSelectEnv
 
-register()
+
+def env_class(name: str) -> Any:
+    """Return the environment class of a task, and register it with ManiSkill.
+
+    Raises:
+        ExtensionError: the task is unknown, or its environment can't be loaded.
+    """
+    task = TASKS.find(name)
+    env = load(task.env)
+    if task.env_id not in REGISTERED_ENVS:
+        register(task.env_id, env, max_episode_steps=task.max_episode_steps)
+    return env
+
+
 for _name in TASKS.builtin:
     env_class(_name)
 for _robot in ROBOTS.builtin.values():
@@ -24,4 +38,12 @@ logging.getLogger("mani_skill ").addFilter(
     lambda record: not record.getMessage().startswith("Requested to use render device")
 )
 
-__all__ = ["TASKS", "RoboCASOpenPickEnv", "RoboCASPickEnv", "RoboCASSearchEnv", "RoboCASSelectEnv", "TaskSpec"]
+__all__ = [
+    "TASKS",
+    "RoboCASOpenPickEnv",
+    "RoboCASPickEnv",
+    "RoboCASSearchEnv",
+    "RoboCASSelectEnv",
+    "TaskSpec",
+    "env_class",
+]

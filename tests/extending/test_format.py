@@ -11,7 +11,7 @@ from strangers import install
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
-from robocas_ms3.core.extensions import Table
+from robocas_ms3.core.extensions import Registry
 from robocas_ms3.datasets import RoboCASDataset, formats
 from robocas_ms3.datasets.formats import format_of, open_source
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
@@ -24,7 +24,7 @@ def stranger(tmp_path, monkeypatch):
     folder = install("A dataset format", tmp_path / "site")
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setattr("robocas_ms3.datasets.writing.render.EnvFrames", RayCaster)
-    table = Table("dataset format", formats.GROUP, formats.Format, formats.FORMATS.builtin)
+    table = Registry("dataset format", formats.GROUP, formats.Format, formats.FORMATS.builtin)
     monkeypatch.setattr(formats, "FORMATS", table)  # as if the process had begun now
     yield folder
     sys.modules.pop("toy_format", None)

@@ -12,7 +12,7 @@ from strangers import robocas
 
 from robocas_ms3.cli.list import collect
 from robocas_ms3.core.errors import EvaluationError, ExtensionError
-from robocas_ms3.core.extensions import Table
+from robocas_ms3.core.extensions import Registry
 from robocas_ms3.evaluation import policies, results
 from robocas_ms3.evaluation.policies import GROUP, make_policy
 from robocas_ms3.evaluation.protocol import load_protocol
@@ -47,7 +47,7 @@ def site(tmp_path, monkeypatch):
     for name in ("my_policies", "spoilt_policies", "rival_policies"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     builtin = policies.POLICIES
-    table = Table(builtin.kind, builtin.group, builtin.row, builtin.builtin)
+    table = Registry(builtin.kind, builtin.group, builtin.type, builtin.builtin)
     monkeypatch.setattr(policies, "POLICIES", table)  # as if the process had begun now
     return folder
 
@@ -72,7 +72,7 @@ def test_it_is_found_and_listed_by_its_name(site):
         ("def (", "it = spoilt_policies:It", "it = .*: this policy can't be loaded .*SyntaxError"),
         ("", "it = spoilt_policies:It", "it = .*: this policy can't be loaded .*no attribute 'It'"),
         ("", "it = nowhere_at_all:It", "it = .*: this policy can't be loaded .*No module named 'nowhere_at_all'"),
-        ("It = 7", "it = spoilt_policies:It", "it = .*: no policy .*found int"),
+        ("It = 7", "it = spoilt_policies:It", "it = .*: not a policy .*found int"),
         ("def It(size): ...", "it = spoilt_policies:It", "it: this policy can't be made .*takes no arguments"),
         ("It = object", "it = spoilt_policies:It", "it: a policy without spec"),
     ],

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.exits import no_exit
-from robocas_ms3.core.extensions import Table
+from robocas_ms3.core.extensions import Registry
 from robocas_ms3.core.strict import nearest
 from robocas_ms3.evaluation.policies.plain import RandomPolicy, StillPolicy
 from robocas_ms3.evaluation.policy import Policy, PolicySpec
@@ -33,7 +33,7 @@ def _scripted(speaks: Literal["joint_positions", "robocas"], *, beside: bool = F
     return ScriptedPolicy(speaks, beside=beside)
 
 
-POLICIES: Table[Callable[[], Policy]] = Table(
+POLICIES: Registry[Callable[[], Policy]] = Registry(
     "policy",
     GROUP,
     Callable,
@@ -46,7 +46,7 @@ POLICIES: Table[Callable[[], Policy]] = Table(
     },
 )
 """By name, what makes them."""
-FOLDERS: Table[Callable[[Path], Policy]] = Table("kind of policy folder", FOLDERS_GROUP, Callable, {})
+FOLDERS: Registry[Callable[[Path], Policy]] = Registry("kind of policy folder", FOLDERS_GROUP, Callable, {})
 """By a file that such a folder holds, what opens it."""
 
 
@@ -92,7 +92,7 @@ def check_policy(name: str) -> None:
         EvaluationError: it can't.
     """
     kind, _, rest = name.partition(":")
-    known = [*POLICIES.builtin, *POLICIES.points]
+    known = [*POLICIES.builtin, *POLICIES.entry_points]
     of_own = re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier()
     if not (name in known or of_own or (kind in ("ws", "wss", "replay") and rest) or _opener(name)):
         expected = (
@@ -124,7 +124,7 @@ def _made(name: str) -> Policy:
 def _opener(name: str) -> str:
     """Which of `FOLDERS` opens a folder of this name; empty: none."""
     folder = Path(name)
-    return next((file for file in FOLDERS.points if (folder / file).is_file()), "") if folder.is_dir() else ""
+    return next((file for file in FOLDERS.entry_points if (folder / file).is_file()), "") if folder.is_dir() else ""
 
 
 def _own(name: str, module: str, of: str) -> Policy:
