@@ -26,7 +26,7 @@ robocas=${ROBOCAS:-.venv/bin/robocas}
 
 mkdir -p "$out"
 timed "$robocas" generate "$task" --config "${task}_upstream_eval" -n "$episodes" --seed "$seed" --jobs "$jobs" \
-    --after-policy "$from/run" --after-steps "${acts[@]}" --out "$out/demos" --resume
+    --after-policy "$from/run" --after-steps "${acts[@]}" --out "$out/demos"
 timed "$robocas" convert "$out/demos/trajectory.h5" --out "$out/parts" --size 512 384 --no-depth --no-video \
     --cameras base_camera gripper_camera --jobs "$jobs" --resume
 timed "$robocas" merge "$from/data" "$out/parts" --out "$out/data" --resume

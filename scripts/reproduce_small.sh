@@ -49,7 +49,7 @@ for part in "${parts[@]}"; do
     ((share)) || continue
     name=$config${first:+-after-$first}
     timed "$robocas" generate "$of" --config "$config" -n "$share" --seed $((seed + offset)) --jobs "$jobs" \
-        --max-attempts "$attempts" ${first:+--after-policy "$first" --after-steps 15 50} --out "$out/demos/$name" --resume
+        --max-attempts "$attempts" ${first:+--after-policy "$first" --after-steps 15 50} --out "$out/demos/$name"
     timed "$robocas" convert "$out/demos/$name/trajectory.h5" --out "$out/parts/$name" --size 512 384 --no-depth --no-video \
         --cameras base_camera gripper_camera --jobs "$jobs" --resume
     data+=("$out/parts/$name")

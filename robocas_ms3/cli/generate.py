@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -76,10 +75,8 @@ class Generate:
     only that is recorded. Scenes in which nothing is left to be done count as seeds given up."""
     after_steps: tuple[int, int] = (5, 60)
     """Least and most of its steps, of which it has a random number in each scene."""
-    resume: bool = False
-    """Go on with an interrupted run, or add episodes to a finished one."""
     overwrite: bool = False
-    """Replace the output folder if it exists."""
+    """Start again. Default: continue a run with the same settings, or add episodes to a finished one."""
 
 
 def main(cfg: Generate) -> int:
@@ -87,7 +84,7 @@ def main(cfg: Generate) -> int:
     try:
         return run(cfg)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt("the same command with --resume goes on") from None
+        raise KeyboardInterrupt("the same command continues") from None
 
 
 def run(cfg: Generate) -> int:
@@ -140,6 +137,11 @@ def run(cfg: Generate) -> int:
                 last = result.failures[-1]
                 shown.note(f"seed {result.seed}: given up ({last.stage}: {last.reason})")
 
+        def on_start(there: int) -> None:
+            if there >= cfg.episodes:
+                shown.note(f"{out} has {count_of(there, 'episode')} already")
+            shown.start(cfg.episodes, there)
+
         summary = generate(
             settings,
             out,
@@ -148,9 +150,8 @@ def run(cfg: Generate) -> int:
             jobs=cfg.jobs,
             fork=cfg.fork,
             limits=Limits(cfg.episode_seconds, cfg.memory_gb),
-            resume=cfg.resume,
             overwrite=cfg.overwrite,
-            on_start=partial(shown.start, cfg.episodes),
+            on_start=on_start,
             on_result=on_result,
             players=players,
             weights=weights,

@@ -168,7 +168,7 @@ class OutputFolder:
         record = self._load()
         if record is None:
             if not any((self.path / mark).exists() for mark in self._kind.marks):
-                what, expected = f"this folder is not of `{self._kind.command}`", " or ".join(self._known_by())
+                what, expected = f"this is not an output of `{self._kind.command}`", " or ".join(self._known_by())
                 raise OutputExistsError(what, where=self.path, expected=expected, fix="Choose another.")
             if not self._overwrite and self._has_results():
                 what, fix = "there are no recorded settings to continue with", "Pass --overwrite to start again."

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import MISSING, fields
-from pathlib import Path
 from typing import Any
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.outputs import check_same
 from robocas_ms3.core.strict import check_number
 from robocas_ms3.demos.episode import EpisodeSettings
 from robocas_ms3.demos.recordings.seeds import GREATEST_SEED
+from robocas_ms3.demos.recordings.versions import versions
 from robocas_ms3.planning.backends import BACKENDS
 from robocas_ms3.robots.table import find_robot
 from robocas_ms3.scenes.config import load_config_of
@@ -21,7 +19,7 @@ from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.task_specs import SIM_FREQ, TASKS
 
 WEIGHTS = "after_policy_weights"
-"""Of ``run.json``; outputs that are older do not say."""
+"""Key of ``run.json``: hash of the weights of ``after_policy``."""
 
 
 def check_limits(episode_seconds: float, memory_gb: float) -> None:
@@ -85,43 +83,10 @@ def check_arguments(
     SceneModel.load(config, load_pack(settings.pack), load_pack("builtin"), robot=robot.description)
 
 
-def check_same_run(path: Path, run: dict[str, Any]) -> None:
-    """Check that an output was begun with the same settings and versions.
-
-    Args:
-        path: ``run.json`` of the output, which may not be there.
-        run: what it would hold now.
-
-    Raises:
-        RobocasError: they differ.
-    """
-    if not path.is_file():
-        return
-    before = load_json(path)
-    if not isinstance(before, dict):
-        raise RobocasError("this file is damaged", where=path, expected="an object", found=type(before).__name__)
-    if isinstance(before.get("settings"), dict):  # a setting that is newer than the output had its default then
-        defaults = {one.name: one.default for one in fields(EpisodeSettings) if one.default is not MISSING}
-        before["settings"] = {**json.loads(json.dumps(defaults)), **before["settings"]}
-    if isinstance(before.get("versions"), dict):  # outputs that are older have none
-        now, fix = run.get("versions", {}), "Install those, or choose another --out."
-        what = "this machine has other versions than this output was begun with"
-        check_same(before["versions"], now, what, where=path, fix=fix, error=RobocasError)
-    for key, value in json.loads(json.dumps(run)).items():
-        if key != "versions" and before.get(key, value if key == WEIGHTS else None) != value:
-            place, expected, found = _first_difference(before.get(key), value, key)
-            raise RobocasError(
-                f"{place} is not that of this output",
-                where=path,
-                expected=expected,
-                found=found,
-                fix="Use the same, another --out, or --overwrite.",
-            )
-
-
-def _first_difference(one: Any, other: Any, place: str) -> tuple[str, Any, Any]:
-    """Return the dotted key of the first values that differ, and both values, of JSON values that differ."""
-    if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
-        key = next(key for key in one if one[key] != other[key])
-        return _first_difference(one[key], other[key], f"{place}.{key}")
-    return place, one, other
+def upgrade_run(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a ``run.json`` with defaults for what older versions of the package did not record."""
+    defaults = {one.name: one.default for one in fields(EpisodeSettings) if one.default is not MISSING}
+    settings = record["settings"]
+    if isinstance(settings, dict):
+        settings = {**json.loads(json.dumps(defaults)), **settings}
+    return {"versions": versions(), **record, "settings": settings}

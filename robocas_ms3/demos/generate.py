@@ -13,10 +13,9 @@ import numpy as np
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
-from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.core.outputs import check_one_way, check_overwrite, check_run, check_there, claim_output, while_there
+from robocas_ms3.core.outputs import FolderKind, OutputFolder
 from robocas_ms3.core.processes import Limits, Worker
-from robocas_ms3.demos.checks import WEIGHTS, check_arguments, check_same_run
+from robocas_ms3.demos.checks import WEIGHTS, check_arguments, upgrade_run
 from robocas_ms3.demos.episode import EpisodeResult, EpisodeSettings
 from robocas_ms3.demos.ledger import FAILURES_FILE, Failure, Ledger, count_by_stage, failed_attempts
 from robocas_ms3.demos.recordings.entries import read_json, reason
@@ -28,7 +27,7 @@ from robocas_ms3.demos.workers import generate_seeds, shard_name
 from robocas_ms3.planning.seconds import Seconds
 
 RUN = "run.json"
-_BEGINNINGS = {RUN, FAILURES_FILE, "episodes"}  # of a run that has not finished a seed yet
+_OUTPUT = FolderKind("robocas generate", (RUN,), "settings", upgrade=upgrade_run)
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,6 @@ def generate(
     jobs: int = 1,
     fork: bool = True,
     limits: Limits | None = None,
-    resume: bool = False,
     overwrite: bool = False,
     on_start: Callable[[int], None] = lambda there: None,
     on_result: Callable[[EpisodeResult], None] = lambda result: None,
@@ -77,10 +75,10 @@ def generate(
 ) -> Summary:
     """Generate episodes of consecutive seeds until there are enough.
 
-    ``out`` gets ``trajectory.h5`` and ``.json``, ``failures.jsonl``, ``run.json`` (how it was made) and
-    ``summary.json``. Each finished episode is a file of its own under ``out/episodes`` until the end, so that an
-    interrupted run goes on with ``resume``. Seeds are consecutive and results are taken in their order, so neither
-    ``jobs`` nor an interruption changes the outcome.
+    ``out`` gets ``trajectory.h5`` and ``.json``, ``failures.jsonl``, ``run.json`` (settings and versions) and
+    ``summary.json``. Each finished episode is a file of its own under ``out/episodes`` until the end: calling again
+    continues an interrupted run, or adds episodes to a finished one. Seeds are consecutive and results are taken in
+    their order, so neither ``jobs`` nor an interruption changes the outcome.
 
     Args:
         settings: the same for all episodes.
@@ -91,8 +89,7 @@ def generate(
         fork: undo what fails by forking where that is safe.
         limits: of each seed. With them one job is a process of its own too; a seed that goes beyond them, or takes its
             process down, is begun again once, and then given up. None: with one job this process does it.
-        resume: go on with what is in ``out``.
-        overwrite: replace what is in ``out``.
+        overwrite: start again, and replace the run in ``out``.
         on_start: called once arguments, configuration, pack and output turned out right, with how many of the episodes
             are there.
         on_result: called for each seed that was not dealt with before, in order.
@@ -100,36 +97,21 @@ def generate(
         weights: hash of those that it acts with, if it has some: an output goes on with the same.
 
     Raises:
-        OutputExistsError: ``out`` has content and neither flag is set, or what was made by another command.
-        RobocasError: an argument is wrong, or both flags are set, which leaves no trace; ``out`` was made with other
-            settings or versions, or another process writes there; far too many seeds fail.
+        OutputExistsError: ``out`` was written with other settings or versions, or by another command.
+        RobocasError: an argument is wrong, which leaves no trace; another process writes there; far too many seeds
+            fail.
     """
-    check_one_way("generate", resume=resume, overwrite=overwrite)
     check_arguments(settings, episodes=episodes, first_seed=first_seed, jobs=jobs, acts_first=players is not None)
-    if overwrite:
-        check_overwrite(out, (RUN,), "made by `robocas generate`")
-    check_run(out / RUN, "settings", "generate")
-    with locked_folder(out):
-        claim_output(out, overwrite=overwrite or _only_begun(out), resume=resume)
-        run = {"settings": asdict(settings), "first_seed": first_seed, "versions": versions()}
-        if weights:
-            run[WEIGHTS] = weights
-        check_same_run(out / RUN, run)
-        make_folder(out)
-        write_json(out / RUN, run)
-        with while_there(out / RUN):
-            return _generate_in(out, settings, episodes, first_seed, jobs, fork, limits, on_start, on_result, players)
-
-
-def _only_begun(out: Path) -> bool:
-    """Whether a run was begun here, and ended before it was through with a seed."""
-    if not (out / RUN).is_file() or {path.name for path in out.iterdir() if path.name != ".lock"} - _BEGINNINGS:
-        return False
-    return not _finished(out, out / "episodes", Ledger(out / FAILURES_FILE))
+    run = {"settings": asdict(settings), "first_seed": first_seed, "versions": versions()}
+    if weights:
+        run[WEIGHTS] = weights
+    with OutputFolder(out, _OUTPUT, run, overwrite=overwrite) as output:
+        output.start(run)
+        return _generate_in(output, settings, episodes, first_seed, jobs, fork, limits, on_start, on_result, players)
 
 
 def _generate_in(
-    out: Path,
+    output: OutputFolder,
     settings: EpisodeSettings,
     episodes: int,
     first_seed: int,
@@ -140,6 +122,7 @@ def _generate_in(
     on_result: Callable[[EpisodeResult], None],
     players: Callable[[], Worker[int, Takeover]] | None,
 ) -> Summary:
+    out = output.path
     shards, ledger = make_folder(out / "episodes"), Ledger(out / FAILURES_FILE)
     earlier = _finished(out, shards, ledger)
     ledger.settle([line for seed in sorted(earlier) for line in _lines(earlier[seed])])
@@ -158,7 +141,7 @@ def _generate_in(
                     good += earlier[seed].success
                     continue
                 result = next(new)
-                check_there(out / RUN)
+                output.check_exists()
                 ledger.append(_lines(result))
                 results.append(result)
                 good += result.success
@@ -170,9 +153,9 @@ def _generate_in(
                         found=f"{len(results) - good} of {len(results)}",
                         fix=f"See {ledger.path.name}; a smaller objects.count may help.",
                     )
-    except RobocasError:
+    except BaseException:
         if not (results or earlier):
-            shutil.rmtree(out, ignore_errors=True)  # it never began
+            shutil.rmtree(shards, ignore_errors=True)  # unfinished episodes
         raise
     return _finish(out, shards, ledger, results, earlier)
 

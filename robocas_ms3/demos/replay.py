@@ -16,7 +16,7 @@ from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES, parse_obs_mo
 
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import make_folder
-from robocas_ms3.core.outputs import claim_output
+from robocas_ms3.core.outputs import check_replaceable
 from robocas_ms3.core.strict import check_number
 from robocas_ms3.demos.convert_actions import CONVERTIBLE, convert_action
 from robocas_ms3.demos.recorded import Recorded
@@ -102,7 +102,7 @@ def replay(
         if save.resolve() == trajectory.resolve():
             raise DatasetError("this is the recording itself", where=save, fix="Choose another name for the replay.")
         for path in (save, save.with_suffix(".json")):
-            claim_output(path, overwrite=overwrite, resume=None)
+            check_replaceable(path, overwrite=overwrite)
     kwargs = {"control_mode": mode, "obs_mode": obs_mode, **(env_kwargs or {})}
     if obs_mode == "none":
         kwargs.setdefault("render_backend", "none")

@@ -119,18 +119,15 @@ def test_resuming_adds_episodes_and_equals_an_uninterrupted_run(run, tmp_path):
     summary, _ = run
     out = tmp_path / "resumed"
     generate(SETTINGS, out, episodes=1)
-    with pytest.raises(OutputExistsError, match="--resume"):
-        generate(SETTINGS, out, episodes=2)
-    resumed = generate(SETTINGS, out, episodes=2, resume=True)
+    resumed = generate(SETTINGS, out, episodes=2)
     assert resumed.episodes == 2
     whole, parts = load(summary.trajectory), load(resumed.trajectory)
     for name in ("traj_0", "traj_1"):
         assert np.array_equal(whole[name]["actions"], parts[name]["actions"])
     other = EpisodeSettings("pick", "pick_table_scattered", "builtin", control_freq=5)
-    with pytest.raises(RobocasError) as caught:
-        generate(other, out, episodes=2, resume=True)
-    assert "settings.control_freq" in caught.value.what
-    assert (caught.value.where, caught.value.expected, caught.value.found) == (out / "run.json", 20, 5)
+    with pytest.raises(OutputExistsError) as caught:
+        generate(other, out, episodes=2)
+    assert (caught.value.where, caught.value.found) == (out / "run.json", "settings.control_freq: 20 -> 5")
 
 
 def test_files_that_cannot_be_read_are_one_clear_line(run, tmp_path):
@@ -152,13 +149,6 @@ def test_a_wrong_pack_leaves_nothing_behind(tmp_path):
     with pytest.raises(RobocasError, match="no such asset pack"):
         generate(EpisodeSettings("pick", "pick_table_scattered", "nowhere"), tmp_path / "out", episodes=1)
     assert not (tmp_path / "out").exists()
-
-
-def test_overwrite_deletes_only_what_generate_made(tmp_path):
-    (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(RobocasError, match="refusing to overwrite what is not made by `robocas generate`"):
-        generate(SETTINGS, tmp_path, episodes=1, overwrite=True)
-    assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
 
 def call_it_done(monkeypatch):
